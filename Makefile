@@ -1,0 +1,43 @@
+# Two commands on a fresh machine: `make train` and `make test`. Both need Python 3.10 or later and make, nothing else.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STEPS ?= 200000
+SEED ?= 0
+LOGS ?= logs
+EPISODES ?= 100
+JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
+POLICIES ?= none full distance:4 cpa:0.7:1.5
+
+.PHONY: help install train test lint bench clean
+help:  ## show this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+install: $(VENV)/.installed  ## make .venv with the pinned dependencies
+
+# torch comes first and alone, so that no other package can draw in another build of it.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[zoo,plot,render,dev]"
+	@touch $@
+
+train: install  ## train MADDPG on the swarm, then print the table of policies (STEPS=20000 for a short run)
+	$(BIN)/python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --n-timesteps $(STEPS) --seed $(SEED) \
+		--log-folder $(LOGS) --tensorboard-log $(LOGS)/tensorboard --progress
+	$(BIN)/python -m sb3_maddpg.zoo evaluate --env QuadSwarm-v0 --policy $(POLICIES) latest:$(LOGS) --scenario all \
+		--episodes $(EPISODES) --jobs $(JOBS) --json $(LOGS)/table.json --plot $(LOGS)/plots
+
+test: install lint  ## every check: ruff, mypy, pytest
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+lint: install  ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: install  ## every script in benchmarks/, as a table and as JSON
+	for script in benchmarks/*.py; do $(BIN)/python $$script --json $(LOGS)/$$(basename $$script .py).json || exit 1; done
+
+clean:  ## remove what the commands above made, but not the logs
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,1 @@
+"""Training recipes: one YAML file per algorithm, in the format of rl_zoo3."""
