@@ -1,0 +1,95 @@
+"""What each robot believes the others will do (Sec. III-C and IV-A).
+
+In order of preference: the plan it requested (made one step ago), the plan it received earlier while that still fits what it observes, and
+a constant velocity.
+
+Arrays carry a leading axis of swarms: E swarms of n robots. ``others`` axes list the n - 1 others of a robot in ascending order.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class BeliefSource(IntEnum):
+    """Where a believed trajectory comes from."""
+
+    CONSTANT_VELOCITY = 0
+    REMEMBERED = 1
+    REQUESTED = 2
+
+
+def other_indices(n_robots: int) -> np.ndarray:
+    """For each robot the indices of the others, ascending: (n, n - 1)."""
+    return np.array([[j for j in range(n_robots) if j != i] for i in range(n_robots)], dtype=np.int64)
+
+
+def constant_velocity(pos: np.ndarray, vel: np.ndarray, horizon: int, dt: float) -> np.ndarray:
+    """Positions at the next ``horizon`` steps if the velocity stayed: (..., 3), (..., 3) -> (..., N, 3) (m)."""
+    times = dt * np.arange(1, horizon + 1)
+    return pos[..., None, :] + times[:, None] * vel[..., None, :]
+
+
+def advance(trajectory: np.ndarray) -> np.ndarray:
+    """A trajectory (..., K, 3) seen one step later; its last piece goes on in a straight line."""
+    end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
+    return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
+
+
+class Beliefs:
+    """The believed trajectories of E swarms and the memory behind them.
+
+    :param n_swarms: number of swarms E
+    :param n_robots: robots in a swarm n
+    :param horizon: stages of a plan N
+    :param dt: length of a stage (s)
+    :param memory: a plan received earlier is believed while it predicts the observed position to within this distance (m) and is
+        younger than N steps; 0 switches the memory off
+    """
+
+    def __init__(self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float):
+        if not memory >= 0:
+            raise ValueError(f"memory={memory}: it is a distance in metres, or 0 to switch it off.")
+        self.others = other_indices(n_robots)
+        self.horizon = horizon
+        self.dt = dt
+        self.memory = memory
+        shape = (n_swarms, n_robots, n_robots - 1)
+        # Remembered positions of now and of the next N steps; age in steps since they were planned, N or more: none.
+        self._remembered = np.zeros((*shape, horizon + 1, 3))
+        self._age = np.full(shape, horizon, dtype=np.int64)
+
+    def forget(self, swarms: np.ndarray) -> None:
+        """Forget every received plan in the given swarms (indices or mask)."""
+        self._age[swarms] = self.horizon
+
+    def keep(self, swarms: np.ndarray) -> None:
+        """Drop all but the given swarms (indices or mask)."""
+        self._remembered, self._age = self._remembered[swarms], self._age[swarms]
+
+    def update(
+        self, requests: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Believed trajectories after this step's requests.
+
+        :param requests: whom each robot asks, (E, n, n - 1) bool
+        :param pos: present positions, (E, n, 3), world frame (m)
+        :param vel: present velocities, (E, n, 3), world frame (m/s)
+        :param plans: positions that each robot planned one step ago, stages 0..N, (E, n, N + 1, 3) (m)
+        :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n - 1)
+        """
+        current = advance(plans)  # now, and the next N steps
+        steady = constant_velocity(pos, vel, self.horizon, self.dt)
+        asked = requests[..., None, None]
+        believed = np.where(asked, current[:, self.others, 1:], steady[:, self.others])
+        source = np.where(requests, BeliefSource.REQUESTED, BeliefSource.CONSTANT_VELOCITY)
+        if self.memory > 0:
+            self._remembered = np.where(asked, current[:, self.others], advance(self._remembered))
+            self._age = np.where(requests, 1, self._age + 1)
+            error = np.linalg.norm(self._remembered[..., 0, :] - pos[:, self.others], axis=-1)
+            usable = ~requests & (self._age < self.horizon) & (error <= self.memory)
+            believed = np.where(usable[..., None, None], self._remembered[..., 1:, :], believed)
+            source = np.where(usable, BeliefSource.REMEMBERED, source)
+        return believed, source

@@ -1,0 +1,164 @@
+"""What every solver is given and gives back, and the ladder that turns its answer into a plan that can always be flown."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ..quadrotor import N_INPUTS, QuadrotorModel
+from .problem import PlannerConfig
+
+
+class Problems(NamedTuple):
+    """A batch of B optimal control problems.
+
+    :param x: present states, (B, 9)
+    :param goal: goals, (B, 3), world frame (m)
+    :param others: believed positions of the n - 1 others at stages 1..N, (B, n - 1, N, 3) (m)
+    """
+
+    x: np.ndarray
+    goal: np.ndarray
+    others: np.ndarray
+
+
+class Solution(NamedTuple):
+    """What a solver found for a batch of B problems.
+
+    :param x: states at stages 0..N, (B, N + 1, 9); stage 0 is the present state
+    :param u: inputs at stages 0..N-1, (B, N, 4)
+    :param success: whether each problem was solved to the solver's own tolerance, (B,) bool
+    :param iterations: iterations spent on each problem, (B,) int
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    success: np.ndarray
+    iterations: np.ndarray
+
+
+class Solver(Protocol):
+    """Solves batches of problems; it reports failure, it never raises for it."""
+
+    name: str
+
+    def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
+        """Solve every problem of the batch.
+
+        :param problems: the batch
+        :param x_guess: initial guess of the states at stages 0..N, (B, N + 1, 9)
+        :param u_guess: initial guess of the inputs, (B, N, 4)
+        """
+        ...
+
+
+class PlanStatus(IntEnum):
+    """How a plan came about: the rung of the ladder that held."""
+
+    SOLVED = 0
+    RETRIED = 1
+    SHIFTED = 2
+    BRAKING = 3
+
+
+class Plans(NamedTuple):
+    """Plans of B robots.
+
+    :param x: states at stages 0..N, (B, N + 1, 9)
+    :param u: inputs at stages 0..N-1, (B, N, 4)
+    :param age: steps since each plan came from the solver, (B,) int
+    :param status: `PlanStatus` of each plan, (B,) int
+    :param iterations: solver iterations spent, (B,) int
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    age: np.ndarray
+    status: np.ndarray
+    iterations: np.ndarray
+
+    @classmethod
+    def hover(cls, x: np.ndarray, horizon: int) -> Plans:
+        """The plan of a robot at rest before its first solve: stay where it is."""
+        count = x.shape[0]
+        return cls(
+            x=np.repeat(x[:, None], horizon + 1, axis=1),
+            u=np.zeros((count, horizon, N_INPUTS)),
+            age=np.zeros(count, dtype=np.int64),
+            status=np.zeros(count, dtype=np.int64),
+            iterations=np.zeros(count, dtype=np.int64),
+        )
+
+
+class Planner:
+    """Warm-started solves with a ladder below them: solve, retry cold, fly the last plan on, brake (Sec. III-B).
+
+    Every rung is decided per robot; a failure of one never touches another's plan.
+
+    :param solver: the solver
+    :param model: discrete dynamics, for the rungs that need no solver
+    :param config: horizon and limits
+    """
+
+    def __init__(self, solver: Solver, model: QuadrotorModel, config: PlannerConfig):
+        self.solver = solver
+        self.model = model
+        self.config = config
+
+    def plan(self, problems: Problems, previous: Plans) -> Plans:
+        """Plans for a batch of B problems.
+
+        :param problems: the batch
+        :param previous: the plans of the same robots one step ago
+        """
+        x_guess, u_guess = shift(previous.x), shift(previous.u)
+        x, u, success, iterations = self.solver.solve(problems, x_guess, u_guess)
+        solved = success & _finite(x, u)
+        status = np.where(solved, PlanStatus.SOLVED, PlanStatus.BRAKING)
+        age = np.zeros(len(status), dtype=np.int64)
+
+        failed = np.flatnonzero(~solved)
+        if failed.size:
+            # Cold: the present state held, no input.
+            cold = Plans.hover(problems.x[failed], self.config.horizon)
+            retry = self.solver.solve(Problems(*(field[failed] for field in problems)), cold.x, cold.u)
+            iterations[failed] += retry.iterations
+            solved = retry.success & _finite(retry.x, retry.u)
+            x[failed], u[failed] = retry.x, retry.u
+            status[failed[solved]] = PlanStatus.RETRIED
+
+            failed = failed[~solved]
+            age[failed] = previous.age[failed] + 1
+            lasts = age[failed] < self.config.horizon
+            status[failed[lasts]] = PlanStatus.SHIFTED
+            u[failed[lasts]] = u_guess[failed[lasts]]
+            u[failed[~lasts]] = self.braking_inputs(problems.x[failed[~lasts]])
+            x[failed] = self.model.rollout(problems.x[failed], u[failed])
+        return Plans(x, u, age, status, iterations)
+
+    def braking_inputs(self, x: np.ndarray) -> np.ndarray:
+        """Inputs that bring robots to hover without a solver, from their states alone: (B, 9) -> (B, N, 4).
+
+        The commanded tilt opposes the velocity and saturates at its limit; the climb rate is commanded to zero.
+        """
+        # Tilt a = v / (g * 0.5 s) stops the linearised robot in about half a second without ringing.
+        gain = 1.0 / (self.model.params.gravity * 0.5)
+        limit = self.config.max_tilt
+        u = np.zeros((x.shape[0], self.config.horizon, N_INPUTS))
+        state = x
+        for k in range(self.config.horizon):
+            u[:, k, 0] = np.clip(gain * state[:, 4], -limit, limit)
+            u[:, k, 1] = np.clip(-gain * state[:, 3], -limit, limit)
+            state = self.model.step(state, u[:, k])
+        return u
+
+
+def shift(trajectory: np.ndarray) -> np.ndarray:
+    """A trajectory (B, K, ...) one step later, its last entry repeated."""
+    return np.concatenate([trajectory[:, 1:], trajectory[:, -1:]], axis=1)
+
+
+def _finite(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return np.isfinite(x).all(axis=(1, 2)) & np.isfinite(u).all(axis=(1, 2))

@@ -1,0 +1,154 @@
+"""The converged nonlinear program, solved with fatrop (structure-exploiting interior point, in CasADi's wheel)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..quadrotor import N_INPUTS, N_STATES
+from .base import Problems, Solution
+from .problem import OptimalControlProblem
+
+
+class FatropSolver:
+    """Reference solver: every problem of a batch to convergence, one after the other.
+
+    :param problem: the problem
+    :param tolerance: fatrop's convergence tolerance
+    :param max_iterations: iterations after which a problem counts as failed (never a time limit: results must repeat)
+    """
+
+    name = "fatrop"
+
+    def __init__(self, problem: OptimalControlProblem, tolerance: float = 1e-4, max_iterations: int = 100):
+        self.problem = problem
+        self.tolerance = tolerance
+        self.max_iterations = max_iterations
+        self._program: _Program | None = None
+
+    def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
+        """See `Solver.solve`."""
+        if self._program is None:
+            self._program = _transcribe(self.problem, self.tolerance, self.max_iterations)
+        program, nx, nu = self._program, self.problem.nx, self.problem.nu
+        count, horizon = u_guess.shape[:2]
+        x = np.zeros((count, horizon + 1, N_STATES))
+        u = np.zeros((count, horizon, N_INPUTS))
+        x[:, 0] = problems.x
+        success = np.zeros(count, dtype=bool)
+        iterations = np.zeros(count, dtype=np.int64)
+        variables = np.zeros(program.n_variables)
+        for b in range(count):
+            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], problems.others[b].ravel()])
+            variables[program.x_index] = x_guess[b, 1:, :nx]
+            variables[program.u_index] = u_guess[b, :, :nu]
+            if not (np.isfinite(parameters).all() and np.isfinite(variables).all()):
+                continue
+            try:
+                solution = program.solver(x0=variables, p=parameters, **program.bounds)
+            except RuntimeError:  # fatrop gave up on the numbers; the ladder takes over
+                continue
+            stats = program.solver.stats()
+            success[b], iterations[b] = stats["success"], stats["iter_count"]
+            optimum = solution["x"].full().ravel()
+            x[b, 1:, :nx] = optimum[program.x_index]
+            u[b, :, :nu] = optimum[program.u_index]
+        return Solution(x, u, success, iterations)
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_program": None}  # rebuilt in the process that needs it
+
+
+class _Program(NamedTuple):
+    """The transcribed program and where states and inputs stand among its variables."""
+
+    solver: ca.Function
+    bounds: dict[str, np.ndarray]
+    x_index: np.ndarray
+    u_index: np.ndarray
+    n_variables: int
+
+
+def _transcribe(problem: OptimalControlProblem, tolerance: float, max_iterations: int) -> _Program:
+    """Multiple shooting in the stage order that fatrop expects: x_0 is a parameter, slacks are further inputs of their stage."""
+    config, nx, nu, n_others = problem.config, problem.nx, problem.nu, problem.n_others
+    horizon = config.horizon
+    x0, goal = ca.SX.sym("x0", nx), ca.SX.sym("goal", 3)
+    others = ca.SX.sym("others", 3, horizon * n_others)  # column j * N + k - 1: robot j at stage k
+    states = [x0] + [ca.SX.sym(f"x{k}", nx) for k in range(1, horizon + 1)]
+    inputs = [ca.SX.sym(f"u{k}", nu) for k in range(horizon)]
+    step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
+
+    cost = problem.goal_cost(states[-1], x0, goal)
+    variables, lower, upper, x_index, u_index = [], [], [], [], []
+    constraints, constraint_lower, equality, n_slacks = [], [], [], []
+    max_input = problem.max_input.full().ravel()
+    offset = 0
+    for k in range(horizon + 1):
+        slack = ca.SX.sym(f"slack{k}", n_others if k > 0 else 0)
+        n_slacks.append(slack.numel())
+        if k > 0:
+            variables.append(states[k])
+            lower.append(np.full(nx, -np.inf))
+            x_index.append(np.arange(offset, offset + nx))
+            offset += nx
+            distances = problem.distances(states[k], others[:, [j * horizon + k - 1 for j in range(n_others)]])
+            cost += sum((problem.repulsion_cost(d) for d in distances), start=ca.SX(0))
+            cost += config.violation_weight * (
+                ca.sumsqr(slack) + ca.sumsqr(ca.fmax(problem.box_violations(states[k]), 0))
+            )
+        if k < horizon:
+            cost += problem.input_cost(inputs[k])
+            variables.append(inputs[k])
+            lower.append(-max_input)
+            u_index.append(np.arange(offset, offset + nu))
+            offset += nu
+            constraints.append(states[k + 1] - step(states[k], inputs[k]))
+            constraint_lower.append(np.zeros(nx))
+            equality += [True] * nx
+        variables.append(slack)
+        lower.append(np.full(n_slacks[k], -np.inf))
+        offset += n_slacks[k]
+        if k > 0:
+            constraints += [d - config.separation + slack[j] for j, d in enumerate(distances)]
+            constraint_lower.append(np.zeros(n_others))
+            equality += [False] * n_others
+    bounds = np.concatenate(lower)
+    solver = ca.nlpsol(
+        "planner",
+        "fatrop",
+        {
+            "x": ca.vertcat(*variables),
+            "f": cost,
+            "g": ca.vertcat(*constraints),
+            "p": ca.vertcat(x0, goal, ca.vec(others)),
+        },
+        {
+            "structure_detection": "manual",
+            "N": horizon,
+            "nx": [0] + [nx] * horizon,
+            "nu": [(nu if k < horizon else 0) + n_slacks[k] for k in range(horizon + 1)],
+            "ng": n_slacks,
+            "equality": equality,
+            "print_time": False,
+            "error_on_fail": False,
+            "fatrop.print_level": 0,
+            "fatrop.tolerance": tolerance,
+            "fatrop.mu_init": 1e-2,
+            "fatrop.max_iter": max_iterations,
+        },
+    )
+    return _Program(
+        solver=solver,
+        bounds={
+            "lbx": bounds,
+            "ubx": -bounds,
+            "lbg": np.concatenate(constraint_lower),
+            "ubg": np.where(equality, 0.0, np.inf),
+        },
+        x_index=np.array(x_index),
+        u_index=np.array(u_index),
+        n_variables=offset,
+    )

@@ -1,0 +1,116 @@
+"""The optimal control problem of one robot (eq. 2), written down once for every solver."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+
+from ..quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Horizon, limits and weights of the problem. Form of the cost and most weights: tud-amr/mrca-mav (docs/method.md).
+
+    :param horizon: number of stages N (-)
+    :param dt: length of a stage and of a simulation step (s)
+    :param separation: distance to keep between the centres of two robots (m); the paper's constraint is 2r
+    :param max_tilt: limit of the commanded roll and pitch (rad)
+    :param max_climb_rate: limit of the commanded climb rate (m/s)
+    :param max_yaw_rate: limit of the commanded yaw rate (rad/s); 0 holds the yaw and takes it out of the problem
+    :param max_speed: limit of the velocity along x and along y, soft (m/s)
+    :param max_vertical_speed: limit of the velocity along z, soft (m/s)
+    :param workspace_low: lower corner of the workspace, soft (m)
+    :param workspace_high: upper corner of the workspace, soft (m)
+    :param goal_weight: weight of the terminal squared distance to the goal over max(1, squared distance at present)
+    :param input_weight: weight of the squared inputs, each over its limit
+    :param repulsion_weight: weight of the smooth repulsion from each other robot
+    :param repulsion_buffer: distance at which half of the repulsion acts, in separations (-)
+    :param repulsion_steepness: steepness of the repulsion, per separation (-)
+    :param violation_weight: weight of the squared violation of a soft constraint (1/m^2)
+    """
+
+    horizon: int = 10
+    dt: float = 0.1
+    separation: float = 0.6
+    max_tilt: float = math.radians(12.0)
+    max_climb_rate: float = 1.0
+    max_yaw_rate: float = 0.0
+    max_speed: float = 4.0
+    max_vertical_speed: float = 1.5
+    workspace_low: tuple[float, float, float] = (-4.8, -4.8, 0.48)
+    workspace_high: tuple[float, float, float] = (4.8, 4.8, 2.4)
+    goal_weight: float = 8.0
+    input_weight: float = 0.1
+    repulsion_weight: float = 0.1
+    repulsion_buffer: float = 1.2
+    repulsion_steepness: float = 10.0
+    violation_weight: float = 1e4
+
+    def __post_init__(self) -> None:
+        if self.horizon < 2:
+            raise ValueError(f"horizon={self.horizon}: the planner needs at least 2 stages.")
+        for name in ("dt", "separation", "max_tilt", "max_climb_rate", "max_speed", "max_vertical_speed"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)}: it must be positive.")
+        if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
+            raise ValueError(f"Empty workspace: low corner {self.workspace_low}, high corner {self.workspace_high}.")
+
+
+class OptimalControlProblem:
+    """Symbolic building blocks of eq. (2); a solver assembles them in the order that it needs.
+
+    With the yaw held (``max_yaw_rate = 0``) the decision variables are the first 8 states and the first 3 inputs.
+
+    :param config: horizon, limits and weights
+    :param quadrotor: physical parameters
+    :param n_others: number of other robots
+    """
+
+    def __init__(self, config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int):
+        self.config = config
+        self.quadrotor = quadrotor
+        self.n_others = n_others
+        hold_yaw = config.max_yaw_rate == 0.0
+        self.nx = N_STATES - 1 if hold_yaw else N_STATES
+        self.nu = N_INPUTS - 1 if hold_yaw else N_INPUTS
+        limits = [config.max_tilt, config.max_tilt, config.max_climb_rate, config.max_yaw_rate]
+        self.max_input = ca.DM(limits[: self.nu])
+
+    def dynamics(self, x: ca.SX, u: ca.SX) -> ca.SX:
+        """Next state, (nx,), in still air (eq. 1)."""
+        x_full = ca.vertcat(x, ca.SX.zeros(N_STATES - self.nx))
+        u_full = ca.vertcat(u, ca.SX.zeros(N_INPUTS - self.nu))
+        return ca.cse(rk4_step(x_full, u_full, ca.SX.zeros(2), self.quadrotor, self.config.dt))[: self.nx]
+
+    def input_cost(self, u: ca.SX) -> ca.SX:
+        """Cost of the inputs of one stage, each over its limit."""
+        return self.config.input_weight * ca.sumsqr(u / self.max_input)
+
+    def goal_cost(self, x: ca.SX, x0: ca.SX, goal: ca.SX) -> ca.SX:
+        """Terminal cost: squared distance to the goal over that from where the robot is, so that far goals do not dominate."""
+        cost = self.config.goal_weight * ca.sumsqr(goal - x[:3]) / ca.fmax(ca.sumsqr(goal - x0[:3]), 1.0)
+        if self.nx == N_STATES:
+            cost += self.config.goal_weight * x[8] ** 2  # the task asks for no heading: fly with yaw zero
+        return cost
+
+    def distances(self, x: ca.SX, others: ca.SX) -> list[ca.SX]:
+        """Distance (m) to each other robot's believed position; ``others`` is (3, n_others)."""
+        # The small constant keeps the gradient finite where two centres coincide.
+        return [ca.sqrt(ca.sumsqr(x[:3] - others[:, j]) + 1e-6) for j in range(self.n_others)]
+
+    def repulsion_cost(self, distance: ca.SX) -> ca.SX:
+        """Smooth repulsion from one other robot; it conditions the problem where the bare constraint leaves it flat."""
+        c = self.config
+        steepness = c.repulsion_steepness * (distance / c.separation - c.repulsion_buffer)
+        return c.repulsion_weight / (1 + ca.exp(steepness)) ** 2
+
+    def box_violations(self, x: ca.SX) -> ca.SX:
+        """Amounts by which a state leaves the workspace (m) and the speed limits (m/s); violated where positive."""
+        c = self.config
+        speed = ca.DM([c.max_speed, c.max_speed, c.max_vertical_speed])
+        return ca.vertcat(
+            ca.DM(c.workspace_low) - x[:3], x[:3] - ca.DM(c.workspace_high), -speed - x[3:6], x[3:6] - speed
+        )

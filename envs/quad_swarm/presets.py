@@ -1,0 +1,110 @@
+"""Worlds with a name. A preset is frozen together with `PRESET_VERSION`: results name both, and a change reruns every table."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from .errors import unknown_name
+from .planner import PlannerConfig
+from .quadrotor import QuadrotorParams
+from .scenarios import ScenarioSpace
+
+PRESET_VERSION = 1
+
+
+@dataclass(frozen=True)
+class ProcessNoise:
+    """Disturbances of the simulated flight; the planner knows nothing of them. All off by default.
+
+    :param pos: standard deviation added to each position component in each step (m)
+    :param vel: standard deviation added to each velocity component in each step (m/s)
+    :param attitude: standard deviation added to roll and pitch in each step (rad)
+    :param wind: speed of a steady horizontal wind whose direction is drawn for each episode (m/s)
+    """
+
+    pos: float = 0.0
+    vel: float = 0.0
+    attitude: float = 0.0
+    wind: float = 0.0
+
+    def __bool__(self) -> bool:
+        return any(dataclasses.astuple(self))
+
+
+@dataclass(frozen=True)
+class SwarmConfig:
+    """Everything that defines a world but the scenario.
+
+    :param n_robots: number of robots n
+    :param radius: radius r of the sphere around a robot (m)
+    :param collision_tolerance: two robots collide when their centres are closer than 2r by more than this (m); the planner's soft
+        constraint sits exactly at 2r in the paper's world
+    :param goal_radius: a robot is at its goal within this distance (m); the paper takes r
+    :param memory: see `Beliefs` (m)
+    :param quadrotor: physical parameters
+    :param planner: horizon, limits and weights
+    :param space: room of the scenarios
+    :param noise: disturbances
+    """
+
+    n_robots: int = 4
+    radius: float = 0.3
+    collision_tolerance: float = 1e-3
+    goal_radius: float = 0.3
+    memory: float = 0.0
+    quadrotor: QuadrotorParams = field(default_factory=QuadrotorParams)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    space: ScenarioSpace = field(default_factory=ScenarioSpace)
+    noise: ProcessNoise = field(default_factory=ProcessNoise)
+
+
+PRESETS: dict[str, SwarmConfig] = {
+    # The paper's four robots. The planner keeps exactly 2r, which is what makes communication matter here.
+    "paper": SwarmConfig(),
+    # Eight robots in a 6 m square with a margin of 4 cm: communication matters although the planner leaves room for error.
+    "dense": SwarmConfig(
+        n_robots=8,
+        planner=PlannerConfig(separation=0.64, max_tilt=math.radians(20.0)),
+        space=ScenarioSpace(half_width=3.0, circle_radius=(2.5, 3.0), sector_radius=(1.5, 3.0)),
+    ),
+}
+
+
+def make_config(preset: str, **overrides: Any) -> SwarmConfig:
+    """A preset with some of its fields replaced.
+
+    :param preset: a name of `PRESETS`
+    :param overrides: fields of `SwarmConfig`; None keeps the preset's value; nested fields take a mapping of what to replace
+    :raises ValueError: unknown preset or field
+    """
+    if preset not in PRESETS:
+        raise unknown_name("preset", preset, PRESETS)
+    return replace_fields(PRESETS[preset], {name: value for name, value in overrides.items() if value is not None}, "world")
+
+
+def replace_fields(config: Any, changes: Mapping[str, Any], where: str) -> Any:
+    """A frozen dataclass with some fields replaced, nested ones by mappings.
+
+    :param config: the dataclass
+    :param changes: field name -> new value
+    :param where: what the fields belong to, for messages
+    :raises ValueError: unknown field
+    """
+    known = {f.name for f in dataclasses.fields(config)}
+    values = {}
+    for name, value in changes.items():
+        if name not in known:
+            raise unknown_name(f"{where} parameter", name, known)
+        present = getattr(config, name)
+        if isinstance(value, Mapping):
+            if not dataclasses.is_dataclass(present):
+                raise ValueError(f"{where} parameter {name!r} takes a plain value, not the mapping {dict(value)}.")
+            value = replace_fields(present, value, name)
+        elif isinstance(present, tuple):
+            value = tuple(value)
+        values[name] = value
+    return dataclasses.replace(config, **values)

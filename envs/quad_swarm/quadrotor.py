@@ -1,0 +1,143 @@
+"""The attitude-commanded quadrotor: one CasADi expression that both the planner and the simulator integrate.
+
+State ``x`` (9): position ``p`` (m, world frame, z up), velocity ``v`` (m/s), roll ``phi``, pitch ``theta``, yaw ``psi`` (rad).
+Input ``u`` (4): commanded roll and pitch (rad), commanded climb rate (m/s), commanded yaw rate (rad/s).
+
+The model and its values are those of the simulator that the paper's laboratory published (Parrot Bebop 2; tud-amr/mrca-mav,
+dynamics/bebop_dynamics.m): drag is linear in the velocity, attitude and climb rate answer their commands with first-order lags, and
+yaw does not couple into the translation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+N_STATES = 9
+N_INPUTS = 4
+POSITION = slice(0, 3)
+VELOCITY = slice(3, 6)
+ATTITUDE = slice(6, 9)
+
+
+@dataclass(frozen=True)
+class QuadrotorParams:
+    """Physical parameters; source of every value but gravity: Parrot Bebop 2, identified by tud-amr/mrca-mav.
+
+    :param gravity: gravitational acceleration (m/s^2)
+    :param drag_x: drag coefficient along x (1/s)
+    :param drag_y: drag coefficient along y (1/s)
+    :param roll_gain: steady-state gain of the roll command (-)
+    :param roll_time_constant: time constant of the roll response (s)
+    :param pitch_gain: steady-state gain of the pitch command (-)
+    :param pitch_time_constant: time constant of the pitch response (s)
+    :param climb_gain: steady-state gain of the climb-rate command (-)
+    :param climb_time_constant: time constant of the climb-rate response (s)
+    """
+
+    gravity: float = 9.81
+    drag_x: float = 0.25
+    drag_y: float = 0.33
+    roll_gain: float = 1.1260
+    roll_time_constant: float = 0.2368
+    pitch_gain: float = 1.1075
+    pitch_time_constant: float = 0.2318
+    climb_gain: float = 1.2270
+    climb_time_constant: float = 0.3367
+
+
+def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -> ca.SX:
+    """Time derivative of the state.
+
+    :param x: state, (9,)
+    :param u: input, (4,)
+    :param wind: horizontal velocity of the air, (2,), world frame (m/s); drag acts on the velocity relative to it
+    :param params: physical parameters
+    :return: dx/dt, (9,)
+    """
+    vx, vy, vz, phi, theta = x[3], x[4], x[5], x[6], x[7]
+    return ca.vertcat(
+        vx,
+        vy,
+        vz,
+        params.gravity * ca.tan(theta) - params.drag_x * (vx - wind[0]),
+        -params.gravity * ca.tan(phi) - params.drag_y * (vy - wind[1]),
+        (params.climb_gain * u[2] - vz) / params.climb_time_constant,
+        (params.roll_gain * u[0] - phi) / params.roll_time_constant,
+        (params.pitch_gain * u[1] - theta) / params.pitch_time_constant,
+        u[3],
+    )
+
+
+def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float) -> ca.SX:
+    """One classical Runge-Kutta step of length ``dt`` (s) with constant input and wind (eq. 1); shapes as `state_derivative`."""
+    k1 = state_derivative(x, u, wind, params)
+    k2 = state_derivative(x + dt / 2 * k1, u, wind, params)
+    k3 = state_derivative(x + dt / 2 * k2, u, wind, params)
+    k4 = state_derivative(x + dt * k3, u, wind, params)
+    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def step_function(params: QuadrotorParams, dt: float) -> ca.Function:
+    """The discrete dynamics as a CasADi function ``(x, u, wind) -> x_next`` with shapes (9,), (4,), (2,) -> (9,)."""
+    x, u, wind = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS), ca.SX.sym("wind", 2)
+    x_next = ca.cse(rk4_step(x, u, wind, params, dt))
+    return ca.Function("quadrotor_step", [x, u, wind], [x_next], ["x", "u", "wind"], ["x_next"])
+
+
+class QuadrotorModel:
+    """The discrete dynamics of many quadrotors at once, on NumPy arrays.
+
+    :param params: physical parameters
+    :param dt: length of a step (s)
+    """
+
+    def __init__(self, params: QuadrotorParams, dt: float):
+        self.params = params
+        self.dt = dt
+        self._calls: dict[int, _BufferedCall] = {}
+
+    def step(self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None) -> np.ndarray:
+        """Next states.
+
+        :param x: states, (..., 9)
+        :param u: inputs, (..., 4)
+        :param wind: velocity of the air, (..., 2) (m/s); None for still air
+        :return: states one step later, (..., 9)
+        """
+        count = x.size // N_STATES
+        if count not in self._calls:
+            function = step_function(self.params, self.dt)
+            self._calls[count] = _BufferedCall(function if count == 1 else function.map(count), count)
+        return self._calls[count](x, u, wind).reshape(x.shape)
+
+    def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """States that follow from ``x`` (B, 9) under the input sequences ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
+        states = np.empty((x.shape[0], u.shape[1] + 1, N_STATES))
+        states[:, 0] = x
+        for k in range(u.shape[1]):
+            states[:, k + 1] = self.step(states[:, k], u[:, k])
+        return states
+
+    def __getstate__(self) -> dict:
+        return {"params": self.params, "dt": self.dt, "_calls": {}}  # call buffers hold raw memory: rebuilt on demand
+
+
+class _BufferedCall:
+    """Calls a mapped CasADi function on preallocated memory: a plain call converts every array to a CasADi matrix and back."""
+
+    def __init__(self, function: ca.Function, count: int):
+        self._arguments = [np.zeros((count, size)) for size in (N_STATES, N_INPUTS, 2)]
+        self._result = np.zeros((count, N_STATES))
+        self._buffer, self._evaluate = function.buffer()
+        for k, argument in enumerate(self._arguments):
+            self._buffer.set_arg(k, memoryview(argument))
+        self._buffer.set_res(0, memoryview(self._result))
+
+    def __call__(self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None) -> np.ndarray:
+        for argument, value in zip(self._arguments, (x, u, 0.0 if wind is None else wind), strict=True):
+            argument[...] = value.reshape(argument.shape) if isinstance(value, np.ndarray) else value
+        self._evaluate()
+        return self._result.copy()
