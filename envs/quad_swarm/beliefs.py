@@ -1,9 +1,10 @@
 """What each robot believes the others will do (Sec. III-C and IV-A).
 
-In order of preference: the plan it requested (made one step ago), the plan it received earlier while that still fits what it observes, and
-a constant velocity.
+In order of preference: the plan it requested (made one step ago), the plan it received earlier while that still fits
+what it observes, and a constant velocity.
 
-Arrays carry a leading axis of swarms: E swarms of n robots. ``others`` axes list the n - 1 others of a robot in ascending order.
+Arrays carry a leading axis of swarms: E swarms of n robots. ``others`` axes list the n - 1 others of a robot in
+ascending order.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ class Beliefs:
     :param n_robots: robots in a swarm n
     :param horizon: stages of a plan N
     :param dt: length of a stage (s)
-    :param memory: a plan received earlier is believed while it predicts the observed position to within this distance (m) and is
-        younger than N steps; 0 switches the memory off
+    :param memory: a plan received earlier is believed while it predicts the observed position to within this distance
+        (m) and is younger than N steps; 0 switches the memory off
     """
 
     def __init__(self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float):
@@ -78,7 +79,8 @@ class Beliefs:
         :param pos: present positions, (E, n, 3), world frame (m)
         :param vel: present velocities, (E, n, 3), world frame (m/s)
         :param plans: positions that each robot planned one step ago, stages 0..N, (E, n, N + 1, 3) (m)
-        :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n - 1)
+        :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
+            1)
         """
         current = advance(plans)  # now, and the next N steps
         steady = constant_velocity(pos, vel, self.horizon, self.dt)

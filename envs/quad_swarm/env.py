@@ -21,28 +21,32 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     """Quadrotors that fly to their goals and may ask each other for their plans.
 
     ## Description
-    At every step each robot chooses whom to ask. It gets the plans it asked for, predicts the other robots with a constant velocity, solves
-    a nonlinear model predictive control problem with separation constraints, and flies its first input (Serra-Gomez et al., IROS 2020).
+    At every step each robot chooses whom to ask. It gets the plans it asked for, predicts the other robots with a
+    constant velocity, solves a nonlinear model predictive control problem with separation constraints, and flies its
+    first input (Serra-Gomez et al., IROS 2020).
 
     ## Action Space
-    `MultiBinary(n * (n - 1))`: robot 0's bits for robots 1..n-1, robot 1's bits for robots 0, 2..n-1, and so on; 1 asks.
+    `MultiBinary(n * (n - 1))`: robot 0's bits for robots 1..n-1, robot 1's bits for robots 0, 2..n-1, and so on; 1
+    asks.
 
     ## Observation Space
-    `Box(n, 6n)`, one row a robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the others (3(n-1), m),
-    their relative velocities (3(n-1), m/s); others in ascending order.
+    `Box(n, 6n)`, one row a robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the
+    others (3(n-1), m), their relative velocities (3(n-1), m/s); others in ascending order.
 
     ## Rewards
     The team's: +1.3 in each step in which all robots are at their goals, -150 for a collision, -0.1 for each request.
 
     ## Starting State
-    At rest; starts and goals as the scenario draws them. `reset(options={"starts": ..., "goals": ...})` sets them, both (n, 3), m.
+    At rest; starts and goals as the scenario draws them. `reset(options={"starts": ..., "goals": ...})` sets them, both
+    (n, 3), m.
 
     ## Episode End
     Terminated by a collision, truncated after `max_steps`.
 
     ## Info
-    `reward_terms`, `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`, `at_goal` (n,),
-    `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and at the end `is_success` and `metrics`.
+    `reward_terms`, `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
+    `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and at the end `is_success`
+    and `metrics`.
 
     ## Arguments
     :param preset: "paper" or "dense" (`presets.PRESETS`)
@@ -51,7 +55,8 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     :param max_steps: time limit (steps)
     :param scale_observation: divide distances by 4 m and velocities by 4 m/s
     :param continuous_collisions: end episodes at collisions between steps too
-    :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the preset's
+    :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the
+        preset's
     :param reward: values of `RewardConfig` to replace
     :param planner: values of `PlannerConfig` to replace
     :param noise: values of `ProcessNoise` to replace
@@ -179,7 +184,14 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
 
             self._renderer = Renderer(self.config)
         swarm = self.task.swarm
-        return self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, self.statistics)
+        lines = [
+            f"step {self.statistics.steps[0]}   {self.task.scenario[0]}",
+            f"requests {self._requests.sum()} now, {self.statistics.requests[0]} in all",
+            f"smallest separation {self.statistics.min_separation[0]:.2f} m",
+        ]
+        if self.statistics.collided[0]:
+            lines.append("COLLISION")
+        return self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, lines)
 
     def close(self) -> None:
         """Free the renderer."""
@@ -194,7 +206,9 @@ def request_matrix(action: Any, n_robots: int) -> np.ndarray:
     bits = np.asarray(action)
     size = n_robots * (n_robots - 1)
     if bits.size != size:
-        raise ValueError(f"The action has {bits.size} entries; {n_robots} robots need {size} bits, {n_robots - 1} each.")
+        raise ValueError(
+            f"The action has {bits.size} entries; {n_robots} robots need {size} bits, {n_robots - 1} each."
+        )
     asked = bits == 1
     if not (asked | (bits == 0)).all():
         wrong = bits[~(asked | (bits == 0))].ravel()[0]

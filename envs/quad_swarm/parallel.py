@@ -14,7 +14,8 @@ from .env import QuadSwarmEnv
 class QuadSwarmParallelEnv(ParallelEnv):
     """`QuadSwarmEnv` as a PettingZoo environment: same seed and same bits give the same episode.
 
-    Agents are called "robot_0", "robot_1", ...; each observes its row, acts with `MultiBinary(n - 1)` and gets the team's reward.
+    Agents are called "robot_0", "robot_1", ...; each observes its row, acts with `MultiBinary(n - 1)` and gets the
+    team's reward.
 
     :param render_mode: None or "rgb_array"
     :param kwargs: arguments of `QuadSwarmEnv`

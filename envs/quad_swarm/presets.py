@@ -1,4 +1,4 @@
-"""Worlds with a name. A preset is frozen together with `PRESET_VERSION`: results name both, and a change reruns every table."""
+"""Worlds with a name, frozen together with `PRESET_VERSION`: results name both, and a change reruns every table."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class SwarmConfig:
 
     :param n_robots: number of robots n
     :param radius: radius r of the sphere around a robot (m)
-    :param collision_tolerance: two robots collide when their centres are closer than 2r by more than this (m); the planner's soft
-        constraint sits exactly at 2r in the paper's world
+    :param collision_tolerance: two robots collide when their centres are closer than 2r by more than this (m); the
+        planner's soft constraint sits exactly at 2r in the paper's world
     :param goal_radius: a robot is at its goal within this distance (m); the paper takes r
     :param memory: see `Beliefs` (m)
     :param quadrotor: physical parameters
@@ -65,7 +65,8 @@ class SwarmConfig:
 PRESETS: dict[str, SwarmConfig] = {
     # The paper's four robots. The planner keeps exactly 2r, which is what makes communication matter here.
     "paper": SwarmConfig(),
-    # Eight robots in a 6 m square with a margin of 4 cm: communication matters although the planner leaves room for error.
+    # Eight robots in a 6 m square with a margin of 4 cm: communication matters although the planner leaves room for
+    # error.
     "dense": SwarmConfig(
         n_robots=8,
         planner=PlannerConfig(separation=0.64, max_tilt=math.radians(20.0)),
@@ -78,12 +79,15 @@ def make_config(preset: str, **overrides: Any) -> SwarmConfig:
     """A preset with some of its fields replaced.
 
     :param preset: a name of `PRESETS`
-    :param overrides: fields of `SwarmConfig`; None keeps the preset's value; nested fields take a mapping of what to replace
+    :param overrides: fields of `SwarmConfig`; None keeps the preset's value; nested fields take a mapping of what to
+        replace
     :raises ValueError: unknown preset or field
     """
     if preset not in PRESETS:
         raise unknown_name("preset", preset, PRESETS)
-    return replace_fields(PRESETS[preset], {name: value for name, value in overrides.items() if value is not None}, "world")
+    return replace_fields(
+        PRESETS[preset], {name: value for name, value in overrides.items() if value is not None}, "world"
+    )
 
 
 def replace_fields(config: Any, changes: Mapping[str, Any], where: str) -> Any:

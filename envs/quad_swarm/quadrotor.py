@@ -1,11 +1,11 @@
 """The attitude-commanded quadrotor: one CasADi expression that both the planner and the simulator integrate.
 
-State ``x`` (9): position ``p`` (m, world frame, z up), velocity ``v`` (m/s), roll ``phi``, pitch ``theta``, yaw ``psi`` (rad).
-Input ``u`` (4): commanded roll and pitch (rad), commanded climb rate (m/s), commanded yaw rate (rad/s).
+State ``x`` (9): position ``p`` (m, world frame, z up), velocity ``v`` (m/s), roll ``phi``, pitch ``theta``, yaw ``psi``
+(rad). Input ``u`` (4): commanded roll and pitch (rad), commanded climb rate (m/s), commanded yaw rate (rad/s).
 
-The model and its values are those of the simulator that the paper's laboratory published (Parrot Bebop 2; tud-amr/mrca-mav,
-dynamics/bebop_dynamics.m): drag is linear in the velocity, attitude and climb rate answer their commands with first-order lags, and
-yaw does not couple into the translation.
+The model and its values are those of the simulator that the paper's laboratory published (Parrot Bebop 2;
+tud-amr/mrca-mav, dynamics/bebop_dynamics.m): drag is linear in the velocity, attitude and climb rate answer their
+commands with first-order lags, and yaw does not couple into the translation.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -
 
 
 def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float) -> ca.SX:
-    """One classical Runge-Kutta step of length ``dt`` (s) with constant input and wind (eq. 1); shapes as `state_derivative`."""
+    """One classical Runge-Kutta step of length ``dt`` (s) with held input (eq. 1); shapes as `state_derivative`."""
     k1 = state_derivative(x, u, wind, params)
     k2 = state_derivative(x + dt / 2 * k1, u, wind, params)
     k3 = state_derivative(x + dt / 2 * k2, u, wind, params)
@@ -108,13 +108,15 @@ class QuadrotorModel:
         :return: states one step later, (..., 9)
         """
         count = x.size // N_STATES
-        if count not in self._calls:
-            function = step_function(self.params, self.dt)
-            self._calls[count] = _BufferedCall(function if count == 1 else function.map(count), count)
-        return self._calls[count](x, u, wind).reshape(x.shape)
+        if count == 0:
+            return x.copy()
+        capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
+        if capacity not in self._calls:
+            self._calls[capacity] = _BufferedCall(step_function(self.params, self.dt), capacity)
+        return self._calls[capacity](x, u, wind).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """States that follow from ``x`` (B, 9) under the input sequences ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
+        """States that follow from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
         states = np.empty((x.shape[0], u.shape[1] + 1, N_STATES))
         states[:, 0] = x
         for k in range(u.shape[1]):
@@ -126,18 +128,20 @@ class QuadrotorModel:
 
 
 class _BufferedCall:
-    """Calls a mapped CasADi function on preallocated memory: a plain call converts every array to a CasADi matrix and back."""
+    """Calls a CasADi function on preallocated memory: a plain call converts every array to a CasADi matrix and back."""
 
-    def __init__(self, function: ca.Function, count: int):
-        self._arguments = [np.zeros((count, size)) for size in (N_STATES, N_INPUTS, 2)]
-        self._result = np.zeros((count, N_STATES))
-        self._buffer, self._evaluate = function.buffer()
+    def __init__(self, function: ca.Function, capacity: int):
+        self._arguments = [np.zeros((capacity, size)) for size in (N_STATES, N_INPUTS, 2)]
+        self._result = np.zeros((capacity, N_STATES))
+        mapped = function if capacity == 1 else function.map(capacity)
+        self._buffer, self._evaluate = mapped.buffer()
         for k, argument in enumerate(self._arguments):
-            self._buffer.set_arg(k, memoryview(argument))
-        self._buffer.set_res(0, memoryview(self._result))
+            self._buffer.set_arg(k, argument.data)
+        self._buffer.set_res(0, self._result.data)
 
     def __call__(self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None) -> np.ndarray:
-        for argument, value in zip(self._arguments, (x, u, 0.0 if wind is None else wind), strict=True):
-            argument[...] = value.reshape(argument.shape) if isinstance(value, np.ndarray) else value
+        count = x.size // N_STATES
+        for argument, value in zip(self._arguments, (x, u, wind), strict=True):
+            argument[:count] = 0.0 if value is None else value.reshape(count, -1)
         self._evaluate()
-        return self._result.copy()
+        return self._result[:count].copy()

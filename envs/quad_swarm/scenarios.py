@@ -1,7 +1,7 @@
 """Where robots start and where they want to go (Sec. V-B).
 
-A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m). To add one, write the function and
-name it in `SCENARIOS`.
+A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m). To add one, write
+the function and name it in `SCENARIOS`.
 """
 
 from __future__ import annotations
@@ -88,9 +88,10 @@ def random_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarr
 
 
 def asymmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Asymmetric swapping: one robot in each of n sectors, anywhere in it; each flies to the start in the opposite sector.
+    """Asymmetric swapping: one robot anywhere in each of n sectors; each flies to the start in the opposite sector.
 
-    A sector is drawn to 80 % of its width, as in the only such generator that the paper's laboratory published (tud-amr/mrca_vc).
+    A sector is drawn to 80 % of its width, as in the only such generator that the paper's laboratory published
+    (tud-amr/mrca_vc).
     """
     sector = 2 * np.pi / n_robots
 
@@ -104,7 +105,7 @@ def asymmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.n
 
 
 def symmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Symmetric swapping: evenly on a circle at one height, each to the opposite point, starts and goals slightly moved.
+    """Symmetric swapping: evenly on a circle at one height, each to the opposite point, both ends slightly moved.
 
     Without the movement mirrored robots dodge to the same side for ever, however much they communicate.
     """
@@ -172,7 +173,9 @@ class ScenarioSampler:
         :raises ValueError: no such level
         """
         if not 0 <= level < self.n_levels:
-            raise ValueError(f"Level {level} does not exist: scenario {self.name!r} has levels 0 to {self.n_levels - 1}.")
+            raise ValueError(
+                f"Level {level} does not exist: scenario {self.name!r} has levels 0 to {self.n_levels - 1}."
+            )
         self.level = level
 
     def sample(self, rng: Rng) -> tuple[str, np.ndarray, np.ndarray]:

@@ -11,7 +11,8 @@ from .task import Outcome
 class EpisodeStatistics:
     """Figures of the running episodes of E swarms, as arrays of length E.
 
-    Requests and path count from the start until all robots are at their goals at once, a collision, or the time limit, whichever comes first.
+    Requests and path count from the start until all robots are at their goals at once, a collision, or the time limit,
+    whichever comes first.
 
     :ivar steps: steps flown
     :ivar steps_counted: steps in which requests and path counted
@@ -19,7 +20,6 @@ class EpisodeStatistics:
     :ivar path_length: distance flown in them, mean over the robots (m)
     :ivar arrived: all robots were at their goals at once, before any collision
     :ivar collided: ended by a collision
-    :ivar collided_at_steps: a collision seen at a step
     :ivar collided_continuous: a collision seen at or between steps
     :ivar min_separation: smallest distance between two robots at a step (m)
     :ivar min_separation_continuous: the same at or between steps (m)
@@ -34,7 +34,6 @@ class EpisodeStatistics:
         "path_length": 0.0,
         "arrived": False,
         "collided": False,
-        "collided_at_steps": False,
         "collided_continuous": False,
         "min_separation": np.inf,
         "min_separation_continuous": np.inf,
@@ -48,7 +47,6 @@ class EpisodeStatistics:
     path_length: np.ndarray
     arrived: np.ndarray
     collided: np.ndarray
-    collided_at_steps: np.ndarray
     collided_continuous: np.ndarray
     min_separation: np.ndarray
     min_separation_continuous: np.ndarray
@@ -83,7 +81,6 @@ class EpisodeStatistics:
         self.requests += counted * outcome.n_requests
         self.path_length += counted * moved.mean(axis=1)
         self.collided |= outcome.terminated
-        self.collided_at_steps |= report.collision
         self.collided_continuous |= report.collision_continuous
         self.arrived |= report.at_goal.all(axis=1) & ~outcome.terminated
         self.min_separation = np.minimum(self.min_separation, report.min_separation)
@@ -95,6 +92,10 @@ class EpisodeStatistics:
     def success(self) -> np.ndarray:
         """All robots arrived and none collided, not even afterwards."""
         return self.arrived & ~self.collided
+
+    def row(self, swarm: int) -> dict[str, float]:
+        """One swarm's figures by name."""
+        return {name: getattr(self, name)[swarm].item() for name in self._START}
 
     def metrics(self, swarm: int) -> dict[str, float]:
         """Figures of one swarm's episode by the names under which they are logged."""

@@ -86,7 +86,9 @@ class Swarm:
         n = self.config.n_robots
         for name, points in (("starts", starts), ("goals", goals)):
             if np.shape(points) != (n, 3) or not np.isfinite(points).all():
-                raise ValueError(f"{name} must be {n} finite points, shape ({n}, 3); got {np.asarray(points).tolist()}.")
+                raise ValueError(
+                    f"{name} must be {n} finite points, shape ({n}, 3); got {np.asarray(points).tolist()}."
+                )
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals

@@ -111,8 +111,8 @@ class RequestTask:
     def observe(self) -> np.ndarray:
         """z_i = [v_i, p_ig, {p_ij}, {v_ij}] of every robot, (E, n, 6n) float32.
 
-        Own velocity, goal relative to the robot, then all relative positions of the others, then all their relative velocities, others
-        in ascending order.
+        Own velocity, goal relative to the robot, then all relative positions of the others, then all their relative
+        velocities, others in ascending order.
         """
         pos, vel = self.swarm.pos, self.swarm.vel
         relative_pos = pos[:, self._others] - pos[:, :, None]
@@ -140,4 +140,3 @@ class RequestTask:
             n_requests=n_requests,
             report=report,
         )
-

@@ -1,4 +1,4 @@
-"""What every solver is given and gives back, and the ladder that turns its answer into a plan that can always be flown."""
+"""What every solver is given and gives back, and the ladder that always ends in a plan that can be flown."""
 
 from __future__ import annotations
 

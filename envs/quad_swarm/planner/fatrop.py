@@ -72,7 +72,7 @@ class _Program(NamedTuple):
 
 
 def _transcribe(problem: OptimalControlProblem, tolerance: float, max_iterations: int) -> _Program:
-    """Multiple shooting in the stage order that fatrop expects: x_0 is a parameter, slacks are further inputs of their stage."""
+    """Multiple shooting in fatrop's stage order: x_0 is a parameter, slacks are further inputs of their stage."""
     config, nx, nu, n_others = problem.config, problem.nx, problem.nu, problem.n_others
     horizon = config.horizon
     x0, goal = ca.SX.sym("x0", nx), ca.SX.sym("goal", 3)
@@ -82,7 +82,7 @@ def _transcribe(problem: OptimalControlProblem, tolerance: float, max_iterations
     step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
 
     cost = problem.goal_cost(states[-1], x0, goal)
-    variables, lower, upper, x_index, u_index = [], [], [], [], []
+    variables, lower, x_index, u_index = [], [], [], []
     constraints, constraint_lower, equality, n_slacks = [], [], [], []
     max_input = problem.max_input.full().ravel()
     offset = 0

@@ -90,7 +90,7 @@ class OptimalControlProblem:
         return self.config.input_weight * ca.sumsqr(u / self.max_input)
 
     def goal_cost(self, x: ca.SX, x0: ca.SX, goal: ca.SX) -> ca.SX:
-        """Terminal cost: squared distance to the goal over that from where the robot is, so that far goals do not dominate."""
+        """Terminal cost: squared distance to the goal over the present one, so that far goals do not dominate."""
         cost = self.config.goal_weight * ca.sumsqr(goal - x[:3]) / ca.fmax(ca.sumsqr(goal - x0[:3]), 1.0)
         if self.nx == N_STATES:
             cost += self.config.goal_weight * x[8] ** 2  # the task asks for no heading: fly with yaw zero

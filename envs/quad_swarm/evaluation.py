@@ -1,0 +1,269 @@
+"""Fly policies over the same held-out episodes and count what happens.
+
+A policy is a rule (`communication.RULES`) or the zip of a trained model, loaded by the class that ``algo`` names.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import math
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from .communication import View, parse_rule
+from .presets import SwarmConfig
+from .scenarios import ScenarioSampler
+from .statistics import EpisodeStatistics
+from .swarm import Swarm
+from .task import RequestTask, RewardConfig
+
+Requests = Callable[[RequestTask, list[np.random.Generator]], np.ndarray]
+
+# Arguments of the environment that shape what a model sees: they are the model's, everything else is the evaluation's.
+OBSERVATION_ARGUMENTS = ("scale_observation",)
+# Held-out episodes begin here; training seeds count from 0.
+_FIRST_SEED = 10**9
+# Fixed, so that neither the batches nor the results depend on the number of processes.
+_CHUNK = 25
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One policy in one scenario.
+
+    :param policy: rule or path of a model's zip, as given on the command line
+    :param scenario: a name of `SCENARIOS`
+    :param config: the world
+    :param max_steps: time limit (steps)
+    :param algo: ``module:Class`` that loads models
+    :param solver: see `make_planner`
+    """
+
+    policy: str
+    scenario: str
+    config: SwarmConfig
+    max_steps: int
+    algo: str
+    solver: str
+
+
+def is_model(policy: str) -> bool:
+    """Whether a policy's text names a model's file instead of a rule."""
+    return policy.endswith(".zip") or os.sep in policy
+
+
+@functools.lru_cache(maxsize=4)
+def load_model(path: str, algo: str) -> Any:
+    """A trained model.
+
+    :param path: its zip
+    :param algo: ``module:Class`` with a ``load(path, device=...)`` as in Stable-Baselines3
+    :raises FileNotFoundError: no such file
+    :raises ValueError: the class does not exist, or it cannot read the file
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"No model at {path!r}: train one first, or give the zip's full path.")
+    module_name, _, class_name = algo.partition(":")
+    try:
+        loader = getattr(importlib.import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"--algo {algo!r} is no importable module:Class ({error}).") from error
+    try:
+        return loader.load(path, device="cpu")
+    except Exception as error:  # whatever the loader raises for a damaged or foreign file
+        raise ValueError(
+            f"{path} cannot be loaded by {algo} ({type(error).__name__}: {error}). "
+            "Is the file complete, and was it saved by that class?"
+        ) from error
+
+
+def make_policy(cell: Cell) -> tuple[Requests, dict[str, Any]]:
+    """The policy of a cell, and the observation arguments that it needs.
+
+    :raises ValueError: unknown rule, or a model that was trained for another number of robots or another space
+    """
+    if not is_model(cell.policy):
+        try:
+            rule = parse_rule(cell.policy)
+        except ValueError as error:
+            raise ValueError(f"{error} A model is given by the path of its .zip.") from None
+        return (lambda task, rngs: rule(View.of(task.swarm.pos, task.swarm.vel, rngs))), {}
+
+    model = load_model(cell.policy, cell.algo)
+    spec = getattr(model, "env_spec", None) or {}
+    arguments = {k: v for k, v in spec.get("kwargs", {}).items() if k in OBSERVATION_ARGUMENTS}
+    n = cell.config.n_robots
+    expected, trained = (n, 6 * n), tuple(model.observation_space.shape)
+    if trained != expected:
+        robots = f"{trained[0]} robots" if len(trained) == 2 and trained[1] == 6 * trained[0] else "another environment"
+        raise ValueError(
+            f"{cell.policy} was trained for {robots} (observation {trained}); "
+            f"this world has {n} robots (observation {expected}). "
+            "Choose the preset or --n-robots that it was trained with."
+        )
+
+    def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
+        bits, _ = model.predict(task.observe(), deterministic=True)
+        return np.asarray(bits).reshape(-1, n, n - 1) > 0.5
+
+    return request, arguments
+
+
+def _begin(cell: Cell, episodes: Sequence[int]) -> tuple[Requests, RequestTask, list[np.random.Generator]]:
+    policy, arguments = make_policy(cell)
+    config = cell.config
+    task = RequestTask(
+        Swarm(config, len(episodes), cell.solver),
+        ScenarioSampler(cell.scenario, config.n_robots, config.space),
+        RewardConfig(),
+        cell.max_steps,
+        **arguments,
+    )
+    for k, seed in enumerate(episodes):
+        task.reset(k, np.random.default_rng(seed))
+    rngs = [np.random.default_rng([seed, 1]) for seed in episodes]  # a stream of its own for rules that draw
+    return policy, task, rngs
+
+
+class Flight(NamedTuple):
+    """One episode step by step.
+
+    :param pos: positions, (T + 1, n, 3), world frame (m)
+    :param goal: goals, (n, 3), world frame (m)
+    :param requests: who asked whom in each step, (T, n, n - 1) bool
+    """
+
+    pos: np.ndarray
+    goal: np.ndarray
+    requests: np.ndarray
+
+
+def fly(cell: Cell, seed: int) -> Flight:
+    """The first held-out episode of set ``seed``, step by step."""
+    policy, task, rngs = _begin(cell, [first_episode(seed)])
+    pos, asked = [task.swarm.pos[0].copy()], []
+    over = False
+    while not over:
+        asked.append(policy(task, rngs))
+        outcome = task.step(asked[-1])
+        pos.append(task.swarm.pos[0].copy())
+        over = bool(outcome.terminated[0] | outcome.truncated[0])
+    return Flight(np.array(pos), task.swarm.goal[0], np.concatenate(asked))
+
+
+def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
+    """Fly some episodes of a cell, all at once.
+
+    :param cell: policy, scenario and world
+    :param episodes: seeds; ``env.reset(seed=...)`` of `QuadSwarm-v0` draws the same episodes
+    :return: for each episode its figures, see `EpisodeStatistics`
+    """
+    policy, task, rngs = _begin(cell, episodes)
+    statistics = EpisodeStatistics(len(episodes), cell.config.n_robots)
+    index = np.arange(len(episodes))
+    rows: dict[int, dict[str, float]] = {}
+    while index.size:
+        before = task.swarm.pos.copy()
+        outcome = task.step(policy(task, rngs))
+        statistics.add(outcome, np.linalg.norm(task.swarm.pos - before, axis=-1))
+        done = outcome.terminated | outcome.truncated
+        if done.any():
+            rows |= {int(index[k]): statistics.row(int(k)) for k in np.flatnonzero(done)}
+            task.keep(~done)
+            statistics.keep(~done)
+            rngs = [rng for rng, over in zip(rngs, done, strict=True) if not over]
+            index = index[~done]
+    return [rows[k] for k in range(len(episodes))]
+
+
+def first_episode(seed: int) -> int:
+    """Seed of the first held-out episode of set ``seed``; the others follow it."""
+    return _FIRST_SEED + seed * 10**6
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """95 % Wilson score interval of a rate."""
+    rate = successes / trials
+    centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2)) / (1 + z**2 / trials)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def summarise(rows: Sequence[Mapping[str, float]], n_robots: int) -> dict[str, Any]:
+    """The figures of a cell from those of its episodes; `main`'s help explains them."""
+    figures = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    arrived = figures["arrived"].astype(bool)
+    collisions = int(figures["collided"].sum())
+    low, high = wilson_interval(collisions, len(rows))
+    share = float(figures["requests"].sum() / (figures["steps_counted"].sum() * n_robots * (n_robots - 1)))
+    return {
+        "episodes": len(rows),
+        "collisions": collisions,
+        "collision_low": low,
+        "collision_high": high,
+        "collisions_continuous": int(figures["collided_continuous"].sum()),
+        "requests_per_step": float(figures["requests"].sum() / figures["steps_counted"].sum()),
+        "request_share": share,
+        "reduction": 1.0 - share,
+        "arrived": int(arrived.sum()),
+        "steps_to_arrival": float(figures["steps_counted"][arrived].mean()) if arrived.any() else None,
+        "min_separation": float(figures["min_separation"].min()),
+        "min_separation_continuous": float(figures["min_separation_continuous"].min()),
+        "path_length": float(figures["path_length"][arrived].mean()) if arrived.any() else None,
+        "planner_failures": int(figures["planner_failures"].sum()),
+        "solve_us": float(1e6 * figures["solve_seconds"].sum() / (figures["steps"].sum() * n_robots)),
+    }
+
+
+def evaluate(cells: Sequence[Cell], episodes: int, seed: int = 0, jobs: int = 1) -> list[dict[str, Any]]:
+    """Fly ``episodes`` episodes of every cell.
+
+    :param cells: policies in scenarios
+    :param episodes: number of episodes of each cell
+    :param seed: which set of held-out episodes; every cell flies the same
+    :param jobs: processes
+    :return: one row a cell, see `summarise`
+    """
+    if episodes < 1 or jobs < 1:
+        raise ValueError(f"episodes={episodes} and jobs={jobs} must be at least 1.")
+    for cell in cells:
+        make_policy(cell)  # say what is wrong before anything is flown
+    first = first_episode(seed)
+    chunks = [range(first + k, first + min(k + _CHUNK, episodes)) for k in range(0, episodes, _CHUNK)]
+    work = [(cell, chunk) for cell in cells for chunk in chunks]
+    flown: dict[Cell, list[dict[str, float]]] = {cell: [] for cell in cells}
+    for (cell, _), rows in zip(work, _run_all(work, jobs), strict=True):
+        flown[cell] += rows
+    return [
+        {
+            "policy": cell.policy,
+            "scenario": cell.scenario,
+            **summarise(rows, cell.config.n_robots),
+            "n_robots": cell.config.n_robots,
+        }
+        for cell, rows in flown.items()
+    ]
+
+
+def _run_all(work: Sequence[tuple[Cell, range]], jobs: int) -> Iterable[list[dict[str, float]]]:
+    progress = functools.partial(
+        tqdm, total=len(work), unit="chunk", desc="evaluate", disable=not sys.stderr.isatty(), leave=False
+    )
+    if jobs == 1:
+        yield from progress(run_episodes(*item) for item in work)
+        return
+    # Spawned, not forked: the numerical libraries behind a model hold threads. One thread each, or they fight for the
+    # cores.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        yield from progress(pool.map(run_episodes, *zip(*work, strict=True)))
