@@ -70,6 +70,7 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
+    reset_options = ("starts", "goals")
 
     def __init__(
         self,
@@ -128,8 +129,8 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         """Begin an episode; see the class for ``options``."""
         super().reset(seed=seed)
         options = options or {}
-        if unknown := set(options) - {"starts", "goals"}:
-            raise unknown_name("reset option", unknown.pop(), ["starts", "goals"])
+        if unknown := set(options).difference(self.reset_options):
+            raise unknown_name("reset option", unknown.pop(), self.reset_options)
         if len(options) == 1:
             raise ValueError(f"reset options name only {next(iter(options))!r}; give both 'starts' and 'goals'.")
         if options:

@@ -43,8 +43,9 @@ class QuadSwarmParallelEnv(ParallelEnv):
     def reset(
         self, seed: int | None = None, options: dict | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
-        """See `QuadSwarmEnv.reset`."""
-        observation, info = self.team.reset(seed=seed, options=options)
+        """See `QuadSwarmEnv.reset`; unknown options are ignored, as PettingZoo's API test demands."""
+        known = {name: value for name, value in (options or {}).items() if name in QuadSwarmEnv.reset_options}
+        observation, info = self.team.reset(seed=seed, options=known)
         self.agents = list(self.possible_agents)
         return self._rows(observation), {agent: dict(info) for agent in self.agents}
 

@@ -16,8 +16,8 @@ from .errors import unknown_name
 Rng = np.random.Generator
 Scenario = Callable[[int, "ScenarioSpace", Rng], tuple[np.ndarray, np.ndarray]]
 
-_TRIES_PER_POINT = 100
-_RESTARTS = 50
+_DRAWS_PER_POINT = 100  # then the set is begun anew
+_MAX_DRAWS = 20_000
 
 
 @dataclass(frozen=True)
@@ -49,18 +49,18 @@ def _place(n_points: int, draw: Callable[[int], np.ndarray], spacing: float) -> 
 
     :raises DoesNotFit: no such set was found in a bounded number of draws; the message says how many points were placed
     """
-    most = 0
-    for _ in range(_RESTARTS):
-        points = np.empty((n_points, 3))
-        placed = 0
-        for _ in range(_TRIES_PER_POINT * n_points):
-            point = draw(placed)
-            if placed == 0 or ((points[:placed] - point) ** 2).sum(axis=1).min() >= spacing**2:
-                points[placed] = point
-                placed += 1
-                if placed == n_points:
-                    return points
-        most = max(most, placed)
+    points = np.empty((n_points, 3))
+    placed = most = 0
+    for k in range(_MAX_DRAWS):
+        if k % (_DRAWS_PER_POINT * n_points) == 0:
+            placed = 0
+        point = draw(placed)
+        if placed == 0 or ((points[:placed] - point) ** 2).sum(axis=1).min() >= spacing**2:
+            points[placed] = point
+            placed += 1
+            most = max(most, placed)
+            if placed == n_points:
+                return points
     raise DoesNotFit(
         f"{n_points} robots at least {spacing} m apart do not fit into the room of this scenario; about {most} do. "
         "Ask for fewer robots or a preset with more room."

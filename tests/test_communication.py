@@ -1,0 +1,66 @@
+"""The hand-made rules."""
+
+import numpy as np
+import pytest
+from quad_swarm.communication import View, parse_rule
+
+
+def view(pos, vel, n_swarms: int = 1) -> View:
+    pos, vel = (np.broadcast_to(np.array(a, float), (n_swarms, len(a), 3)) for a in (pos, vel))
+    return View.of(pos, vel, [np.random.default_rng(k) for k in range(n_swarms)])
+
+
+# Robot 1 comes towards robot 0 and passes it at 0.5 m after 2 s; robot 2 stands 3 m away.
+SCENE = view([[0, 0, 0], [4, 0.5, 0], [0, -3, 0]], [[0, 0, 0], [-2, 0, 0], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("text", "asked"),
+    [
+        ("none", [[0, 0], [0, 0], [0, 0]]),
+        ("full", [[1, 1], [1, 1], [1, 1]]),
+        ("distance:3.5", [[0, 1], [0, 0], [1, 0]]),
+        ("distance:4.5", [[1, 1], [1, 0], [1, 0]]),
+        ("cpa:0.6:3", [[1, 0], [1, 0], [0, 0]]),
+        ("cpa:0.6:1", [[0, 0], [0, 0], [0, 0]]),  # it is still 2 m away after 1 s
+        ("cpa:0.4:3", [[0, 0], [0, 0], [0, 0]]),
+        ("cpa:3.1:0", [[0, 1], [0, 0], [1, 0]]),
+        ("random:0", [[0, 0], [0, 0], [0, 0]]),
+        ("random:1", [[1, 1], [1, 1], [1, 1]]),
+    ],
+)
+def test_whom_a_rule_asks(text, asked):
+    requests = parse_rule(text)(SCENE)
+    assert requests.dtype == bool
+    assert requests[0].astype(int).tolist() == asked
+
+
+def test_random_asks_with_its_probability_and_each_swarm_draws_for_itself():
+    many = view([[0, 0, 0]] * 5, [[0, 0, 0]] * 5, n_swarms=500)
+    requests = parse_rule("random:0.3")(many)
+    assert abs(requests.mean() - 0.3) < 0.02
+    alone = parse_rule("random:0.3")(view([[0, 0, 0]] * 5, [[0, 0, 0]] * 5, n_swarms=1))
+    assert np.array_equal(alone[0], requests[0])
+
+
+def test_robots_at_the_same_place_do_not_divide_by_zero():
+    with np.errstate(all="raise"):
+        assert parse_rule("cpa:0.5:1")(view([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [1, 0, 0]])).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("distnace:4", "Did you mean 'distance'"),
+        ("distance", "write distance:EPS"),
+        ("distance:far", "must be numbers; write distance:EPS"),
+        ("cpa:0.7", "write cpa:DIST:LOOKAHEAD"),
+        ("distance:-1", "non-negative"),
+        ("distance:nan", "finite"),
+        ("none:1", "takes 0"),
+        ("random:2", r"\[0, 1\]"),
+    ],
+)
+def test_says_how_to_write_a_rule(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_rule(text)

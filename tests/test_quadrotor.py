@@ -1,0 +1,88 @@
+"""The dynamics: against an independent integrator, their steady states, and batches against single calls."""
+
+import pickle
+
+import casadi as ca
+import numpy as np
+import pytest
+from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams, state_derivative
+
+PARAMS = QuadrotorParams()
+
+
+def random_states(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    x = rng.uniform(-1, 1, (count, 9)) * [4, 4, 2, 3, 3, 1, 0.3, 0.3, 3]
+    u = rng.uniform(-1, 1, (count, 4)) * [0.3, 0.3, 1, 1]
+    return x, u
+
+
+@pytest.mark.parametrize(("dt", "tolerance"), [(0.1, 3e-4), (0.05, 3e-5)])  # fourth order: a sixteenth
+def test_agrees_with_an_adaptive_integrator(dt, tolerance):
+    rng = np.random.default_rng(0)
+    model = QuadrotorModel(PARAMS, dt)
+    x, u, wind = ca.SX.sym("x", 9), ca.SX.sym("u", 4), ca.SX.sym("w", 2)
+    ode = {"x": x, "p": ca.vertcat(u, wind), "ode": state_derivative(x, u, wind, PARAMS)}
+    exact = ca.integrator("exact", "cvodes", ode, 0.0, dt, {"abstol": 1e-12, "reltol": 1e-12})
+    for _ in range(20):
+        states, _ = random_states(1, rng)
+        expected = states[0]
+        for _ in range(round(0.5 / dt)):  # half a second of changing inputs
+            _, inputs = random_states(1, rng)
+            blow = rng.uniform(-2, 2, 2)
+            expected = exact(x0=expected, p=np.concatenate([inputs[0], blow]))["xf"].full().ravel()
+            states = model.step(states, inputs, blow[None])
+        np.testing.assert_allclose(states[0], expected, atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("command", "index", "steady"),
+    [
+        ([0, 0, 0.5, 0], 5, 0.5 * PARAMS.climb_gain),
+        ([0, 0.1, 0, 0], 7, 0.1 * PARAMS.pitch_gain),
+        ([0.1, 0, 0, 0], 6, 0.1 * PARAMS.roll_gain),
+        ([0, 0.1, 0, 0], 3, PARAMS.gravity * np.tan(0.1 * PARAMS.pitch_gain) / PARAMS.drag_x),
+        ([0.1, 0, 0, 0], 4, -PARAMS.gravity * np.tan(0.1 * PARAMS.roll_gain) / PARAMS.drag_y),
+    ],
+)
+def test_steady_states(command, index, steady):
+    model = QuadrotorModel(PARAMS, dt=0.1)
+    x = np.zeros((1, 9))
+    for _ in range(600):
+        x = model.step(x, np.array([command], float))
+    assert x[0, index] == pytest.approx(steady, rel=1e-6)
+
+
+def test_drifts_with_the_wind():
+    model = QuadrotorModel(PARAMS, dt=0.1)
+    x = np.zeros((1, 9))
+    for _ in range(600):
+        x = model.step(x, np.zeros((1, 4)), np.array([[1.5, -0.5]]))
+    np.testing.assert_allclose(x[0, 3:6], [1.5, -0.5, 0], atol=1e-6)
+
+
+def test_batch_equals_single_calls_to_the_last_bit():
+    rng = np.random.default_rng(1)
+    model = QuadrotorModel(PARAMS, dt=0.1)
+    x, u = random_states(7, rng)
+    batch = model.step(x, u)
+    for k in range(7):
+        assert np.array_equal(model.step(x[k : k + 1], u[k : k + 1])[0], batch[k])
+    assert np.array_equal(model.step(x.reshape(1, 7, 9), u.reshape(1, 7, 4))[0], batch)
+    assert model.step(x[:0], u[:0]).shape == (0, 9)
+
+
+def test_rollout_repeats_steps():
+    rng = np.random.default_rng(2)
+    model = QuadrotorModel(PARAMS, dt=0.1)
+    x, _ = random_states(3, rng)
+    u = rng.uniform(-0.2, 0.2, (3, 5, 4))
+    states = model.rollout(x, u)
+    for k in range(5):
+        assert np.array_equal(states[:, k + 1], model.step(states[:, k], u[:, k]))
+
+
+def test_survives_pickling():
+    model = QuadrotorModel(PARAMS, dt=0.1)
+    x, u = random_states(2, np.random.default_rng(3))
+    expected = model.step(x, u)
+    assert np.array_equal(pickle.loads(pickle.dumps(model)).step(x, u), expected)

@@ -1,0 +1,132 @@
+"""The world without RL: collisions at and between steps, disturbances, and swarms that do not see each other."""
+
+import numpy as np
+import pytest
+from quad_swarm.beliefs import BeliefSource
+from quad_swarm.planner import PlanStatus
+from quad_swarm.presets import PRESETS, make_config
+from quad_swarm.scenarios import ScenarioSampler
+from quad_swarm.swarm import Swarm
+
+
+def make_swarm(n_swarms: int, scenario: str = "asymmetric_swap", **overrides) -> Swarm:
+    config = make_config("paper", **overrides)
+    swarm = Swarm(config, n_swarms)
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space)
+    for k in range(n_swarms):
+        _, starts, goals = sampler.sample(np.random.default_rng(k))
+        swarm.reset(k, starts, goals, noise_seed=k)
+    return swarm
+
+
+def all_ask(swarm: Swarm, ask: bool = True) -> np.ndarray:
+    n = swarm.config.n_robots
+    return np.full((swarm.n_swarms, n, n - 1), ask)
+
+
+def fly(swarm: Swarm, steps: int, ask: bool = True) -> np.ndarray:
+    return np.array([(swarm.step(all_ask(swarm, ask)), swarm.pos.copy())[1] for _ in range(steps)])
+
+
+def test_robots_reach_their_goals():
+    swarm = make_swarm(3)
+    fly(swarm, 60)
+    assert np.linalg.norm(swarm.pos - swarm.goal, axis=-1).max() < 0.1
+
+
+def test_a_swarm_flies_the_same_alone_and_in_company():
+    together = make_swarm(3)
+    positions = fly(together, 30)
+    for k in range(3):
+        alone = make_swarm(3)
+        alone.keep(np.arange(3) == k)
+        assert np.array_equal(fly(alone, 30)[:, 0], positions[:, k])
+
+
+def test_first_plan_asked_for_is_to_stay():
+    swarm = make_swarm(1)
+    believed, source = swarm.beliefs.update(all_ask(swarm), swarm.pos, swarm.vel, swarm.plans[..., :3])
+    assert (source == BeliefSource.REQUESTED).all()
+    assert np.array_equal(believed, np.broadcast_to(swarm.pos[:, swarm.beliefs.others, None], believed.shape))
+
+
+def test_a_plan_begins_with_the_state_that_is_flown():
+    swarm = make_swarm(1)
+    for _ in range(10):
+        report = swarm.step(all_ask(swarm))
+        assert (report.plan_status == PlanStatus.SOLVED).all()
+        np.testing.assert_allclose(swarm.state[0], swarm.plans[0, :, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "at_step", "between"),
+    [
+        ((1.0, 0, 0), (0.7, 0, 0), 0.7, 0.7),
+        ((1.0, 0.2, 0), (-1.0, 0.2, 0), np.hypot(1.0, 0.2), 0.2),  # passes at 0.2 m in mid-step
+        ((0.3, 0, 0), (0.9, 0, 0), 0.9, 0.3),
+    ],
+)
+def test_separation_at_and_between_steps(start, end, at_step, between):
+    swarm = make_swarm(1, n_robots=2)
+    before = np.array([[[0, 0, 1.0], [0, 0, 1.0] + np.array(start)]])
+    swarm.state[0, :, :3] = [[0, 0, 1.0], [0, 0, 1.0] + np.array(end)]
+    report = swarm._report(before, np.zeros((1, 2, 1)), 0.0)
+    assert report.min_separation[0] == pytest.approx(at_step)
+    assert report.min_separation_continuous[0] == pytest.approx(between)
+    assert report.collision[0] == (at_step < 0.599)
+    assert report.collision_continuous[0] == (between < 0.599)
+
+
+@pytest.mark.parametrize(("distance", "collides"), [(0.5985, True), (0.5995, False)])
+def test_collision_tolerance_is_one_millimetre(distance, collides):
+    swarm = make_swarm(1, n_robots=2)
+    swarm.state[0, :, :3] = [[0, 0, 1], [distance, 0, 1]]
+    report = swarm._report(swarm.pos.copy(), np.zeros((1, 2, 1)), 0.0)
+    assert report.collision[0] == collides
+
+
+def test_noise_is_off_by_default_and_repeats_from_its_seed():
+    assert not PRESETS["paper"].noise
+    noise = {"pos": 0.004, "vel": 0.02, "attitude": 0.006, "wind": 1.0}
+    first, second = (fly(make_swarm(2, noise=noise), 20) for _ in range(2))
+    assert np.array_equal(first, second)
+    assert np.abs(first - fly(make_swarm(2), 20)).max() > 0.01
+
+
+def test_noise_of_a_swarm_does_not_depend_on_its_company():
+    noise = {"vel": 0.05, "wind": 0.5}
+    together = fly(make_swarm(2, noise=noise), 15)
+    alone = make_swarm(2, noise=noise)
+    alone.keep(np.array([False, True]))
+    assert np.array_equal(fly(alone, 15)[:, 0], together[:, 1])
+
+
+def test_wind_blows_hovering_robots_until_they_lean_into_it():
+    swarm = make_swarm(1, noise={"wind": 2.0})
+    fly(swarm, 80)
+    tilt = np.abs(swarm.state[0, :, 6:8]).max(axis=1)
+    assert (tilt > 0.02).all()
+    assert np.abs(swarm.state[0, :, 8]).max() == 0
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.full((4, 3), np.nan)])
+def test_refuses_senseless_starts(bad):
+    swarm = make_swarm(1)
+    with pytest.raises(ValueError, match="starts must be 4 finite points"):
+        swarm.reset(0, bad, np.zeros((4, 3)))
+
+
+def test_presets_take_replacements_and_name_what_they_do_not_know():
+    config = make_config("dense", n_robots=5, planner={"separation": 0.7, "workspace_low": [-3, -3, 0.5]})
+    assert (config.n_robots, config.planner.separation, config.planner.max_speed) == (5, 0.7, 4.0)
+    assert config.planner.workspace_low == (-3, -3, 0.5)
+    assert make_config("dense", n_robots=None) == PRESETS["dense"]
+    for values, message in [
+        ({"planner": {"seperation": 1}}, "planner parameter 'seperation'.*Did you mean 'separation'"),
+        ({"speed": 1}, "world parameter 'speed'"),
+        ({"memory": {"far": 1}}, "takes a plain value"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            make_config("paper", **values)
+    with pytest.raises(ValueError, match="Did you mean 'dense'"):
+        make_config("dens")
