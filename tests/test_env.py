@@ -153,7 +153,7 @@ def test_info_at_the_end_carries_what_the_learner_logs():
     assert metrics["swarm/collision_rate"] == 0.0
     assert metrics["planner/failure_rate"] == 0.0
     assert metrics["planner/solve_us"] > 0
-    assert metrics["swarm/min_separation"] == pytest.approx(env.statistics.min_separation[0])
+    assert metrics["swarm/min_separation"] == pytest.approx(env.task.statistics.min_separation[0])
 
 
 def test_a_hopeless_planner_never_raises():

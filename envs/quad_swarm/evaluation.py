@@ -23,7 +23,6 @@ from tqdm import tqdm
 from .communication import View, parse_rule
 from .presets import SwarmConfig
 from .scenarios import ScenarioSampler
-from .statistics import EpisodeStatistics
 from .swarm import Swarm
 from .task import RequestTask, RewardConfig
 
@@ -169,18 +168,14 @@ def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
     :return: for each episode its figures, see `EpisodeStatistics`
     """
     policy, task, rngs = _begin(cell, episodes)
-    statistics = EpisodeStatistics(len(episodes), cell.config.n_robots)
     index = np.arange(len(episodes))
     rows: dict[int, dict[str, float]] = {}
     while index.size:
-        before = task.swarm.pos.copy()
         outcome = task.step(policy(task, rngs))
-        statistics.add(outcome, np.linalg.norm(task.swarm.pos - before, axis=-1))
         done = outcome.terminated | outcome.truncated
         if done.any():
-            rows |= {int(index[k]): statistics.row(int(k)) for k in np.flatnonzero(done)}
+            rows |= {int(index[k]): task.statistics.row(int(k)) for k in np.flatnonzero(done)}
             task.keep(~done)
-            statistics.keep(~done)
             rngs = [rng for rng, over in zip(rngs, done, strict=True) if not over]
             index = index[~done]
     return [rows[k] for k in range(len(episodes))]

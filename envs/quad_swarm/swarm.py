@@ -20,6 +20,7 @@ class StepReport(NamedTuple):
     :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line, (E,) (m)
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
     :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
+    :param moved: distance that each robot flew, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
     :param plan_status: `PlanStatus` of each robot's plan, (E, n)
@@ -31,6 +32,7 @@ class StepReport(NamedTuple):
     min_separation_continuous: np.ndarray
     collision: np.ndarray
     collision_continuous: np.ndarray
+    moved: np.ndarray
     at_goal: np.ndarray
     belief_source: np.ndarray
     plan_status: np.ndarray
@@ -151,9 +153,10 @@ class Swarm:
             min_separation_continuous=separation_continuous,
             collision=separation < limit,
             collision_continuous=separation_continuous < limit,
+            moved=np.linalg.norm(self.pos - before, axis=-1),
             at_goal=np.linalg.norm(self.pos - self.goal, axis=-1) <= self.config.goal_radius,
             belief_source=source,
-            plan_status=self._plans.status.reshape(shape),
-            iterations=self._plans.iterations.reshape(shape),
+            plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
+            iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
         )
