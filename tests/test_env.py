@@ -6,12 +6,13 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-import quad_swarm
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from pettingzoo.test import parallel_api_test
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import quad_swarm
 from quad_swarm.env import QuadSwarmEnv
 from quad_swarm.scenarios import SCENARIOS
-from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 
 def run(env: gymnasium.Env, seed: int, steps: int) -> list:

@@ -6,6 +6,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+
 from quad_swarm.evaluate import main
 from quad_swarm.evaluation import Cell, evaluate, first_episode, fly, run_episodes, wilson_interval
 from quad_swarm.presets import make_config

@@ -6,6 +6,7 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
+
 from quad_swarm.planner import (
     FatropSolver,
     OptimalControlProblem,

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from quad_swarm.beliefs import BeliefSource
 from quad_swarm.planner import PlanStatus
 from quad_swarm.presets import PRESETS, make_config

@@ -3,8 +3,9 @@
 import gymnasium
 import numpy as np
 import pytest
-import quad_swarm
 from gymnasium.vector import AutoresetMode
+
+import quad_swarm
 from quad_swarm.env import QuadSwarmEnv, info_of
 
 
