@@ -69,8 +69,8 @@ def test_a_plan_begins_with_the_state_that_is_flown():
 )
 def test_separation_at_and_between_steps(start, end, at_step, between):
     swarm = make_swarm(1, n_robots=2)
-    before = np.array([[[0, 0, 1.0], [0, 0, 1.0] + np.array(start)]])
-    swarm.state[0, :, :3] = [[0, 0, 1.0], [0, 0, 1.0] + np.array(end)]
+    before = np.array([[[0, 0, 1.0], np.add([0, 0, 1.0], start)]])
+    swarm.state[0, :, :3] = [[0, 0, 1.0], np.add([0, 0, 1.0], end)]
     report = swarm._report(before, np.zeros((1, 2, 1)), 0.0)
     assert report.min_separation[0] == pytest.approx(at_step)
     assert report.min_separation_continuous[0] == pytest.approx(between)

@@ -32,7 +32,7 @@ class ProcessNoise:
     wind: float = 0.0
 
     def __bool__(self) -> bool:
-        return any(dataclasses.astuple(self))
+        return any((self.pos, self.vel, self.attitude, self.wind))
 
 
 @dataclass(frozen=True)
