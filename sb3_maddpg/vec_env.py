@@ -33,7 +33,7 @@ class GymnasiumVecEnv(VecEnv):
         if any(self._options):
             raise ValueError(f"Options for single environments, {self._options}, cannot be passed on to {self.envs}.")
         seeds = list(self._seeds) if any(seed is not None for seed in self._seeds) else None
-        observations, infos = self.envs.reset(seed=seeds)
+        observations, infos = self.envs.reset(seed=seeds)  # type: ignore[arg-type]  # one of each is allowed too
         self.reset_infos = unbatch(infos, self.num_envs)
         self._reset_seeds()
         return observations
