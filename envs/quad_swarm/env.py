@@ -138,7 +138,8 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         if len(options) == 1:
             raise ValueError(f"reset options name only {next(iter(options))!r}; give both 'starts' and 'goals'.")
         if options:
-            self.task.place(0, "custom", np.asarray(options["starts"], float), np.asarray(options["goals"], float))
+            starts, goals = (np.asarray(options[name], dtype=float) for name in self.reset_options)
+            self.task.place(0, "custom", starts, goals, self.np_random)
         else:
             self.task.reset(0, self.np_random)
         self._requests = np.zeros_like(self._requests)

@@ -97,12 +97,11 @@ class RequestTask:
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
         """Draw a new episode for one swarm; every random number of the episode comes from ``rng``."""
-        name, starts, goals = self.sampler.sample(rng)
-        noise_seed = int(rng.integers(2**63)) if self.swarm.config.noise else 0
-        self.place(swarm, name, starts, goals, noise_seed)
+        self.place(swarm, *self.sampler.sample(rng), rng)
 
-    def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
-        """Begin a given episode in one swarm; see `Swarm.reset`."""
+    def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, rng: np.random.Generator) -> None:
+        """Begin a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
+        noise_seed = int(rng.integers(2**63)) if self.swarm.config.noise else 0
         self.swarm.reset(swarm, starts, goals, noise_seed)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
