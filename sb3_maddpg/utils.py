@@ -12,6 +12,9 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
+# Arguments that gymnasium.make and make_vec take and keep among those of the environment
+NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"}
+
 
 def suggest(kind: str, name: str, known: Iterable[str]) -> str:
     """
@@ -60,7 +63,7 @@ def describe_env(env: VecEnv) -> dict[str, Any] | None:
 
     :param env: vectorised environment; its first one is described
     :return: ``{"id": ..., "kwargs": ...}``, or None where it was not made by ``gymnasium.make`` or its arguments
-        cannot be written as JSON. The render mode is left out: it is no part of the task.
+        cannot be written as JSON. What is no part of the task is left out: the render mode, the number of copies.
     """
     try:
         spec = env.get_attr("spec", indices=0)[0]
@@ -68,7 +71,7 @@ def describe_env(env: VecEnv) -> dict[str, Any] | None:
         return None
     if not isinstance(spec, EnvSpec):
         return None
-    kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
+    kwargs = {key: value for key, value in spec.kwargs.items() if key not in NOT_THE_TASK}
     try:
         return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs))}
     except (TypeError, ValueError):

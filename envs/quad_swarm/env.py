@@ -205,11 +205,11 @@ def request_matrices(actions: Any, n_swarms: int, n_robots: int) -> np.ndarray:
     return asked.reshape(n_swarms, n_robots, n_robots - 1)
 
 
-def info_of(batch: Mapping[str, Any], swarm: int) -> dict[str, Any]:
+def info_of(batch: dict[str, Any], swarm: int) -> dict[str, Any]:
     """One swarm's part of a batched `info`, in plain Python numbers and fresh arrays."""
     return {
         name: info_of(value, swarm)
-        if isinstance(value, Mapping)
+        if isinstance(value, dict)
         else (value[swarm].copy() if value.ndim > 1 else value[swarm].item())
         for name, value in batch.items()
     }

@@ -138,14 +138,14 @@ class Swarm:
 
     def _report(self, before: np.ndarray, source: np.ndarray, solve_seconds: float) -> StepReport:
         i, j = self._pairs
-        start = before[:, i] - before[:, j]
-        end = self.pos[:, i] - self.pos[:, j]
-        separation = np.linalg.norm(end, axis=-1).min(axis=-1)
+        pos = self.pos
+        start, end = before[:, i] - before[:, j], pos[:, i] - pos[:, j]
         # Closest point of the segment from start to end to the origin.
         change = end - start
-        along = -(start * change).sum(axis=-1) / np.maximum((change**2).sum(axis=-1), 1e-12)
-        closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
-        separation_continuous = np.linalg.norm(closest, axis=-1).min(axis=-1)
+        along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
+        closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
+        separation = np.sqrt(_dot(end, end).min(axis=-1))
+        separation_continuous = np.sqrt(_dot(closest, closest).min(axis=-1))
         limit = 2 * self.config.radius - self.config.collision_tolerance
         shape = self.state.shape[:2]
         return StepReport(
@@ -153,10 +153,14 @@ class Swarm:
             min_separation_continuous=separation_continuous,
             collision=separation < limit,
             collision_continuous=separation_continuous < limit,
-            moved=np.linalg.norm(self.pos - before, axis=-1),
-            at_goal=np.linalg.norm(self.pos - self.goal, axis=-1) <= self.config.goal_radius,
+            moved=np.sqrt(_dot(pos - before, pos - before)),
+            at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
             belief_source=source,
             plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
         )
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...k,...k->...", a, b)
