@@ -26,8 +26,9 @@ def suggest(kind: str, name: str, known: Iterable[str]) -> str:
     """
     known = sorted(known)
     nearest = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean '{nearest[0]}'?" if nearest else "there is nothing like it."
-    return f"Unknown {kind} '{name}': {hint} Known: {', '.join(known)}."
+    if nearest:
+        return f"Unknown {kind} '{name}': did you mean '{nearest[0]}'?"
+    return f"Unknown {kind} '{name}'. There are: {', '.join(known)}."
 
 
 def team_shape(observation_space: spaces.Space, action_space: spaces.Space) -> tuple[int, int, int]:
