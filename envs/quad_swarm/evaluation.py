@@ -137,12 +137,14 @@ def _begin(cell: Cell, episodes: Sequence[int]) -> tuple[Requests, RequestTask, 
 class Flight(NamedTuple):
     """One episode step by step.
 
-    :param pos: positions, (T + 1, n, 3), world frame (m)
+    :param state: states, (T + 1, n, 9)
+    :param plans: planned states as of each step, stages 0..N, (T + 1, n, N + 1, 9)
     :param goal: goals, (n, 3), world frame (m)
     :param requests: who asked whom in each step, (T, n, n - 1) bool
     """
 
-    pos: np.ndarray
+    state: np.ndarray
+    plans: np.ndarray
     goal: np.ndarray
     requests: np.ndarray
 
@@ -150,14 +152,15 @@ class Flight(NamedTuple):
 def fly(cell: Cell, seed: int) -> Flight:
     """The first held-out episode of set ``seed``, step by step."""
     policy, task, rngs = _begin(cell, [first_episode(seed)])
-    pos, asked = [task.swarm.pos[0].copy()], []
+    state, plans, asked = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], []
     over = False
     while not over:
         asked.append(policy(task, rngs))
         outcome = task.step(asked[-1])
-        pos.append(task.swarm.pos[0].copy())
+        state.append(task.swarm.state[0].copy())
+        plans.append(task.swarm.plans[0].copy())
         over = bool(outcome.terminated[0] | outcome.truncated[0])
-    return Flight(np.array(pos), task.swarm.goal[0], np.concatenate(asked))
+    return Flight(np.array(state), np.array(plans), task.swarm.goal[0], np.concatenate(asked))
 
 
 def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
