@@ -55,7 +55,7 @@ class SwarmConfig:
     radius: float = 0.3
     collision_tolerance: float = 1e-3
     goal_radius: float = 0.3
-    memory: float = 0.0
+    memory: float = 0.03
     quadrotor: QuadrotorParams = field(default_factory=QuadrotorParams)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     space: ScenarioSpace = field(default_factory=ScenarioSpace)
