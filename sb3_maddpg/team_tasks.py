@@ -19,6 +19,7 @@ class TeamTask(gym.Env):
     :param episode_length: steps until the episode is truncated
     """
 
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - Gymnasium's own convention
     n_agents: ClassVar[int]
     action_dim: ClassVar[int]
     obs_dim: ClassVar[int]
@@ -56,15 +57,23 @@ class TeamTask(gym.Env):
         super().reset(seed=seed)
         self._steps = 0
         self._obs = self.draw(self.np_random, 1)
+        self._actions = np.zeros((self.n_agents, self.action_dim))
         return self._obs[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         actions = np.asarray(action).reshape(1, self.n_agents, self.action_dim)
         rewards = self.payoff(self._obs, actions)[0].astype(np.float32)
         self._steps += 1
-        self._obs = self.draw(self.np_random, 1)
+        self._obs, self._actions = self.draw(self.np_random, 1), actions[0]
         info = {"agent_rewards": rewards, "metrics": {"task/mean_action": float(actions.mean())}}
         return self._obs[0], float(rewards.mean()), False, self._steps >= self.episode_length, info
+
+    def render(self) -> np.ndarray | None:
+        """A row per agent: its observation in grey, then the bits it just set in white."""
+        if self.render_mode is None:
+            return None
+        cells = np.hstack([96 + 64 * self._obs[0], 255 * np.clip(self._actions, 0, 1)])
+        return np.repeat(np.kron(cells, np.ones((32, 32)))[..., None], 3, axis=2).astype(np.uint8)
 
     def play(self, model: Any, n_steps: int = 10_000, seed: int = 0) -> float:
         """
