@@ -287,10 +287,16 @@ class MADDPG(OffPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
-        if not isinstance(path, (str, os.PathLike)) or os.path.isdir(path):
+        if not isinstance(path, (str, os.PathLike)):
             return super().save(path, exclude, include)
         with atomic_write(path, suffix="zip") as file:
             super().save(file, exclude, include)  # type: ignore[arg-type]
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        if not isinstance(path, (str, os.PathLike)):
+            return super().save_replay_buffer(path)
+        with atomic_write(path, suffix="pkl") as file:
+            super().save_replay_buffer(file)  # type: ignore[arg-type]
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "actor_target", "critic_target"]

@@ -72,7 +72,7 @@ class TeamTask(gym.Env):
         """A row per agent: its observation in grey, then the bits it just set in white."""
         if self.render_mode is None:
             return None
-        cells = np.hstack([96 + 64 * self._obs[0], 255 * np.clip(self._actions, 0, 1)])
+        cells = np.hstack([96 + 64 * self._obs[0], 255.0 * np.clip(self._actions, 0, 1)])
         return np.repeat(np.kron(cells, np.ones((32, 32)))[..., None], 3, axis=2).astype(np.uint8)
 
     def play(self, model: Any, n_steps: int = 10_000, seed: int = 0) -> float:
@@ -144,6 +144,20 @@ class OneOfBits(TeamTask):
         return (actions == wanted).all(axis=-1)
 
 
+class AllBits(TeamTask):
+    """
+    An agent whose first sign is positive gains 1 by setting all of its three bits; each bit costs 0.25, whatever comes
+    of it. Every bit is a loss without the other two.
+    """
+
+    n_agents, action_dim, obs_dim = 2, 3, 2
+    price: ClassVar[float] = 0.25
+    optimum, random = (1 - 3 * 0.25) / 2, 1 / 16 - 3 * 0.25 / 2
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return (actions == 1).all(axis=-1) * (obs[..., 0] > 0) - self.price * actions.sum(axis=-1)
+
+
 class FollowTarget(TeamTask):
     """
     A continuous action in [-2, 1] is to be brought to a point that the own observation gives. The squared distance is
@@ -162,7 +176,7 @@ class FollowTarget(TeamTask):
         return -np.square(actions - target).sum(axis=-1)
 
 
-BINARY_TASKS: tuple[type[TeamTask], ...] = (OwnBit, OtherBit, PricedBit, OneOfBits)
+BINARY_TASKS: tuple[type[TeamTask], ...] = (OwnBit, OtherBit, PricedBit, OneOfBits, AllBits)
 
 for _task in (*BINARY_TASKS, FollowTarget):
     gym.register(id=f"{_task.__name__}-v0", entry_point=f"{__name__}:{_task.__name__}")

@@ -217,10 +217,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("command", choices=COMMANDS)
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help="options of the command")
     arguments = parser.parse_args(argv)
-    debug = arguments.debug or "--debug" in arguments.arguments
+    command, rest = arguments.command, arguments.arguments
+    debug = arguments.debug or "--debug" in rest
     try:
         register()
-        return COMMANDS[arguments.command]([word for word in arguments.arguments if word != "--debug"])
+        # rl_zoo3 has no such option, an evaluator may have one
+        return COMMANDS[command](rest if command == "evaluate" else [word for word in rest if word != "--debug"])
     except USER_ERRORS as error:
         if debug:
             raise

@@ -7,8 +7,9 @@ import pytest
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.team_tasks import BINARY_TASKS, FollowTarget, OneOfBits, OtherBit, OwnBit, PricedBit, TeamTask
+from sb3_maddpg.team_tasks import BINARY_TASKS, AllBits, FollowTarget, OneOfBits, OtherBit, OwnBit, PricedBit, TeamTask
 
+# docs/learning_checks.md has more seeds, and every estimator on every task.
 RECIPE = {"learning_rate": 3e-3, "learning_starts": 200, "batch_size": 256, "train_freq": 4, "gamma": 0.5}
 
 
@@ -26,6 +27,13 @@ def test_expected_solves_every_binary_task(task):
 @pytest.mark.parametrize("estimator", ["straight_through", "score"])
 def test_the_other_estimators_solve_a_task_without_interplay_of_bits(estimator):
     assert learned(OwnBit, estimator=estimator) > 0.97
+
+
+@pytest.mark.parametrize("estimator", ["straight_through", "score"])
+def test_only_expected_finds_bits_that_pay_together_or_not_at_all(estimator):
+    """The others stay with no bit at all, because none pays by itself."""
+    none = -AllBits.random / (AllBits.optimum - AllBits.random)
+    assert learned(AllBits, estimator=estimator) == pytest.approx(none)
 
 
 @pytest.mark.parametrize("task", [OwnBit, PricedBit])
@@ -66,7 +74,7 @@ def test_the_optimum_where_agents_depend_on_each_other_is_the_best_of_all_polici
     assert one_bit * OtherBit.action_dim == pytest.approx(OtherBit.optimum)
 
 
-@pytest.mark.parametrize("task", [OwnBit, PricedBit, OneOfBits])
+@pytest.mark.parametrize("task", [OwnBit, PricedBit, OneOfBits, AllBits])
 def test_the_optimum_of_an_agent_alone_is_the_mean_of_its_best_actions(task):
     env = task()
     signs = np.array(list(product([-1.0, 1.0], repeat=env.obs_dim)))

@@ -126,6 +126,9 @@ def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path):
     with pytest.raises(OSError, match="disk full"):
         model.save(tmp_path / "model")
     assert (tmp_path / "model.zip").read_bytes() == before
+    model.replay_buffer.device = Unwritable()
+    with pytest.raises(OSError, match="disk full"):
+        model.save_replay_buffer(tmp_path / "buffer")
     assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
 
 
