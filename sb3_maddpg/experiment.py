@@ -3,13 +3,17 @@
 import inspect
 from typing import Any
 
+import gymnasium
 import optuna
+from gymnasium.envs.registration import load_env_creator
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from sb3_maddpg.utils import suggest
+from sb3_maddpg.utils import describe_env, suggest
+from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 # Keys of a recipe that rl_zoo3 uses up itself; every other key is an argument of the algorithm.
 ZOO_KEYS = {
@@ -25,6 +29,7 @@ ZOO_KEYS = {
     "noise_type",
     "normalize",
     "policy",
+    "vec_env",
     "vec_env_wrapper",
 }
 # Arguments of the algorithm that the command line gives.
@@ -41,6 +46,8 @@ class TeamExperimentManager(ExperimentManager):
     - ``--env-kwargs`` are merged over the recipe's ``env_kwargs``, and both reach the evaluation environment, there
       with ``eval_env_kwargs`` and ``--eval-env-kwargs`` merged over them;
     - unknown keys are refused, with the nearest known one;
+    - ``vec_env: gymnasium`` takes the environment's own Gymnasium vector environment, see ``GymnasiumVecEnv``;
+    - every model, not only MADDPG's, carries the environment it was trained in as ``env_spec``;
     - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up.
     """
 
@@ -52,12 +59,46 @@ class TeamExperimentManager(ExperimentManager):
         if hyperparams.get("noise_type") is None:
             hyperparams.pop("noise_type", None)
             hyperparams.pop("noise_std", None)
+        self.own_vec_env = self._read_vec_env(hyperparams)
         env_kwargs = {**(hyperparams.get("env_kwargs") or {}), **given}
         eval_env_kwargs = {**(hyperparams.pop("eval_env_kwargs", None) or {}), **(self._eval_env_kwargs_args or {})}
         self.eval_env_kwargs = {**env_kwargs, **eval_env_kwargs}
         hyperparams["env_kwargs"] = env_kwargs
         saved = {**hyperparams, "eval_env_kwargs": eval_env_kwargs}
+        if self.own_vec_env:
+            saved["vec_env"] = "gymnasium"
+        check_env_kwargs(self.env_name.gym_id, self.eval_env_kwargs)
         return hyperparams, dict(sorted(saved.items()))
+
+    def _read_vec_env(self, hyperparams: dict[str, Any]) -> bool:
+        """Whether training steps the environment's own vector environment."""
+        vec_env = hyperparams.pop("vec_env", None)
+        if vec_env not in (None, "gymnasium"):
+            raise ValueError(
+                f"vec_env: {vec_env} in the recipe: only 'gymnasium' is known; --vec-env chooses dummy or subproc."
+            )
+        if vec_env and gymnasium.spec(self.env_name.gym_id).vector_entry_point is None:
+            raise ValueError(
+                f"vec_env: gymnasium in the recipe, but {self.env_name.gym_id} has no vector environment of its own."
+            )
+        if vec_env and (wrappers := {"env_wrapper", "frame_stack", "monitor_kwargs"} & set(hyperparams)):
+            raise ValueError(
+                f"vec_env: gymnasium in the recipe does not go with {', '.join(sorted(wrappers))}: leave one out."
+            )
+        return vec_env is not None
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """
+        :param n_envs: number of environments
+        :param eval_env: whether they are for evaluation
+        :param no_log: write no monitor file
+        """
+        if eval_env or not self.own_vec_env:
+            return super().create_envs(n_envs, eval_env, no_log)
+        envs = gymnasium.make_vec(self.env_name.gym_id, num_envs=n_envs, **self.env_kwargs)
+        env = VecMonitor(GymnasiumVecEnv(envs), None if no_log else f"{self.save_path}/0")
+        env.seed(self.seed)
+        return self._maybe_normalize(env, eval_env)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
         model = super()._load_pretrained_agent(hyperparams, env)
@@ -71,6 +112,8 @@ class TeamExperimentManager(ExperimentManager):
         """
         :param model: a new or a loaded model
         """
+        assert model.env is not None
+        model.env_spec = describe_env(model.env)  # type: ignore[attr-defined]
         kwargs: dict[str, Any] = {}
         if self.log_interval != -1:
             kwargs["log_interval"] = max(self.log_interval, 0) or None
@@ -121,6 +164,26 @@ def check_keys(algo: str, hyperparams: dict[str, Any]) -> None:
         for key in policy_kwargs:
             if key not in known:
                 raise ValueError(suggest(f"key in policy_kwargs for {algo}", key, known))
+
+
+def check_env_kwargs(env_id: str, env_kwargs: dict[str, Any]) -> None:
+    """
+    Refuse arguments that the environment does not take.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: from the recipe and the command line
+    """
+    entry_point = gymnasium.spec(env_id).entry_point
+    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    if creator is None:
+        return
+    parameters = inspect.signature(creator).parameters.values()
+    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    known = {parameter.name for parameter in parameters}
+    for key in env_kwargs:
+        if key not in known:
+            raise ValueError(suggest(f"argument of {env_id}", key, known))
 
 
 def sample_maddpg_params(
