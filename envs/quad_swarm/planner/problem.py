@@ -101,11 +101,15 @@ class OptimalControlProblem:
         # The small constant keeps the gradient finite where two centres coincide.
         return [ca.sqrt(ca.sumsqr(x[:3] - others[:, j]) + 1e-6) for j in range(self.n_others)]
 
-    def repulsion_cost(self, distance: ca.SX) -> ca.SX:
-        """Smooth repulsion from one other robot; it conditions the problem where the bare constraint leaves it flat."""
+    def repulsion_residual(self, distance: ca.SX) -> ca.SX:
+        """Square root of the repulsion from one other robot, for methods that linearise it (Gauss-Newton)."""
         c = self.config
         steepness = c.repulsion_steepness * (distance / c.separation - c.repulsion_buffer)
-        return c.repulsion_weight / (1 + ca.exp(steepness)) ** 2
+        return math.sqrt(c.repulsion_weight) / (1 + ca.exp(steepness))
+
+    def repulsion_cost(self, distance: ca.SX) -> ca.SX:
+        """Smooth repulsion from one other robot; it conditions the problem where the bare constraint leaves it flat."""
+        return self.repulsion_residual(distance) ** 2
 
     def box_violations(self, x: ca.SX) -> ca.SX:
         """Amounts by which a state leaves the workspace (m) and the speed limits (m/s); violated where positive."""
