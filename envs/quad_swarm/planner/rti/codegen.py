@@ -73,7 +73,7 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
         _emit(
             "goal_derivatives",
             {"x": x, "x0": x0, "goal": goal},
-            {"gradient": ca.densify(gradient), "hessian": _packed(hessian)},
+            {"gradient": gradient, "hessian": _packed(hessian)},
         ),
         _emit(
             "separation",
@@ -251,16 +251,13 @@ _BINARY = {
 
 
 def _emit(name: str, inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]) -> str:
-    """A C++ function of lanes that evaluates the outputs; arrays hold the non-zeros of each argument, by columns.
+    """A C++ function of lanes that evaluates the outputs; arrays hold each argument column by column.
 
     :param name: name of the C++ function
     :param inputs: argument names and their symbols
     :param outputs: argument names and their expressions
     """
-    function = ca.Function(
-        name, list(inputs.values()), ca.cse([ca.sparsify(value) if value.is_scalar() else value for value in outputs.values()]),
-        {"allow_free": False},
-    )
+    function = ca.Function(name, list(inputs.values()), ca.cse([ca.densify(value) for value in outputs.values()]))
     arguments = [f"const V* __restrict {argument}" for argument in inputs]
     arguments += [f"V* __restrict {argument}" for argument in outputs]
     body = _Walk(function, list(inputs), list(outputs)).lines()
