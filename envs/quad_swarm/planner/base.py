@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..quadrotor import N_INPUTS, QuadrotorModel
+from ..quadrotor import N_INPUTS, POSITION, QuadrotorModel
 from .problem import PlannerConfig
 
 
@@ -114,6 +114,7 @@ class Planner:
         :param previous: the plans of the same robots one step ago
         """
         x_guess, u_guess = shift(previous.x), shift(previous.u)
+        problems = self._nearest_others(problems, x_guess)
         x, u, success, iterations = self.solver.solve(problems, x_guess, u_guess)
         solved = success & _finite(x, u)
         status = np.where(solved, PlanStatus.SOLVED, PlanStatus.BRAKING)
@@ -137,6 +138,16 @@ class Planner:
             u[failed[~lasts]] = self.braking_inputs(problems.x[failed[~lasts]])
             x[failed] = self.model.rollout(problems.x[failed], u[failed])
         return Plans(x, u, age, status, iterations)
+
+    def _nearest_others(self, problems: Problems, x_guess: np.ndarray) -> Problems:
+        """The same problems with only the ``max_neighbours`` others that come nearest over the horizon."""
+        kept = self.config.max_neighbours
+        if kept is None or kept >= problems.others.shape[1]:
+            return problems
+        offset = problems.others - x_guess[:, None, 1:, POSITION]
+        closest = np.einsum("bjki,bjki->bjk", offset, offset).min(axis=2)
+        nearest = np.sort(np.argsort(closest, axis=1, kind="stable")[:, :kept], axis=1)
+        return problems._replace(others=np.take_along_axis(problems.others, nearest[:, :, None, None], axis=1))
 
     def braking_inputs(self, x: np.ndarray) -> np.ndarray:
         """Inputs that bring robots to hover without a solver, from their states alone: (B, 9) -> (B, N, 4).

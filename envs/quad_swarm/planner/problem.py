@@ -30,6 +30,8 @@ class PlannerConfig:
     :param repulsion_buffer: distance at which half of the repulsion acts, in separations (-)
     :param repulsion_steepness: steepness of the repulsion, per separation (-)
     :param violation_weight: weight of the squared violation of a soft constraint (1/m^2)
+    :param max_neighbours: consider only so many others, those whose believed trajectories come nearest to the robot's
+        last plan; None considers all
     """
 
     horizon: int = 10
@@ -48,6 +50,7 @@ class PlannerConfig:
     repulsion_buffer: float = 1.2
     repulsion_steepness: float = 10.0
     violation_weight: float = 1e4
+    max_neighbours: int | None = None
 
     def __post_init__(self) -> None:
         if self.horizon < 2:
@@ -55,6 +58,8 @@ class PlannerConfig:
         for name in ("dt", "separation", "max_tilt", "max_climb_rate", "max_speed", "max_vertical_speed"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}={getattr(self, name)}: it must be positive.")
+        if self.max_neighbours is not None and self.max_neighbours < 1:
+            raise ValueError(f"max_neighbours={self.max_neighbours}: it must be at least 1, or None for all.")
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
             raise ValueError(f"Empty workspace: low corner {self.workspace_low}, high corner {self.workspace_high}.")
 
