@@ -101,7 +101,7 @@ def load(path: str) -> ctypes.CDLL:
         function = library.quad_swarm_rti
     except (OSError, AttributeError) as error:
         raise BuildError(f"cannot load {path} ({error}); delete that file to have it compiled again") from error
-    function.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 8, ctypes.c_int64, ctypes.c_int64, ctypes.c_double]
+    function.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 8, *[ctypes.c_int64] * 3, ctypes.c_double]
     function.restype = None
     return library
 

@@ -5,6 +5,10 @@
 // one stage of the Riccati recursion. Nothing in this file knows a quadrotor.
 //
 // A lane that is done, or whose numbers have gone bad, is frozen by a select. No lane ever reads another.
+#include <algorithm>
+#include <numeric>
+#include <vector>
+
 #include "lanes.hpp"
 #include "model.hpp"
 
@@ -14,7 +18,8 @@ constexpr int STATE_STRIDE = 9;  // of the arrays that the caller passes; the pr
 constexpr int INPUT_STRIDE = 4;
 
 struct Options {
-  std::int64_t sqp_iterations;
+  std::int64_t sqp_iterations;    // quadratic programs for every problem,
+  std::int64_t extra_iterations;  // and how many more for one that still moves
   std::int64_t max_iterations;  // of the interior-point method, for each quadratic program
   double tolerance;             // on the mean complementarity
 };
@@ -29,6 +34,7 @@ struct Batch {
   double* u_plan;         // (count, N, 4)
   std::uint8_t* success;  // (count,)
   std::int64_t* iterations;  // (count,)
+  std::uint8_t* moving;      // (count,) whether the last quadratic program still changed much
 };
 
 // How far below the boundary the interior-point method may start, and what it starts from.
@@ -36,6 +42,7 @@ constexpr double START_COMPLEMENTARITY = 1.0;
 constexpr double START_SLACK = 0.05;
 constexpr double RESIDUAL_TOLERANCE = 2e-3;  // of the linear conditions, over their residual at the start
 constexpr double STEP_TO_BOUNDARY = 0.99;
+constexpr double STILL_MOVING = 0.3;  // change of an input over its limit in the last quadratic program
 
 // One inequality h + g z >= -s in the step z. A hard one has no violation s; a soft one pays rho s^2 / 2 for it, which
 // makes s = lambda / rho and lets it be eliminated: `compliance` is 1 / rho, or 0.
@@ -119,32 +126,33 @@ class LaneGroup {
   using V = typename LaneTypes<T, W>::Real;
   using Mask = MaskOf<V>;
 
-  // Problems first .. first + count - 1 of the batch; lanes left over repeat the last of them.
-  void solve(const Batch& batch, std::int64_t first, int count, const Options& options) {
-    load(batch, first, count);
+  // Some problems of the batch, at most W; lanes left over repeat the last of them.
+  void solve(const Batch& batch, const double* u_guess, const std::int64_t* problems, int count, std::int64_t rounds,
+             const Options& options) {
+    load(batch, u_guess, problems, count);
     iterations_ = Mask{};
-    for (std::int64_t k = 0; k < options.sqp_iterations; k++) {
+    for (std::int64_t k = 0; k < rounds; k++) {
       linearise();
       solve_quadratic_program(options);
       take_step();
     }
-    store(batch, first, count);
+    store(batch, problems, count);
   }
 
  private:
   Stage<V> stages_[N];
   V x0_[NX], goal_[3];
   V goal_gradient_[NX], goal_hessian_[N_SYMMETRIC];
-  Mask iterations_, converged_;
+  Mask iterations_, converged_, moving_;
   const V soft_ = splat<V>(0.5 / VIOLATION_WEIGHT);
   const V hard_ = V{};
 
-  void load(const Batch& batch, std::int64_t first, int count) {
+  void load(const Batch& batch, const double* u_guess, const std::int64_t* problems, int count) {
     for (int q = 0; q < W; q++) {
-      const std::int64_t problem = first + (q < count ? q : count - 1);
+      const std::int64_t problem = problems[q < count ? q : count - 1];
       for (int i = 0; i < NX; i++) x0_[i][q] = static_cast<T>(batch.x[problem * STATE_STRIDE + i]);
       for (int i = 0; i < 3; i++) goal_[i][q] = static_cast<T>(batch.goal[problem * 3 + i]);
-      const double* u = batch.u_guess + problem * N * INPUT_STRIDE;
+      const double* u = u_guess + problem * N * INPUT_STRIDE;
       const double* others = batch.others + problem * N_OTHERS * N * 3;
       for (int k = 0; k < N; k++) {
         Stage<V>& s = stages_[k];
@@ -338,15 +346,21 @@ class LaneGroup {
   }
 
   void take_step() {
+    moving_ = Mask{};
     for (int k = 0; k < N; k++) {
-      for (int i = 0; i < NU; i++) stages_[k].u[i] += stages_[k].du[i];
+      for (int i = 0; i < NU; i++) {
+        const V du = stages_[k].du[i], limit = splat<V>(STILL_MOVING * MAX_INPUT[i]);
+        stages_[k].u[i] += du;
+        moving_ |= (du > limit) | (du < -limit);
+      }
       limit_inputs(stages_[k].u);
     }
   }
 
-  void store(const Batch& batch, std::int64_t first, int count) {
+  void store(const Batch& batch, const std::int64_t* problems, int count) {
     for (int q = 0; q < count; q++) {
-      double* u = batch.u_plan + (first + q) * N * INPUT_STRIDE;
+      const std::int64_t problem = problems[q];
+      double* u = batch.u_plan + problem * N * INPUT_STRIDE;
       for (int k = 0; k < N; k++)
         for (int i = 0; i < INPUT_STRIDE; i++) {
           double value = i < NU ? static_cast<double>(stages_[k].u[i][q]) : 0.0;
@@ -354,8 +368,9 @@ class LaneGroup {
           if (i < NU && value < -MAX_INPUT[i]) value = -MAX_INPUT[i];
           u[k * INPUT_STRIDE + i] = value;
         }
-      batch.success[first + q] = converged_[q] != 0;
-      batch.iterations[first + q] = iterations_[q];
+      batch.success[problem] = converged_[q] != 0;
+      batch.moving[problem] = (converged_[q] & moving_[q]) != 0;
+      batch.iterations[problem] += iterations_[q];
     }
   }
 };
@@ -389,9 +404,26 @@ void roll_out(const Batch& batch, std::int64_t first, int count) {
 }
 
 template <int W>
-void solve_lanes(const Batch& batch, std::int64_t first, int count, const Options& options) {
+void solve_lanes(const Batch& batch, const double* u_guess, const std::int64_t* problems, int count,
+                 std::int64_t rounds, const Options& options) {
   static thread_local LaneGroup<REAL, W> group;
-  group.solve(batch, first, count, options);
+  group.solve(batch, u_guess, problems, count, rounds, options);
+}
+
+void solve_all(const Batch& batch, const double* u_guess, const std::vector<std::int64_t>& problems,
+               std::int64_t rounds, const Options& options) {
+  constexpr std::int64_t wide = VECTOR_BYTES / sizeof(REAL), narrow = wide / 2;
+  const std::int64_t count = static_cast<std::int64_t>(problems.size());
+  for (std::int64_t first = 0; first < count;) {
+    const std::int64_t left = count - first;
+    if (left > narrow) {
+      solve_lanes<wide>(batch, u_guess, &problems[first], std::min(left, wide), rounds, options);
+      first += wide;
+    } else {
+      solve_lanes<narrow>(batch, u_guess, &problems[first], left, rounds, options);
+      first += narrow;
+    }
+  }
 }
 
 }  // namespace
@@ -399,19 +431,19 @@ void solve_lanes(const Batch& batch, std::int64_t first, int count, const Option
 extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
     std::int64_t count, const double* x, const double* goal, const double* others, const double* u_guess,
     double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations, std::int64_t sqp_iterations,
-    std::int64_t max_iterations, double tolerance) {
-  const Batch batch{x, goal, others, u_guess, x_plan, u_plan, success, iterations};
-  const Options options{sqp_iterations, max_iterations, tolerance};
-  constexpr int wide = VECTOR_BYTES / sizeof(REAL), narrow = wide / 2;
-  for (std::int64_t first = 0; first < count;) {
-    const std::int64_t left = count - first;
-    if (left > narrow) {
-      solve_lanes<wide>(batch, first, static_cast<int>(left < wide ? left : wide), options);
-      first += wide;
-    } else {
-      solve_lanes<narrow>(batch, first, static_cast<int>(left), options);
-      first += narrow;
-    }
+    std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
+  std::vector<std::uint8_t> moving(count);
+  const Batch batch{x, goal, others, u_guess, x_plan, u_plan, success, iterations, moving.data()};
+  const Options options{sqp_iterations, extra_iterations, max_iterations, tolerance};
+  std::fill(iterations, iterations + count, 0);
+  std::vector<std::int64_t> problems(count);
+  std::iota(problems.begin(), problems.end(), 0);
+  solve_all(batch, u_guess, problems, sqp_iterations, options);
+  // The few problems that still move go on together, in groups of their own.
+  for (std::int64_t k = 0; k < extra_iterations; k++) {
+    const auto settled = [&](std::int64_t problem) { return !moving[problem]; };
+    problems.erase(std::remove_if(problems.begin(), problems.end(), settled), problems.end());
+    solve_all(batch, u_plan, problems, 1, options);
   }
   constexpr int doubles = VECTOR_BYTES / sizeof(double);
   for (std::int64_t first = 0; first < count; first += doubles)

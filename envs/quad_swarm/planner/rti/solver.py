@@ -23,6 +23,8 @@ class RtiSolver:
 
     :param problem: the problem
     :param sqp_iterations: quadratic programs solved for each problem
+    :param extra_iterations: how many more are solved at most for a problem whose inputs the last one still changed by
+        more than 0.3 of their limits
     :param precision: "float32" or "float64", of the iteration; plans are rolled out in double precision
     :param max_iterations: interior-point iterations after which a quadratic program counts as failed (never a time
         limit: results must repeat)
@@ -35,18 +37,21 @@ class RtiSolver:
         self,
         problem: OptimalControlProblem,
         sqp_iterations: int = 2,
+        extra_iterations: int = 6,
         precision: str = "float32",
         max_iterations: int = 25,
         tolerance: float = 1e-4,
     ):
-        if sqp_iterations < 1 or max_iterations < 1:
+        if sqp_iterations < 1 or extra_iterations < 0 or max_iterations < 1:
             raise ValueError(
-                f"sqp_iterations={sqp_iterations} and max_iterations={max_iterations} must be at least 1."
+                f"sqp_iterations={sqp_iterations} and max_iterations={max_iterations} must be at least 1, "
+                f"extra_iterations={extra_iterations} at least 0."
             )
         if precision not in PRECISIONS:
             raise unknown_name("precision", precision, PRECISIONS)
         self.problem = problem
         self.sqp_iterations = sqp_iterations
+        self.extra_iterations = extra_iterations
         self.precision = precision
         self.max_iterations = max_iterations
         self.tolerance = tolerance
@@ -80,6 +85,7 @@ class RtiSolver:
             count,
             *[array.ctypes.data for array in (*arguments, *solution)],
             self.sqp_iterations,
+            self.extra_iterations,
             self.max_iterations,
             self.tolerance,
         )
