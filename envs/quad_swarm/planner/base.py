@@ -29,7 +29,7 @@ class Solution(NamedTuple):
 
     :param x: states at stages 0..N, (B, N + 1, 9); stage 0 is the present state
     :param u: inputs at stages 0..N-1, (B, N, 4)
-    :param success: whether each problem was solved to the solver's own tolerance, (B,) bool
+    :param success: whether each problem was solved to the solver's own tolerance, (B,) bool; x and u are finite then
     :param iterations: iterations spent on each problem, (B,) int
     """
 
@@ -116,21 +116,19 @@ class Planner:
         x_guess, u_guess = shift(previous.x), shift(previous.u)
         problems = self._nearest_others(problems, x_guess)
         x, u, success, iterations = self.solver.solve(problems, x_guess, u_guess)
-        solved = success & _finite(x, u)
-        status = np.where(solved, PlanStatus.SOLVED, PlanStatus.BRAKING)
+        status = np.where(success, PlanStatus.SOLVED, PlanStatus.BRAKING)
         age = np.zeros(len(status), dtype=np.int64)
 
-        failed = np.flatnonzero(~solved)
+        failed = np.flatnonzero(~success)
         if failed.size:
             # Cold: the present state held, no input.
             cold = Plans.hover(problems.x[failed], self.config.horizon)
             retry = self.solver.solve(Problems(*(field[failed] for field in problems)), cold.x, cold.u)
             iterations[failed] += retry.iterations
-            solved = retry.success & _finite(retry.x, retry.u)
             x[failed], u[failed] = retry.x, retry.u
-            status[failed[solved]] = PlanStatus.RETRIED
+            status[failed[retry.success]] = PlanStatus.RETRIED
 
-            failed = failed[~solved]
+            failed = failed[~retry.success]
             age[failed] = previous.age[failed] + 1
             lasts = age[failed] < self.config.horizon
             status[failed[lasts]] = PlanStatus.SHIFTED
@@ -169,7 +167,3 @@ class Planner:
 def shift(trajectory: np.ndarray) -> np.ndarray:
     """A trajectory (B, K, ...) one step later, its last entry repeated."""
     return np.concatenate([trajectory[:, 1:], trajectory[:, -1:]], axis=1)
-
-
-def _finite(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return np.isfinite(x).all(axis=(1, 2)) & np.isfinite(u).all(axis=(1, 2))

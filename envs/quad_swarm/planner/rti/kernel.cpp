@@ -18,8 +18,6 @@ constexpr int STATE_STRIDE = 9;  // of the arrays that the caller passes; the pr
 constexpr int INPUT_STRIDE = 4;
 
 struct Options {
-  std::int64_t sqp_iterations;    // quadratic programs for every problem,
-  std::int64_t extra_iterations;  // and how many more for one that still moves
   std::int64_t max_iterations;  // of the interior-point method, for each quadratic program
   double tolerance;             // on the mean complementarity
 };
@@ -29,7 +27,6 @@ struct Batch {
   const double* x;        // (count, 9)
   const double* goal;     // (count, 3)
   const double* others;   // (count, N_OTHERS, N, 3)
-  const double* u_guess;  // (count, N, 4)
   double* x_plan;         // (count, N + 1, 9)
   double* u_plan;         // (count, N, 4)
   std::uint8_t* success;  // (count,)
@@ -37,9 +34,8 @@ struct Batch {
   std::uint8_t* moving;      // (count,) whether the last quadratic program still changed much
 };
 
-// How far below the boundary the interior-point method may start, and what it starts from.
 constexpr double START_COMPLEMENTARITY = 1.0;
-constexpr double START_SLACK = 0.05;
+constexpr double START_SLACK = 0.05;  // least t at the start, where the guess is nearer to the boundary or beyond it
 constexpr double RESIDUAL_TOLERANCE = 2e-3;  // of the linear conditions, over their residual at the start
 constexpr double STEP_TO_BOUNDARY = 0.99;
 constexpr double STILL_MOVING = 0.3;  // change of an input over its limit in the last quadratic program
@@ -48,12 +44,12 @@ constexpr double STILL_MOVING = 0.3;  // change of an input over its limit in th
 // makes s = lambda / rho and lets it be eliminated: `compliance` is 1 / rho, or 0.
 template <class V>
 struct Inequality {
-  V value;   // h, at the point of linearisation
-  V slack, multiplier;         // t, lambda > 0 with t = h + g z + lambda / rho at the solution
+  V value;              // h, at the point of linearisation
+  V slack, multiplier;  // t, lambda > 0 with t = h + g z + lambda / rho at the solution
   V slack_step, multiplier_step;
-  V offset;                    // c in lambda = c - w (h + g z)
-  V scaling;                   // 1 / (t + lambda / rho)
-  V inverse_product;           // 1 / (t lambda)
+  V offset;           // c in lambda = c - w (h + g z), what Newton's method makes of t lambda = target
+  V scaling;          // 1 / (t + lambda / rho)
+  V inverse_product;  // 1 / (t lambda)
 
   void start(V h) {
     value = h;
@@ -61,9 +57,10 @@ struct Inequality {
     multiplier = splat<V>(START_COMPLEMENTARITY) / slack;
   }
 
+  // w in lambda = c - w (h + g z)
   V weight() const { return multiplier * scaling; }
 
-  // Newton's method on t lambda = 0 makes lambda a linear function of z. One division serves all that need one.
+  // Make lambda a linear function of z, for the predictor's target 0. One division serves all that need one.
   void eliminate(V compliance) {
     const V product = slack * multiplier;
     const V sum = multiply_add(compliance, multiplier, slack);
@@ -73,16 +70,17 @@ struct Inequality {
     offset = product * scaling;
   }
 
-  // The same with a target for t lambda and the second-order term of the step that the predictor took.
+  // The same for the corrector's target, and for the second-order term that the predictor's step left out.
   void correct(V target) {
     const V aim = negative_multiply_add(slack_step, multiplier_step, target);
     offset = multiply_add(slack, multiplier, aim) * scaling;
   }
 
-  // -(gradient of the eliminated inequality) / g at z = 0.
+  // What it pushes with along g at z = 0.
   V force() const { return negative_multiply_add(weight(), value, offset); }
 
-  // The step of t and lambda that goes with h + g z = `reached`; how far it overshoots the boundary; its curvature.
+  // The step of t and lambda that goes with h + g z = `reached`. It may be taken up to 1 / `overshoot`; `curvature`
+  // sums the products of the two steps.
   void direct(V reached, V compliance, V& overshoot, V& curvature) {
     const V new_multiplier = negative_multiply_add(weight(), reached, offset);
     slack_step = multiply_add(compliance, new_multiplier, reached) - slack;
@@ -234,9 +232,9 @@ class LaneGroup {
   // Backward sweep: eliminate the inequalities, then the Riccati recursion for matrices and, with the predictor's
   // target, for vectors.
   void factorise() {
-    V p[N_SYMMETRIC], costate[NX], p_previous[N_SYMMETRIC], costate_previous[NX];
-    for (int i = 0; i < N_SYMMETRIC; i++) p[i] = goal_hessian_[i];
-    for (int i = 0; i < NX; i++) costate[i] = goal_gradient_[i];
+    V p[N_SYMMETRIC], p_previous[N_SYMMETRIC], costate[NX];
+    std::copy(goal_hessian_, goal_hessian_ + N_SYMMETRIC, p);
+    std::copy(goal_gradient_, goal_gradient_ + NX, costate);
     for (int k = N - 1; k >= 0; k--) {
       Stage<V>& s = stages_[k];
       for (int i = 0; i < N_BOUNDS; i++) {
@@ -260,16 +258,15 @@ class LaneGroup {
         ::riccati<V>(p, s.a, s.b, weight, s.factor, s.gain, p_previous);
       else
         ::riccati_first<V>(p, s.b, weight, s.factor);
-      step_back(k, costate, costate_previous);
-      for (int i = 0; i < N_SYMMETRIC; i++) p[i] = p_previous[i];
-      for (int i = 0; i < NX; i++) costate[i] = costate_previous[i];
+      step_back(k, costate);
+      if (k > 0) std::copy(p_previous, p_previous + N_SYMMETRIC, p);
     }
   }
 
   // Backward sweep with the corrector's target; the factors stay.
   void correct(V target) {
-    V costate[NX], costate_previous[NX];
-    for (int i = 0; i < NX; i++) costate[i] = goal_gradient_[i];
+    V costate[NX];
+    std::copy(goal_gradient_, goal_gradient_ + NX, costate);
     for (int k = N - 1; k >= 0; k--) {
       Stage<V>& s = stages_[k];
       for (int i = 0; i < N_BOUNDS; i++) s.bound[i].correct(target);
@@ -278,13 +275,12 @@ class LaneGroup {
         s.input_low[i].correct(target);
         s.input_high[i].correct(target);
       }
-      step_back(k, costate, costate_previous);
-      for (int i = 0; i < NX; i++) costate[i] = costate_previous[i];
+      step_back(k, costate);
     }
   }
 
-  // One stage of the vector recursion.
-  void step_back(int k, V* costate, V* costate_previous) {
+  // One stage of the vector recursion: from the costate at stage k + 1 to that at stage k.
+  void step_back(int k, V* costate) {
     Stage<V>& s = stages_[k];
     for (int i = 0; i < N_BOUNDS; i++)
       costate[BOUNDED_STATE[i]] =
@@ -296,10 +292,13 @@ class LaneGroup {
     V gradient[NU];
     for (int i = 0; i < NU; i++)
       gradient[i] = s.input_gradient[i] - s.input_low[i].force() + s.input_high[i].force();
-    if (k > 0)
+    if (k > 0) {
+      V costate_previous[NX];
       ::backward<V>(costate, gradient, s.a, s.b, s.factor, s.gain, s.feedforward, costate_previous);
-    else
+      std::copy(costate_previous, costate_previous + NX, costate);
+    } else {
       ::backward_first<V>(costate, gradient, s.b, s.factor, s.feedforward);
+    }
   }
 
   // Forward sweep: the step of inputs and states, and from it that of slacks and multipliers.
@@ -310,10 +309,10 @@ class LaneGroup {
       if (k > 0) {
         ::forward<V>(dx, s.feedforward, s.gain, s.a, s.b, s.new_du, dx_next);
       } else {
-        for (int i = 0; i < NU; i++) s.new_du[i] = s.feedforward[i];
+        std::copy(s.feedforward, s.feedforward + NU, s.new_du);
         ::forward_first<V>(s.new_du, s.b, dx_next);
       }
-      for (int i = 0; i < NX; i++) dx[i] = dx_next[i];
+      std::copy(dx_next, dx_next + NX, dx);
       for (int i = 0; i < NU; i++) {
         s.input_low[i].direct(s.input_low[i].value + s.new_du[i], hard_, overshoot, curvature);
         s.input_high[i].direct(s.input_high[i].value - s.new_du[i], hard_, overshoot, curvature);
@@ -433,8 +432,8 @@ extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
     double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations, std::int64_t sqp_iterations,
     std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
   std::vector<std::uint8_t> moving(count);
-  const Batch batch{x, goal, others, u_guess, x_plan, u_plan, success, iterations, moving.data()};
-  const Options options{sqp_iterations, extra_iterations, max_iterations, tolerance};
+  const Batch batch{x, goal, others, x_plan, u_plan, success, iterations, moving.data()};
+  const Options options{max_iterations, tolerance};
   std::fill(iterations, iterations + count, 0);
   std::vector<std::int64_t> problems(count);
   std::iota(problems.begin(), problems.end(), 0);
@@ -447,5 +446,5 @@ extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
   }
   constexpr int doubles = VECTOR_BYTES / sizeof(double);
   for (std::int64_t first = 0; first < count; first += doubles)
-    roll_out<doubles>(batch, first, static_cast<int>(count - first < doubles ? count - first : doubles));
+    roll_out<doubles>(batch, first, static_cast<int>(std::min<std::int64_t>(count - first, doubles)));
 }
