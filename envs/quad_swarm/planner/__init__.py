@@ -1,12 +1,18 @@
 """Planning: the optimal control problem of one robot, solvers for batches of it, and the ladder below them."""
 
+from __future__ import annotations
+
+import functools
+import warnings
+
 from ..errors import unknown_name
 from ..quadrotor import QuadrotorModel, QuadrotorParams
 from .base import Planner, Plans, PlanStatus, Problems, Solution, Solver
 from .fatrop import FatropSolver
 from .problem import OptimalControlProblem, PlannerConfig
+from .rti import BuildError, RtiSolver
 
-SOLVERS: dict[str, type] = {"fatrop": FatropSolver}
+SOLVERS: dict[str, type[FatropSolver] | type[RtiSolver]] = {"rti": RtiSolver, "fatrop": FatropSolver}
 
 
 def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: int, solver: str = "auto") -> Planner:
@@ -15,18 +21,39 @@ def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: in
     :param config: horizon, limits and weights
     :param quadrotor: physical parameters
     :param n_robots: number of robots in a swarm
-    :param solver: one of `SOLVERS`, or "auto" for the best one that runs here
+    :param solver: one of `SOLVERS`, or "auto": "rti" where it can be compiled, else "fatrop" with a warning
     :raises ValueError: unknown solver
+    :raises RuntimeError: "rti" is asked for and cannot be compiled here
     """
-    name = "fatrop" if solver == "auto" else solver
-    if name not in SOLVERS:
+    if solver != "auto" and solver not in SOLVERS:
         raise unknown_name("solver", solver, ["auto", *SOLVERS])
-    problem = OptimalControlProblem(config, quadrotor, n_robots - 1)
-    return Planner(SOLVERS[name](problem), QuadrotorModel(quadrotor, config.dt), config)
+    n_others = n_robots - 1 if config.max_neighbours is None else min(n_robots - 1, config.max_neighbours)
+    problem = OptimalControlProblem(config, quadrotor, n_others)
+    return Planner(_make_solver(problem, solver), QuadrotorModel(quadrotor, config.dt), config)
+
+
+def _make_solver(problem: OptimalControlProblem, solver: str) -> Solver:
+    if solver == "fatrop":
+        return FatropSolver(problem)
+    rti = RtiSolver(problem)
+    try:
+        rti.compile()
+    except BuildError as error:
+        if solver == "rti":
+            raise BuildError(f"solver='rti' cannot run: {error}; solver='fatrop' needs no compiler.") from error
+        _warn_once(f"quad_swarm plans with fatrop, hundreds of times slower than rti: {error}.")
+        return FatropSolver(problem)
+    return rti
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    warnings.warn(message, RuntimeWarning, stacklevel=4)
 
 
 __all__ = [
     "SOLVERS",
+    "BuildError",
     "FatropSolver",
     "OptimalControlProblem",
     "PlanStatus",
@@ -34,6 +61,7 @@ __all__ = [
     "PlannerConfig",
     "Plans",
     "Problems",
+    "RtiSolver",
     "Solution",
     "Solver",
     "make_planner",

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..quadrotor import N_INPUTS, QuadrotorModel
+from ..quadrotor import N_INPUTS, POSITION, QuadrotorModel
 from .problem import PlannerConfig
 
 
@@ -29,7 +29,7 @@ class Solution(NamedTuple):
 
     :param x: states at stages 0..N, (B, N + 1, 9); stage 0 is the present state
     :param u: inputs at stages 0..N-1, (B, N, 4)
-    :param success: whether each problem was solved to the solver's own tolerance, (B,) bool
+    :param success: whether each problem was solved to the solver's own tolerance, (B,) bool; x and u are finite then
     :param iterations: iterations spent on each problem, (B,) int
     """
 
@@ -114,22 +114,21 @@ class Planner:
         :param previous: the plans of the same robots one step ago
         """
         x_guess, u_guess = shift(previous.x), shift(previous.u)
+        problems = self._nearest_others(problems, x_guess)
         x, u, success, iterations = self.solver.solve(problems, x_guess, u_guess)
-        solved = success & _finite(x, u)
-        status = np.where(solved, PlanStatus.SOLVED, PlanStatus.BRAKING)
+        status = np.where(success, PlanStatus.SOLVED, PlanStatus.BRAKING)
         age = np.zeros(len(status), dtype=np.int64)
 
-        failed = np.flatnonzero(~solved)
+        failed = np.flatnonzero(~success)
         if failed.size:
             # Cold: the present state held, no input.
             cold = Plans.hover(problems.x[failed], self.config.horizon)
             retry = self.solver.solve(Problems(*(field[failed] for field in problems)), cold.x, cold.u)
             iterations[failed] += retry.iterations
-            solved = retry.success & _finite(retry.x, retry.u)
             x[failed], u[failed] = retry.x, retry.u
-            status[failed[solved]] = PlanStatus.RETRIED
+            status[failed[retry.success]] = PlanStatus.RETRIED
 
-            failed = failed[~solved]
+            failed = failed[~retry.success]
             age[failed] = previous.age[failed] + 1
             lasts = age[failed] < self.config.horizon
             status[failed[lasts]] = PlanStatus.SHIFTED
@@ -137,6 +136,16 @@ class Planner:
             u[failed[~lasts]] = self.braking_inputs(problems.x[failed[~lasts]])
             x[failed] = self.model.rollout(problems.x[failed], u[failed])
         return Plans(x, u, age, status, iterations)
+
+    def _nearest_others(self, problems: Problems, x_guess: np.ndarray) -> Problems:
+        """The same problems with only the ``max_neighbours`` others that come nearest over the horizon."""
+        kept = self.config.max_neighbours
+        if kept is None or kept >= problems.others.shape[1]:
+            return problems
+        offset = problems.others - x_guess[:, None, 1:, POSITION]
+        closest = np.einsum("bjki,bjki->bjk", offset, offset).min(axis=2)
+        nearest = np.sort(np.argsort(closest, axis=1, kind="stable")[:, :kept], axis=1)
+        return problems._replace(others=np.take_along_axis(problems.others, nearest[:, :, None, None], axis=1))
 
     def braking_inputs(self, x: np.ndarray) -> np.ndarray:
         """Inputs that bring robots to hover without a solver, from their states alone: (B, 9) -> (B, N, 4).
@@ -158,7 +167,3 @@ class Planner:
 def shift(trajectory: np.ndarray) -> np.ndarray:
     """A trajectory (B, K, ...) one step later, its last entry repeated."""
     return np.concatenate([trajectory[:, 1:], trajectory[:, -1:]], axis=1)
-
-
-def _finite(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return np.isfinite(x).all(axis=(1, 2)) & np.isfinite(u).all(axis=(1, 2))

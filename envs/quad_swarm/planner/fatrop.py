@@ -53,6 +53,7 @@ class FatropSolver:
             stats = program.solver.stats()
             success[b], iterations[b] = stats["success"], stats["iter_count"]
             optimum = solution["x"].full().ravel()
+            success[b] &= np.isfinite(optimum).all()
             x[b, 1:, :nx] = optimum[program.x_index]
             u[b, :, :nu] = optimum[program.u_index]
         return Solution(x, u, success, iterations)

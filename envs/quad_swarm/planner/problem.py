@@ -30,6 +30,8 @@ class PlannerConfig:
     :param repulsion_buffer: distance at which half of the repulsion acts, in separations (-)
     :param repulsion_steepness: steepness of the repulsion, per separation (-)
     :param violation_weight: weight of the squared violation of a soft constraint (1/m^2)
+    :param max_neighbours: consider only so many others, those whose believed trajectories come nearest to the robot's
+        last plan; None considers all
     """
 
     horizon: int = 10
@@ -48,6 +50,7 @@ class PlannerConfig:
     repulsion_buffer: float = 1.2
     repulsion_steepness: float = 10.0
     violation_weight: float = 1e4
+    max_neighbours: int | None = None
 
     def __post_init__(self) -> None:
         if self.horizon < 2:
@@ -55,6 +58,8 @@ class PlannerConfig:
         for name in ("dt", "separation", "max_tilt", "max_climb_rate", "max_speed", "max_vertical_speed"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}={getattr(self, name)}: it must be positive.")
+        if self.max_neighbours is not None and self.max_neighbours < 1:
+            raise ValueError(f"max_neighbours={self.max_neighbours}: it must be at least 1, or None for all.")
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
             raise ValueError(f"Empty workspace: low corner {self.workspace_low}, high corner {self.workspace_high}.")
 
@@ -101,11 +106,15 @@ class OptimalControlProblem:
         # The small constant keeps the gradient finite where two centres coincide.
         return [ca.sqrt(ca.sumsqr(x[:3] - others[:, j]) + 1e-6) for j in range(self.n_others)]
 
-    def repulsion_cost(self, distance: ca.SX) -> ca.SX:
-        """Smooth repulsion from one other robot; it conditions the problem where the bare constraint leaves it flat."""
+    def repulsion_residual(self, distance: ca.SX) -> ca.SX:
+        """Square root of the repulsion from one other robot, for methods that linearise it (Gauss-Newton)."""
         c = self.config
         steepness = c.repulsion_steepness * (distance / c.separation - c.repulsion_buffer)
-        return c.repulsion_weight / (1 + ca.exp(steepness)) ** 2
+        return math.sqrt(c.repulsion_weight) / (1 + ca.exp(steepness))
+
+    def repulsion_cost(self, distance: ca.SX) -> ca.SX:
+        """Smooth repulsion from one other robot; it conditions the problem where the bare constraint leaves it flat."""
+        return self.repulsion_residual(distance) ** 2
 
     def box_violations(self, x: ca.SX) -> ca.SX:
         """Amounts by which a state leaves the workspace (m) and the speed limits (m/s); violated where positive."""

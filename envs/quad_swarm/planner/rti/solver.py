@@ -1,0 +1,103 @@
+"""The batched real-time iteration: every problem of a batch in one call of compiled code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...errors import unknown_name
+from ...quadrotor import N_INPUTS, N_STATES
+from ..base import Problems, Solution
+from ..problem import OptimalControlProblem
+from .build import build, load
+from .codegen import generate_model
+
+PRECISIONS = ("float32", "float64")
+
+
+class RtiSolver:
+    """Few iterations of sequential quadratic programming, many problems at once (docs/planner.md).
+
+    One iteration is a controller, not an optimum. The states of a guess are not used: they follow from its inputs.
+
+    :param problem: the problem
+    :param sqp_iterations: quadratic programs solved for each problem
+    :param extra_iterations: how many more are solved at most for a problem whose inputs the last one still changed by
+        more than 0.3 of their limits
+    :param precision: "float32" or "float64", of the iteration; plans are rolled out in double precision
+    :param max_iterations: interior-point iterations after which a quadratic program counts as failed (never a time
+        limit: results must repeat)
+    :param tolerance: mean complementarity at which a quadratic program counts as solved
+    """
+
+    name = "rti"
+
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        sqp_iterations: int = 2,
+        extra_iterations: int = 6,
+        precision: str = "float32",
+        max_iterations: int = 25,
+        tolerance: float = 1e-4,
+    ):
+        if sqp_iterations < 1 or extra_iterations < 0 or max_iterations < 1:
+            raise ValueError(
+                f"sqp_iterations={sqp_iterations} and max_iterations={max_iterations} must be at least 1, "
+                f"extra_iterations={extra_iterations} at least 0."
+            )
+        if precision not in PRECISIONS:
+            raise unknown_name("precision", precision, PRECISIONS)
+        self.problem = problem
+        self.sqp_iterations = sqp_iterations
+        self.extra_iterations = extra_iterations
+        self.precision = precision
+        self.max_iterations = max_iterations
+        self.tolerance = tolerance
+        self._kernel: Any = None
+
+    def compile(self) -> None:
+        """Have the kernel compiled and loaded now instead of at the first solve.
+
+        :raises BuildError: it cannot be compiled here
+        """
+        if self._kernel is None:
+            self._kernel = load(str(build(generate_model(self.problem), self.precision))).quad_swarm_rti
+
+    def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
+        """See `Solver.solve`."""
+        self.compile()
+        count, horizon, n_others = problems.x.shape[0], self.problem.config.horizon, self.problem.n_others
+        arguments = (
+            _array("x", problems.x, (count, N_STATES)),
+            _array("goal", problems.goal, (count, 3)),
+            _array("others", problems.others, (count, n_others, horizon, 3)),
+            _array("u_guess", u_guess, (count, horizon, N_INPUTS)),
+        )
+        solution = Solution(
+            x=np.empty((count, horizon + 1, N_STATES)),
+            u=np.empty((count, horizon, N_INPUTS)),
+            success=np.empty(count, dtype=bool),
+            iterations=np.empty(count, dtype=np.int64),
+        )
+        self._kernel(
+            count,
+            *[array.ctypes.data for array in (*arguments, *solution)],
+            self.sqp_iterations,
+            self.extra_iterations,
+            self.max_iterations,
+            self.tolerance,
+        )
+        return solution
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_kernel": None}  # loaded again in the process that needs it
+
+
+def _array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The array as the kernel reads it; it trusts the shape, so that is checked here."""
+    array = np.ascontiguousarray(array, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}; this solver takes {shape}.")
+    return array
