@@ -94,7 +94,7 @@ def train(argv: list[str]) -> int:
     parser = _parser()
     parser.add_argument("-conf", "--conf-file")
     known, _ = parser.parse_known_args(argv)
-    # One thread unless asked otherwise: such small networks do not gain by a second, and lose badly where it is not free.
+    # One thread unless asked otherwise: small networks gain nothing by a second and lose badly where it is not free.
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
     if known.env is not None and known.conf_file is None:
         path = packaged_config(known.algo, known.env)
