@@ -16,6 +16,7 @@ int stage(const double **arg, double **res, casadi_int *iw, double *w, int mem);
 int separation(const double **arg, double **res, casadi_int *iw, double *w, int mem);
 int goal_cost(const double **arg, double **res, casadi_int *iw, double *w, int mem);
 
+enum { N = OCP_N, NX = OCP_NX, NU = OCP_NU, OTHERS = OCP_OTHERS };
 enum { STATES = 9, INPUTS = 4 }; /* strides of the caller's arrays */
 
 static struct d_ocp_qp_dim dim;

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -32,6 +33,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+
 from quad_swarm.planner import FatropSolver, OptimalControlProblem, Problems, RtiSolver, Solution
 from quad_swarm.planner.fatrop import transcribe
 from quad_swarm.presets import SwarmConfig, make_config
@@ -64,28 +66,25 @@ Solve = Callable[[Call], Solution]
 
 
 def world(n_robots: int, horizon: int) -> tuple[str, SwarmConfig]:
-    """The preset for a number of robots, its room widened where they would not fit."""
+    """The preset for a number of robots; its room is widened for more than eight, which would not fit."""
     preset = "paper" if n_robots <= 4 else "dense"
     config = make_config(preset, n_robots=n_robots)
-    scale = max(1.0, np.sqrt(n_robots / config.n_robots))
+    space, planner = config.space, replace(config.planner, horizon=horizon)
     if n_robots > 8:
-        space, planner = config.space, config.planner
-        scale = np.sqrt(n_robots / 8)
-        config = replace(
-            config,
-            space=replace(
-                space,
-                half_width=scale * space.half_width,
-                circle_radius=tuple(scale * r for r in space.circle_radius),
-                sector_radius=tuple(scale * r for r in space.sector_radius),
-            ),
-            planner=replace(
-                planner,
-                workspace_low=(*(scale * w for w in planner.workspace_low[:2]), planner.workspace_low[2]),
-                workspace_high=(*(scale * w for w in planner.workspace_high[:2]), planner.workspace_high[2]),
-            ),
+        scale = max(math.sqrt(n_robots / 8), n_robots / 12)  # the second for the circle of the symmetric swap
+        space = replace(
+            space,
+            half_width=scale * space.half_width,
+            circle_radius=(scale * space.circle_radius[0], scale * space.circle_radius[1]),
+            sector_radius=(scale * space.sector_radius[0], scale * space.sector_radius[1]),
         )
-    return preset, replace(config, planner=replace(config.planner, horizon=horizon))
+        low, high = planner.workspace_low, planner.workspace_high
+        planner = replace(
+            planner,
+            workspace_low=(scale * low[0], scale * low[1], low[2]),
+            workspace_high=(scale * high[0], scale * high[1], high[2]),
+        )
+    return preset, replace(config, space=space, planner=planner)
 
 
 def record(config: SwarmConfig, n_envs: int, seed: int = 0) -> list[Call]:
@@ -234,7 +233,7 @@ def _compile_hpipm(problem: OptimalControlProblem, folder: Path) -> Path:
     subprocess.run(
         [
             shutil.which("gcc") or "cc", "-O3", "-march=native", "-shared", "-fPIC",
-            f"-DN={horizon}", f"-DNX={nx}", f"-DNU={nu}", f"-DOTHERS={n_others}",
+            f"-DOCP_N={horizon}", f"-DOCP_NX={nx}", f"-DOCP_NU={nu}", f"-DOCP_OTHERS={n_others}",
             str(Path(__file__).with_name("hpipm_rti.c")), str(folder / f"{name}_functions.c"),
             f"-I{wheel / 'include'}", f"-L{wheel}", "-l:libhpipm.so", "-l:libblasfeo.so.0",
             "-Wl,--disable-new-dtags", f"-Wl,-rpath,{wheel}", "-lm", "-o", str(result),
@@ -248,9 +247,8 @@ def compare(n_robots: int, horizon: int, n_envs: Sequence[int], full: bool, fold
     """All solvers on the problems of one world."""
     preset, config = world(n_robots, horizon)
     calls = record(config, max(16, *n_envs))
-    single = split(calls, 1, n_robots, 100)
-    rng = np.random.default_rng(0)
-    alone = [call.part(slice(k, k + 1)) for call in single for k in rng.integers(n_robots, size=1)]
+    robots = np.random.default_rng(0).integers(n_robots, size=100)
+    alone = [call.part(slice(k, k + 1)) for call, k in zip(split(calls, 1, n_robots, 100), robots, strict=True)]
     problem = OptimalControlProblem(config.planner, config.quadrotor, n_robots - 1)
     common = {"horizon": horizon, "n_robots": n_robots, "preset": preset}
     count = 100 if full else max(20, 400 // (n_robots * horizon // 10))

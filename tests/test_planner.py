@@ -1,4 +1,4 @@
-"""The reference solver: its optimum against an independent transcription, and every rung of the ladder with the real solver."""
+"""The reference solver: its optimum against an independent transcription, and every rung of the ladder with it."""
 
 import math
 import pickle
@@ -6,6 +6,7 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
+
 from quad_swarm.planner import (
     FatropSolver,
     OptimalControlProblem,
