@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from quad_swarm.beliefs import Beliefs, BeliefSource, advance, constant_velocity, other_indices
 
 N, DT = 4, 0.1
@@ -61,9 +62,9 @@ def test_memory_ends_when_the_plan_no_longer_fits_and_when_it_is_old():
 
     beliefs = Beliefs(1, 2, N, DT, memory=0.3)
     beliefs.update(asked, pos, vel, straight_plans(pos, vel))
-    _, source = beliefs.update(silent, pos + [[[0, 0, 0], [0.2, 0, 0]]], vel, straight_plans(pos, vel))
+    _, source = beliefs.update(silent, pos + np.array([[[0, 0, 0], [0.2, 0, 0]]]), vel, straight_plans(pos, vel))
     assert (source == BeliefSource.REMEMBERED).all()
-    _, source = beliefs.update(silent, pos + [[[0, 0, 0], [0.4, 0, 0]]], vel, straight_plans(pos, vel))
+    _, source = beliefs.update(silent, pos + np.array([[[0, 0, 0], [0.4, 0, 0]]]), vel, straight_plans(pos, vel))
     assert source.ravel().tolist() == [BeliefSource.CONSTANT_VELOCITY, BeliefSource.REMEMBERED]
 
     beliefs = Beliefs(1, 2, N, DT, memory=0.3)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from quad_swarm.communication import View, parse_rule
 
 

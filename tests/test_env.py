@@ -6,12 +6,13 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-import quad_swarm
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from pettingzoo.test import parallel_api_test
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import quad_swarm
 from quad_swarm.env import QuadSwarmEnv
 from quad_swarm.scenarios import SCENARIOS
-from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 
 def run(env: gymnasium.Env, seed: int, steps: int) -> list:
@@ -153,7 +154,7 @@ def test_info_at_the_end_carries_what_the_learner_logs():
     assert metrics["swarm/collision_rate"] == 0.0
     assert metrics["planner/failure_rate"] == 0.0
     assert metrics["planner/solve_us"] > 0
-    assert metrics["swarm/min_separation"] == pytest.approx(env.statistics.min_separation[0])
+    assert metrics["swarm/min_separation"] == pytest.approx(env.task.statistics.min_separation[0])
 
 
 def test_a_hopeless_planner_never_raises():

@@ -6,6 +6,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+
 from quad_swarm.evaluate import main
 from quad_swarm.evaluation import Cell, evaluate, first_episode, fly, run_episodes, wilson_interval
 from quad_swarm.presets import make_config
@@ -60,7 +61,7 @@ def test_other_seeds_are_other_episodes():
     first, second = (fly(cell("none"), seed) for seed in (0, 1))
     assert not np.array_equal(first.goal, second.goal)
     assert first.requests.shape[1:] == (4, 3)
-    assert len(first.pos) == len(first.requests) + 1
+    assert len(first.state) == len(first.plans) == len(first.requests) + 1
 
 
 @pytest.mark.parametrize(
@@ -88,7 +89,12 @@ def test_writes_table_json_and_figures(tmp_path, capsys):
         assert row["requests_per_step"] == 12 * row["request_share"]
         assert row["arrived"] <= row["episodes"] == 2
     assert list(target.parent.iterdir()) == [target]
-    assert {path.name for path in (tmp_path / "plots").iterdir()} == {"collisions.png", "requests.png", "flights.png"}
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {
+        "collisions.png",
+        "requests.png",
+        "flights.png",
+        "swarm.gif",
+    }
 
 
 def test_world_can_be_changed(capsys):

@@ -5,6 +5,7 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
+
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams, state_derivative
 
 PARAMS = QuadrotorParams()

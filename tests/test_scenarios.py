@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from quad_swarm.presets import PRESETS
 from quad_swarm.scenarios import SCENARIOS, DoesNotFit, ScenarioSampler, ScenarioSpace
 

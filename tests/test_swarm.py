@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from quad_swarm.beliefs import BeliefSource
 from quad_swarm.planner import PlanStatus
 from quad_swarm.presets import PRESETS, make_config
@@ -50,6 +51,18 @@ def test_first_plan_asked_for_is_to_stay():
     assert np.array_equal(believed, np.broadcast_to(swarm.pos[:, swarm.beliefs.others, None], believed.shape))
 
 
+def test_robots_that_ask_believe_the_plan_of_one_step_ago_shifted_by_one(monkeypatch):
+    swarm = make_swarm(1)
+    fly(swarm, 5)
+    plans = swarm.plans[0, :, :, :3].copy()
+    asked, plan = [], swarm.planner.plan
+    monkeypatch.setattr(swarm.planner, "plan", lambda problems, last: asked.append(problems) or plan(problems, last))
+    fly(swarm, 1)
+    for i in range(4):
+        for k, j in enumerate(swarm.beliefs.others[i]):
+            assert np.array_equal(asked[0].others[i, k, :-1], plans[j, 2:])
+
+
 def test_a_plan_begins_with_the_state_that_is_flown():
     swarm = make_swarm(1)
     for _ in range(10):
@@ -68,8 +81,8 @@ def test_a_plan_begins_with_the_state_that_is_flown():
 )
 def test_separation_at_and_between_steps(start, end, at_step, between):
     swarm = make_swarm(1, n_robots=2)
-    before = np.array([[[0, 0, 1.0], [0, 0, 1.0] + np.array(start)]])
-    swarm.state[0, :, :3] = [[0, 0, 1.0], [0, 0, 1.0] + np.array(end)]
+    before = np.array([[[0, 0, 1.0], np.add([0, 0, 1.0], start)]])
+    swarm.state[0, :, :3] = [[0, 0, 1.0], np.add([0, 0, 1.0], end)]
     report = swarm._report(before, np.zeros((1, 2, 1)), 0.0)
     assert report.min_separation[0] == pytest.approx(at_step)
     assert report.min_separation_continuous[0] == pytest.approx(between)
@@ -120,10 +133,15 @@ def test_presets_take_replacements_and_name_what_they_do_not_know():
     config = make_config("dense", n_robots=5, planner={"separation": 0.7, "workspace_low": [-3, -3, 0.5]})
     assert (config.n_robots, config.planner.separation, config.planner.max_speed) == (5, 0.7, 4.0)
     assert config.planner.workspace_low == (-3, -3, 0.5)
+    assert make_config("paper", planner={"violation_weight": "1e5"}).planner.violation_weight == 1e5
     assert make_config("dense", n_robots=None) == PRESETS["dense"]
     for values, message in [
         ({"planner": {"seperation": 1}}, "planner parameter 'seperation'.*Did you mean 'separation'"),
         ({"speed": 1}, "world parameter 'speed'"),
+        ({"planner": {"dt": "fast"}}, "'dt' takes a number, not 'fast'"),
+        ({"planner": {"horizon": 9.5}}, "'horizon' takes an integer, not 9.5"),
+        ({"planner": {"workspace_low": [0, 0]}}, r"'workspace_low' takes 3 numbers"),
+        ({"radius": float("nan")}, "'radius' takes a finite number"),
         ({"memory": {"far": 1}}, "takes a plain value"),
     ]:
         with pytest.raises(ValueError, match=message):

@@ -9,10 +9,23 @@ from .env import QuadSwarmEnv
 from .parallel import QuadSwarmParallelEnv
 from .presets import PRESET_VERSION, PRESETS
 from .scenarios import SCENARIOS
+from .vector import QuadSwarmVectorEnv
 
 parallel_env = QuadSwarmParallelEnv
 
 if "QuadSwarm-v0" not in gymnasium.registry:
-    gymnasium.register("QuadSwarm-v0", entry_point="quad_swarm.env:QuadSwarmEnv")
+    gymnasium.register(
+        "QuadSwarm-v0",
+        entry_point="quad_swarm.env:QuadSwarmEnv",
+        vector_entry_point="quad_swarm.vector:QuadSwarmVectorEnv",
+    )
 
-__all__ = ["PRESETS", "PRESET_VERSION", "SCENARIOS", "QuadSwarmEnv", "QuadSwarmParallelEnv", "parallel_env"]
+__all__ = [
+    "PRESETS",
+    "PRESET_VERSION",
+    "SCENARIOS",
+    "QuadSwarmEnv",
+    "QuadSwarmParallelEnv",
+    "QuadSwarmVectorEnv",
+    "parallel_env",
+]

@@ -10,11 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .errors import unknown_name
-from .presets import make_config, replace_fields
-from .scenarios import ScenarioSampler
-from .statistics import EpisodeStatistics
-from .swarm import Swarm
-from .task import Outcome, RequestTask, RewardConfig
+from .task import make_task
 
 
 class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -88,17 +84,25 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         solver: str = "auto",
         render_mode: str | None = None,
     ):
-        config = make_config(preset, n_robots=n_robots, memory=memory, planner=planner, noise=noise, space=space)
-        self.config = config
-        self.n_agents = n = config.n_robots
-        sampler = ScenarioSampler(scenario, n, config.space)
-        weights = replace_fields(RewardConfig(), reward or {}, "reward")
-        self.task = RequestTask(
-            Swarm(config, solver=solver), sampler, weights, max_steps, scale_observation, continuous_collisions
+        self.task = make_task(
+            1,
+            preset,
+            scenario,
+            n_robots,
+            max_steps,
+            scale_observation,
+            continuous_collisions,
+            memory,
+            reward,
+            planner,
+            noise,
+            space,
+            solver,
         )
+        self.config = self.task.swarm.config
+        self.n_agents = n = self.config.n_robots
         self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
         self.action_space = spaces.MultiBinary(n * (n - 1))
-        self.statistics = EpisodeStatistics(1, n)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
@@ -134,10 +138,10 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         if len(options) == 1:
             raise ValueError(f"reset options name only {next(iter(options))!r}; give both 'starts' and 'goals'.")
         if options:
-            self.task.place(0, "custom", np.asarray(options["starts"], float), np.asarray(options["goals"], float))
+            starts, goals = (np.asarray(options[name], dtype=float) for name in self.reset_options)
+            self.task.place(0, "custom", starts, goals, self.np_random)
         else:
             self.task.reset(0, self.np_random)
-        self.statistics.reset(0)
         self._requests = np.zeros_like(self._requests)
         if self._renderer is not None:
             self._renderer.reset()
@@ -148,33 +152,15 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
 
         :raises ValueError: the action is not n(n - 1) bits; a solver's failure never raises
         """
-        self._requests = request_matrix(action, self.n_agents)
-        before = self.task.swarm.pos.copy()
+        self._requests = request_matrices(action, 1, self.n_agents)[0]
         outcome = self.task.step(self._requests[None])
-        self.statistics.add(outcome, np.linalg.norm(self.task.swarm.pos - before, axis=-1))
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
-        info = self._info(outcome)
+        info = info_of(self.task.info(outcome), 0)
         if terminated or truncated:
-            info["is_success"] = bool(self.statistics.success[0])
-            info["metrics"] |= self.statistics.metrics(0)
+            final = info_of(self.task.final_info(), 0)
+            info["is_success"] = final["is_success"]
+            info["metrics"] |= final["metrics"]
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
-
-    def _info(self, outcome: Outcome) -> dict[str, Any]:
-        report = outcome.report
-        terms = {name: float(term[0]) for name, term in outcome.reward_terms.items()}
-        return {
-            "scenario": self.task.scenario[0],
-            "reward_terms": terms,
-            "n_requests": int(outcome.n_requests[0]),
-            "min_separation": float(report.min_separation[0]),
-            "min_separation_continuous": float(report.min_separation_continuous[0]),
-            "collision": bool(report.collision[0]),
-            "collision_continuous": bool(report.collision_continuous[0]),
-            "at_goal": report.at_goal[0].copy(),
-            "belief_source": report.belief_source[0].copy(),
-            "planner": {"status": report.plan_status[0].copy(), "iterations": report.iterations[0].copy()},
-            "metrics": {f"reward/{name}": term for name, term in terms.items()},
-        }
 
     def render(self) -> Any:
         """The present step as an image, (480, 640, 3) uint8."""
@@ -184,13 +170,13 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
             from .render import Renderer  # pygame is needed only here
 
             self._renderer = Renderer(self.config)
-        swarm = self.task.swarm
+        swarm, statistics = self.task.swarm, self.task.statistics
         lines = [
-            f"step {self.statistics.steps[0]}   {self.task.scenario[0]}",
-            f"requests {self._requests.sum()} now, {self.statistics.requests[0]} in all",
-            f"smallest separation {self.statistics.min_separation[0]:.2f} m",
+            f"step {statistics.steps[0]}   {self.task.scenario[0]}",
+            f"requests {self._requests.sum()} now, {statistics.requests[0]} in all",
+            f"smallest separation {statistics.min_separation[0]:.2f} m",
         ]
-        if self.statistics.collided[0]:
+        if statistics.collided[0]:
             lines.append("COLLISION")
         return self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, lines)
 
@@ -199,19 +185,31 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         self._renderer = None
 
 
-def request_matrix(action: Any, n_robots: int) -> np.ndarray:
-    """A joint action as whom each robot asks, (n, n - 1) bool.
+def request_matrices(actions: Any, n_swarms: int, n_robots: int) -> np.ndarray:
+    """Joint actions as whom each robot asks, (E, n, n - 1) bool.
 
+    :param actions: E times n(n - 1) bits, in any shape
     :raises ValueError: wrong size, or anything but zeros and ones
     """
-    bits = np.asarray(action)
+    bits = np.asarray(actions)
     size = n_robots * (n_robots - 1)
-    if bits.size != size:
+    if bits.size != n_swarms * size:
         raise ValueError(
-            f"The action has {bits.size} entries; {n_robots} robots need {size} bits, {n_robots - 1} each."
+            f"The action has {bits.size} entries; {n_robots} robots need {size} bits, {n_robots - 1} each"
+            + (f", in each of {n_swarms} swarms." if n_swarms > 1 else ".")
         )
     asked = bits == 1
     if not (asked | (bits == 0)).all():
         wrong = bits[~(asked | (bits == 0))].ravel()[0]
         raise ValueError(f"The action contains {wrong!r}; every entry must be 0 or 1. Threshold scores before acting.")
-    return asked.reshape(n_robots, n_robots - 1)
+    return asked.reshape(n_swarms, n_robots, n_robots - 1)
+
+
+def info_of(batch: dict[str, Any], swarm: int) -> dict[str, Any]:
+    """One swarm's part of a batched `info`, in plain Python numbers and fresh arrays."""
+    return {
+        name: info_of(value, swarm)
+        if isinstance(value, dict)
+        else (value[swarm].copy() if value.ndim > 1 else value[swarm].item())
+        for name, value in batch.items()
+    }

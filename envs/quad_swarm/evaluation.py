@@ -23,7 +23,6 @@ from tqdm import tqdm
 from .communication import View, parse_rule
 from .presets import SwarmConfig
 from .scenarios import ScenarioSampler
-from .statistics import EpisodeStatistics
 from .swarm import Swarm
 from .task import RequestTask, RewardConfig
 
@@ -138,12 +137,14 @@ def _begin(cell: Cell, episodes: Sequence[int]) -> tuple[Requests, RequestTask, 
 class Flight(NamedTuple):
     """One episode step by step.
 
-    :param pos: positions, (T + 1, n, 3), world frame (m)
+    :param state: states, (T + 1, n, 9)
+    :param plans: planned states as of each step, stages 0..N, (T + 1, n, N + 1, 9)
     :param goal: goals, (n, 3), world frame (m)
     :param requests: who asked whom in each step, (T, n, n - 1) bool
     """
 
-    pos: np.ndarray
+    state: np.ndarray
+    plans: np.ndarray
     goal: np.ndarray
     requests: np.ndarray
 
@@ -151,14 +152,15 @@ class Flight(NamedTuple):
 def fly(cell: Cell, seed: int) -> Flight:
     """The first held-out episode of set ``seed``, step by step."""
     policy, task, rngs = _begin(cell, [first_episode(seed)])
-    pos, asked = [task.swarm.pos[0].copy()], []
+    state, plans, asked = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], []
     over = False
     while not over:
         asked.append(policy(task, rngs))
         outcome = task.step(asked[-1])
-        pos.append(task.swarm.pos[0].copy())
+        state.append(task.swarm.state[0].copy())
+        plans.append(task.swarm.plans[0].copy())
         over = bool(outcome.terminated[0] | outcome.truncated[0])
-    return Flight(np.array(pos), task.swarm.goal[0], np.concatenate(asked))
+    return Flight(np.array(state), np.array(plans), task.swarm.goal[0], np.concatenate(asked))
 
 
 def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
@@ -169,18 +171,14 @@ def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
     :return: for each episode its figures, see `EpisodeStatistics`
     """
     policy, task, rngs = _begin(cell, episodes)
-    statistics = EpisodeStatistics(len(episodes), cell.config.n_robots)
     index = np.arange(len(episodes))
     rows: dict[int, dict[str, float]] = {}
     while index.size:
-        before = task.swarm.pos.copy()
         outcome = task.step(policy(task, rngs))
-        statistics.add(outcome, np.linalg.norm(task.swarm.pos - before, axis=-1))
         done = outcome.terminated | outcome.truncated
         if done.any():
-            rows |= {int(index[k]): statistics.row(int(k)) for k in np.flatnonzero(done)}
+            rows |= {int(index[k]): task.statistics.row(int(k)) for k in np.flatnonzero(done)}
             task.keep(~done)
-            statistics.keep(~done)
             rngs = [rng for rng, over in zip(rngs, done, strict=True) if not over]
             index = index[~done]
     return [rows[k] for k in range(len(episodes))]

@@ -1,4 +1,4 @@
-"""Figures of an evaluation: collisions and requests (the paper's Fig. 3 and 4), one flight a scenario (Fig. 2)."""
+"""Figures of an evaluation: collisions and requests (the paper's Fig. 3 and 4), flights (Fig. 2) and an animation."""
 
 from __future__ import annotations
 
@@ -13,29 +13,35 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from .colours import colour_of
 from .evaluation import Cell, Flight, fly
+from .render import Renderer
 
 
 def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int, folder: Path) -> list[Path]:
-    """Draw every figure as PNG into ``folder``; returns their paths.
+    """Draw every figure as PNG into ``folder``, and a flight as an animation; returns their paths.
 
     :param rows: what `evaluate` returned
     :param cells: what it was given; the last policy's flights are drawn
     :param seed: the same seed
     """
     folder.mkdir(parents=True, exist_ok=True)
+    last = [cell for cell in cells if cell.policy == cells[-1].policy]
+    flights = [fly(cell, seed) for cell in last]
     figures = {
         "collisions": draw_collisions(rows),
         "requests": draw_requests(rows),
-        "flights": draw_flights(cells, seed),
+        "flights": draw_flights(last, flights),
     }
     paths = []
     for name, figure in figures.items():
         paths.append(folder / f"{name}.png")
         figure.savefig(paths[-1], dpi=130)
         plt.close(figure)
+    paths.append(folder / "swarm.gif")
+    animate(last[-1], flights[-1], paths[-1])
     return paths
 
 
@@ -74,21 +80,34 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def draw_flights(cells: Sequence[Cell], seed: int) -> Figure:
-    """One flight of the last policy in each scenario, from above: where robots asked, and where they did not."""
-    last = [cell for cell in cells if cell.policy == cells[-1].policy]
-    figure, panels = plt.subplots(1, len(last), figsize=(3.4 * len(last), 3.8), layout="constrained", squeeze=False)
-    for axes, cell in zip(panels[0], last, strict=True):
-        _draw_flight(axes, fly(cell, seed))
+def draw_flights(cells: Sequence[Cell], flights: Sequence[Flight]) -> Figure:
+    """One flight of a policy in each scenario, from above: where robots asked, and where they did not."""
+    figure, panels = plt.subplots(1, len(cells), figsize=(3.4 * len(cells), 3.8), layout="constrained", squeeze=False)
+    for axes, cell, flight in zip(panels[0], cells, flights, strict=True):
+        _draw_flight(axes, flight)
         axes.set_title(cell.scenario.replace("_", " "), fontsize=10)
     figure.suptitle(f"{cells[-1].policy}: dots mark steps with a request", fontsize=9)
     return figure
 
 
+def animate(cell: Cell, flight: Flight, path: Path) -> None:
+    """The flight as an animated GIF in real time, until shortly after all have arrived."""
+    renderer = Renderer(cell.config)
+    at_goal = (np.linalg.norm(flight.state[1:, :, :3] - flight.goal, axis=-1) <= cell.config.goal_radius).all(axis=1)
+    steps = min(int(at_goal.argmax()) + 10 if at_goal.any() else len(at_goal), len(at_goal))
+    frames = []
+    for k in range(steps):
+        lines = [f"{cell.policy}, {cell.scenario}", f"step {k + 1}   requests {flight.requests[k].sum()}"]
+        picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
+        frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
+    duration = round(1000 * cell.config.planner.dt)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
+
+
 def _draw_flight(axes: Axes, flight: Flight) -> None:
-    for i in range(flight.pos.shape[1]):
+    for i in range(len(flight.goal)):
         colour = colour_of(i)
-        path = flight.pos[:, i]
+        path = flight.state[:, i, :3]
         axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=1)
         asked = path[:-1][flight.requests[:, i].any(axis=1)]
         axes.scatter(asked[:, 0], asked[:, 1], s=14, color=colour)

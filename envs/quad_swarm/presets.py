@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,7 +32,7 @@ class ProcessNoise:
     wind: float = 0.0
 
     def __bool__(self) -> bool:
-        return any(dataclasses.astuple(self))
+        return any((self.pos, self.vel, self.attitude, self.wind))
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class SwarmConfig:
     radius: float = 0.3
     collision_tolerance: float = 1e-3
     goal_radius: float = 0.3
-    memory: float = 0.0
+    memory: float = 0.03
     quadrotor: QuadrotorParams = field(default_factory=QuadrotorParams)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     space: ScenarioSpace = field(default_factory=ScenarioSpace)
@@ -108,7 +108,23 @@ def replace_fields(config: Any, changes: Mapping[str, Any], where: str) -> Any:
             if not dataclasses.is_dataclass(present):
                 raise ValueError(f"{where} parameter {name!r} takes a plain value, not the mapping {dict(value)}.")
             value = replace_fields(present, value, name)
-        elif isinstance(present, tuple):
-            value = tuple(value)
+        else:
+            value = _like(present, value, f"{where} parameter {name!r}")
         values[name] = value
     return dataclasses.replace(config, **values)
+
+
+def _like(present: Any, value: Any, what: str) -> Any:
+    """``value`` in the type of the present one; YAML, for one, reads 1e4 as a text."""
+    if isinstance(present, tuple):
+        if not isinstance(value, Sequence) or len(value) != len(present):
+            raise ValueError(f"{what} takes {len(present)} numbers, not {value!r}.")
+        return tuple(_like(p, v, what) for p, v in zip(present, value, strict=True))
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} takes a number, not {value!r}.") from None
+    if not math.isfinite(number) or (isinstance(present, int) and number != int(number)):
+        kind = "an integer" if isinstance(present, int) else "a finite number"
+        raise ValueError(f"{what} takes {kind}, not {value!r}.")
+    return type(present)(number)

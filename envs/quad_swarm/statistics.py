@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .planner import PlanStatus
-from .task import Outcome
+from .swarm import StepReport
 
 
 class EpisodeStatistics:
@@ -68,21 +68,21 @@ class EpisodeStatistics:
         for name in self._START:
             setattr(self, name, getattr(self, name)[swarms])
 
-    def add(self, outcome: Outcome, moved: np.ndarray) -> None:
+    def add(self, report: StepReport, n_requests: np.ndarray, collided: np.ndarray) -> None:
         """Count one step.
 
-        :param outcome: its outcome
-        :param moved: distance that each robot flew in it, (E, n) (m)
+        :param report: what happened in it
+        :param n_requests: requests made in it, (E,)
+        :param collided: whether it ended the episode by a collision, (E,) bool
         """
-        report = outcome.report
         counted = ~self.arrived
         self.steps += 1
         self.steps_counted += counted
-        self.requests += counted * outcome.n_requests
-        self.path_length += counted * moved.mean(axis=1)
-        self.collided |= outcome.terminated
+        self.requests += counted * n_requests
+        self.path_length += counted * report.moved.mean(axis=1)
+        self.collided |= collided
         self.collided_continuous |= report.collision_continuous
-        self.arrived |= report.at_goal.all(axis=1) & ~outcome.terminated
+        self.arrived |= report.at_goal.all(axis=1) & ~collided
         self.min_separation = np.minimum(self.min_separation, report.min_separation)
         self.min_separation_continuous = np.minimum(self.min_separation_continuous, report.min_separation_continuous)
         self.planner_failures += (report.plan_status >= PlanStatus.SHIFTED).sum(axis=1)
@@ -97,15 +97,15 @@ class EpisodeStatistics:
         """One swarm's figures by name."""
         return {name: getattr(self, name)[swarm].item() for name in self._START}
 
-    def metrics(self, swarm: int) -> dict[str, float]:
-        """Figures of one swarm's episode by the names under which they are logged."""
-        plans = self.steps[swarm] * self.n_robots
-        possible = self.steps_counted[swarm] * self.n_robots * (self.n_robots - 1)
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Figures of the episodes so far, each (E,), by the names under which they are logged."""
+        plans = self.steps * self.n_robots
+        possible = self.steps_counted * self.n_robots * (self.n_robots - 1)
         return {
-            "swarm/collision_rate": float(self.collided[swarm]),
-            "swarm/arrival_rate": float(self.success[swarm]),
-            "swarm/min_separation": float(self.min_separation[swarm]),
-            "comm/request_share": float(self.requests[swarm] / possible),
-            "planner/failure_rate": float(self.planner_failures[swarm] / plans),
-            "planner/solve_us": float(1e6 * self.solve_seconds[swarm] / plans),
+            "swarm/collision_rate": self.collided.astype(float),
+            "swarm/arrival_rate": self.success.astype(float),
+            "swarm/min_separation": self.min_separation.copy(),
+            "comm/request_share": self.requests / possible,
+            "planner/failure_rate": self.planner_failures / plans,
+            "planner/solve_us": 1e6 * self.solve_seconds / plans,
         }

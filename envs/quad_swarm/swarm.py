@@ -20,6 +20,7 @@ class StepReport(NamedTuple):
     :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line, (E,) (m)
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
     :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
+    :param moved: distance that each robot flew, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
     :param plan_status: `PlanStatus` of each robot's plan, (E, n)
@@ -31,6 +32,7 @@ class StepReport(NamedTuple):
     min_separation_continuous: np.ndarray
     collision: np.ndarray
     collision_continuous: np.ndarray
+    moved: np.ndarray
     at_goal: np.ndarray
     belief_source: np.ndarray
     plan_status: np.ndarray
@@ -136,14 +138,14 @@ class Swarm:
 
     def _report(self, before: np.ndarray, source: np.ndarray, solve_seconds: float) -> StepReport:
         i, j = self._pairs
-        start = before[:, i] - before[:, j]
-        end = self.pos[:, i] - self.pos[:, j]
-        separation = np.linalg.norm(end, axis=-1).min(axis=-1)
+        pos = self.pos
+        start, end = before[:, i] - before[:, j], pos[:, i] - pos[:, j]
         # Closest point of the segment from start to end to the origin.
         change = end - start
-        along = -(start * change).sum(axis=-1) / np.maximum((change**2).sum(axis=-1), 1e-12)
-        closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
-        separation_continuous = np.linalg.norm(closest, axis=-1).min(axis=-1)
+        along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
+        closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
+        separation = np.sqrt(_dot(end, end).min(axis=-1))
+        separation_continuous = np.sqrt(_dot(closest, closest).min(axis=-1))
         limit = 2 * self.config.radius - self.config.collision_tolerance
         shape = self.state.shape[:2]
         return StepReport(
@@ -151,9 +153,14 @@ class Swarm:
             min_separation_continuous=separation_continuous,
             collision=separation < limit,
             collision_continuous=separation_continuous < limit,
-            at_goal=np.linalg.norm(self.pos - self.goal, axis=-1) <= self.config.goal_radius,
+            moved=np.sqrt(_dot(pos - before, pos - before)),
+            at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
             belief_source=source,
-            plan_status=self._plans.status.reshape(shape),
-            iterations=self._plans.iterations.reshape(shape),
+            plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
+            iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
         )
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...k,...k->...", a, b)

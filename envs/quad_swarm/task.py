@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .beliefs import other_indices
+from .presets import make_config, replace_fields
 from .scenarios import ScenarioSampler
+from .statistics import EpisodeStatistics
 from .swarm import StepReport, Swarm
 
 
@@ -53,6 +56,8 @@ _POSITION_SCALE = 4.0
 class RequestTask:
     """Episodes of E swarms.
 
+    :ivar statistics: figures of the running episodes
+
     :param swarm: the swarms
     :param sampler: draws episodes
     :param reward: weights of the reward
@@ -79,7 +84,7 @@ class RequestTask:
         self.continuous_collisions = continuous_collisions
         n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
-        self.elapsed = np.zeros(swarm.n_swarms, dtype=np.int64)
+        self.statistics = EpisodeStatistics(swarm.n_swarms, n)
         self._others = other_indices(n)
         distance = _POSITION_SCALE if scale_observation else 1.0
         velocity = _VELOCITY_SCALE if scale_observation else 1.0
@@ -92,20 +97,19 @@ class RequestTask:
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
         """Draw a new episode for one swarm; every random number of the episode comes from ``rng``."""
-        name, starts, goals = self.sampler.sample(rng)
-        noise_seed = int(rng.integers(2**63)) if self.swarm.config.noise else 0
-        self.place(swarm, name, starts, goals, noise_seed)
+        self.place(swarm, *self.sampler.sample(rng), rng)
 
-    def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
-        """Begin a given episode in one swarm; see `Swarm.reset`."""
+    def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, rng: np.random.Generator) -> None:
+        """Begin a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
+        noise_seed = int(rng.integers(2**63)) if self.swarm.config.noise else 0
         self.swarm.reset(swarm, starts, goals, noise_seed)
         self.scenario[swarm] = name
-        self.elapsed[swarm] = 0
+        self.statistics.reset(swarm)
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
         self.swarm.keep(swarms)
-        self.elapsed = self.elapsed[swarms]
+        self.statistics.keep(swarms)
         self.scenario = [name for name, kept in zip(self.scenario, swarms, strict=True) if kept]
 
     def observe(self) -> np.ndarray:
@@ -124,9 +128,9 @@ class RequestTask:
     def step(self, requests: np.ndarray) -> Outcome:
         """One step of every swarm; ``requests`` as in `Swarm.step`."""
         report = self.swarm.step(requests)
-        self.elapsed += 1
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         n_requests = requests.sum(axis=(1, 2))
+        self.statistics.add(report, n_requests, collided)
         terms = {
             "goal": self.reward.goal * report.at_goal.all(axis=1),
             "collision": -self.reward.collision * collided,
@@ -136,7 +140,55 @@ class RequestTask:
             reward=terms["goal"] + terms["collision"] + terms["requests"],
             reward_terms=terms,
             terminated=collided,
-            truncated=~collided & (self.elapsed >= self.max_steps),
+            truncated=~collided & (self.statistics.steps >= self.max_steps),
             n_requests=n_requests,
             report=report,
         )
+
+    def info(self, outcome: Outcome) -> dict[str, Any]:
+        """The last step for `info`: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
+        report = outcome.report
+        return {
+            "scenario": np.array(self.scenario),
+            "reward_terms": outcome.reward_terms,
+            "n_requests": outcome.n_requests,
+            "min_separation": report.min_separation,
+            "min_separation_continuous": report.min_separation_continuous,
+            "collision": report.collision,
+            "collision_continuous": report.collision_continuous,
+            "at_goal": report.at_goal,
+            "belief_source": report.belief_source,
+            "planner": {"status": report.plan_status, "iterations": report.iterations},
+            "metrics": {f"reward/{name}": term for name, term in outcome.reward_terms.items()},
+        }
+
+    def final_info(self) -> dict[str, Any]:
+        """What `info` says at the end of an episode beside that: arrays with a leading axis of swarms."""
+        return {"is_success": self.statistics.success, "metrics": self.statistics.metrics()}
+
+
+def make_task(
+    n_swarms: int = 1,
+    preset: str = "paper",
+    scenario: str = "mixed",
+    n_robots: int | None = None,
+    max_steps: int = 100,
+    scale_observation: bool = False,
+    continuous_collisions: bool = False,
+    memory: float | None = None,
+    reward: Mapping[str, float] | None = None,
+    planner: Mapping[str, Any] | None = None,
+    noise: Mapping[str, float] | None = None,
+    space: Mapping[str, Any] | None = None,
+    solver: str = "auto",
+) -> RequestTask:
+    """The task of an environment; arguments as in `QuadSwarmEnv`.
+
+    :param n_swarms: number of swarms E
+    :raises ValueError: a wrong value; the message names it and the remedy
+    """
+    config = make_config(preset, n_robots=n_robots, memory=memory, planner=planner, noise=noise, space=space)
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space)
+    weights = replace_fields(RewardConfig(), reward or {}, "reward")
+    swarm = Swarm(config, n_swarms, solver)
+    return RequestTask(swarm, sampler, weights, max_steps, scale_observation, continuous_collisions)

@@ -1,0 +1,121 @@
+"""Environment steps per second, and where the time goes.
+
+``python benchmarks/env.py [--json F]`` steps the swarm through Gymnasium (one swarm) and through the Stable-Baselines3
+VecEnv (many), rewards, infos and auto-reset included, with random requests. Each cell is one process per core, pinned
+to it where the system allows; rates of two cores are sums. JSON: one row a cell with the keys face, preset, n_robots,
+n_envs, cores, steps_per_s, and the share of each part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import numpy as np
+
+import quad_swarm
+from quad_swarm.task import RequestTask
+from sb3_maddpg.vec_env import GymnasiumVecEnv
+
+CELLS = [("gym", "paper", 1), ("gym", "dense", 1)] + [
+    ("vecenv", preset, n_envs) for preset in ("paper", "dense") for n_envs in (1, 16, 64, 256)
+]
+
+
+def measure(face: str, preset: str, n_envs: int, core: int, seconds: float, solver: str) -> dict[str, Any]:
+    """Steps per second of one process, and the share of the time that each part takes."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {core % (os.cpu_count() or 1)})
+    kwargs: dict[str, Any] = {"preset": preset, "scenario": "mixed", "solver": solver}
+    step: Callable[[np.ndarray], Any]
+    if face == "gym":
+        env = gymnasium.make("QuadSwarm-v0", **kwargs)
+        env.reset(seed=core)
+
+        def step(action: np.ndarray) -> None:
+            *_, terminated, truncated, _ = env.step(action[0])
+            if terminated or truncated:
+                env.reset()
+
+        task = env.unwrapped.task  # type: ignore[attr-defined]
+    else:
+        vec_env = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=n_envs, **kwargs))
+        vec_env.seed(core)
+        vec_env.reset()
+        step, task = vec_env.step, vec_env.envs.unwrapped.task  # type: ignore[attr-defined]
+    n = task.swarm.config.n_robots
+    actions = np.random.default_rng(0).integers(0, 2, (64, n_envs, n * (n - 1)), dtype=np.int8)
+    for k in range(5):
+        step(actions[k])
+    timers = attach_timers(task)
+    count, started = 0, time.perf_counter()
+    while time.perf_counter() - started < seconds:
+        step(actions[count % len(actions)])
+        count += 1
+    elapsed = time.perf_counter() - started
+    shares = {name: timer[0] / elapsed for name, timer in timers.items()}
+    return {"steps_per_s": count * n_envs / elapsed, **shares, "rest": 1 - sum(shares.values())}
+
+
+def attach_timers(task: RequestTask) -> dict[str, list[float]]:
+    """Let the parts of a step count their own time."""
+    timers: dict[str, list[float]] = {}
+    for name, owner, method in [
+        ("solve", task.swarm.planner, "plan"),
+        ("beliefs", task.swarm.beliefs, "update"),
+        ("dynamics", task.swarm.planner.model, "step"),
+        ("observation", task, "observe"),
+        ("info", task, "info"),
+        ("reset", task, "reset"),
+    ]:
+        timers[name] = [0.0]
+        setattr(owner, method, _timed(getattr(owner, method), timers[name]))
+    return timers
+
+
+def _timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        started = time.perf_counter()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            total[0] += time.perf_counter() - started
+
+    return call
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write one JSON object a cell")
+    parser.add_argument("--seconds", type=float, default=4.0, help="time of each cell (default 4)")
+    parser.add_argument("--solver", default="auto", help="planner's solver (default auto)")
+    args = parser.parse_args()
+    rows = []
+    print(f"{'face':7} {'preset':6} {'envs':>5} {'cores':>5} {'steps/s':>9}   shares of the time")
+    for face, preset, n_envs in CELLS:
+        for cores in (1, 2):
+            work = [(face, preset, n_envs, core, args.seconds, args.solver) for core in range(cores)]
+            with multiprocessing.get_context("spawn").Pool(cores) as pool:
+                parts = pool.starmap(measure, work)
+            total = sum(part.pop("steps_per_s") for part in parts)
+            n_robots = quad_swarm.PRESETS[preset].n_robots
+            row = {"face": face, "preset": preset, "n_robots": n_robots, "n_envs": n_envs, "cores": cores}
+            rows.append({**row, "steps_per_s": total, **parts[0]})
+            shares = "  ".join(f"{name} {share:.0%}" for name, share in parts[0].items())
+            print(f"{face:7} {preset:6} {n_envs:5} {cores:5} {total:9.0f}   {shares}", flush=True)
+    if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""
+How well each estimator of the gradient through the threshold learns the binary team tasks.
+
+``python benchmarks/estimators.py [--seeds 5] [--json FILE]``
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_maddpg import MADDPG
+from sb3_maddpg.estimators import ESTIMATORS
+from sb3_maddpg.team_tasks import BINARY_TASKS, TeamTask
+from sb3_maddpg.utils import atomic_write
+
+# Same for every estimator; the steps after which the deterministic policy is measured.
+RECIPE: dict[str, Any] = {
+    "learning_rate": 3e-3,
+    "learning_starts": 200,
+    "batch_size": 256,
+    "train_freq": 4,
+    "gamma": 0.5,
+}
+CHECKPOINTS = (500, 1000, 2000, 4000)
+# Student's t for a two-sided 95 % interval, by degrees of freedom
+T_95 = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 7: 2.36, 8: 2.31, 9: 2.26}
+
+
+def learning_curve(task: type[TeamTask], estimator: str, seed: int) -> list[float]:
+    """
+    :param task: to learn
+    :param estimator: name of the estimator
+    :param seed: of environment, networks and exploration
+    :return: at each checkpoint the return, 0 for random actions, 1 for the best policy
+    """
+    model = MADDPG("MlpPolicy", task(), estimator=estimator, seed=seed, buffer_size=CHECKPOINTS[-1], **RECIPE)
+    curve = []
+    for steps in np.diff(CHECKPOINTS, prepend=0).tolist():
+        model.learn(steps, reset_num_timesteps=False)
+        curve.append(task().play(model))
+    return curve
+
+
+def cell(returns: Sequence[float]) -> str:
+    """
+    :param returns: of the seeds
+    :return: mean and half the width of the 95 % interval
+    """
+    half = T_95[len(returns) - 1] * np.std(returns, ddof=1) / len(returns) ** 0.5
+    return f"{np.mean(returns):5.2f} ± {half:.2f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5, choices=range(2, 11), help="runs of each (default 5)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every return")
+    arguments = parser.parse_args()
+    th.set_num_threads(1)
+
+    print(
+        "Return of the deterministic policy after so many steps: 0 random actions, 1 optimum; mean and 95 % interval."
+    )
+    print(f"{'task':10} {'estimator':17}" + "".join(f"{steps:>15}" for steps in CHECKPOINTS))
+    rows = []
+    for task in BINARY_TASKS:
+        for estimator in ESTIMATORS:
+            curves = [learning_curve(task, estimator, seed) for seed in range(arguments.seeds)]
+            cells = [cell(returns) for returns in zip(*curves, strict=True)]
+            print(f"{task.__name__:10} {estimator:17}" + "".join(f"{text:>15}" for text in cells), flush=True)
+            rows.append({"task": task.__name__, "estimator": estimator, "steps": CHECKPOINTS, "returns": curves})
+    if arguments.json is not None:
+        with atomic_write(arguments.json, suffix="json") as file:
+            file.write("".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""Callbacks for MADDPG and for any other Stable-Baselines3 algorithm."""
+
+from collections import deque
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+
+
+def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
+    """
+    Log the numbers an environment puts into ``info["metrics"]``, as means over the steps until the next log dump.
+
+    :param logger: of the algorithm
+    :param infos: of one step, one per environment
+    """
+    for info in infos:
+        for name, value in info.get("metrics", {}).items():
+            logger.record_mean(name, float(value))
+
+
+class MetricsCallback(BaseCallback):
+    """Logs ``info["metrics"]`` for algorithms that, unlike MADDPG, do not do so themselves."""
+
+    def _on_step(self) -> bool:
+        record_metrics(self.logger, self.locals["infos"])
+        return True
+
+
+class CurriculumCallback(BaseCallback):
+    """
+    Makes the training environment harder once the team succeeds. The environment has a number ``n_curriculum_levels``,
+    a method ``set_curriculum_level(level)`` with levels from 0, and says ``info["is_success"]`` at the end of an
+    episode. The level is kept in ``model.curriculum_level``, hence in the saved model, and logged as
+    ``curriculum/level``. Evaluation environments neither count nor change.
+
+    :param success_threshold: share of successes that raises the level
+    :param window: number of latest episodes at the current level over which it is taken
+    :param verbose: 1 says when the level is raised
+    """
+
+    def __init__(self, success_threshold: float = 0.9, window: int = 100, verbose: int = 0):
+        super().__init__(verbose)
+        if not 0.0 < success_threshold <= 1.0:
+            raise ValueError(f"success_threshold={success_threshold} is a share of episodes: choose it in (0, 1].")
+        if window < 1:
+            raise ValueError(f"window={window} is a number of episodes: choose at least 1.")
+        self.success_threshold = success_threshold
+        self.successes: deque[bool] = deque(maxlen=window)
+        self.n_levels = 0
+
+    @property
+    def level(self) -> int:
+        """The model's current level."""
+        return getattr(self.model, "curriculum_level", 0)
+
+    def _set_level(self, level: int) -> None:
+        self.model.curriculum_level = level  # type: ignore[attr-defined]
+        self.training_env.env_method("set_curriculum_level", level)
+        self.successes.clear()
+
+    def _on_training_start(self) -> None:
+        for name in ("n_curriculum_levels", "set_curriculum_level"):
+            if not self.training_env.has_attr(name):
+                raise ValueError(
+                    f"CurriculumCallback needs an environment with `{name}`, which this one lacks. Choose an "
+                    "environment (or a scenario of it) with a curriculum, or drop the callback."
+                )
+        self.n_levels = int(self.training_env.get_attr("n_curriculum_levels", indices=0)[0])
+        self._set_level(min(self.level, self.n_levels - 1))
+
+    def _on_step(self) -> bool:
+        for info, done in zip(self.locals["infos"], self.locals["dones"], strict=True):
+            if done:
+                if "is_success" not in info:
+                    raise ValueError('CurriculumCallback needs info["is_success"] at the end of every episode.')
+                self.successes.append(bool(info["is_success"]))
+        full = len(self.successes) == self.successes.maxlen
+        if (
+            full
+            and self.level < self.n_levels - 1
+            and sum(self.successes) >= self.success_threshold * len(self.successes)
+        ):
+            self._set_level(self.level + 1)
+            if self.verbose > 0:
+                print(f"Curriculum: level {self.level} of {self.n_levels - 1} at step {self.num_timesteps}")
+        self.logger.record("curriculum/level", self.level)
+        return True

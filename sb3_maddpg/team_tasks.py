@@ -1,0 +1,182 @@
+"""
+Small team tasks with known optimum, to check that a learner learns. Import this module to register them.
+
+Every step the observations are drawn anew, so that the best joint policy maximises each step's reward by itself and the
+optimum has a closed form. Episodes of ten steps end by the time limit.
+"""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+
+class TeamTask(gym.Env):
+    """
+    A repeated game with fresh observations. Sub-classes give ``payoff`` and the constants.
+
+    :param episode_length: steps until the episode is truncated
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - Gymnasium's own convention
+    n_agents: ClassVar[int]
+    action_dim: ClassVar[int]
+    obs_dim: ClassVar[int]
+    optimum: ClassVar[float]
+    """Largest expected team reward per step of any decentralised policy."""
+    random: ClassVar[float]
+    """Expected team reward per step of uniformly random actions."""
+
+    def __init__(self, episode_length: int = 10, render_mode: str | None = None):
+        if episode_length < 1:
+            raise ValueError(f"episode_length={episode_length} must be at least 1.")
+        self.episode_length = episode_length
+        self.render_mode = render_mode
+        self.observation_space = spaces.Box(-1.0, 1.0, (self.n_agents, self.obs_dim), np.float32)
+        self.action_space: spaces.Space = spaces.MultiBinary(self.n_agents * self.action_dim)
+        self._steps = 0
+
+    def draw(self, rng: np.random.Generator, batch: int) -> np.ndarray:
+        """
+        :param rng: source of randomness
+        :param batch: how many
+        :return: observations, independent signs, (batch, n_agents, obs_dim)
+        """
+        return rng.choice(np.array([-1.0, 1.0], np.float32), size=(batch, self.n_agents, self.obs_dim))
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """
+        :param obs: (batch, n_agents, obs_dim)
+        :param actions: (batch, n_agents, action_dim)
+        :return: each agent's reward, (batch, n_agents); the team's is the mean
+        """
+        raise NotImplementedError
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self._steps = 0
+        self._obs = self.draw(self.np_random, 1)
+        self._actions = np.zeros((self.n_agents, self.action_dim))
+        return self._obs[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        actions = np.asarray(action).reshape(1, self.n_agents, self.action_dim)
+        rewards = self.payoff(self._obs, actions)[0].astype(np.float32)
+        self._steps += 1
+        self._obs, self._actions = self.draw(self.np_random, 1), actions[0]
+        info = {"agent_rewards": rewards, "metrics": {"task/mean_action": float(actions.mean())}}
+        return self._obs[0], float(rewards.mean()), False, self._steps >= self.episode_length, info
+
+    def render(self) -> np.ndarray | None:
+        """A row per agent: its observation in grey, then the bits it just set in white."""
+        if self.render_mode is None:
+            return None
+        cells = np.hstack([96 + 64 * self._obs[0], 255.0 * np.clip(self._actions, 0, 1)])
+        return np.repeat(np.kron(cells, np.ones((32, 32)))[..., None], 3, axis=2).astype(np.uint8)
+
+    def play(self, model: Any, n_steps: int = 10_000, seed: int = 0) -> float:
+        """
+        :param model: anything with SB3's ``predict``
+        :param n_steps: over how many draws of the observations
+        :param seed: of the draws
+        :return: mean team reward per step of the deterministic policy, 0 for random actions, 1 for the optimum
+        """
+        obs = self.draw(np.random.default_rng(seed), n_steps)
+        actions, _ = model.predict(obs, deterministic=True)
+        reward = float(self.payoff(obs, actions.reshape(n_steps, self.n_agents, self.action_dim)).mean())
+        return (reward - self.random) / (self.optimum - self.random)
+
+
+class OwnBit(TeamTask):
+    """The best bits are the signs of the own observation. Each right bit pays 1 to its agent."""
+
+    n_agents, action_dim, obs_dim = 3, 3, 3
+    optimum, random = 3.0, 1.5
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return (actions == (obs > 0)).sum(axis=-1)
+
+
+class OtherBit(TeamTask):
+    """
+    A bit pays only together with the other agent's: two bits set pay the sum s_0 + s_1 of the two agents' signs, less
+    a half, to both. An agent knows its own sign only; what its bit is worth hangs on the other's sign and bit, which
+    the critic sees and the actor does not. The best policy sets a bit where the own sign is positive: then 3/2 is paid
+    in one case of four.
+    """
+
+    n_agents, action_dim, obs_dim = 2, 2, 2
+    optimum, random = 2 * 3 / 8, 2 * -1 / 8
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        together = actions.prod(axis=1) * (obs.sum(axis=1) - 0.5)
+        return np.repeat(together.sum(axis=-1, keepdims=True), self.n_agents, axis=1)
+
+
+class PricedBit(TeamTask):
+    """
+    Every bit costs 0.4 and pays 1 where both signs of its pair in the own observation are positive, in one case of
+    four: asking always loses, asking never gains nothing.
+    """
+
+    n_agents, action_dim, obs_dim = 3, 3, 6
+    price: ClassVar[float] = 0.4
+    optimum, random = 3 * 0.25 * (1 - 0.4), 3 * 0.5 * (0.25 - 0.4)
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        useful = (obs.reshape(*obs.shape[:-1], self.action_dim, 2) > 0).all(axis=-1)
+        return (actions * (useful - self.price)).sum(axis=-1)
+
+
+class OneOfBits(TeamTask):
+    """
+    One of an agent's three bits must be set, and just one: the one its observation points to by the signs of its two
+    numbers (none points to "no bit"). The set as a whole pays 1, anything else nothing: no bit has a worth by itself.
+    """
+
+    n_agents, action_dim, obs_dim = 2, 3, 2
+    optimum, random = 1.0, 1 / 8
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        pointed = (obs > 0) @ np.array([1, 2]) - 1
+        wanted = pointed[..., None] == np.arange(self.action_dim)
+        return (actions == wanted).all(axis=-1)
+
+
+class AllBits(TeamTask):
+    """
+    An agent whose first sign is positive gains 1 by setting all of its three bits; each bit costs 0.25, whatever comes
+    of it. Every bit is a loss without the other two.
+    """
+
+    n_agents, action_dim, obs_dim = 2, 3, 2
+    price: ClassVar[float] = 0.25
+    optimum, random = (1 - 3 * 0.25) / 2, 1 / 16 - 3 * 0.25 / 2
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return (actions == 1).all(axis=-1) * (obs[..., 0] > 0) - self.price * actions.sum(axis=-1)
+
+
+class FollowTarget(TeamTask):
+    """
+    A continuous action in [-2, 1] is to be brought to a point that the own observation gives. The squared distance is
+    the price.
+    """
+
+    n_agents, action_dim, obs_dim = 2, 1, 2
+    optimum, random = 0.0, -1.0625
+
+    def __init__(self, episode_length: int = 10, render_mode: str | None = None):
+        super().__init__(episode_length, render_mode)
+        self.action_space = spaces.Box(-2.0, 1.0, (self.n_agents * self.action_dim,), np.float32)
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        target = -0.5 + 0.5 * obs[..., :1] + 0.25 * obs[..., 1:]
+        return -np.square(actions - target).sum(axis=-1)
+
+
+BINARY_TASKS: tuple[type[TeamTask], ...] = (OwnBit, OtherBit, PricedBit, OneOfBits, AllBits)
+
+for _task in (*BINARY_TASKS, FollowTarget):
+    gym.register(id=f"{_task.__name__}-v0", entry_point=f"{__name__}:{_task.__name__}")

@@ -1,0 +1,103 @@
+"""Small helpers shared by the algorithm, its policy, its buffer and the zoo."""
+
+import difflib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import VecEnv
+
+# Arguments that gymnasium.make and make_vec take and keep among those of the environment
+NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"}
+
+
+def suggest(kind: str, name: str, known: Iterable[str]) -> str:
+    """
+    Message for a name that is not known, with the nearest one that is.
+
+    :param kind: what is named, e.g. "estimator"
+    :param name: the name that was given
+    :param known: the names that exist
+    """
+    known = sorted(known)
+    nearest = difflib.get_close_matches(name, known, n=1)
+    if nearest:
+        return f"Unknown {kind} '{name}': did you mean '{nearest[0]}'?"
+    return f"Unknown {kind} '{name}'. There are: {', '.join(known)}."
+
+
+def team_shape(observation_space: spaces.Space, action_space: spaces.Space) -> tuple[int, int, int]:
+    """
+    Read the team out of its spaces and refuse spaces that do not describe one.
+
+    :param observation_space: ``Box(n_agents, obs_dim)``
+    :param action_space: flat joint action, ``MultiBinary(n_agents * action_dim)`` or ``Box(n_agents * action_dim)``
+    :return: ``n_agents``, ``obs_dim`` and ``action_dim`` (both per agent)
+    """
+    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 2:
+        raise ValueError(
+            f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. "
+            "Stack the agents' observations along a first axis; pad them if they differ in length."
+        )
+    if action_space.shape is None or len(action_space.shape) != 1:
+        raise ValueError(
+            f"A team action is flat, of length n_agents * action_dim, not {action_space}. "
+            "Flatten it in the environment and reshape it there to (n_agents, action_dim)."
+        )
+    (n_agents, obs_dim), (n_actions,) = observation_space.shape, action_space.shape
+    if n_actions % n_agents:
+        raise ValueError(
+            f"A joint action of {n_actions} numbers cannot be shared out evenly among {n_agents} agents. "
+            "Give every agent the same number of actions; pad the shorter ones."
+        )
+    return n_agents, obs_dim, n_actions // n_agents
+
+
+def describe_env(env: VecEnv) -> dict[str, Any] | None:
+    """
+    What is needed to build a training environment again.
+
+    :param env: vectorised environment; its first one is described
+    :return: ``{"id": ..., "kwargs": ...}``, or None where it was not made by ``gymnasium.make`` or its arguments
+        cannot be written as JSON. What is no part of the task is left out: the render mode, the number of copies.
+    """
+    try:
+        spec = env.get_attr("spec", indices=0)[0]
+    except (AttributeError, NotImplementedError):  # e.g. a SuperSuit vector environment
+        return None
+    if not isinstance(spec, EnvSpec):
+        return None
+    kwargs = {key: value for key, value in spec.kwargs.items() if key not in NOT_THE_TASK}
+    try:
+        return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs))}
+    except (TypeError, ValueError):
+        return None
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO]:
+    """
+    Write a file that appears whole or not at all: what stood there before stays until the last byte is on disk.
+
+    :param path: where to write; missing folders are made
+    :param suffix: added to a path without suffix, as Stable-Baselines3 does
+    """
+    target = Path(path)
+    if not target.suffix:
+        target = Path(f"{target}.{suffix}")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # In the same folder, because a file cannot be renamed across file systems.
+    temporary = target.with_name(f".{target.name}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,108 @@
+"""Gymnasium's vector environments as Stable-Baselines3's."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import Wrapper
+from gymnasium.vector import AutoresetMode, VectorEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+
+class GymnasiumVecEnv(VecEnv):
+    """
+    Presents a Gymnasium ``VectorEnv`` as an SB3 ``VecEnv``, so that environments which step many copies in one call
+    keep that speed. Wrap it in ``VecMonitor`` for episode statistics.
+
+    :param envs: a vector environment that begins anew in the step in which an episode ends
+        (``AutoresetMode.SAME_STEP``), as SB3's do
+    :raises ValueError: another autoreset mode
+    """
+
+    def __init__(self, envs: VectorEnv):
+        mode = envs.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"The vector environment has autoreset mode {mode}; Stable-Baselines3 needs {AutoresetMode.SAME_STEP}. "
+                'Make it with gymnasium.make_vec(..., vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}).'
+            )
+        self.envs = envs
+        self._actions: np.ndarray | None = None
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> VecEnvObs:
+        if any(self._options):
+            raise ValueError(f"Options for single environments, {self._options}, cannot be passed on to {self.envs}.")
+        seeds = list(self._seeds) if any(seed is not None for seed in self._seeds) else None
+        observations, infos = self.envs.reset(seed=seeds)  # type: ignore[arg-type]  # one of each is allowed too
+        self.reset_infos = unbatch(infos, self.num_envs)
+        self._reset_seeds()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, terminations, truncations, infos = self.envs.step(self._actions)
+        rows = unbatch(infos, self.num_envs)
+        dones = terminations | truncations
+        for k in np.flatnonzero(dones):
+            # The info that came with the observation belongs to the next episode.
+            self.reset_infos[k] = {name: v for name, v in rows[k].items() if name not in ("final_obs", "final_info")}
+            rows[k] = {**rows[k].get("final_info", {}), "terminal_observation": rows[k]["final_obs"]}
+        for row, timeout in zip(rows, (truncations & ~terminations).tolist(), strict=True):
+            row["TimeLimit.truncated"] = timeout
+        return observations, rewards.astype(np.float32), dones, rows
+
+    def close(self) -> None:
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of the vector environment, once for each of the given environments."""
+        value = getattr(self.envs if hasattr(self.envs, attr_name) else self.envs.unwrapped, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set the attribute of the vector environment, which all environments share."""
+        self._only_all(indices, attr_name)
+        setattr(self.envs.unwrapped, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args, indices: VecEnvIndices = None, **method_kwargs) -> list[Any]:
+        """Call the method of the vector environment once; its result is given once for each environment."""
+        self._only_all(indices, method_name)
+        result = getattr(self.envs.unwrapped, method_name)(*method_args, **method_kwargs)
+        return [result for _ in range(self.num_envs)]
+
+    def env_is_wrapped(self, wrapper_class: type[Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """Never: single environments do not exist here."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _only_all(self, indices: VecEnvIndices, name: str) -> None:
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"{name!r} concerns all {self.num_envs} environments of {self.envs}, not only {indices}.")
+
+
+def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
+    """
+    Gymnasium's batched infos as one dict per environment.
+
+    :param infos: arrays with a leading axis of environments, some in dicts, each with a mask under its name with a
+        leading underscore
+    :param num_envs: number of environments
+    """
+    rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+    for name, value in infos.items():
+        if name.startswith("_"):
+            continue
+        parts: Any
+        if isinstance(value, dict):
+            parts = unbatch(value, num_envs)
+        else:
+            parts = value.tolist() if value.ndim == 1 and value.dtype != object else value
+        mask = infos.get(f"_{name}")
+        if mask is None or mask.all():
+            for row, part in zip(rows, parts, strict=True):
+                row[name] = part
+        else:
+            for k in np.flatnonzero(mask):
+                rows[k][name] = parts[k]
+    return rows

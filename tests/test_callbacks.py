@@ -1,0 +1,124 @@
+"""The curriculum and the metrics, with MADDPG and with another algorithm."""
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_maddpg import MADDPG, CurriculumCallback, MetricsCallback
+from sb3_maddpg.team_tasks import OwnBit
+
+SMALL = {"learning_starts": 50, "batch_size": 16, "train_freq": 10, "buffer_size": 500, "seed": 0}
+
+
+class Levelled(OwnBit):
+    """Succeeds on every level but the last; five steps an episode."""
+
+    n_curriculum_levels = 3
+
+    def __init__(self):
+        super().__init__(episode_length=5)
+        self.level = 0
+        self.levels_set: list[int] = []
+
+    def set_curriculum_level(self, level: int) -> None:
+        self.level = level
+        self.levels_set.append(level)
+
+    def step(self, action):
+        *rest, truncated, info = super().step(action)
+        if truncated:
+            info["is_success"] = self.level < 2
+        info["metrics"]["task/level"] = self.level
+        return *rest, truncated, info
+
+
+def test_levels_rise_with_success_and_stop_at_the_last():
+    env = Levelled()
+    model = MADDPG("MlpPolicy", env, **SMALL)
+    model.learn(3 * 5 * 10, callback=CurriculumCallback(window=10))
+    assert env.levels_set == [0, 1, 2]
+    assert model.curriculum_level == 2
+    assert model.logger.name_to_value.get("curriculum/level", 2) == 2
+
+
+@pytest.mark.parametrize(("successes", "raised"), [(9, True), (8, False)])
+def test_the_threshold_is_a_share_of_the_window(successes, raised):
+    class Given(Levelled):
+        outcomes = iter([True] * successes + [False] * (10 - successes))
+
+        def step(self, action):
+            *rest, truncated, info = super().step(action)
+            if truncated:
+                info["is_success"] = next(self.outcomes)
+            return *rest, truncated, info
+
+    model = MADDPG("MlpPolicy", Given(), **SMALL)
+    model.learn(50, callback=CurriculumCallback(0.9, window=10))
+    assert model.curriculum_level == raised
+
+
+def test_the_level_survives_the_model_file(tmp_path):
+    model = MADDPG("MlpPolicy", Levelled(), **SMALL).learn(60, callback=CurriculumCallback(window=10))
+    assert model.curriculum_level == 1
+    model.save(tmp_path / "model")
+    env = Levelled()
+    resumed = MADDPG.load(tmp_path / "model", env=env)
+    resumed.learn(20, callback=CurriculumCallback(window=10), reset_num_timesteps=False)
+    assert env.levels_set == [1]
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_every_training_environment_is_raised_for_any_algorithm(vec_env_cls):
+    env = make_vec_env(Levelled, 2, vec_env_cls=vec_env_cls)
+    PPO("MlpPolicy", env, n_steps=40, batch_size=40, n_epochs=1).learn(80, callback=CurriculumCallback(window=10))
+    assert env.get_attr("level") == [1, 1]
+    env.close()
+
+
+def test_evaluation_neither_counts_nor_changes():
+    evaluation = Levelled()
+    callbacks = [CurriculumCallback(window=1000), EvalCallback(Monitor(evaluation), n_eval_episodes=20, eval_freq=10)]
+    model = MADDPG("MlpPolicy", Levelled(), **SMALL).learn(60, callback=callbacks)
+    assert model.curriculum_level == 0
+    assert evaluation.levels_set == []
+
+
+def test_an_environment_without_curriculum_is_refused():
+    with pytest.raises(ValueError, match="`n_curriculum_levels`, which this one lacks"):
+        MADDPG("MlpPolicy", OwnBit(), **SMALL).learn(20, callback=CurriculumCallback())
+
+
+def test_an_environment_that_never_says_whether_it_succeeded_is_refused():
+    class Silent(OwnBit):
+        n_curriculum_levels = 2
+
+        def set_curriculum_level(self, level: int) -> None:
+            assert level == 0
+
+    with pytest.raises(ValueError, match="is_success"):
+        MADDPG("MlpPolicy", Silent(), **SMALL).learn(20, callback=CurriculumCallback())
+
+
+@pytest.mark.parametrize("kwargs", [{"success_threshold": 0.0}, {"success_threshold": 1.1}, {"window": 0}])
+def test_bad_arguments_are_refused(kwargs):
+    with pytest.raises(ValueError, match="choose"):
+        CurriculumCallback(**kwargs)
+
+
+def test_metrics_of_another_algorithm(tmp_path):
+    env = make_vec_env(Levelled, 2)
+    model = PPO("MlpPolicy", env, n_steps=20, batch_size=40, n_epochs=1)
+    logged = []
+
+    class Spy(MetricsCallback):
+        def _on_rollout_end(self) -> None:
+            logged.append(dict(self.logger.name_to_value))
+
+    model.learn(80, callback=Spy())
+    assert [values["task/level"] for values in logged] == [0, 0]
+    assert all(0.3 < values["task/mean_action"] < 0.7 for values in logged)
+    assert np.diff([values["task/mean_action"] for values in logged]) != 0

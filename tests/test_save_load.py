@@ -1,0 +1,150 @@
+"""Files: what a saved model brings back, how it is resumed, and what happens when a file or an environment is wrong."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_maddpg import MADDPG
+from sb3_maddpg.team_tasks import OtherBit, OwnBit
+
+SMALL = {"learning_starts": 20, "batch_size": 16, "train_freq": 5, "buffer_size": 1000, "seed": 0}
+OBS = np.random.default_rng(0).choice([-1.0, 1.0], (50, 3, 3)).astype(np.float32)
+
+
+def learned(env="OwnBit-v0", steps: int = 100, **kwargs) -> MADDPG:
+    return MADDPG("MlpPolicy", env, **{**SMALL, **kwargs}).learn(steps)
+
+
+def assert_equal_state(a: dict, b: dict) -> None:
+    """Networks and optimizers, leaf by leaf."""
+    for x, y in zip(th.utils._pytree.tree_leaves(a), th.utils._pytree.tree_leaves(b), strict=True):
+        assert th.equal(x, y) if isinstance(x, th.Tensor) else x == y
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_a_loaded_model_is_the_saved_one(tmp_path, share):
+    kwargs = {"net_arch": [8], "share_actor": share, "share_critic": share, "threshold": 0.3}
+    model = learned(policy_kwargs=kwargs, estimator="score", max_grad_norm=None)
+    model.curriculum_level = 2
+    model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model.zip")
+    assert_equal_state(model.get_parameters(), loaded.get_parameters())
+    assert np.array_equal(model.predict(OBS, deterministic=True)[0], loaded.predict(OBS, deterministic=True)[0])
+    th.manual_seed(1)
+    exploring = model.predict(OBS)[0]
+    th.manual_seed(1)
+    assert np.array_equal(exploring, loaded.predict(OBS)[0])
+    for name in ("estimator", "max_grad_norm", "buffer_size", "num_timesteps", "_n_updates", "curriculum_level"):
+        assert getattr(loaded, name) == getattr(model, name)
+    assert loaded.policy.threshold == loaded.policy.actor.threshold == 0.3
+
+
+def test_a_resumed_run_is_the_uninterrupted_one(tmp_path):
+    """With the buffer and the state of the random generators, parameter by parameter."""
+    whole = learned()
+    whole.save(tmp_path / "model")
+    whole.save_replay_buffer(tmp_path / "buffer")
+    resumed = MADDPG.load(tmp_path / "model", env=OwnBit(), force_reset=False)
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    for name in ("observations", "actions", "agent_rewards", "agent_terminated", "dones", "timeouts"):
+        assert np.array_equal(getattr(whole.replay_buffer, name), getattr(resumed.replay_buffer, name))
+    results = []
+    for model in (whole, resumed):
+        model.set_env(OwnBit())
+        model.set_random_seed(7)
+        results.append(model.learn(100, reset_num_timesteps=False))
+    assert results[0].num_timesteps == results[1].num_timesteps == 200
+    assert_equal_state(results[0].get_parameters(), results[1].get_parameters())
+
+
+def test_set_parameters_restores_networks_and_optimizers(tmp_path):
+    model = learned()
+    model.save(tmp_path / "model")
+    other = learned(seed=1)
+    other.set_parameters(tmp_path / "model")
+    assert_equal_state(model.get_parameters(), other.get_parameters())
+
+
+def test_a_model_without_environment_takes_no_memory_until_it_gets_one(tmp_path):
+    learned(buffer_size=500).save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model")
+    assert loaded.buffer_size == 500
+    assert loaded.replay_buffer.buffer_size == 1
+    loaded.set_env(OwnBit())
+    assert loaded.replay_buffer.buffer_size == 500
+    loaded.learn(100, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 200
+    assert loaded.replay_buffer.size() == 100
+
+
+def test_set_env_keeps_a_filled_memory():
+    model = learned()
+    memory = model.replay_buffer
+    model.set_env(OwnBit())
+    assert model.replay_buffer is memory
+
+
+def test_the_training_environment_is_written_as_json(tmp_path):
+    env = make_vec_env("OwnBit-v0", 1, env_kwargs={"episode_length": 7})
+    model = learned(env)
+    model.save(tmp_path / "model")
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        assert json.loads(archive.read("data"))["env_spec"] == {"id": "OwnBit-v0", "kwargs": {"episode_length": 7}}
+    assert MADDPG.load(tmp_path / "model").env_spec == model.env_spec
+    model.set_env(OwnBit())  # not made by gymnasium.make
+    assert model.env_spec is None
+
+
+def test_paths_as_in_sb3(tmp_path):
+    model = learned()
+    model.save(str(tmp_path / "new" / "folder" / "a"))
+    model.save(tmp_path / "b.model")
+    stream = io.BytesIO()
+    model.save(stream)
+    stream.seek(0)
+    for saved in (tmp_path / "new" / "folder" / "a.zip", tmp_path / "b.model", stream):
+        assert_equal_state(MADDPG.load(saved).get_parameters(), model.get_parameters())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.model", "new"]
+    assert (tmp_path / "b.model").stat().st_mode & 0o777 == (tmp_path / "new/folder/a.zip").stat().st_mode & 0o777
+
+
+def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path):
+    model = learned()
+    model.save(tmp_path / "model")
+    before = (tmp_path / "model.zip").read_bytes()
+
+    class Unwritable:
+        def __reduce__(self):
+            raise OSError("disk full")
+
+    model.policy_kwargs = {"activation_fn": Unwritable()}
+    with pytest.raises(OSError, match="disk full"):
+        model.save(tmp_path / "model")
+    assert (tmp_path / "model.zip").read_bytes() == before
+    model.replay_buffer.device = Unwritable()
+    with pytest.raises(OSError, match="disk full"):
+        model.save_replay_buffer(tmp_path / "buffer")
+    assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "empty"])
+def test_a_bad_file_is_refused(tmp_path, kind):
+    path = tmp_path / "model.zip"
+    if kind != "missing":
+        learned().save(path)
+        path.write_bytes(path.read_bytes()[:5000] if kind == "truncated" else b"")
+    with pytest.raises((ValueError, FileNotFoundError), match=r"model\.zip"):
+        MADDPG.load(path)
+
+
+def test_another_team_is_refused_with_both_spaces_and_a_remedy(tmp_path):
+    model = learned()
+    model.save(tmp_path / "model")
+    for refused in (lambda: MADDPG.load(tmp_path / "model", env=OtherBit()), lambda: model.set_env(OtherBit())):
+        with pytest.raises(ValueError, match=r"\(3, 3\).*\(2, 2\).*env_spec"):
+            refused()

@@ -1,0 +1,109 @@
+"""Gymnasium's vector environments under Stable-Baselines3: the same transitions as its own DummyVecEnv."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
+from sb3_maddpg.vec_env import GymnasiumVecEnv
+
+SAME_STEP = {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+
+def cartpoles(num_envs: int) -> GymnasiumVecEnv:
+    envs = gymnasium.make_vec("CartPole-v1", num_envs, "sync", vector_kwargs=SAME_STEP, max_episode_steps=15)
+    return GymnasiumVecEnv(envs)
+
+
+def test_same_transitions_as_dummy_vec_env():
+    """With time limits and failures, so that both ends of an episode occur."""
+    mine = cartpoles(4)
+    theirs = DummyVecEnv([lambda: gymnasium.make("CartPole-v1", max_episode_steps=15) for _ in range(4)])
+    mine.seed(7)
+    theirs.seed(7)
+    assert np.array_equal(mine.reset(), theirs.reset())
+    rng = np.random.default_rng(0)
+    ends = set()
+    for step in range(120):
+        # Upright for a while (time limit), then pushed over (failure).
+        actions = np.full(4, step % 2) if step < 60 else rng.integers(0, 2, 4) * 0
+        (obs, rewards, dones, infos), (obs2, rewards2, dones2, infos2) = mine.step(actions), theirs.step(actions)
+        assert np.array_equal(obs, obs2)
+        assert np.array_equal(rewards, rewards2)
+        assert rewards.dtype == rewards2.dtype
+        assert np.array_equal(dones, dones2)
+        for info, info2, done in zip(infos, infos2, dones, strict=True):
+            assert info["TimeLimit.truncated"] == info2["TimeLimit.truncated"]
+            assert ("terminal_observation" in info) == ("terminal_observation" in info2) == done
+            if done:
+                assert np.array_equal(info["terminal_observation"], info2["terminal_observation"])
+                ends.add(info["TimeLimit.truncated"])
+    assert ends == {True, False}
+
+
+def test_trains_an_sb3_algorithm_with_episode_statistics():
+    env = VecMonitor(cartpoles(4))
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=64, seed=0)
+    model.learn(512)
+    assert {info["l"] for info in model.ep_info_buffer} <= set(range(1, 16))
+    assert len(model.ep_info_buffer) > 10
+
+
+def test_attributes_and_methods_reach_the_vector_environment():
+    env = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=3, scenario="curriculum"))
+    assert env.get_attr("n_curriculum_levels") == [4, 4, 4]
+    assert env.has_attr("n_curriculum_levels")
+    assert not env.has_attr("no_such_thing")
+    env.env_method("set_curriculum_level", 2)
+    assert env.envs.unwrapped.task.sampler.level == 2
+    assert env.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
+    with pytest.raises(ValueError, match="concerns all 3"):
+        env.env_method("set_curriculum_level", 2, indices=[0])
+
+
+def test_final_info_and_reset_info_are_kept_apart():
+    env = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=2, max_steps=3))
+    env.seed(1)
+    env.reset()
+    for _ in range(3):
+        *_, dones, infos = env.step(np.ones((2, 12), dtype=np.int8))
+    assert dones.all()
+    for info in infos:
+        assert info["TimeLimit.truncated"]
+        assert info["metrics"]["comm/request_share"] == 1.0
+        assert info["terminal_observation"].shape == (4, 24)
+    assert all("is_success" not in info for info in env.step(np.ones((2, 12), dtype=np.int8))[3])
+
+
+def test_seeds_repeat():
+    def rollout() -> np.ndarray:
+        env = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=2, max_steps=5))
+        env.seed(3)
+        first = env.reset()
+        return np.array([first, *(env.step(np.zeros((2, 12)))[0] for _ in range(12))])
+
+    assert np.array_equal(rollout(), rollout())
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_refuses_other_autoreset_modes(mode):
+    envs = gymnasium.make_vec("CartPole-v1", 2, "sync", vector_kwargs={"autoreset_mode": mode})
+    with pytest.raises(ValueError, match="SAME_STEP"):
+        GymnasiumVecEnv(envs)
+
+
+def test_agrees_with_single_environments_under_sb3():
+    kwargs = {"scenario": "random", "max_steps": 6}
+    many = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=2, **kwargs))
+    single = make_vec_env("QuadSwarm-v0", n_envs=2, env_kwargs=kwargs)
+    many.seed(4)
+    single.seed(4)
+    assert np.array_equal(many.reset(), single.reset())
+    for _ in range(15):
+        actions = np.ones((2, 12), dtype=np.int8)
+        for mine, theirs in zip(many.step(actions)[:3], single.step(actions)[:3], strict=True):
+            assert np.array_equal(mine, theirs)

@@ -1,0 +1,214 @@
+"""The command line, with a package of its own that brings an environment, a callback and an evaluator."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_maddpg import MADDPG
+from sb3_maddpg.zoo import main
+
+PACKAGE = """
+import json, sys
+import gymnasium
+from stable_baselines3.common.callbacks import BaseCallback
+from sb3_maddpg.team_tasks import OwnBit
+
+MADE = []  # arguments of every environment, in order
+PROGRESS = []
+
+class Arena(OwnBit):
+    def __init__(self, flavour="plain", spice=0, render_mode=None):
+        super().__init__(render_mode=render_mode)
+        MADE.append({"flavour": flavour, "spice": spice, "render_mode": render_mode})
+
+class Watch(BaseCallback):
+    def __init__(self, interrupt_at=-1):
+        super().__init__()
+        self.interrupt_at = interrupt_at
+    def _on_step(self):
+        PROGRESS.append(self.model._current_progress_remaining)
+        if self.num_timesteps == self.interrupt_at:
+            raise KeyboardInterrupt
+        return True
+
+def evaluate(argv):
+    print(json.dumps(argv))
+    return 3
+
+if "Arena-v0" not in gymnasium.registry:
+    gymnasium.register("Arena-v0", entry_point="arena:Arena")
+"""
+RECIPE = {
+    "n_timesteps": 200,
+    "policy": "MlpPolicy",
+    "policy_kwargs": {"net_arch": [8]},
+    "learning_starts": 100,
+    "train_freq": 10,
+    "batch_size": 16,
+    "buffer_size": 1000,
+    "learning_rate": "lin_0.01",
+    "noise_type": None,
+    "env_kwargs": {"flavour": "sweet", "spice": 1},
+    "eval_env_kwargs": {"flavour": "sour"},
+    "callback": ["arena.Watch"],
+}
+
+
+@pytest.fixture
+def arena(tmp_path, monkeypatch):
+    """An installed package, as far as Python can tell."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "arena.py").write_text(PACKAGE)
+    info = tmp_path / "site" / "arena-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: arena\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(
+        "[sb3_maddpg.environments]\narena = arena\n[sb3_maddpg.evaluators]\nArena-v0 = arena:evaluate\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.chdir(tmp_path)
+    sys.modules.pop("arena", None)
+    yield importlib.import_module("arena")
+    sys.modules.pop("arena", None)
+
+
+def write(recipe: dict, env: str = "Arena-v0") -> str:
+    with open("recipe.yml", "w") as file:
+        yaml.safe_dump({env: recipe}, file)
+    return "recipe.yml"
+
+
+def train(*argv: str, recipe: dict | None = None) -> int:
+    conf = write({**RECIPE, **(recipe or {})})
+    return main(["train", "--env", "Arena-v0", "--conf-file", conf, "--verbose", "0", "--seed", "1", *argv])
+
+
+def test_arguments_of_the_environment_reach_training_and_evaluation(arena, tmp_path, capsys):
+    assert train("--env-kwargs", "spice:7", "--eval-freq", "100", "--eval-episodes", "1") == 0
+    assert {(made["flavour"], made["spice"]) for made in arena.MADE} == {("sweet", 7), ("sour", 7)}
+    run = tmp_path / "logs" / "maddpg" / "Arena-v0_1"
+    assert {"Arena-v0.zip", "best_model.zip", "0.monitor.csv"} <= {path.name for path in run.iterdir()}
+    assert yaml.safe_load((run / "Arena-v0" / "config.yml").read_text())["env_kwargs"] == {
+        "flavour": "sweet",
+        "spice": 7,
+    }
+    assert MADDPG.load(run / "Arena-v0.zip").env_spec == {"id": "Arena-v0", "kwargs": {"flavour": "sweet", "spice": 7}}
+    assert "logs/maddpg/Arena-v0_1/Arena-v0.zip" in capsys.readouterr().out
+
+
+def test_resuming_goes_on_where_training_ended(arena):
+    assert train("--eval-freq", "-1", "--save-replay-buffer") == 0
+    assert arena.PROGRESS[0] == pytest.approx(1.0, abs=0.01)
+    arena.PROGRESS.clear()
+    assert train("--eval-freq", "-1", "--save-replay-buffer", "-i", "logs/maddpg/Arena-v0_1/Arena-v0.zip") == 0
+    model = MADDPG.load("logs/maddpg/Arena-v0_2/Arena-v0.zip")
+    assert model.num_timesteps == 400
+    # 100 steps of warm-up, once, then an update every 10 steps
+    assert model._n_updates == 30
+    # The schedule goes on instead of starting again
+    assert arena.PROGRESS[1] == pytest.approx(0.5, abs=0.01)
+    model.load_replay_buffer("logs/maddpg/Arena-v0_2/replay_buffer.pkl")
+    assert model.replay_buffer.size() == 400
+
+
+def test_an_interrupted_training_is_saved(arena):
+    recipe = {"callback": [{"arena.Watch": {"interrupt_at": 150}}]}
+    assert train("--eval-freq", "-1", "--progress", recipe=recipe) == 0
+    assert MADDPG.load("logs/maddpg/Arena-v0_1/Arena-v0.zip").num_timesteps == 150
+
+
+@pytest.mark.parametrize(
+    ("recipe", "argv", "message"),
+    [
+        ({"estimatr": "score"}, [], "Unknown key in the recipe for maddpg 'estimatr': did you mean 'estimator'?"),
+        ({}, ["-params", "taau:0.1"], "did you mean 'tau'?"),
+        ({"policy_kwargs": {"net_arc": [8]}}, [], "did you mean 'net_arch'?"),
+        ({"estimator": "expect"}, [], "did you mean 'expected'?"),
+    ],
+)
+def test_a_name_that_nothing_reads_is_refused(arena, capsys, recipe, argv, message):
+    assert train(*argv, "--eval-freq", "-1", recipe=recipe) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_debug_shows_where_an_error_came_from(arena):
+    with pytest.raises(ValueError, match="estimatr"):
+        train("--debug", recipe={"estimatr": "score"})
+
+
+def test_watching_and_recording_use_the_training_environment(arena, tmp_path, capsys):
+    assert train("--env-kwargs", "spice:7", "--eval-freq", "-1") == 0
+    for command in ("enjoy", "record"):
+        arena.MADE.clear()
+        assert main([command, "--env", "Arena-v0", "-n", "25", "--env-kwargs", "flavour:'salty'"]) == 0
+        assert {(made["flavour"], made["spice"]) for made in arena.MADE} == {("salty", 7)}
+    assert "2 Episodes" in capsys.readouterr().out
+    (video,) = (tmp_path / "logs").rglob("*.mp4")
+    assert video.stat().st_size > 500
+    assert main(["enjoy", "--env", "Arena-v1"]) == 2
+    assert "did you mean 'Arena-v0'" in capsys.readouterr().err
+
+
+def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
+    runs = Path("logs/maddpg")
+    for run, name in ((2, "Arena-v0.zip"), (2, "best_model.zip"), (10, "best_model.zip"), (11, "0.monitor.csv")):
+        (runs / f"Arena-v0_{run}").mkdir(parents=True, exist_ok=True)
+        (runs / f"Arena-v0_{run}" / name).touch()
+    newest = "logs/maddpg/Arena-v0_10"
+    assert main(["evaluate", "--env", "Arena-v0", "--policy", "none", "latest:logs", "--seed", "4"]) == 3
+    assert json.loads(capsys.readouterr().out) == ["--policy", "none", f"{newest}/best_model.zip", "--seed", "4"]
+    Path(newest, "Arena-v0.zip").touch()
+    assert main(["evaluate", "--env", "Arena-v0", "latest:logs"]) == 3
+    assert json.loads(capsys.readouterr().out) == [f"{newest}/Arena-v0.zip"]
+    assert main(["evaluate", "--env", "Arena-v0", "--algo", "ppo", "none"]) == 3
+    assert json.loads(capsys.readouterr().out) == ["none", "--algo", "stable_baselines3.ppo.ppo:PPO"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--env", "Arena-v0", "latest:logs"], "no trained model of maddpg for Arena-v0 in logs/maddpg"),
+        (["--env", "Arena-v1", "none"], "did you mean 'Arena-v0'"),
+        (["--env", "Arena-v0", "--algo", "madpg"], "did you mean 'maddpg'"),
+    ],
+)
+def test_evaluation_that_cannot_be_is_refused(arena, capsys, argv, message):
+    assert main(["evaluate", *argv]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_hyperparameters_are_searched(arena, capsys):
+    recipe = {"n_timesteps": 150, "learning_rate": 0.01, "callback": None}
+    argv = ["-optimize", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+    assert train(*argv, "--sampler", "random", "--pruner", "none", recipe=recipe) == 0
+    out = capsys.readouterr().out
+    assert "Number of finished trials:  2" in out
+    assert "policy_regularization:" in out
+
+
+@pytest.mark.parametrize("algo", ["maddpg", "ppo"])
+def test_the_packaged_recipes_train_the_swarm(algo, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ["learning_starts:50", "train_freq:25"] if algo == "maddpg" else ["n_steps:16", "batch_size:32"]
+    argv = ["train", "--algo", algo, "--env", "QuadSwarm-v0", "-n", "100", "--eval-freq", "64", "--eval-episodes", "1"]
+    assert main([*argv, "--n-eval-envs", "1", "-params", *small]) == 0
+    assert (tmp_path / "logs" / algo / "QuadSwarm-v0_1" / "QuadSwarm-v0.zip").is_file()
+    out = capsys.readouterr().out
+    assert f"zoo_configs/{algo}.yml" in out
+    assert "eval_env_kwargs={'preset': 'paper', 'scenario': 'mixed', 'scale_observation': True}" in out
+
+
+def test_as_a_command(tmp_path):
+    command = [sys.executable, "-m", "sb3_maddpg.zoo"]
+    shown = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
+    assert all(word in shown for word in ("train", "enjoy", "record", "evaluate", "latest:LOGDIR"))
+    argv = ["train", "--env", "OwnBit-v0", "-n", "600", "--vec-env", "subproc", "--eval-freq", "-1", "--verbose", "0"]
+    subprocess.run([*command, *argv, "-params", "n_envs:2"], check=True, cwd=tmp_path)
+    assert MADDPG.load(tmp_path / "logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip").num_timesteps == 600
