@@ -310,17 +310,20 @@ def main() -> None:
     parser.add_argument("--n-robots", type=int, nargs="+", default=ROBOTS, help="default 4 8 16")
     parser.add_argument("--n-envs", type=int, nargs="+", default=ENVIRONMENTS, help="default 1 4 16 64")
     args = parser.parse_args()
+    target = args.json.absolute() if args.json else None
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     print("solver            N   n envs real     iters success     median        p99  x ipopt  x fatrop   x hpipm")
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)  # CasADi compiles in the working directory
         for horizon in args.horizon:
             for n_robots in args.n_robots:
                 rows += compare(n_robots, horizon, args.n_envs, args.full, Path(folder))
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+        os.chdir(Path(__file__).parent)
+    if target:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
 
 
 if __name__ == "__main__":
