@@ -2,10 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-STEPS ?= 200000
+STEPS ?= 1000000
 SEED ?= 0
 LOGS ?= logs
-EPISODES ?= 100
+EPISODES ?= 500
 JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
 POLICIES ?= none full distance:4 cpa:0.7:1.5
 

@@ -36,8 +36,8 @@ Train, watch and compare teams with rl_zoo3, MADDPG and the installed environmen
   evaluate  compare policies with the environment's own evaluator; `latest:LOGDIR` stands for the newest model there
 
 `<command> --help` lists a command's options, which are those of rl_zoo3. What differs: --algo is maddpg unless given,
-the packaged recipe is used unless --conf-file is given, --env-kwargs are merged over the recipe's, and
--i MODEL.zip continues the training where it ended."""
+the packaged recipe is used unless --conf-file is given, --env-kwargs are merged over the recipe's, --num-threads is 1
+unless given, and -i MODEL.zip continues the training where it ended."""
 EPILOG = """\
 examples:
   python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --progress --tensorboard-log logs/tensorboard
@@ -94,7 +94,8 @@ def train(argv: list[str]) -> int:
     parser = _parser()
     parser.add_argument("-conf", "--conf-file")
     known, _ = parser.parse_known_args(argv)
-    argv = ["--algo", known.algo, *argv]
+    # One thread unless asked otherwise: small networks gain nothing by a second and lose badly where it is not free.
+    argv = ["--algo", known.algo, "--num-threads", "1", *argv]
     if known.env is not None and known.conf_file is None:
         path = packaged_config(known.algo, known.env)
         argv += ["--conf-file", path] if path is not None else []
