@@ -1,4 +1,4 @@
-"""The planner: the optimum against an independent transcription, and every rung of the ladder with the real solver."""
+"""The reference solver: its optimum against an independent transcription, and every rung of the ladder with it."""
 
 import math
 import pickle
@@ -68,7 +68,7 @@ def single_shooting_cost(config: PlannerConfig, n_others: int) -> ca.Function:
 def test_finds_what_ipopt_finds_on_another_transcription(horizon):
     config = PlannerConfig(horizon=horizon)
     problems = crossing(12, config)
-    plans = make_planner(config, QUADROTOR, 3).plan(problems, hover(problems, config))
+    plans = make_planner(config, QUADROTOR, 3, "fatrop").plan(problems, hover(problems, config))
     assert (plans.status == PlanStatus.SOLVED).all()
     cost = single_shooting_cost(config, 2)
     u = ca.SX.sym("u", 3, horizon)
@@ -93,7 +93,7 @@ def test_finds_what_ipopt_finds_on_another_transcription(horizon):
 def test_plans_obey_dynamics_and_limits():
     config = PlannerConfig()
     problems = crossing(10, config)
-    plans = make_planner(config, QUADROTOR, 3).plan(problems, hover(problems, config))
+    plans = make_planner(config, QUADROTOR, 3, "fatrop").plan(problems, hover(problems, config))
     model = QuadrotorModel(QUADROTOR, config.dt)
     np.testing.assert_allclose(plans.x, model.rollout(problems.x, plans.u), atol=1e-4)
     limits = np.array([config.max_tilt, config.max_tilt, config.max_climb_rate, 0.0])
@@ -107,7 +107,7 @@ def test_keeps_the_separation_where_it_can():
     x[0, :4] = [-1.5, 0, 1.5, 1.0]
     standing = np.tile([0.0, 0.05, 1.5], (config.horizon, 1))
     problems = Problems(x, np.array([[3.0, 0, 1.5]]), standing[None, None])
-    planner = make_planner(config, QUADROTOR, 2)
+    planner = make_planner(config, QUADROTOR, 2, "fatrop")
     plans = hover(problems, config)
     closest = np.inf
     for _ in range(40):
@@ -122,7 +122,7 @@ def test_order_of_the_others_does_not_matter():
     config = PlannerConfig()
     problems = crossing(6, config, n_others=3)
     swapped = problems._replace(others=problems.others[:, [2, 0, 1]])
-    planner = make_planner(config, QUADROTOR, 4)
+    planner = make_planner(config, QUADROTOR, 4, "fatrop")
     first = planner.plan(problems, hover(problems, config))
     second = planner.plan(swapped, hover(problems, config))
     np.testing.assert_allclose(first.x, second.x, atol=2e-3)
@@ -132,7 +132,7 @@ def test_yaw_can_be_planned_too():
     config = PlannerConfig(max_yaw_rate=math.radians(90))
     problems = crossing(2, config)
     problems.x[:, 8] = [0.5, -0.5]
-    plans = make_planner(config, QUADROTOR, 3).plan(problems, hover(problems, config))
+    plans = make_planner(config, QUADROTOR, 3, "fatrop").plan(problems, hover(problems, config))
     assert (plans.status == PlanStatus.SOLVED).all()
     assert (np.abs(plans.x[:, -1, 8]) < 0.05).all()
 
@@ -140,7 +140,7 @@ def test_yaw_can_be_planned_too():
 def test_a_batch_solves_each_problem_as_if_alone():
     config = PlannerConfig()
     problems = crossing(5, config)
-    planner = make_planner(config, QUADROTOR, 3)
+    planner = make_planner(config, QUADROTOR, 3, "fatrop")
     together = planner.plan(problems, hover(problems, config))
     for b in range(5):
         alone = Problems(*(field[b : b + 1] for field in problems))
@@ -150,7 +150,7 @@ def test_a_batch_solves_each_problem_as_if_alone():
 def test_a_bad_lane_brakes_and_leaves_its_neighbours_alone():
     config = PlannerConfig()
     problems = crossing(3, config)
-    planner = make_planner(config, QUADROTOR, 3)
+    planner = make_planner(config, QUADROTOR, 3, "fatrop")
     good = planner.plan(problems, hover(problems, config))
     broken = problems._replace(others=problems.others.copy())
     broken.others[1, 0, 3] = np.nan
@@ -184,14 +184,14 @@ def test_flies_the_last_plan_on_while_it_lasts_and_then_brakes():
 def test_a_cold_retry_rescues_a_hopeless_guess():
     config = PlannerConfig()
     problems = crossing(2, config)
-    planner = make_planner(config, QUADROTOR, 3)
+    planner = make_planner(config, QUADROTOR, 3, "fatrop")
     absurd = hover(problems, config)._replace(x=np.full((2, config.horizon + 1, 9), np.nan))
     plans = planner.plan(problems, absurd)
     assert (plans.status == PlanStatus.RETRIED).all()
 
 
 def test_braking_stops_from_full_speed():
-    planner = make_planner(PlannerConfig(horizon=60), QUADROTOR, 2)
+    planner = make_planner(PlannerConfig(horizon=60), QUADROTOR, 2, "fatrop")
     x = np.zeros((1, 9))
     x[0, 3:6] = [3.0, -3.0, 1.0]
     states = planner.model.rollout(x, planner.braking_inputs(x))
@@ -202,7 +202,7 @@ def test_braking_stops_from_full_speed():
 def test_survives_pickling():
     config = PlannerConfig()
     problems = crossing(2, config)
-    planner = make_planner(config, QUADROTOR, 3)
+    planner = make_planner(config, QUADROTOR, 3, "fatrop")
     expected = planner.plan(problems, hover(problems, config))
     copy = pickle.loads(pickle.dumps(planner))
     assert np.array_equal(copy.plan(problems, hover(problems, config)).x, expected.x)

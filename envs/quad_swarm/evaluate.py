@@ -18,6 +18,7 @@ import yaml
 
 from .errors import unknown_name
 from .evaluation import Cell, evaluate
+from .planner import BuildError
 from .presets import PRESET_VERSION, PRESETS, make_config
 from .scenarios import SCENARIOS, ScenarioSampler
 from .swarm import Swarm
@@ -121,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     try:
         _run(args)
-    except (ValueError, FileNotFoundError, ModuleNotFoundError) as error:
+    except (ValueError, FileNotFoundError, ModuleNotFoundError, BuildError) as error:
         if args.debug:
             raise
         print(f"error: {error}", file=sys.stderr)

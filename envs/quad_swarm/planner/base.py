@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..quadrotor import N_INPUTS, POSITION, QuadrotorModel
+from ..quadrotor import N_INPUTS, QuadrotorModel
 from .problem import PlannerConfig
 
 
@@ -142,10 +142,9 @@ class Planner:
         kept = self.config.max_neighbours
         if kept is None or kept >= problems.others.shape[1]:
             return problems
-        offset = problems.others - x_guess[:, None, 1:, POSITION]
-        closest = np.einsum("bjki,bjki->bjk", offset, offset).min(axis=2)
-        nearest = np.sort(np.argsort(closest, axis=1, kind="stable")[:, :kept], axis=1)
-        return problems._replace(others=np.take_along_axis(problems.others, nearest[:, :, None, None], axis=1))
+        squared = sum((problems.others[..., i] - x_guess[:, None, 1:, i]) ** 2 for i in range(3))
+        nearest = np.sort(np.argsort(squared.min(axis=2), axis=1, kind="stable")[:, :kept], axis=1)
+        return problems._replace(others=problems.others[np.arange(len(nearest))[:, None], nearest])
 
     def braking_inputs(self, x: np.ndarray) -> np.ndarray:
         """Inputs that bring robots to hover without a solver, from their states alone: (B, 9) -> (B, N, 4).

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,20 +26,30 @@ class FatropSolver:
         self.problem = problem
         self.tolerance = tolerance
         self.max_iterations = max_iterations
-        self._program: _Program | None = None
+        self._program: Program | None = None
+        self._solver: ca.Function | None = None
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """See `Solver.solve`."""
-        if self._program is None:
-            self._program = _transcribe(self.problem, self.tolerance, self.max_iterations)
-        program, nx, nu = self._program, self.problem.nx, self.problem.nu
+        if self._program is None or self._solver is None:
+            self._program = transcribe(self.problem)
+            options = {
+                "print_time": False,
+                "error_on_fail": False,
+                "fatrop.print_level": 0,
+                "fatrop.tolerance": self.tolerance,
+                "fatrop.mu_init": 1e-2,
+                "fatrop.max_iter": self.max_iterations,
+            }
+            self._solver = ca.nlpsol("planner", "fatrop", self._program.nlp, self._program.structure | options)
+        program, solver, nx, nu = self._program, self._solver, self.problem.nx, self.problem.nu
         count, horizon = u_guess.shape[:2]
         x = np.zeros((count, horizon + 1, N_STATES))
         u = np.zeros((count, horizon, N_INPUTS))
         x[:, 0] = problems.x
         success = np.zeros(count, dtype=bool)
         iterations = np.zeros(count, dtype=np.int64)
-        variables = np.zeros(program.n_variables)
+        variables = np.zeros(program.bounds["lbx"].size)
         for b in range(count):
             parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], problems.others[b].ravel()])
             variables[program.x_index] = x_guess[b, 1:, :nx]
@@ -47,10 +57,10 @@ class FatropSolver:
             if not (np.isfinite(parameters).all() and np.isfinite(variables).all()):
                 continue
             try:
-                solution = program.solver(x0=variables, p=parameters, **program.bounds)
+                solution = solver(x0=variables, p=parameters, **program.bounds)
             except RuntimeError:  # fatrop gave up on the numbers; the ladder takes over
                 continue
-            stats = program.solver.stats()
+            stats = solver.stats()
             success[b], iterations[b] = stats["success"], stats["iter_count"]
             optimum = solution["x"].full().ravel()
             success[b] &= np.isfinite(optimum).all()
@@ -59,20 +69,27 @@ class FatropSolver:
         return Solution(x, u, success, iterations)
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"_program": None}  # rebuilt in the process that needs it
+        return self.__dict__ | {"_program": None, "_solver": None}  # rebuilt in the process that needs it
 
 
-class _Program(NamedTuple):
-    """The transcribed program and where states and inputs stand among its variables."""
+class Program(NamedTuple):
+    """The problem as a nonlinear program.
 
-    solver: ca.Function
+    :param nlp: variables ``x``, parameters ``p`` (present state, goal, others), cost ``f``, constraints ``g``
+    :param bounds: of variables and constraints
+    :param structure: fatrop's description of the stages
+    :param x_index: where the states at stages 1..N stand among the variables, (N, nx)
+    :param u_index: where the inputs stand, (N, nu)
+    """
+
+    nlp: dict[str, ca.SX]
     bounds: dict[str, np.ndarray]
+    structure: dict[str, Any]
     x_index: np.ndarray
     u_index: np.ndarray
-    n_variables: int
 
 
-def _transcribe(problem: OptimalControlProblem, tolerance: float, max_iterations: int) -> _Program:
+def transcribe(problem: OptimalControlProblem) -> Program:
     """Multiple shooting in fatrop's stage order: x_0 is a parameter, slacks are further inputs of their stage."""
     config, nx, nu, n_others = problem.config, problem.nx, problem.nu, problem.n_others
     horizon = config.horizon
@@ -117,39 +134,27 @@ def _transcribe(problem: OptimalControlProblem, tolerance: float, max_iterations
             constraint_lower.append(np.zeros(n_others))
             equality += [False] * n_others
     bounds = np.concatenate(lower)
-    solver = ca.nlpsol(
-        "planner",
-        "fatrop",
-        {
+    return Program(
+        nlp={
             "x": ca.vertcat(*variables),
             "f": cost,
             "g": ca.vertcat(*constraints),
             "p": ca.vertcat(x0, goal, ca.vec(others)),
         },
-        {
-            "structure_detection": "manual",
-            "N": horizon,
-            "nx": [0] + [nx] * horizon,
-            "nu": [(nu if k < horizon else 0) + n_slacks[k] for k in range(horizon + 1)],
-            "ng": n_slacks,
-            "equality": equality,
-            "print_time": False,
-            "error_on_fail": False,
-            "fatrop.print_level": 0,
-            "fatrop.tolerance": tolerance,
-            "fatrop.mu_init": 1e-2,
-            "fatrop.max_iter": max_iterations,
-        },
-    )
-    return _Program(
-        solver=solver,
         bounds={
             "lbx": bounds,
             "ubx": -bounds,
             "lbg": np.concatenate(constraint_lower),
             "ubg": np.where(equality, 0.0, np.inf),
         },
+        structure={
+            "structure_detection": "manual",
+            "N": horizon,
+            "nx": [0] + [nx] * horizon,
+            "nu": [(nu if k < horizon else 0) + n_slacks[k] for k in range(horizon + 1)],
+            "ng": n_slacks,
+            "equality": equality,
+        },
         x_index=np.array(x_index),
         u_index=np.array(u_index),
-        n_variables=offset,
     )

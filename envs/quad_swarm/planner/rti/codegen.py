@@ -84,9 +84,7 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
                 "direction": ca.gradient(separation, x)[:3],
             },
         ),
-        _emit(
-            "repulsion", {"distance": distance}, {"gradient": 2 * residual * slope, "curvature": 2 * slope * slope}
-        ),
+        _emit("repulsion", {"distance": distance}, {"gradient": 2 * residual * slope, "curvature": 2 * slope * slope}),
     ]
 
 
@@ -198,7 +196,9 @@ def _unpacked_factor(packed: ca.SX, n: int) -> tuple[ca.SX, ca.SX]:
 def _factorise(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
     """L (its part below the unit diagonal) and 1 / D of a positive definite L D L'."""
     n = matrix.shape[0]
-    lower, d, inverse_d = ca.SX(n, n), [], []
+    lower = ca.SX(n, n)
+    d: list[ca.SX] = []
+    inverse_d: list[ca.SX] = []
     for j in range(n):
         d.append(matrix[j, j] - sum((lower[j, k] * (lower[j, k] * d[k]) for k in range(j)), start=ca.SX(0)))
         inverse_d.append(1 / d[j])

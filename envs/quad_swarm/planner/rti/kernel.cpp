@@ -19,7 +19,9 @@ constexpr int INPUT_STRIDE = 4;
 
 struct Options {
   std::int64_t max_iterations;  // of the interior-point method, for each quadratic program
-  double tolerance;             // on the mean complementarity
+  // On the mean complementarity, relative to 1 + COST_IN_TOLERANCE times what violations cost: where that is large,
+  // single precision cannot reach less, and nothing would be gained by it.
+  double tolerance;
 };
 
 // The caller's arrays, all contiguous and of double precision.
@@ -37,12 +39,13 @@ struct Batch {
 constexpr double START_COMPLEMENTARITY = 1.0;
 constexpr double START_SLACK = 0.05;  // least t at the start, where the guess is nearer to the boundary or beyond it
 constexpr double RESIDUAL_TOLERANCE = 2e-3;  // of the linear conditions, over their residual at the start
+constexpr double COST_IN_TOLERANCE = 0.01;    // violations of metres cost thousands; see tolerance in Options
 constexpr double STEP_TO_BOUNDARY = 0.99;
 constexpr double STILL_MOVING = 0.3;  // change of an input over its limit in the last quadratic program
 
 // One inequality h + g z >= -s in the step z. A hard one has no violation s; a soft one pays rho s^2 / 2 for it, which
-// makes s = lambda / rho and lets it be eliminated: `compliance` is 1 / rho, or 0.
-template <class V>
+// makes s = lambda / rho and lets it be eliminated.
+template <class V, bool SOFT>
 struct Inequality {
   V value;              // h, at the point of linearisation
   V slack, multiplier;  // t, lambda > 0 with t = h + g z + lambda / rho at the solution
@@ -57,13 +60,22 @@ struct Inequality {
     multiplier = splat<V>(START_COMPLEMENTARITY) / slack;
   }
 
+  // y + lambda / rho
+  static V relaxed(V y, V lambda) {
+    if constexpr (SOFT) return multiply_add(splat<V>(0.5 / VIOLATION_WEIGHT), lambda, y);
+    return y;
+  }
+
   // w in lambda = c - w (h + g z)
   V weight() const { return multiplier * scaling; }
 
+  // What it pushes with along g at z = 0.
+  V force() const { return negative_multiply_add(weight(), value, offset); }
+
   // Make lambda a linear function of z, for the predictor's target 0. One division serves all that need one.
-  void eliminate(V compliance) {
+  void eliminate() {
     const V product = slack * multiplier;
-    const V sum = multiply_add(compliance, multiplier, slack);
+    const V sum = relaxed(slack, multiplier);
     const V quotient = splat<V>(1) / (product * sum);
     inverse_product = quotient * sum;
     scaling = quotient * product;
@@ -76,25 +88,23 @@ struct Inequality {
     offset = multiply_add(slack, multiplier, aim) * scaling;
   }
 
-  // What it pushes with along g at z = 0.
-  V force() const { return negative_multiply_add(weight(), value, offset); }
-
   // The step of t and lambda that goes with h + g z = `reached`. It may be taken up to 1 / `overshoot`; `curvature`
   // sums the products of the two steps.
-  void direct(V reached, V compliance, V& overshoot, V& curvature) {
+  void direct(V reached, V& overshoot, V& curvature) {
     const V new_multiplier = negative_multiply_add(weight(), reached, offset);
-    slack_step = multiply_add(compliance, new_multiplier, reached) - slack;
+    slack_step = relaxed(reached, new_multiplier) - slack;
     multiplier_step = new_multiplier - multiplier;
     overshoot = maximum(overshoot, -slack_step * multiplier * inverse_product);
     overshoot = maximum(overshoot, -multiplier_step * slack * inverse_product);
     curvature = multiply_add(slack_step, multiplier_step, curvature);
   }
 
-  // Take a part of the step; returns the complementarity reached.
-  V advance(V part) {
+  // Take a part of the step; adds the complementarity reached, and what the violation costs.
+  void advance(V part, V& complementarity, V& cost) {
     slack = multiply_add(part, slack_step, slack);
     multiplier = multiply_add(part, multiplier_step, multiplier);
-    return slack * multiplier;
+    complementarity = multiply_add(slack, multiplier, complementarity);
+    if constexpr (SOFT) cost = multiply_add(multiplier * splat<V>(0.25 / VIOLATION_WEIGHT), multiplier, cost);
   }
 };
 
@@ -108,7 +118,8 @@ struct Stage {
   V direction[N_OTHERS][3];  // from each other robot to this one
   V repulsion_gradient[N_OTHERS], repulsion_curvature[N_OTHERS];
   V bound_sign[N_BOUNDS];
-  Inequality<V> input_low[NU], input_high[NU], bound[N_BOUNDS], separation[N_OTHERS];
+  Inequality<V, false> input_low[NU], input_high[NU];
+  Inequality<V, true> bound[N_BOUNDS], separation[N_OTHERS];
   V factor[N_FACTOR], gain[NU * NX], feedforward[NU];  // of the Riccati recursion
   V du[NU];      // step of the input so far
   V new_du[NU];  // and where the interior-point iteration wants it
@@ -142,8 +153,6 @@ class LaneGroup {
   V x0_[NX], goal_[3];
   V goal_gradient_[NX], goal_hessian_[N_SYMMETRIC];
   Mask iterations_, converged_, moving_;
-  const V soft_ = splat<V>(0.5 / VIOLATION_WEIGHT);
-  const V hard_ = V{};
 
   void load(const Batch& batch, const double* u_guess, const std::int64_t* problems, int count) {
     for (int q = 0; q < W; q++) {
@@ -220,10 +229,12 @@ class LaneGroup {
       overshoot = splat<V>(STEP_TO_BOUNDARY), curvature = V{};
       roll_out_step(overshoot, curvature);
       const V step = splat<V>(STEP_TO_BOUNDARY) / overshoot;
-      complementarity = select<V>(active, advance(active, step), complementarity);
+      V cost;
+      advance(active, step, complementarity, cost);
       residual = select<V>(active, residual - step * residual, residual);
       iterations_ -= active;  // a true mask is -1
-      const Mask done = (complementarity < splat<V>(options.tolerance)) & (residual < splat<V>(RESIDUAL_TOLERANCE));
+      const V tolerance = multiply_add(splat<V>(COST_IN_TOLERANCE * options.tolerance), cost, splat<V>(options.tolerance));
+      const Mask done = (complementarity < tolerance) & (residual < splat<V>(RESIDUAL_TOLERANCE));
       converged_ |= active & done;
       active &= ~done & (complementarity < splat<V>(1e15));  // false for NaN
     }
@@ -238,11 +249,11 @@ class LaneGroup {
     for (int k = N - 1; k >= 0; k--) {
       Stage<V>& s = stages_[k];
       for (int i = 0; i < N_BOUNDS; i++) {
-        s.bound[i].eliminate(soft_);
+        s.bound[i].eliminate();
         p[packed(BOUNDED_STATE[i], BOUNDED_STATE[i])] += s.bound[i].weight();
       }
       for (int j = 0; j < N_OTHERS; j++) {
-        s.separation[j].eliminate(soft_);
+        s.separation[j].eliminate();
         const V weight = s.separation[j].weight() + s.repulsion_curvature[j];
         for (int i = 0; i < 3; i++)
           for (int l = 0; l <= i; l++)
@@ -250,8 +261,8 @@ class LaneGroup {
       }
       V weight[NU];
       for (int i = 0; i < NU; i++) {
-        s.input_low[i].eliminate(hard_);
-        s.input_high[i].eliminate(hard_);
+        s.input_low[i].eliminate();
+        s.input_high[i].eliminate();
         weight[i] = s.input_low[i].weight() + s.input_high[i].weight();
       }
       if (k > 0)
@@ -314,34 +325,36 @@ class LaneGroup {
       }
       std::copy(dx_next, dx_next + NX, dx);
       for (int i = 0; i < NU; i++) {
-        s.input_low[i].direct(s.input_low[i].value + s.new_du[i], hard_, overshoot, curvature);
-        s.input_high[i].direct(s.input_high[i].value - s.new_du[i], hard_, overshoot, curvature);
+        s.input_low[i].direct(s.input_low[i].value + s.new_du[i], overshoot, curvature);
+        s.input_high[i].direct(s.input_high[i].value - s.new_du[i], overshoot, curvature);
       }
       for (int i = 0; i < N_BOUNDS; i++)
-        s.bound[i].direct(multiply_add(s.bound_sign[i], dx[BOUNDED_STATE[i]], s.bound[i].value), soft_, overshoot,
+        s.bound[i].direct(multiply_add(s.bound_sign[i], dx[BOUNDED_STATE[i]], s.bound[i].value), overshoot,
                           curvature);
       for (int j = 0; j < N_OTHERS; j++) {
         V reached = s.separation[j].value;
         for (int i = 0; i < 3; i++) reached = multiply_add(s.direction[j][i], dx[i], reached);
-        s.separation[j].direct(reached, soft_, overshoot, curvature);
+        s.separation[j].direct(reached, overshoot, curvature);
       }
     }
   }
 
-  // Take the step in the active lanes; returns the mean complementarity.
-  V advance(Mask active, V step) {
+  // Take the step in the active lanes; gives their mean complementarity and what violations cost.
+  void advance(Mask active, V step, V& complementarity, V& cost) {
     const V part = select<V>(active, step, V{});
     V sum = V{};
+    cost = V{};
     for (int k = 0; k < N; k++) {
       Stage<V>& s = stages_[k];
       for (int i = 0; i < NU; i++) {
         s.du[i] = select<V>(active, multiply_add(part, s.new_du[i] - s.du[i], s.du[i]), s.du[i]);
-        sum += s.input_low[i].advance(part) + s.input_high[i].advance(part);
+        s.input_low[i].advance(part, sum, cost);
+        s.input_high[i].advance(part, sum, cost);
       }
-      for (int i = 0; i < N_BOUNDS; i++) sum += s.bound[i].advance(part);
-      for (int j = 0; j < N_OTHERS; j++) sum += s.separation[j].advance(part);
+      for (int i = 0; i < N_BOUNDS; i++) s.bound[i].advance(part, sum, cost);
+      for (int j = 0; j < N_OTHERS; j++) s.separation[j].advance(part, sum, cost);
     }
-    return sum * splat<V>(1 / INEQUALITIES);
+    complementarity = select<V>(active, sum * splat<V>(1 / INEQUALITIES), complementarity);
   }
 
   void take_step() {
@@ -411,7 +424,7 @@ void solve_lanes(const Batch& batch, const double* u_guess, const std::int64_t* 
 
 void solve_all(const Batch& batch, const double* u_guess, const std::vector<std::int64_t>& problems,
                std::int64_t rounds, const Options& options) {
-  constexpr std::int64_t wide = VECTOR_BYTES / sizeof(REAL), narrow = wide / 2;
+  constexpr std::int64_t wide = VECTOR_BYTES / sizeof(REAL), narrow = NARROW_VECTOR_BYTES / sizeof(REAL);
   const std::int64_t count = static_cast<std::int64_t>(problems.size());
   for (std::int64_t first = 0; first < count;) {
     const std::int64_t left = count - first;

@@ -39,7 +39,7 @@ class RtiSolver:
         sqp_iterations: int = 2,
         extra_iterations: int = 6,
         precision: str = "float32",
-        max_iterations: int = 25,
+        max_iterations: int = 50,
         tolerance: float = 1e-4,
     ):
         if sqp_iterations < 1 or extra_iterations < 0 or max_iterations < 1:

@@ -1,0 +1,260 @@
+"""The kernel as a piece of software: compilers, cache, processes, sanitizers, and the same bits from every build."""
+
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from quad_swarm import planner
+from quad_swarm.planner import (
+    BuildError,
+    FatropSolver,
+    OptimalControlProblem,
+    PlannerConfig,
+    Problems,
+    RtiSolver,
+    make_planner,
+)
+from quad_swarm.planner.rti import build as build_module
+from quad_swarm.planner.rti.codegen import generate_model
+from quad_swarm.quadrotor import QuadrotorParams
+
+QUADROTOR = QuadrotorParams()
+CONFIG = PlannerConfig(horizon=3)
+SOURCES = Path(build_module.__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("QUAD_SWARM_CACHE", str(tmp_path / "cache"))
+    planner._warn_once.cache_clear()
+    return tmp_path / "cache"
+
+
+def libraries(cache: Path) -> list[str]:
+    return sorted(os.listdir(cache))
+
+
+def solve(precision: str = "float32", solver: RtiSolver | None = None):
+    rng = np.random.default_rng(0)
+    problems = Problems(rng.normal(size=(21, 9)) * 0.3, rng.normal(size=(21, 3)), rng.normal(size=(21, 2, 3, 3)))
+    solver = solver or RtiSolver(OptimalControlProblem(CONFIG, QUADROTOR, 2), precision=precision)
+    return solver.solve(problems, np.zeros((21, 4, 9)), np.zeros((21, 3, 4)))
+
+
+def assert_same(first, second) -> None:
+    for a, b in zip(first, second, strict=True):
+        assert np.array_equal(a, b)
+
+
+def test_compiles_once_for_each_problem(cache):
+    first = solve()
+    (library,) = libraries(cache)
+    modified = (cache / library).stat().st_mtime_ns
+    build_module.load.cache_clear()
+    assert_same(solve(), first)
+    assert (cache / library).stat().st_mtime_ns == modified
+    solve("float64")
+    assert len(libraries(cache)) == 2  # and no temporary folders
+
+
+def test_every_number_of_the_problem_is_in_the_key(cache):
+    for config in (CONFIG, PlannerConfig(horizon=3, goal_weight=9.0)):
+        model = generate_model(OptimalControlProblem(config, QUADROTOR, 1))
+        assert build_module.build(model, "float32").is_file()
+    assert len(libraries(cache)) == 2
+
+
+def test_the_cache_is_where_the_user_wants_it(monkeypatch, tmp_path):
+    monkeypatch.delenv("QUAD_SWARM_CACHE")
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert build_module.cache_directory() == tmp_path / "quad_swarm"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert build_module.cache_directory() == Path.home() / ".cache" / "quad_swarm"
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "local"))
+    assert build_module.cache_directory() == tmp_path / "local" / "quad_swarm"
+
+
+def test_processes_may_build_at_once(cache):
+    with multiprocessing.get_context("spawn").Pool(3) as pool:
+        results = pool.map(solve, ["float32"] * 3, chunksize=1)
+    for result in results:
+        assert_same(result, solve())
+    assert len(libraries(cache)) == 1
+
+
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_travels_to_another_process(method):
+    solver = RtiSolver(OptimalControlProblem(CONFIG, QUADROTOR, 2), sqp_iterations=3)
+    expected = solve(solver=solver)
+    assert_same(solve(solver=pickle.loads(pickle.dumps(solver))), expected)
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"this system cannot {method}")
+    with multiprocessing.get_context(method).Pool(1) as pool:
+        assert_same(pool.apply(solve, ("float32", solver)), expected)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_every_build_gives_the_same_bits(precision, monkeypatch):
+    expected = solve(precision)
+    compiler = " ".join(build_module.compiler())
+    for option in ("-DLANES_VECTOR_BYTES=16", "-DLANES_VECTOR_BYTES=32", "-fno-inline -fno-tree-vectorize"):
+        monkeypatch.setenv("CXX", f"{compiler} {option}")
+        assert_same(solve(precision), expected)
+
+
+def break_compiler(kind: str, folder: Path, monkeypatch) -> str:
+    """Make it impossible to compile; returns what the message must name."""
+    if kind == "absent":
+        monkeypatch.delenv("CXX", raising=False)
+        monkeypatch.setenv("PATH", str(folder))
+        return "no C\\+\\+ compiler: install"
+    if kind == "misnamed":
+        monkeypatch.setenv("CXX", "no-such-compiler")
+        return "CXX='no-such-compiler' is no command"
+    if kind == "cache":
+        (folder / "file").touch()
+        monkeypatch.setenv("QUAD_SWARM_CACHE", str(folder / "file"))
+        return "cannot write to the cache .*QUAD_SWARM_CACHE"
+    script = folder / "broken"
+    script.write_text("#!/bin/sh\necho 'broken.cpp:1: error: out of order' >&2\nexit 3\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("CXX", str(script))
+    return "fails .*out of order"
+
+
+@pytest.mark.parametrize("kind", ["absent", "misnamed", "failing", "cache"])
+def test_without_a_compiler(kind, tmp_path, monkeypatch):
+    message = break_compiler(kind, tmp_path, monkeypatch)
+    with pytest.raises(BuildError, match=f"solver='rti' cannot run: .*{message}.*solver='fatrop' needs no compiler"):
+        make_planner(CONFIG, QUADROTOR, 2, "rti")
+    with pytest.warns(RuntimeWarning, match=message) as notices:
+        assert isinstance(make_planner(CONFIG, QUADROTOR, 2).solver, FatropSolver)
+    assert len(notices) == 1
+    assert "\n" not in str(notices[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # said once is enough
+        assert make_planner(CONFIG, QUADROTOR, 2).solver.name == "fatrop"
+
+
+def test_with_a_compiler_the_fast_solver_is_the_default():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert make_planner(CONFIG, QUADROTOR, 2).solver.name == "rti"
+
+
+def test_names_a_damaged_library(cache):
+    model = generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2))
+    library = build_module.build(model, "float32")
+    library.unlink()
+    library.write_bytes(b"no library")
+    with pytest.raises(BuildError, match=f"{library.name}.*delete that file"):
+        solve()
+
+
+def run_harness(folder: Path, main: str, *flags: str) -> str:
+    """Compile a program around the sources and run it."""
+    model = generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2))
+    (folder / "model.hpp").write_text(model)
+    (folder / "main.cpp").write_text(main)
+    command = [*build_module.compiler(), *build_module._FLAGS, build_module._native_flag(), "-DREAL=float", *flags]
+    command += [f"-I{folder}", f"-I{SOURCES}", str(folder / "main.cpp"), "-o", str(folder / "main")]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    done = subprocess.run([str(folder / "main")], check=False, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+SANITIZED = r"""
+#include "kernel.cpp"
+#include <cstdio>
+#include <limits>
+#include <random>
+
+int main() {
+  std::mt19937 random(0);
+  std::normal_distribution<double> normal;
+  const double bad[] = {std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity(), 1e30};
+  long solved = 0;
+  for (int count : {0, 1, 2, 3, 5, 8, 9, 16, 17, 33, 50}) {
+    std::vector<double> x(count * 9), goal(count * 3), others(count * N_OTHERS * N * 3), guess(count * N * 4);
+    for (auto* array : {&x, &goal, &others, &guess})
+      for (double& value : *array) value = normal(random);
+    for (int k = 0; k < count; k += 4) x[k * 9] = bad[k / 4 % 3];
+    std::vector<double> x_plan(count * (N + 1) * 9), u_plan(count * N * 4);
+    std::vector<std::uint8_t> success(count);
+    std::vector<std::int64_t> iterations(count);
+    quad_swarm_rti(count, x.data(), goal.data(), others.data(), guess.data(), x_plan.data(), u_plan.data(),
+                   success.data(), iterations.data(), 2, 6, 50, 1e-4);
+    for (auto s : success) solved += s;
+  }
+  std::printf("%ld", solved);
+}
+"""
+
+
+def test_sanitizers_find_nothing(tmp_path):
+    solved = run_harness(tmp_path, SANITIZED, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    assert int(solved) > 70  # of 144 problems a quarter are absurd
+
+
+FUNCTIONS = r"""
+#include "lanes.hpp"
+#include <cstdio>
+
+template <class T, class F, class G>
+double error(F mine, G exact, double limit) {
+  using V = typename LaneTypes<T, VECTOR_BYTES / sizeof(T)>::Real;
+  double worst = 0;
+  for (int k = -100000; k <= 100000; k++) {
+    const T a = static_cast<T>(limit * k / 100000);
+    const double expected = exact(static_cast<double>(a));
+    const double difference = std::abs(mine(splat<V>(a))[0] - expected);
+    if (expected != 0) worst = std::max(worst, difference / std::abs(expected));
+  }
+  return worst;
+}
+
+int main() {
+  const auto tan_ = [](auto a) { return tangent(a); };
+  const auto cos_ = [](auto a) { return cosine(a); };
+  const auto exp_ = [](auto a) { return exponential(a); };
+  const auto tan_exact = [](double a) { return std::tan(a); };
+  const auto cos_exact = [](double a) { return std::cos(a); };
+  const auto exp_exact = [](double a) { return std::exp(a); };
+  std::printf("%g %g %g %g ", error<double>(tan_, tan_exact, 0.6), error<double>(tan_, tan_exact, 1.0),
+              error<float>(tan_, tan_exact, 1.0), error<double>(cos_, cos_exact, 1.0));
+  std::printf("%g %g %g", error<float>(cos_, cos_exact, 1.0), error<double>(exp_, exp_exact, 40),
+              error<float>(exp_, exp_exact, 40));
+}
+"""
+
+
+def test_functions_of_lanes_are_accurate(tmp_path):
+    errors = [float(text) for text in run_harness(tmp_path, FUNCTIONS).split()]
+    limits = [3e-12, 2e-9, 5e-7, 1e-12, 3e-7, 1e-15, 3e-7]
+    assert all(error <= limit for error, limit in zip(errors, limits, strict=True)), errors
+
+
+def test_says_what_the_generator_cannot_do():
+    class Spinning(OptimalControlProblem):
+        def dynamics(self, x, u):
+            return ca.atan(super().dynamics(x, u))
+
+    class Cornered(OptimalControlProblem):
+        def box_violations(self, x):
+            return x[0] * x[1]
+
+    with pytest.raises(NotImplementedError, match="no lane form"):
+        generate_model(Spinning(CONFIG, QUADROTOR, 1))
+    with pytest.raises(ValueError, match="must be bounds"):
+        generate_model(Cornered(CONFIG, QUADROTOR, 1))
