@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from .colours import colour_of
-from .evaluation import Cell, Flight, fly
+from .evaluation import Cell, Flight, fly, is_model
 from .render import Renderer
 
 
@@ -61,6 +61,11 @@ def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
+def _label(policy: str) -> str:
+    """A rule as it is written, a model by its file's name."""
+    return Path(policy).name if is_model(policy) else policy
+
+
 def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: Any) -> None:
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
@@ -69,8 +74,7 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
         mine = {row["scenario"]: row for row in rows if row["policy"] == policy}
         x = np.arange(len(scenarios)) + (k - (len(policies) - 1) / 2) * width
         heights = np.array([height(mine[name]) for name in scenarios])
-        label = policy if len(policy) <= 30 else "..." + policy[-27:]
-        axes.bar(x, heights, 0.9 * width, color=colour_of(k), label=label)
+        axes.bar(x, heights, 0.9 * width, color=colour_of(k), label=_label(policy))
         if interval is not None:
             bounds = np.array([interval(mine[name]) for name in scenarios]).T
             axes.errorbar(x, heights, np.abs(bounds - heights), fmt="none", ecolor="#333333", capsize=2, linewidth=1)
@@ -86,7 +90,7 @@ def draw_flights(cells: Sequence[Cell], flights: Sequence[Flight]) -> Figure:
     for axes, cell, flight in zip(panels[0], cells, flights, strict=True):
         _draw_flight(axes, flight)
         axes.set_title(cell.scenario.replace("_", " "), fontsize=10)
-    figure.suptitle(f"{cells[-1].policy}: dots mark steps with a request", fontsize=9)
+    figure.suptitle(f"{_label(cells[-1].policy)}: dots mark steps with a request", fontsize=9)
     return figure
 
 
@@ -97,7 +101,7 @@ def animate(cell: Cell, flight: Flight, path: Path) -> None:
     steps = min(int(at_goal.argmax()) + 10 if at_goal.any() else len(at_goal), len(at_goal))
     frames = []
     for k in range(steps):
-        lines = [f"{cell.policy}, {cell.scenario}", f"step {k + 1}   requests {flight.requests[k].sum()}"]
+        lines = [f"{_label(cell.policy)}, {cell.scenario}", f"step {k + 1}   requests {flight.requests[k].sum()}"]
         picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
         frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
     duration = round(1000 * cell.config.planner.dt)
