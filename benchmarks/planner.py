@@ -13,6 +13,9 @@ trust the ratios.
 - rti: the batched real-time iteration of `quad_swarm`
 
 iterations: quadratic programs a problem for hpipm and rti, the solver's own iterations (mean) for the others.
+
+With --agreement it compares plans instead of times: rti after 1, 2 and 3 quadratic programs against the converged
+optimum of fatrop (tolerance 1e-6), in both presets.
 """
 
 from __future__ import annotations
@@ -278,6 +281,63 @@ def compare(n_robots: int, horizon: int, n_envs: Sequence[int], full: bool, fold
     return _with_ratios(rows)
 
 
+def plan_cost(problem: OptimalControlProblem, call: Call, u: np.ndarray) -> np.ndarray:
+    """The cost (eq. 2) of the inputs (B, N, 4) of each problem and the states that follow from them."""
+    c, n_others = problem.config, problem.n_others
+    x0, goal, others = ca.SX.sym("x0", problem.nx), ca.SX.sym("goal", 3), ca.SX.sym("others", 3, c.horizon * n_others)
+    inputs = ca.SX.sym("u", problem.nu, c.horizon)
+    x, cost = x0, ca.SX(0)
+    for k in range(c.horizon):
+        x = problem.dynamics(x, inputs[:, k])
+        distances = ca.vertcat(*problem.distances(x, others[:, k :: c.horizon]))
+        violations = ca.fmax(ca.vertcat(c.separation - distances, problem.box_violations(x)), 0)
+        cost += problem.input_cost(inputs[:, k]) + ca.sum1(problem.repulsion_cost(distances))
+        cost += c.violation_weight * ca.sumsqr(violations)
+    cost += problem.goal_cost(x, x0, goal)
+    count = len(u)
+    total = ca.Function("total", [x0, goal, others, inputs], [cost]).map(count)
+    return (
+        total(
+            call.problems.x[:, : problem.nx].T,
+            call.problems.goal.T,
+            call.problems.others.reshape(-1, 3).T,
+            u[:, :, : problem.nu].reshape(-1, problem.nu).T,
+        )
+        .full()
+        .ravel()
+    )
+
+
+def agreement() -> None:
+    """Print how far the plans of rti are from the converged optimum."""
+    print("preset  programs  precision  success   cost gap            first input         position (m)")
+    print("                                      (median, p99, max of each)")
+    for n_robots in (4, 8):
+        preset, config = world(n_robots, 10)
+        calls = record(config, 16)
+        every = range(0, STEPS, 2 if n_robots == 4 else 4)
+        fields = [[*calls[k].problems, calls[k].x_guess, calls[k].u_guess] for k in every]
+        x, goal, others, x_guess, u_guess = (np.concatenate(field) for field in zip(*fields, strict=True))
+        call = Call(Problems(x, goal, others), x_guess, u_guess)
+        problem = OptimalControlProblem(config.planner, config.quadrotor, n_robots - 1)
+        best = FatropSolver(problem, tolerance=1e-6).solve(*call)
+        best_cost = plan_cost(problem, call, best.u)
+        limit = problem.max_input.full().ravel()
+        for precision in ("float32", "float64"):
+            for iterations in (1, 2, 3):
+                mine = RtiSolver(problem, iterations, 0, precision).solve(*call)
+                gap = (plan_cost(problem, call, mine.u) - best_cost) / (1 + best_cost)
+                first = (np.abs(mine.u - best.u)[:, 0, : problem.nu] / limit).max(axis=1)
+                position = np.abs(mine.x - best.x)[..., :3].max(axis=(1, 2))
+                text = "  ".join(
+                    " ".join(f"{value:8.1e}" for value in np.percentile(figure, [50, 99, 100]))
+                    for figure in (gap, first, position)
+                )
+                print(
+                    f"{preset:7} {iterations:8}  {precision}  {mine.success.mean():7.4f}  {text}  ({len(x)} problems)"
+                )
+
+
 def _with_ratios(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows with how many times faster each is than three rivals; of hpipm the single iteration counts."""
     rivals: dict[str, float] = {}
@@ -306,6 +366,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a row")
     parser.add_argument("--full", action="store_true", help="more problems and variants (half an hour)")
+    parser.add_argument("--agreement", action="store_true", help="compare plans with the converged optimum instead")
     parser.add_argument("--horizon", type=int, nargs="+", default=HORIZONS, help="default 10 20")
     parser.add_argument("--n-robots", type=int, nargs="+", default=ROBOTS, help="default 4 8 16")
     parser.add_argument("--n-envs", type=int, nargs="+", default=ENVIRONMENTS, help="default 1 4 16 64")
@@ -313,6 +374,8 @@ def main() -> None:
     target = args.json.absolute() if args.json else None
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    if args.agreement:
+        return agreement()
     print("solver            N   n envs real     iters success     median        p99  x ipopt  x fatrop   x hpipm")
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
