@@ -194,7 +194,7 @@ class LaneGroup {
       }
       x = s.x;
       for (int i = 0; i < N_BOUNDS; i++) {
-        // Of a state's two bounds only the nearer one can matter to a step.
+        // Of a state's two bounds only the nearer one enters; the other lies across the room.
         const V low = x[BOUNDED_STATE[i]] - splat<V>(STATE_LOW[i]);
         const V high = splat<V>(STATE_HIGH[i]) - x[BOUNDED_STATE[i]];
         s.bound_sign[i] = select<V>(low < high, splat<V>(1), splat<V>(-1));
