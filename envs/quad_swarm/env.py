@@ -85,19 +85,19 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
     ):
         self.task = make_task(
-            1,
-            preset,
-            scenario,
-            n_robots,
-            max_steps,
-            scale_observation,
-            continuous_collisions,
-            memory,
-            reward,
-            planner,
-            noise,
-            space,
-            solver,
+            n_swarms=1,
+            preset=preset,
+            scenario=scenario,
+            n_robots=n_robots,
+            max_steps=max_steps,
+            scale_observation=scale_observation,
+            continuous_collisions=continuous_collisions,
+            memory=memory,
+            reward=reward,
+            planner=planner,
+            noise=noise,
+            space=space,
+            solver=solver,
         )
         self.config = self.task.swarm.config
         self.n_agents = n = self.config.n_robots
