@@ -8,10 +8,11 @@ LOGS ?= logs
 EPISODES ?= 500
 JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
 POLICIES ?= none full distance:4 cpa:0.7:1.5
+PEERS := agilerl benchmarl xuance
 
-.PHONY: help install train test lint bench clean
+.PHONY: help install train test lint bench bench-peers clean
 help:  ## show this list
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 install: $(VENV)/.installed  ## make .venv with the pinned dependencies
 
@@ -39,5 +40,14 @@ lint: install  ## ruff and mypy
 bench: install  ## every script in benchmarks/, as a table and as JSON
 	for script in benchmarks/*.py; do $(BIN)/python $$script --json $(LOGS)/$$(basename $$script .py).json || exit 1; done
 
+bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against other libraries, each in its own environment
+	$(BIN)/python benchmarks/training.py --json benchmarks/results/training.json
+
+.bench/%/.installed: benchmarks/peers/%.txt
+	$(PYTHON) -m venv .bench/$*
+	.bench/$*/bin/pip install --quiet --disable-pip-version-check $$(grep ^torch== $<)
+	.bench/$*/bin/pip install --quiet --disable-pip-version-check -r $<
+	@touch $@
+
 clean:  ## remove what the commands above made, but not the logs
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .bench build *.egg-info .mypy_cache .ruff_cache .pytest_cache

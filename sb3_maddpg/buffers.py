@@ -1,33 +1,84 @@
 """Replay buffer of a team."""
 
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_maddpg.utils import team_shape
+from sb3_maddpg.team import Team
+
+
+class TeamReplayBufferSamples(NamedTuple):
+    """
+    SB3's ``ReplayBufferSamples`` with an entry per agent. The window of a sample is the ``n_steps`` transitions from
+    the sampled one on, or fewer where it has to stop early, see ``TeamReplayBuffer``.
+
+    :param observations: (batch, n_agents, columns)
+    :param actions: (batch, length of the joint action), as they were stored
+    :param next_observations: (batch, n_agents, columns), at the end of the window
+    :param dones: (batch, n_agents), 1 where nothing is to be added to the rewards
+    :param rewards: (batch, n_agents), discounted sum over the window
+    :param discounts: what the value of the next observation is to be multiplied with: the number gamma with single
+        steps, else (batch, n_agents), gamma to the number of rewards summed
+    :param active: (batch, n_agents), 1 where the agent acted; ``None`` if every agent always has
+    :param next_active: (batch, n_agents), 1 where the agent is still there at the end of the window; ``None`` as above
+    :param pair_rewards: (batch, n_agents, n_pairs), discounted sums, ``None`` if they are not kept
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor | float
+    active: th.Tensor | None = None
+    next_active: th.Tensor | None = None
+    pair_rewards: th.Tensor | None = None
 
 
 class TeamReplayBuffer(ReplayBuffer):
     """
-    SB3's replay buffer with one reward and one end per agent. They come from ``info["agent_rewards"]`` and
-    ``info["agent_terminated"]``, both (n_agents,); where an environment leaves them out, every agent gets the team's
-    reward and ends with the team. A time limit ends no agent's return.
+    SB3's replay buffer with rewards and ends of each agent, which come from ``infos``:
+
+    - ``agent_rewards`` (n_agents,): where it is left out, every agent gets the team's reward;
+    - ``agent_terminated`` (n_agents,): where it is left out, no agent ends before the team;
+    - ``agent_active`` (n_agents,), whether the agent acted: where it is left out, all did;
+    - ``pair_rewards`` (n_agents, n_pairs), needed if ``n_pairs`` is set: the part of an agent's reward that belongs to
+      each of its neighbours.
+
+    A time limit ends no agent's return. With ``n_steps`` > 1 rewards are summed over a window of that many
+    transitions. It stops early at the end of the episode, at the newest transition and where an agent drops out
+    without having terminated, for all agents, since they share the next observation; the sum of an agent that
+    terminates stops there while those of the others go on.
 
     ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running spread of the team's return.
 
+    All arrays are views into ``records``, (buffer_size, n_envs), so that one transition lies in one place.
+
     :param buffer_size: max number of transitions
-    :param observation_space: ``Box(n_agents, obs_dim)``
+    :param observation_space: ``Box(n_agents, columns)``
     :param action_space: flat joint action space
     :param device: PyTorch device
     :param n_envs: number of parallel environments
-    :param optimize_memory_usage: see SB3's ``ReplayBuffer``
+    :param optimize_memory_usage: see SB3's ``ReplayBuffer``, only with ``n_steps=1``
     :param handle_timeout_termination: see SB3's ``ReplayBuffer``
+    :param n_steps: how many rewards to sum before the value of the next observation is used
+    :param gamma: discount factor
+    :param n_pairs: number of neighbours of an agent with a reward of their own, 0 if there are no such rewards
     """
+
+    records: np.ndarray
+    numbers: np.ndarray
+    agent_rewards: np.ndarray
+    agent_terminated: np.ndarray
+    agent_active: np.ndarray
+    pair_rewards: np.ndarray
+    cuts: np.ndarray
 
     def __init__(
         self,
@@ -38,7 +89,12 @@ class TeamReplayBuffer(ReplayBuffer):
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        n_pairs: int = 0,
     ):
+        self.team = Team.from_spaces(observation_space, action_space)
+        _check_arguments(n_steps, gamma, n_pairs, optimize_memory_usage)
         super().__init__(
             buffer_size,
             observation_space,
@@ -48,9 +104,61 @@ class TeamReplayBuffer(ReplayBuffer):
             optimize_memory_usage=optimize_memory_usage,
             handle_timeout_termination=handle_timeout_termination,
         )
-        self.n_agents, _, _ = team_shape(observation_space, action_space)
-        self.agent_rewards = np.zeros((self.buffer_size, self.n_envs, self.n_agents), dtype=np.float32)
-        self.agent_terminated = np.zeros((self.buffer_size, self.n_envs, self.n_agents), dtype=np.float32)
+        self.n_agents = self.team.n_agents
+        self.n_steps = n_steps
+        self.gamma = gamma
+        self.n_pairs = n_pairs
+        self.all_active = True
+        names = ["observations", "actions"]
+        if not optimize_memory_usage:
+            names.append("next_observations")
+        fields: list[Any] = [(name, getattr(self, name).dtype, getattr(self, name).shape[2:]) for name in names]
+        # Side by side and of one type, so that n steps of them are read with one index
+        fields.append(("numbers", np.float32, (self.n_agents * (3 + n_pairs) + 4,)))
+        self._use(np.zeros((self.buffer_size, n_envs), np.dtype(fields, align=True)))
+
+    def _use(self, records: np.ndarray) -> None:
+        self.records = records
+        views = {name: records[name] for name in records.dtype.names or ()}
+        views |= self._columns(views["numbers"])
+        self._views = tuple(views)
+        self.__dict__.update(views)
+
+    def _columns(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
+        """
+        :param numbers: what is kept of transitions besides observations and actions, in the last axis
+        :return: views of it
+        """
+        n = self.n_agents
+        return {
+            "agent_rewards": numbers[..., :n],
+            "agent_terminated": numbers[..., n : 2 * n],
+            "agent_active": numbers[..., 2 * n : 3 * n],
+            "rewards": numbers[..., 3 * n],
+            "dones": numbers[..., 3 * n + 1],
+            "timeouts": numbers[..., 3 * n + 2],
+            # Where the environment went on elsewhere without an end, as when learn() is called again
+            "cuts": numbers[..., 3 * n + 3],
+            "pair_rewards": numbers[..., 3 * n + 4 :].reshape(*numbers.shape[:-1], n, self.n_pairs),
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {name: value for name, value in self.__dict__.items() if name not in self._views}
+        # The part in use. Without next_observations the last of them stands one further
+        state["records"] = self.records[: self.size() + int(self.optimize_memory_usage)]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        records = self.records
+        if len(records) < self.buffer_size:
+            records = np.zeros((self.buffer_size, self.n_envs), records.dtype)
+            records[: len(self.records)] = self.records
+        self._use(records)
+
+    def reset(self) -> None:
+        super().reset()
+        self.all_active = True
 
     def add(
         self,
@@ -61,38 +169,225 @@ class TeamReplayBuffer(ReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        # Before super().add, which moves self.pos
-        for env, info in enumerate(infos):
-            self.agent_rewards[self.pos, env] = self._per_agent(info, "agent_rewards", reward[env])
-            self.agent_terminated[self.pos, env] = self._per_agent(info, "agent_terminated", False)
-        super().add(obs, next_obs, action, reward, done, infos)
+        """
+        Add a transition of every environment.
 
-    def _per_agent(self, info: dict[str, Any], key: str, default: float) -> np.ndarray | float:
-        if key not in info:
-            return default
-        if np.shape(info[key]) != (self.n_agents,):
-            raise ValueError(
-                f"info['{key}'] has shape {np.shape(info[key])}, but there are {self.n_agents} agents: "
-                f"the environment must give shape ({self.n_agents},), or leave the key out."
-            )
-        return info[key]
+        :param obs: (n_envs, n_agents, columns)
+        :param next_obs: (n_envs, n_agents, columns), of an ended episode its last
+        :param action: (n_envs, length of the joint action)
+        :param reward: (n_envs,), the team's
+        :param done: (n_envs,), whether the episode ended or was cut off
+        :param infos: of each environment
+        :raises ValueError: an entry of ``infos`` has another shape than it must, is missing or not finite
+        """
+        pos = self.pos
+        self.observations[pos] = obs
+        if self.optimize_memory_usage:
+            self.observations[(pos + 1) % self.buffer_size] = next_obs
+        else:
+            self.next_observations[pos] = next_obs
+        self.actions[pos] = action.reshape(self.n_envs, self.action_dim)
+        self.rewards[pos] = reward
+        self.dones[pos] = done
+        if self.handle_timeout_termination:
+            self.timeouts[pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+        self._add_infos("agent_rewards", infos, self.rewards[pos, :, None])
+        self._add_infos("agent_terminated", infos, 0.0)
+        if self._add_infos("agent_active", infos, 1.0) and self.all_active:
+            self.all_active = bool(self.agent_active[pos].all())
+        if self.n_pairs:
+            self._add_infos("pair_rewards", infos, None)
+        numbers = self.numbers[pos]
+        # One quick look at all of them. Large numbers fail it too, and pass the thorough one
+        if not math.isfinite(np.vdot(numbers, numbers)):
+            self._check_finite(infos)
+        if self.n_steps > 1:
+            self.cuts[pos - 1] = (self.next_observations[pos - 1] != self.observations[pos]).any(axis=(1, 2))
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full = True
+            self.pos = 0
 
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+    def _add_infos(self, key: str, infos: Sequence[dict[str, Any]], default: np.ndarray | float | None) -> bool:
+        """
+        :param key: of infos, and name of the array to write to
+        :param infos: of each environment
+        :param default: for environments that leave the key out, None if they must not
+        :return: whether any environment has the key
+        """
+        array = getattr(self, key)[self.pos]
+        if len(infos) == 1 and getattr(infos[0].get(key), "shape", None) == array.shape[1:]:
+            array[0] = infos[0][key]  # the common case, in a fraction of the time
+            return True
+        values = [info[key] for info in infos if key in info]
+        where: slice | list[int] = slice(None)
+        if len(values) < len(infos):
+            if default is None:
+                raise ValueError(
+                    f"info['{key}'] is missing, but the buffer was made with n_pairs={self.n_pairs}: the environment "
+                    f"must give shape {array.shape[1:]} in every step, or leave n_pairs at 0."
+                )
+            array[:] = default
+            if not values:
+                return False
+            where = [env for env, info in enumerate(infos) if key in info]
+        try:
+            rows = np.array(values, np.float32)
+        except (TypeError, ValueError):
+            self._check_shapes(key, values)
+            raise
+        if rows.shape[1:] != array.shape[1:]:
+            self._check_shapes(key, values)
+        array[where] = rows
+        return True
+
+    def _check_shapes(self, key: str, values: Sequence[Any]) -> None:
+        needed = getattr(self, key).shape[2:]
+        for value in values:
+            if np.shape(value) != needed:
+                pairs = f" and n_pairs={self.n_pairs}" if key == "pair_rewards" else ""
+                remedy = "" if key == "pair_rewards" else ", or leave the key out"
+                raise ValueError(
+                    f"info['{key}'] has shape {np.shape(value)}, but there are {self.n_agents} agents{pairs}: "
+                    f"the environment must give shape {needed}{remedy}."
+                )
+
+    def _check_finite(self, infos: Sequence[dict[str, Any]]) -> None:
+        for key in ("agent_rewards", "pair_rewards", "agent_terminated", "agent_active", "rewards"):
+            array = getattr(self, key)[self.pos]
+            for index in np.argwhere(~np.isfinite(array)):
+                env, agent = index[0], index[-1 if key != "pair_rewards" else 1]
+                source = "The team's reward"
+                if key in infos[env]:
+                    source = f"info['{key}'] of agent {agent} ({self.team.names[agent]})"
+                raise ValueError(
+                    f"{source} is {array[tuple(index)]} in environment {env}: it must be finite. Look there for a "
+                    "division by zero or a simulation that diverged, end the episode before it does, or bound it."
+                )
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> TeamReplayBufferSamples:
         """
         :param batch_inds: which steps
         :param env: to normalise observations and rewards
-        :return: SB3's samples with ``rewards`` and ``dones`` of shape (batch, n_agents)
         """
         # The global generator, as in SB3: set_random_seed() then makes sampling repeat
-        index = (batch_inds, np.random.randint(0, high=self.n_envs, size=len(batch_inds)))  # noqa: NPY002
-        next_index = ((batch_inds + 1) % self.buffer_size, index[1])
-        next_obs = self.observations[next_index] if self.optimize_memory_usage else self.next_observations[index]
-        # timeouts stays zero if they are not handled
-        team_done = self.dones[index] * (1 - self.timeouts[index])
-        return ReplayBufferSamples(
-            observations=self.to_torch(self._normalize_obs(self.observations[index], env)),  # type: ignore[arg-type]
-            actions=self.to_torch(self.actions[index]),
+        env_inds = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
+        return self.samples_at(batch_inds, env_inds, env)
+
+    def samples_at(
+        self, batch_inds: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> TeamReplayBufferSamples:
+        """
+        The samples that start at given transitions.
+
+        :param batch_inds: (batch,), their rows in the buffer
+        :param env_inds: (batch,), their environments
+        :param env: to normalise observations and rewards
+        """
+        # take() is several times faster than an index, and one read per transition than one per array
+        batch = self.records.reshape(-1).take(batch_inds * self.n_envs + env_inds)
+        if self.n_steps > 1:
+            last, data = self._windows(batch_inds, env_inds, env)
+            next_obs = self._read("next_observations", last * self.n_envs + env_inds)
+        else:
+            data = self._single_steps(batch["numbers"], env)
+            if self.optimize_memory_usage:
+                next_obs = self.observations[(batch_inds + 1) % self.buffer_size, env_inds]
+            else:
+                next_obs = batch["next_observations"]
+        return TeamReplayBufferSamples(
+            observations=self.to_torch(self._normalize_obs(batch["observations"], env)),  # type: ignore[arg-type]
+            actions=self.to_torch(batch["actions"]),
             next_observations=self.to_torch(self._normalize_obs(next_obs, env)),  # type: ignore[arg-type]
-            dones=self.to_torch(np.maximum(self.agent_terminated[index], team_done[:, None])),
-            rewards=self.to_torch(self._normalize_reward(self.agent_rewards[index], env)),
+            active=None if self.all_active else self.to_torch(self._columns(batch["numbers"])["agent_active"]),
+            **{name: self.to_torch(value) if isinstance(value, np.ndarray) else value for name, value in data.items()},
+        )
+
+    def _read(self, name: str, index: np.ndarray) -> np.ndarray:
+        """
+        :param name: of an array
+        :param index: (batch,), which transitions, counted through all environments
+        :return: (batch, ...), its part there; take() would copy the whole array first
+        """
+        array = getattr(self, name)
+        flat = th.from_numpy(array.reshape(-1, *array.shape[2:]))
+        return flat.index_select(0, th.from_numpy(index)).numpy()
+
+    def _single_steps(self, numbers: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
+        """
+        :param numbers: (batch, columns) of the sampled transitions
+        :param env: to normalise rewards
+        :return: rewards and what else differs from ``_windows``
+        """
+        columns = self._columns(numbers)
+        # timeouts stays zero if they are not handled
+        team_done = columns["dones"] * (1 - columns["timeouts"])
+        terminated = columns["agent_terminated"]
+        return {
+            "dones": np.maximum(terminated, team_done[:, None]),
+            "rewards": self._normalize_reward(columns["agent_rewards"], env),
+            "discounts": self.gamma,
+            "next_active": None if self.all_active else columns["agent_active"] * (1 - terminated),
+            "pair_rewards": self._normalize_reward(columns["pair_rewards"], env) if self.n_pairs else None,
+        }
+
+    def _windows(
+        self, batch_inds: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param batch_inds: (batch,), first rows of the windows
+        :param env_inds: (batch,), their environments
+        :param env: to normalise rewards, each before they are summed
+        :return: last rows of the windows, and rewards and what else is summed over them
+        """
+        rows = (batch_inds + np.arange(self.n_steps)[:, None]) % self.buffer_size
+        numbers = self._read("numbers", (rows * self.n_envs + env_inds).ravel())
+        # One column after the other in memory: what follows then works along the batch, not along a few agents
+        columns = self._columns(np.moveaxis(numbers.T.copy().reshape(-1, *rows.shape), 0, -1))
+        rewards = self._normalize_reward(columns["agent_rewards"], env)
+        pairs = self._normalize_reward(columns["pair_rewards"], env)
+        terminated, active = columns["agent_terminated"] > 0, columns["agent_active"] > 0
+        ends = (columns["dones"] > 0) | (columns["cuts"] > 0)
+        newer = (self.pos - 1 - batch_inds) % self.buffer_size
+
+        total, pair_total = rewards[0].copy(order="K"), pairs[0].copy(order="K")
+        discounts = np.full_like(total, self.gamma)
+        last = np.zeros(len(batch_inds), np.intp)
+        # Whose return goes on after the steps so far, and which windows do
+        alive, goes_on = active[0] & ~terminated[0], np.ones(len(batch_inds), bool)
+        gone = terminated[0].copy(order="K")
+        for step in range(1, self.n_steps):
+            goes_on &= (newer >= step) & ~ends[step - 1] & (active[step] | ~alive).all(axis=1)
+            counts = alive & goes_on[:, None]
+            total += self.gamma**step * rewards[step] * counts
+            if self.n_pairs:
+                pair_total += self.gamma**step * pairs[step] * counts[..., None]
+            np.copyto(discounts, self.gamma ** (step + 1), where=counts)
+            last += goes_on
+            gone |= counts & terminated[step]
+            alive &= ~terminated[step]
+        at_end = (last, np.arange(len(last)))
+        team_done = columns["dones"][at_end] * (1 - columns["timeouts"][at_end])
+        return (batch_inds + last) % self.buffer_size, {
+            "dones": np.maximum(gone, team_done[:, None]),
+            "rewards": total,
+            "discounts": discounts,
+            "next_active": None if self.all_active else (active & ~terminated)[at_end].astype(np.float32),
+            "pair_rewards": pair_total if self.n_pairs else None,
+        }
+
+
+def _check_arguments(n_steps: int, gamma: float, n_pairs: int, optimize_memory_usage: bool) -> None:
+    if n_steps < 1:
+        raise ValueError(f"n_steps={n_steps} must be at least 1, which sums no rewards.")
+    if not 0 <= gamma <= 1:
+        raise ValueError(f"gamma={gamma} must be between 0 and 1.")
+    if n_pairs < 0:
+        raise ValueError(f"n_pairs={n_pairs} must be the number of an agent's neighbours, 0 for no rewards of pairs.")
+    if n_steps > 1 and optimize_memory_usage:
+        raise ValueError(
+            f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not keep "
+            "where an episode ends. Set n_steps=1 or optimize_memory_usage=False."
         )

@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
+from sb3_maddpg import parallel
 from sb3_maddpg.utils import describe_env, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
@@ -173,17 +174,24 @@ def check_env_kwargs(env_id: str, env_kwargs: dict[str, Any]) -> None:
     :param env_id: Gymnasium id
     :param env_kwargs: from the recipe and the command line
     """
-    entry_point = gymnasium.spec(env_id).entry_point
-    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    known = _env_arguments(env_id)
+    for key in env_kwargs:
+        if known is not None and key not in known:
+            raise ValueError(suggest(f"argument of {env_id}", key, known))
+
+
+def _env_arguments(env_id: str) -> set[str] | None:
+    """Names of the arguments an environment takes, or None if it takes any."""
+    spec = gymnasium.spec(env_id)
+    if spec.entry_point == parallel.ENTRY_POINT:
+        return parallel.arguments(spec.kwargs["entry"])
+    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
     if creator is None:
-        return
+        return None
     parameters = inspect.signature(creator).parameters.values()
     if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
-        return
-    known = {parameter.name for parameter in parameters}
-    for key in env_kwargs:
-        if key not in known:
-            raise ValueError(suggest(f"argument of {env_id}", key, known))
+        return None
+    return {parameter.name for parameter in parameters}
 
 
 def sample_maddpg_params(

@@ -1,30 +1,42 @@
 """Multi-Agent Deep Deterministic Policy Gradient."""
 
+from __future__ import annotations
+
 import io
+import json
 import os
 import pathlib
+import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.callbacks import record_metrics
-from sb3_maddpg.estimators import ESTIMATORS, score
-from sb3_maddpg.policies import MADDPGPolicy, TeamActor, TeamCritic
-from sb3_maddpg.utils import atomic_write, describe_env, suggest, team_shape
+from sb3_maddpg.estimators import ESTIMATORS
+from sb3_maddpg.networks import polyak_update
+from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, by_agent
+from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.team import ACTION_SPACES, Team
+from sb3_maddpg.utils import atomic_write, describe_env, suggest
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
+
+# Raised whenever an older model's networks would be read wrongly
+FILE_FORMAT = 2
 
 
 class MADDPG(OffPolicyAlgorithm):
@@ -34,12 +46,15 @@ class MADDPG(OffPolicyAlgorithm):
     Paper: https://arxiv.org/abs/1706.02275 (Lowe et al., 2017), original code https://github.com/openai/maddpg.
     Threshold actions: Serra-Gomez et al., IROS 2020. Code based on SB3's TD3.
 
-    The environment is a team: observation ``Box(n_agents, obs_dim)``, flat joint action
-    ``MultiBinary(n_agents * action_dim)`` or ``Box(n_agents * action_dim)``, a scalar team reward, and, where agents
-    differ, ``info["agent_rewards"]`` and ``info["agent_terminated"]``, both (n_agents,). Numbers in
-    ``info["metrics"]`` are logged as means.
+    The environment is a PettingZoo parallel environment, or a team environment: one Gymnasium environment with
+    observation ``Box(n_agents, obs_dim)``, a flat joint action (``MultiBinary``, ``Box`` or ``MultiDiscrete`` of length
+    ``n_agents * k``), a scalar team reward, and, where agents differ, ``info["agent_rewards"]``,
+    ``info["agent_terminated"]`` and ``info["agent_active"]``, all (n_agents,). Numbers in ``info["metrics"]`` are
+    logged as means. Of the environment's attributes it reads ``agent_names``, ``observation_layout`` (see
+    ``PairPolicy``) and ``action_cost``: what an action costs as long as the reward holds that as a plain sum over
+    bits, numbers or categories, a float or (n_agents, width). Critics then learn the rest of the return.
 
-    :param policy: The policy model to use (MlpPolicy)
+    :param policy: The policy model to use (MlpPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param learning_rate: learning rate of all Adam optimizers,
         it can be a function of the current progress remaining (from 1 to 0)
@@ -52,12 +67,17 @@ class MADDPG(OffPolicyAlgorithm):
         tuple of frequency and unit like ``(5, "step")`` or ``(2, "episode")``.
     :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``),
         ``-1`` means as many as environment steps were done
-    :param action_noise: the action noise type, for continuous actions only (bits explore by a random threshold)
+    :param action_noise: the action noise type, for continuous actions only, in place of ``exploration_noise``
     :param replay_buffer_class: Replay buffer class to use, ``TeamReplayBuffer`` if ``None``
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
-    :param estimator: gradient through the threshold: "expected", "straight_through" or "score",
-        see ``sb3_maddpg.estimators``. Unused for continuous actions.
+    :param n_steps: number of rewards in a return before the critic's estimate takes over
+    :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
+        [-1, 1]; two numbers go from the first to the second over the training. Bits explore by a random threshold,
+        categories by their probabilities.
+    :param estimator: gradient through bits and categories, see ``sb3_maddpg.estimators``; unused for continuous actions
+    :param temperature: of the estimators that relax, can be a function of the current progress remaining
+    :param policy_delay: the policy and the target networks are updated every ``policy_delay`` critic updates
     :param max_grad_norm: largest gradient norm of each agent's network, ``None`` for no limit
     :param policy_regularization: weight of the mean squared actor output before squashing (1e-3 in the original code)
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``MADDPGPolicy``
@@ -71,12 +91,14 @@ class MADDPG(OffPolicyAlgorithm):
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MADDPGPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MADDPGPolicy, "PairPolicy": PairPolicy}
+    policy_class: type[MADDPGPolicy]
     policy: MADDPGPolicy
-    actor: TeamActor
-    actor_target: TeamActor
-    critic: TeamCritic
-    critic_target: TeamCritic
+    replay_buffer: TeamReplayBuffer
+    actor: Actor
+    actor_target: Actor
+    critic: Critic
+    critic_target: Critic
 
     def __init__(
         self,
@@ -94,7 +116,11 @@ class MADDPG(OffPolicyAlgorithm):
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        exploration_noise: float | tuple[float, float] = 0.1,
         estimator: str = "expected",
+        temperature: float | Schedule = 1.0,
+        policy_delay: int = 1,
         max_grad_norm: float | None = 0.5,
         policy_regularization: float = 1e-3,
         policy_kwargs: dict[str, Any] | None = None,
@@ -118,51 +144,108 @@ class MADDPG(OffPolicyAlgorithm):
             gradient_steps,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),  # copies, which take what the environment says
             optimize_memory_usage=optimize_memory_usage,
-            policy_kwargs=policy_kwargs,
+            n_steps=n_steps,
+            policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
             seed=seed,
             sde_support=False,
-            supported_action_spaces=(spaces.MultiBinary, spaces.Box),
+            supported_action_spaces=ACTION_SPACES,
             support_multi_env=True,
         )
+        self.exploration_noise = exploration_noise
         self.estimator = estimator
+        self.temperature = temperature
+        self.policy_delay = policy_delay
         self.max_grad_norm = max_grad_norm
         self.policy_regularization = policy_regularization
+        self.action_cost: np.ndarray | None = None
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
+        self.algorithm = type(self).__name__
+        self.file_format = FILE_FORMAT
 
         if _init_setup_model:
             self._setup_model()
 
-    def _setup_model(self) -> None:
-        self.n_agents, _, self.action_dim = team_shape(self.observation_space, self.action_space)
-        self._check_arguments()
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = TeamReplayBuffer
-        # A model loaded without an environment only predicts: its memory has to wait for set_env()
-        buffer_size = self.buffer_size
-        self.buffer_size = buffer_size if self.env is not None else 1
-        super()._setup_model()
-        self.buffer_size = buffer_size
-        if self.env is not None:
-            self.env_spec = describe_env(self.env)
-        self._create_aliases()
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if isinstance(env, (ParallelEnv, AECEnv)):
+            env = TeamEnv(env)
+        vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        Team.from_spaces(vec_env.observation_space, vec_env.action_space)  # SB3 would advise policies that are not here
+        return vec_env
 
-    def _check_arguments(self) -> None:
-        if self.estimator not in ESTIMATORS:
-            raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
-        if self.action_noise is not None and isinstance(self.action_space, spaces.MultiBinary):
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        if self.env is not None:
+            self._read_env(self.env)
+        # SB3 knows n_steps of its own buffer only, and would make the buffer of a model that is loaded without an
+        # environment, only to predict, at full size
+        n_steps, buffer_size = self.n_steps, self.buffer_size
+        self.n_steps, self.buffer_size = 1, buffer_size if self.env is not None else 1
+        self.replay_buffer_class = self.replay_buffer_class or TeamReplayBuffer
+        self.replay_buffer_kwargs |= {"n_steps": n_steps, "gamma": self.gamma}
+        try:
+            super()._setup_model()
+        finally:
+            self.n_steps, self.buffer_size = n_steps, buffer_size
+        self._create_aliases()
+        actions = self.policy.actions
+        if self.action_noise is not None and not actions.has_continuous:
             raise ValueError(
                 f"action_noise={self.action_noise} is for continuous actions, the action space is {self.action_space}. "
-                "Leave it out: bits explore by a random threshold."
+                "Leave it out: bits explore by a random threshold, categories by their probabilities."
             )
+        self._action_cost: th.Tensor | None = None
+        if self.action_cost is not None:
+            shape = (self.policy.team.n_agents, actions.width)
+            try:
+                cost = np.broadcast_to(np.asarray(self.action_cost, np.float32), shape)
+            except ValueError as error:
+                raise ValueError(
+                    f"action_cost of shape {np.shape(self.action_cost)} does not fit (n_agents, width) = {shape}."
+                ) from error
+            self._action_cost = th.as_tensor(cost.copy(), device=self.device)
+
+    def _read_env(self, env: VecEnv) -> None:
+        """What an environment says of itself beside its spaces."""
+        self.env_spec = describe_env(env)
+        if env.has_attr("action_cost"):
+            self.action_cost = env.get_attr("action_cost", indices=0)[0]
+        for name in self.policy_class.env_attributes:
+            if name not in self.policy_kwargs and env.has_attr(name):
+                self.policy_kwargs[name] = env.get_attr(name, indices=0)[0]
+        if self.policy_kwargs.get("pair_credit"):
+            neighbours = self.policy_kwargs["observation_layout"]["neighbours"]
+            self.replay_buffer_kwargs["n_pairs"] = len(neighbours)
+
+    def _check_arguments(self) -> None:
+        if not issubclass(self.policy_class, MADDPGPolicy):
+            raise ValueError(f"{self.policy_class.__name__} is no policy of a team: use MlpPolicy or PairPolicy.")
+        if self.estimator not in ESTIMATORS:
+            raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
         if self.max_grad_norm is not None and not self.max_grad_norm > 0:
             raise ValueError(f"max_grad_norm={self.max_grad_norm} must be positive, or None for no limit.")
+        if self.n_steps < 1 or self.policy_delay < 1:
+            raise ValueError(f"n_steps={self.n_steps} and policy_delay={self.policy_delay} must be at least 1.")
+        noise = np.asarray(self.exploration_noise)
+        if noise.shape not in ((), (2,)) or not (noise >= 0).all():
+            raise ValueError(
+                f"exploration_noise={self.exploration_noise} is a standard deviation, or two of them, of at least 0."
+            )
+        if not callable(self.temperature) and not self.temperature > 0:
+            raise ValueError(f"temperature={self.temperature} must be positive.")
+        if self.replay_buffer_class is not None and not issubclass(self.replay_buffer_class, TeamReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class={self.replay_buffer_class.__name__} knows no agents: derive it from "
+                "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
+                "observations, which a team does not have."
+            )
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -170,61 +253,137 @@ class MADDPG(OffPolicyAlgorithm):
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
 
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        actions = self.policy.actions
+        if self.num_timesteps < learning_starts:
+            drawn = np.array([self.action_space.sample() for _ in range(n_envs)])
+            return drawn, actions.scale(drawn)
+        assert isinstance(self._last_obs, np.ndarray)
+        self.policy.check_finite(self._last_obs)
+        with th.no_grad():
+            obs = th.as_tensor(self._last_obs, dtype=th.float32, device=self.device)
+            flat = self.policy.flat_actions(obs).cpu().numpy()
+        if actions.has_continuous:
+            # SB3's seeded generator
+            noise = action_noise() if action_noise else np.random.normal(0.0, self.noise_std, flat.shape)  # noqa: NPY002
+            noisy = np.clip(flat + noise, -1.0, 1.0)
+            flat = np.where(actions.is_continuous, noisy, flat).astype(np.float32)
+        return actions.unscale(flat).astype(self.action_space.dtype), flat
+
+    @property
+    def noise_std(self) -> float:
+        """Present standard deviation of the exploration noise."""
+        if isinstance(self.exploration_noise, (int, float)):
+            return float(self.exploration_noise)
+        first, last = self.exploration_noise
+        return last + self._current_progress_remaining * (first - last)
+
+    def _target_actions(self, next_obs: th.Tensor) -> th.Tensor:
+        """
+        :param next_obs: (batch, n_agents, obs_dim)
+        :return: the target policy's actions there, (batch, n_agents, width)
+        """
+        return self.actor_target.act(next_obs)
+
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         # Update learning rate according to lr schedule
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
 
-        binary = isinstance(self.action_space, spaces.MultiBinary)
-        estimate = ESTIMATORS[self.estimator] if binary else score
-        actor_losses, critic_losses, q_values, scores = [], [], [], []
+        actor_losses, critic_losses, q_values, outputs = [], [], [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
-            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            obs, next_obs = replay_data.observations.float(), replay_data.next_observations.float()
-            actions = replay_data.actions.float().view(-1, self.n_agents, self.action_dim)
+            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            obs = data.observations.float()
+            actions = self.policy.actions.encode(data.actions)
+            if data.active is not None:
+                actions = actions * data.active.unsqueeze(2)
 
-            with th.no_grad():
-                next_q_values = self.critic_target(next_obs, self.actor_target.act(next_obs))
-                target_q_values = replay_data.rewards + (1 - replay_data.dones) * self.gamma * next_q_values
-
-            # A sum over agents: each gradient is that of the agent's own mean squared error
-            current_q_values = self.critic(obs, actions)
-            critic_loss = (current_q_values - target_q_values).square().mean(dim=0).sum()
+            critic_loss, values = self._critic_loss(data, obs, actions)
             self._descend(self.critic, critic_loss)
+            critic_losses.append(critic_loss.item() / self.policy.team.n_agents)
+            q_values.append(values)
 
-            # The other agents' actions are those of the replay buffer, as in the original code
-            logits = self.actor.logits(obs)
-            output = self.actor.squash(logits)
-            objective = estimate(output, partial(self.critic.forward_alternatives, obs, actions))
-            regularization = self.policy_regularization * logits.square().mean(dim=(0, 2))
-            actor_loss = (regularization - objective.mean(dim=0)).sum()
-            self._descend(self.actor, actor_loss)
-
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-            polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
-
-            critic_losses.append(critic_loss.item() / self.n_agents)
-            actor_losses.append(actor_loss.item() / self.n_agents)
-            q_values.append(current_q_values.detach().mean(dim=0))
-            scores.append(output.detach())
+            if self._n_updates % self.policy_delay == 0:
+                actor_loss, output = self._actor_loss(data, obs, actions)
+                self._descend(self.actor, actor_loss)
+                actor_losses.append(actor_loss.item() / self.policy.team.n_agents)
+                outputs.append(output)
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/actor_loss", np.mean(actor_losses))
         self.logger.record("train/critic_loss", np.mean(critic_losses))
         for agent, q_value in enumerate(th.stack(q_values).mean(dim=0).tolist()):
             self.logger.record(f"train/q_value_{agent}", q_value)
-        if binary:
-            self.logger.record("train/score_mean", th.stack(scores).mean().item())
-            self.logger.record("train/score_std", th.stack(scores).std().item())
+        if outputs:
+            self.logger.record("train/actor_loss", np.mean(actor_losses))
+            if self.policy.actions.discrete:
+                self.logger.record("train/score_mean", th.stack(outputs).mean().item())
+                self.logger.record("train/score_std", th.stack(outputs).std().item())
+        if self.policy.actions.has_continuous and self.action_noise is None:
+            self.logger.record("train/exploration_noise", self.noise_std)
 
-    def _descend(self, network: TeamActor | TeamCritic, loss: th.Tensor) -> None:
+    def _critic_loss(self, data: Any, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """:return: the loss, summed over agents, and each agent's mean value, (n_agents,)"""
+        critic = self.critic
+        rewards = data.pair_rewards.flatten(1) if critic.part_credit else data.rewards
+        with th.no_grad():
+            next_obs = data.next_observations.float()
+            next_actions = self._target_actions(next_obs)
+            if data.next_active is not None:
+                next_actions = next_actions * data.next_active.unsqueeze(2)
+            next_values = critic.credited(self.critic_target(next_obs, next_actions)).amin(dim=0)
+            if self._action_cost is not None:
+                next_values = next_values - critic.cost(next_actions, self._action_cost)
+                rewards = rewards + critic.cost(actions, self._action_cost)
+            targets = rewards + critic.spread((1 - data.dones) * data.discounts) * next_values
+
+        # A sum over agents: each gradient is that of the agent's own mean squared error
+        values = critic.credited(critic(obs, actions))
+        errors = (values - targets).square().sum(dim=0)
+        loss = _mean_over_batch(errors, None if data.active is None else critic.spread(data.active)).sum()
+        parts_left = critic.parts_per_agent if critic.part_credit else 1
+        return loss, by_agent(values[0].detach(), parts_left).mean(dim=0)
+
+    def _actor_loss(self, data: Any, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """:return: the loss, summed over agents, and the actors' outputs, (batch, n_agents, width)"""
+        critic, team = self.critic, self.policy.actions
+        # The other agents' actions are those of the replay buffer, as in the original code
+
+        def q(own: th.Tensor, units: th.Tensor | None) -> th.Tensor:
+            values = critic.forward_alternatives(obs, actions, own, units)
+            if self._action_cost is None:
+                return values
+            cost = critic.to_units(self._action_cost.unsqueeze(0))[0]
+            return values - (own * (cost if units is None else cost[units]).unsqueeze(1)).sum(dim=-1)
+
+        logits = self.actor.logits(obs)
+        temperature = self.temperature
+        if callable(temperature):
+            temperature = temperature(self._current_progress_remaining)
+        with _no_gradients(critic):
+            objective = critic.units.objective(ESTIMATORS[self.estimator], critic.to_units(logits), q, temperature)
+        losses = self.policy_regularization * team.regularization(logits) - by_agent(objective, critic.units_per_agent)
+        return _mean_over_batch(losses, data.active).sum(), team.squash(logits.detach())
+
+    def _descend(self, network: Actor | Critic, loss: th.Tensor) -> None:
         network.optimizer.zero_grad()
         loss.backward()
         if self.max_grad_norm is not None:
-            network.net.clip_grad_norm_(self.max_grad_norm)
+            network.clip_grad_norm_(self.max_grad_norm)
         network.optimizer.step()
+
+    def agent_policy(self, agent: str | int) -> AgentPolicy:
+        """
+        What one agent needs to act by itself, without the team and without the critics.
+
+        :param agent: its name or its number
+        """
+        return AgentPolicy.of(self.policy, agent)
 
     def learn(
         self: SelfMADDPG,
@@ -278,8 +437,32 @@ class MADDPG(OffPolicyAlgorithm):
         force_reset: bool = True,
         **kwargs,
     ) -> SelfMADDPG:
+        cls._check_file(path)
         with _remedy_for_other_team():
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    @classmethod
+    def _check_file(cls, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Refuse a model of another algorithm or of another format, before anything in it is unpickled."""
+        file = open_path(path, "r", verbose=0, suffix="zip")
+        if not zipfile.is_zipfile(file):
+            return  # SB3 says what is wrong
+        with zipfile.ZipFile(file) as archive:
+            data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
+        if isinstance(path, (str, os.PathLike)):
+            file.close()
+        else:
+            file.seek(0)
+        algorithm = data.get("algorithm")
+        if algorithm not in (None, cls.__name__):
+            raise ValueError(f"{path} holds a model of {algorithm}: load it with `{algorithm}.load`.")
+        if algorithm is None and "policy_regularization" not in data:
+            raise ValueError(f"{path} holds a model of another algorithm than {cls.__name__}.")
+        if data.get("file_format", 1) != FILE_FORMAT:
+            raise ValueError(
+                f"{path} has format {data.get('file_format', 1)}, this version of sb3-maddpg reads format "
+                f"{FILE_FORMAT}: install the version that wrote it, or train again."
+            )
 
     def save(
         self,
@@ -299,10 +482,29 @@ class MADDPG(OffPolicyAlgorithm):
             super().save_replay_buffer(file)  # type: ignore[arg-type]
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "critic", "actor_target", "critic_target"]
+        return [*super()._excluded_save_params(), "actor", "critic", "actor_target", "critic_target", "_action_cost"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def _mean_over_batch(values: th.Tensor, active: th.Tensor | None) -> th.Tensor:
+    """
+    :param values: (batch, n)
+    :param active: which of them count, (batch, n), None for all
+    :return: (n,)
+    """
+    return values.mean(dim=0) if active is None else (values * active).sum(dim=0) / active.sum(dim=0).clamp(min=1.0)
+
+
+@contextmanager
+def _no_gradients(network: th.nn.Module) -> Iterator[None]:
+    """Leave the network's parameters out of the backward pass, where only its inputs' gradients are wanted."""
+    network.requires_grad_(False)
+    try:
+        yield
+    finally:
+        network.requires_grad_(True)
 
 
 @contextmanager

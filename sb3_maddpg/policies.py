@@ -1,8 +1,10 @@
-"""Actors and critics of a team, every layer of all agents in one tensor with a leading agent axis."""
+"""Policies of a team: decentralised actors, centralised critics and their targets."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from copy import deepcopy
-from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -12,224 +14,348 @@ from stable_baselines3.common.torch_layers import get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_maddpg.utils import team_shape
+from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.networks import StackedMLP
+from sb3_maddpg.team import MixedActions, Team
+
+Sharing = bool | Sequence[Sequence[str | int]]
 
 
-class StackedMLP(nn.Module):
+def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
     """
-    One multi-layer perceptron per agent, evaluated together. Initialised like ``torch.nn.Linear``.
-
-    :param n_agents: number of networks
-    :param in_features: inputs of each
-    :param out_features: outputs of each
-    :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
-    :param shared: one set of parameters for all agents (an agent axis of length one)
+    :param share: True: all agents share one network, False: each has its own, or lists of agents that share one
+    :param team: whose agents
+    :param argument: name of the argument, for the error's message
+    :return: for each agent the number of its network
+    :raises ValueError: an agent in two lists, or unlike agents in one
     """
-
-    def __init__(
-        self,
-        n_agents: int,
-        in_features: int,
-        out_features: int,
-        net_arch: list[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-        shared: bool = False,
-    ):
-        super().__init__()
-        self.n_agents = n_agents
-        self.activation = activation_fn()
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        copies = 1 if shared else n_agents
-        for width, next_width in pairwise([in_features, *net_arch, out_features]):
-            bound = width**-0.5
-            self.weights.append(nn.init.uniform_(th.empty(copies, width, next_width), -bound, bound))
-            self.biases.append(nn.init.uniform_(th.empty(copies, 1, next_width), -bound, bound))
-
-    def layer(self, index: int, x: th.Tensor) -> th.Tensor:
-        """
-        :param index: which layer
-        :param x: (n_agents, batch, in)
-        :return: before the activation, (n_agents, batch, out)
-        """
-        return th.baddbmm(self.biases[index], x, self.weights[index].expand(self.n_agents, -1, -1))
-
-    def after_first(self, x: th.Tensor) -> th.Tensor:
-        """
-        :param x: what the first layer gives before its activation, (n_agents, batch, width)
-        :return: what the network gives, (n_agents, batch, out_features)
-        """
-        for index in range(1, len(self.weights)):
-            x = self.layer(index, self.activation(x))
-        return x
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        """
-        :param x: (n_agents, batch, in_features)
-        :return: (n_agents, batch, out_features)
-        """
-        return self.after_first(self.layer(0, x))
-
-    def clip_grad_norm_(self, max_norm: float) -> None:
-        """
-        Clip the gradient of each agent's network by its own norm, so that no agent slows another.
-
-        :param max_norm: largest Euclidean norm over all parameters of one network
-        """
-        gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
-        norm = th.stack([gradient.square().sum(dim=(1, 2)) for gradient in gradients]).sum(dim=0).sqrt()
-        scale = (max_norm / (norm + 1e-6)).clamp(max=1.0).view(-1, 1, 1)
-        for gradient in gradients:
-            gradient.mul_(scale)
+    if isinstance(share, bool):
+        lists = [list(range(team.n_agents))] if share else []
+    else:
+        lists = [[team.index(agent) for agent in agents] for agents in share]
+    named = [agent for agents in lists for agent in agents]
+    if len(set(named)) < len(named):
+        raise ValueError(f"{argument}={share} names an agent twice: an agent has one network.")
+    for first, *others in filter(None, lists):
+        for other in others:
+            same_obs = team.obs_dims[first] == team.obs_dims[other]
+            if not same_obs or team.action_spaces[first] != team.action_spaces[other]:
+                raise ValueError(
+                    f"{argument}={share}: {team.names[first]} and {team.names[other]} have unlike spaces and cannot "
+                    "share a network. Give lists of agents that are alike, or False."
+                )
+    lists += [[agent] for agent in range(team.n_agents) if agent not in named]
+    groups = [0] * team.n_agents
+    for number, agents in enumerate(sorted(filter(None, lists))):
+        for agent in agents:
+            groups[agent] = number
+    return groups
 
 
-class TeamActor(nn.Module):
+class Actor(nn.Module):
     """
-    Decentralised actors f_i(z_i): agent i's output depends on its own observation only.
+    Decentralised actors: agent i's output depends on its own observation only.
 
-    :param n_agents: number of agents
-    :param obs_dim: observation length of each
-    :param action_dim: number of actions of each
-    :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
-    :param shared: one network for all agents
-    :param threshold: delta, for bits 1[f > delta] of scores f in [0, 1]; None for continuous actions in [-1, 1]
+    :param actions: how the team acts
     """
 
     optimizer: th.optim.Optimizer
 
-    def __init__(
-        self,
-        n_agents: int,
-        obs_dim: int,
-        action_dim: int,
-        net_arch: list[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-        shared: bool = False,
-        threshold: float | None = None,
-    ):
+    def __init__(self, actions: TeamActions):
         super().__init__()
-        self.net = StackedMLP(n_agents, obs_dim, action_dim, net_arch, activation_fn, shared)
-        self.threshold = threshold
+        self.actions = actions
 
     def logits(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim)
-        :return: the networks' outputs before they are squashed, (batch, n_agents, action_dim)
+        :param obs: (batch, n_agents, obs_dim or more)
+        :return: the networks' outputs before they are squashed, (batch, n_agents, width)
         """
-        return self.net(obs.transpose(0, 1)).transpose(0, 1)
+        raise NotImplementedError
 
-    def squash(self, logits: th.Tensor) -> th.Tensor:
+    def single(self, agent: int) -> nn.Module:
         """
-        :param logits: (batch, n_agents, action_dim)
-        :return: scores in [0, 1] for bits, or continuous actions in [-1, 1], (batch, n_agents, action_dim)
+        :param agent: which one
+        :return: a network that maps its observation without padding, (batch, its obs_dim), to outputs, (batch, width)
         """
-        return th.tanh(logits) if self.threshold is None else th.sigmoid(logits)
+        raise NotImplementedError
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        """
+        :param max_norm: largest norm of each network's gradient
+        """
+        raise NotImplementedError
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim)
-        :return: scores or continuous actions, (batch, n_agents, action_dim)
+        :param obs: (batch, n_agents, obs_dim or more)
+        :return: scores, continuous actions or probabilities, (batch, n_agents, width)
         """
-        return self.squash(self.logits(obs))
+        return self.actions.squash(self.logits(obs))
 
     def act(self, obs: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim)
-        :param deterministic: threshold at delta; otherwise at one delta' ~ U(0, 1) per agent, shared by its bits
-            (Serra-Gomez et al., IROS 2020, Sec. IV-C)
-        :return: actions, (batch, n_agents, action_dim)
+        :param obs: (batch, n_agents, obs_dim or more)
+        :param deterministic: without exploration, see ``TeamActions``
+        :return: actions as critics read them, (batch, n_agents, width)
         """
-        output = self(obs)
-        if self.threshold is None:
-            return output
-        threshold = self.threshold if deterministic else th.rand_like(output[..., :1])
-        return (output > threshold).to(output.dtype)
+        return self.actions.act(self.logits(obs), deterministic)
 
 
-class TeamCritic(nn.Module):
+class TeamActor(Actor):
     """
-    Centralised critics Q_i(z_1..z_n, a_1..a_n). Critic i reads agent by agent, from agent i on and round the circle,
-    so that its own observation and action come first: a shared critic then knows whose value it gives.
+    One multi-layer perceptron per agent.
 
-    :param n_agents: number of agents
-    :param obs_dim: observation length of each
-    :param action_dim: number of actions of each
+    :param team: the team
+    :param actions: how it acts
     :param net_arch: widths of the hidden layers
     :param activation_fn: between the layers
-    :param shared: one network for all agents
+    :param groups: for each agent the number of its network
     """
-
-    optimizer: th.optim.Optimizer
-    order: th.Tensor
 
     def __init__(
         self,
-        n_agents: int,
-        obs_dim: int,
-        action_dim: int,
+        team: Team,
+        actions: TeamActions,
         net_arch: list[int],
         activation_fn: type[nn.Module] = nn.ReLU,
-        shared: bool = False,
+        groups: Sequence[int] | None = None,
+    ):
+        super().__init__(actions)
+        self.team = team
+        self.net = StackedMLP(groups or range(team.n_agents), team.obs_dim, actions.width, net_arch, activation_fn)
+
+    def logits(self, obs: th.Tensor) -> th.Tensor:
+        return self.net(obs[..., : self.team.obs_dim].permute(1, 2, 0)).permute(2, 0, 1)
+
+    def single(self, agent: int) -> nn.Module:
+        return self.net.single(agent, self.team.obs_dims[agent])
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        self.net.clip_grad_norm_(max_norm)
+
+
+class Critic(nn.Module):
+    """
+    Centralised critics, which read all observations and all actions. An agent's value may be a sum of parts, and its
+    action may be made of units whose gradient is estimated unit by unit; in the plain case each agent is one of both.
+
+    :param units: how units act
+    :param units_per_agent: number of units of an agent's action
+    :param parts_per_agent: number of parts of an agent's value
+    :param part_credit: each part is fitted to rewards of its own, otherwise their sum to the agent's reward
+    :param n_critics: number of critics (two for MATD3)
+    """
+
+    optimizer: th.optim.Optimizer
+
+    def __init__(
+        self,
+        units: TeamActions,
+        units_per_agent: int = 1,
+        parts_per_agent: int = 1,
+        part_credit: bool = False,
+        n_critics: int = 1,
     ):
         super().__init__()
-        self.net = StackedMLP(n_agents, n_agents * (obs_dim + action_dim), 1, net_arch, activation_fn, shared)
-        self.own_action = slice(obs_dim, obs_dim + action_dim)
-        agents = th.arange(n_agents)
-        self.register_buffer("order", (agents.unsqueeze(1) + agents) % n_agents, persistent=False)
-
-    def _views(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
-        :param obs: (batch, n_agents, obs_dim)
-        :param actions: (batch, n_agents, action_dim)
-        :return: what each critic reads, (n_agents, batch, n_agents * (obs_dim + action_dim)), a fresh tensor
-        """
-        return th.cat([obs, actions], dim=-1)[:, self.order].transpose(0, 1).flatten(2)
+        self.units = units
+        self.units_per_agent = units_per_agent
+        self.parts_per_agent = parts_per_agent
+        self.part_credit = part_credit
+        self.n_critics = n_critics
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim)
-        :param actions: (batch, n_agents, action_dim)
-        :return: Q_i of every agent i, (batch, n_agents)
+        :param obs: (batch, n_agents, obs_dim or more)
+        :param actions: (batch, n_agents, width)
+        :return: the parts of the values, agent after agent, (n_critics, batch, n_agents * parts_per_agent)
         """
-        return self.net(self._views(obs, actions)).squeeze(-1).T
+        raise NotImplementedError
 
-    def forward_alternatives(self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor) -> th.Tensor:
+    def forward_alternatives(
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, units: th.Tensor | None = None
+    ) -> th.Tensor:
         """
-        Q_i with agent i's action replaced, the others' kept. The first layer is linear: it sees the wide joint input
-        once, and each of the M alternatives only adds its own few columns.
+        The first critic's value with a unit's action replaced and everything else kept.
 
-        :param obs: (batch, n_agents, obs_dim)
-        :param actions: (batch, n_agents, action_dim); the own part of each critic is not read
-        :param own: alternatives for the own action, (batch, n_agents, M, action_dim)
-        :return: (batch, n_agents, M)
+        :param obs: (batch, n_agents, obs_dim or more)
+        :param actions: (batch, n_agents, width); the unit's own part is not read
+        :param own: alternatives for the unit's action, (batch, len(units), M, the units' width)
+        :param units: which units, None for all
+        :return: (batch, len(units), M)
         """
-        batch, n_agents, n_alternatives, _ = own.shape
-        views = self._views(obs, actions)
-        views[:, :, self.own_action] = 0.0
-        others = self.net.layer(0, views)
-        own_weight = self.net.weights[0][:, self.own_action].expand(n_agents, -1, -1)
-        mine = th.bmm(own.transpose(0, 1).flatten(1, 2), own_weight).unflatten(1, (batch, n_alternatives))
-        q_values = self.net.after_first((others.unsqueeze(2) + mine).flatten(1, 2))
-        return q_values.view(n_agents, batch, n_alternatives).transpose(0, 1)
+        raise NotImplementedError
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        """
+        :param max_norm: largest norm of each network's gradient
+        """
+        raise NotImplementedError
+
+    def to_units(self, actions: th.Tensor) -> th.Tensor:
+        """
+        :param actions: actions or outputs of agents, (batch, n_agents, width)
+        :return: those of units, (batch, n_units, the units' width)
+        """
+        return actions if self.units_per_agent == 1 else actions.reshape(len(actions), -1, self.units.width)
+
+    def credited(self, parts: th.Tensor) -> th.Tensor:
+        """
+        :param parts: (..., n_agents * parts_per_agent)
+        :return: what has rewards of its own: the parts, or their sums, (..., n_credited)
+        """
+        return parts if self.part_credit else by_agent(parts, self.parts_per_agent)
+
+    def spread(self, of_agents: th.Tensor) -> th.Tensor:
+        """
+        :param of_agents: something every agent has, (batch, n_agents)
+        :return: the same for what has rewards of its own, (batch, n_credited)
+        """
+        return of_agents.repeat_interleave(self.parts_per_agent, dim=-1) if self.part_credit else of_agents
+
+    def cost(self, actions: th.Tensor, action_cost: th.Tensor) -> th.Tensor:
+        """
+        :param actions: (batch, n_agents, width)
+        :param action_cost: (n_agents, width)
+        :return: what the actions cost those who have rewards of their own, (batch, n_credited)
+        """
+        of_units = self.to_units(actions * action_cost).sum(dim=-1)
+        if not self.part_credit:
+            return by_agent(of_units, self.units_per_agent)
+        return of_units if self.units_per_agent > 1 else self.spread(of_units) / self.parts_per_agent
+
+
+def by_agent(parts: th.Tensor, per_agent: int) -> th.Tensor:
+    """
+    :param parts: agent after agent, (..., n_agents * per_agent)
+    :param per_agent: how many each agent has
+    :return: their sums, (..., n_agents)
+    """
+    return parts if per_agent == 1 else parts.unflatten(-1, (-1, per_agent)).sum(dim=-1)
+
+
+class TeamCritic(Critic):
+    """
+    One multi-layer perceptron per agent, Q_i(z_1..z_n, a_1..a_n), or Q_i(s, a_1..a_n) with a global state s. Critics
+    that share parameters read the agents in another order each: the own agent first, then those it shares with, then
+    the others. So they know whose value they give; with a global state a further input tells them.
+
+    :param team: the team
+    :param actions: how it acts
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    :param groups: for each agent the number of its network
+    :param n_critics: number of critics
+    """
+
+    columns: th.Tensor
+    own_columns: th.Tensor
+
+    def __init__(
+        self,
+        team: Team,
+        actions: TeamActions,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        groups: Sequence[int] | None = None,
+        n_critics: int = 1,
+    ):
+        super().__init__(actions, n_critics=n_critics)
+        self.team = team
+        n = team.n_agents
+        groups = list(groups or range(n))
+        self.shared = len(set(groups)) < n
+        parts = [team.obs_dim, actions.width] if team.state_dim == 0 else [actions.width]
+        columns = np.arange(team.state_dim)[None].repeat(n, axis=0)
+        for width in parts:
+            block = columns.shape[1] + np.arange(n * width).reshape(n, width)
+            # Where in the own view, if there is one, each agent stands
+            place = np.array([_places(groups, agent) if self.shared else np.arange(n) for agent in range(n)])
+            columns = np.concatenate([columns, block[place].reshape(n, -1)], axis=1)
+        own = columns.reshape(n, -1)[:, -n * actions.width :].reshape(n, n, -1)[np.arange(n), np.arange(n)]
+        self.tells_agent = self.shared and team.state_dim > 0
+        if self.tells_agent:
+            columns = np.concatenate([columns, columns.shape[1] + np.arange(n)[:, None]], axis=1)
+        self.register_buffer("columns", th.as_tensor(columns).repeat(n_critics, 1), persistent=False)
+        self.register_buffer("own_columns", th.as_tensor(own), persistent=False)
+        networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
+        self.net = StackedMLP(networks, int(columns.max()) + 1, 1, net_arch, activation_fn)
+
+    def _inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """:return: what all critics read, (features, batch)"""
+        seen = obs[..., self.team.obs_dim :] if self.team.state_dim else obs[..., : self.team.obs_dim]
+        inputs = [seen.flatten(1)[:, : self.team.state_dim or None], actions.flatten(1)]
+        if self.tells_agent:
+            inputs.append(actions.new_ones(len(actions), 1))
+        return th.cat(inputs, dim=1).T
+
+    def _first(self, inputs: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
+        """:return: what the first layer gives, (n_networks, width, batch)"""
+        weight, bias = self.net.layer(0, networks)
+        if self.shared:  # reordering the few weights does what reordering the whole batch would
+            columns = self.columns if networks is None else self.columns[networks]
+            weight = weight.gather(2, columns.unsqueeze(1).expand(-1, weight.shape[1], -1))
+        return th.baddbmm(bias, weight, inputs.expand(len(weight), -1, -1))
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        values = self.net.after_first(self._first(self._inputs(obs, actions)))
+        return values.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        self.net.clip_grad_norm_(max_norm)
+
+    def forward_alternatives(
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, units: th.Tensor | None = None
+    ) -> th.Tensor:
+        # The first layer is linear: it reads the wide joint input once, and every alternative adds its few columns
+        agents = th.arange(self.team.n_agents, device=own.device) if units is None else units
+        networks = None if units is None and self.n_critics == 1 else agents
+        first = self._first(self._inputs(obs, actions), networks)
+        weight = self.net.of_networks(self.net.weights[0], networks)
+        own_weight = weight.gather(2, self.own_columns[agents].unsqueeze(1).expand(-1, weight.shape[1], -1))
+        change = (own - actions[:, agents].unsqueeze(2)).permute(1, 3, 0, 2)
+        batch, n_alternatives = change.shape[2:]
+        first = first.unsqueeze(3) + th.bmm(own_weight, change.flatten(2)).unflatten(2, (batch, n_alternatives))
+        values = self.net.after_first(first.flatten(2), networks)
+        return values.squeeze(1).unflatten(1, (batch, n_alternatives)).transpose(0, 1)
+
+
+def _places(groups: Sequence[int], agent: int) -> list[int]:
+    """
+    :param groups: for each agent the number of its network
+    :param agent: whose critic
+    :return: for each agent its place in what that critic reads
+    """
+    n = len(groups)
+    order = sorted(range(n), key=lambda other: (groups[other] != groups[agent], (other - agent) % n))
+    return [order.index(other) for other in range(n)]
 
 
 class MADDPGPolicy(BasePolicy):
     """
-    Policy of MADDPG: actors, critics and their targets.
+    Policy of MADDPG: actors, critics and their targets, a multi-layer perceptron for each agent.
 
-    :param observation_space: ``Box(n_agents, obs_dim)``
-    :param action_space: ``MultiBinary(n_agents * action_dim)`` or ``Box(n_agents * action_dim)``
+    :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
+    :param action_space: flat joint action, see ``Team.from_spaces``
     :param lr_schedule: learning rate schedule (could be constant)
     :param net_arch: widths of the hidden layers, as a list or as ``dict(pi=[...], qf=[...])``
     :param activation_fn: between the layers
-    :param share_actor: one actor network for all agents
-    :param share_critic: one critic network for all agents
-    :param threshold: delta in [0, 1): a bit is set where its score exceeds it. Unused for continuous actions.
+    :param share_actor: True: one actor network for all agents, False: one for each; or lists of agents (names or
+        numbers) that share one
+    :param share_critic: the same for critics
+    :param threshold: delta in [0, 1): a bit is set where its score exceeds it. For ``MultiBinary`` alone.
+    :param n_critics: number of critics of each agent
+    :param agent_names: by default those of the observation space, or agent_0, agent_1, ...
     :param normalize_images: kept for Stable-Baselines3, a team observation is never an image
     :param optimizer_class: ``th.optim.Adam`` by default, in its fused form
     :param optimizer_kwargs: further keyword arguments for the optimizer, the learning rate excluded
     """
+
+    # Attributes of the environment that are arguments of the policy, see MADDPG
+    env_attributes: ClassVar[tuple[str, ...]] = ("agent_names",)
+    actor: Actor
+    actor_target: Actor
+    critic: Critic
+    critic_target: Critic
 
     def __init__(
         self,
@@ -238,9 +364,11 @@ class MADDPGPolicy(BasePolicy):
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
-        share_actor: bool = False,
-        share_critic: bool = False,
+        share_actor: Sharing = False,
+        share_critic: Sharing = False,
         threshold: float = 0.5,
+        n_critics: int = 1,
+        agent_names: Sequence[str] | None = None,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
@@ -254,27 +382,41 @@ class MADDPGPolicy(BasePolicy):
             normalize_images=normalize_images,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
-            squash_output=isinstance(action_space, spaces.Box),
+            squash_output=isinstance(action_space, spaces.Box) and not isinstance(action_space, MixedActions),
         )
         if not 0.0 <= threshold < 1.0:
             raise ValueError(f"threshold={threshold}: scores lie in [0, 1], choose 0 <= threshold < 1.")
+        if n_critics < 1:
+            raise ValueError(f"n_critics={n_critics}: an agent needs at least one.")
+        self.team = Team.from_spaces(observation_space, action_space, agent_names)
         self.net_arch = [64, 64] if net_arch is None else net_arch
         self.activation_fn = activation_fn
         self.share_actor = share_actor
         self.share_critic = share_critic
         self.threshold = threshold
+        self.n_critics = n_critics
+        self._build(lr_schedule)
 
-        team = team_shape(observation_space, action_space)
-        actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
-        delta = None if isinstance(action_space, spaces.Box) else threshold
-        self.actor = TeamActor(*team, actor_arch, activation_fn, share_actor, delta)
-        self.critic = TeamCritic(*team, critic_arch, activation_fn, share_critic)
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.actor, self.critic = self._make_networks(*get_actor_critic_arch(self.net_arch))
+        self.actions = self.actor.actions
         self.actor_target = deepcopy(self.actor)
         self.critic_target = deepcopy(self.critic)
         for module in (self.actor, self.critic):
-            module.optimizer = optimizer_class(module.parameters(), lr=lr_schedule(1), **optimizer_kwargs)  # type: ignore[call-arg]
+            module.optimizer = self.optimizer_class(  # type: ignore[call-arg]
+                module.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
+            )
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
+
+    def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
+        actions = TeamActions(self.team.action_spaces, self.threshold)
+        actor_groups = sharing_groups(self.share_actor, self.team, "share_actor")
+        critic_groups = sharing_groups(self.share_critic, self.team, "share_critic")
+        return (
+            TeamActor(self.team, actions, actor_arch, self.activation_fn, actor_groups),
+            TeamCritic(self.team, actions, critic_arch, self.activation_fn, critic_groups, self.n_critics),
+        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
@@ -285,26 +427,45 @@ class MADDPGPolicy(BasePolicy):
             "share_actor": self.share_actor,
             "share_critic": self.share_critic,
             "threshold": self.threshold,
+            "n_critics": self.n_critics,
+            "agent_names": self.team.names,
             "optimizer_class": self.optimizer_class,
             "optimizer_kwargs": self.optimizer_kwargs,
         }
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        obs, vectorized = super().obs_to_tensor(observation)
-        assert isinstance(obs, th.Tensor)
-        finite = obs.isfinite()
+        self.check_finite(np.asarray(observation))
+        return super().obs_to_tensor(observation)
+
+    def check_finite(self, observation: np.ndarray) -> None:
+        """
+        :param observation: (..., n_agents, obs_dim or more)
+        :raises ValueError: NaN or infinity
+        """
+        finite = np.isfinite(observation)
         if not finite.all():
-            agents = (~finite).any(dim=-1).nonzero()[:, 1].unique().tolist()
+            agents = np.flatnonzero(~finite.all(axis=-1).reshape(-1, self.team.n_agents).all(axis=0))
             raise ValueError(
-                f"The observation of agent(s) {agents} holds NaN or infinity. An action for it would mean nothing: "
-                "clip or replace such values in the environment."
+                f"The observation of agent(s) {', '.join(self.team.names[agent] for agent in agents)} holds NaN or "
+                "infinity. An action for it would mean nothing: clip or replace such values in the environment."
             )
-        return obs, vectorized
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
 
+    def flat_actions(self, obs: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        """
+        :param obs: (batch, n_agents, obs_dim or more)
+        :param deterministic: without exploration
+        :return: joint actions as the replay buffer keeps them, (batch, length)
+        """
+        return self.actions.decode(self.actor.act(obs.float(), deterministic))
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
-        actions = self.actor.act(observation.float(), deterministic).flatten(1)
-        return actions if isinstance(self.action_space, spaces.Box) else actions.to(th.int8)
+        flat = self.flat_actions(observation, deterministic)
+        if self.squash_output:  # Stable-Baselines3 unscales a Box itself
+            return flat
+        if isinstance(self.action_space, MixedActions):
+            return th.as_tensor(self.actions.unscale(flat.cpu().numpy()))
+        return flat.to(th.int8 if isinstance(self.action_space, spaces.MultiBinary) else th.int64)

@@ -23,7 +23,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, StoreDict, get_latest_run_id, get_saved_hyperparams
 
-from sb3_maddpg import MADDPG
+from sb3_maddpg import MADDPG, parallel
 from sb3_maddpg.experiment import TeamExperimentManager, convert_maddpg_params, sample_maddpg_params
 from sb3_maddpg.utils import suggest
 
@@ -37,11 +37,13 @@ Train, watch and compare teams with rl_zoo3, MADDPG and the installed environmen
 
 `<command> --help` lists a command's options, which are those of rl_zoo3. What differs: --algo is maddpg unless given,
 the packaged recipe is used unless --conf-file is given, --env-kwargs are merged over the recipe's, --num-threads is 1
-unless given, and -i MODEL.zip continues the training where it ended."""
+unless given, and -i MODEL.zip continues the training where it ended. --env PACKAGE/MODULE is a PettingZoo environment;
+its --env-kwargs are those of its parallel_env, `state:True` for critics that read the global state, and `wrappers`."""
 EPILOG = """\
 examples:
   python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --progress --tensorboard-log logs/tensorboard
   python -m sb3_maddpg.zoo train --env OwnBit-v0
+  python -m sb3_maddpg.zoo train --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:True
   python -m sb3_maddpg.zoo evaluate --env QuadSwarm-v0 --policy none full latest:logs --scenario all"""
 
 # Mistakes in what the user gave. Their messages say what to do, so one line is enough.
@@ -93,7 +95,9 @@ def train(argv: list[str]) -> int:
     """Train as rl_zoo3 does, by the packaged recipe unless another is given."""
     parser = _parser()
     parser.add_argument("-conf", "--conf-file")
-    known, _ = parser.parse_known_args(argv)
+    known, rest = parser.parse_known_args(argv)
+    if known.env is not None and not {"-h", "--help"} & set(rest):
+        _find_env(known.env, known.gym_packages)
     # One thread unless asked otherwise: small networks gain nothing by a second and lose badly where it is not free.
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
     if known.env is not None and known.conf_file is None:
@@ -111,9 +115,7 @@ def _replay(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, default={})
     known, rest = parser.parse_known_args(argv)
     if known.env is not None and not {"-h", "--help"} & set(rest):
-        for package in known.gym_packages:
-            importlib.import_module(package)
-        _check_env(known.env)
+        _find_env(known.env, known.gym_packages)
         name = EnvironmentName(known.env)
         exp_id = known.exp_id or get_latest_run_id(str(Path(known.folder, known.algo)), name)
         run = Path(known.folder, known.algo, f"{name}_{exp_id}" if exp_id > 0 else "")
@@ -122,7 +124,7 @@ def _replay(command: str, function: Callable[[], Any], argv: list[str]) -> int:
         rest += ["--env", known.env]
         # rl_zoo3 reads these values as Python; its own merging forgets some of them
         rest += ["--env-kwargs", *(f"{key}:{value!r}" for key, value in env_kwargs.items())] if env_kwargs else []
-        if command == "enjoy" and "--no-render" not in rest and not _has_window(known.env):
+        if command == "enjoy" and "--no-render" not in rest and not _has_window(known.env, env_kwargs):
             print(f"{known.env} has no window to show: only the rewards are printed. `record` makes a video.")
             rest.append("--no-render")
     _call(function, command, ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest])
@@ -184,14 +186,30 @@ def latest_model(word: str, algo: str, env_id: str) -> str:
     )
 
 
-def _check_env(env_id: str) -> None:
-    if env_id not in gymnasium.registry:
-        raise ValueError(suggest("environment", env_id, gymnasium.registry))
+def _find_env(env_id: str, packages: list[str]) -> None:
+    """Make the environment known to Gymnasium: one that is registered, or a PettingZoo module."""
+    for package in packages:
+        importlib.import_module(package)
+    if parallel.register(env_id):
+        return
+    package, slash, _ = env_id.rpartition("/")
+    known = parallel.siblings(env_id) or gymnasium.registry
+    if slash and not any(name.startswith(f"{package}/") for name in known):
+        raise ValueError(
+            f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
+            "parallel_env, as PettingZoo's have. Is its package installed?"
+        )
+    raise ValueError(suggest("environment", env_id, known))
 
 
-def _has_window(env_id: str) -> bool:
-    entry_point = gymnasium.spec(env_id).entry_point
-    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+def _has_window(env_id: str, env_kwargs: dict[str, Any]) -> bool:
+    spec = gymnasium.spec(env_id)
+    if spec.entry_point == parallel.ENTRY_POINT:
+        # Only the environment itself knows
+        env = parallel.make(**{**spec.kwargs, **env_kwargs})
+        env.close()
+        return "human" in env.metadata["render_modes"]
+    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
     return "human" in getattr(creator, "metadata", {}).get("render_modes", ["human"])
 
 

@@ -1,20 +1,25 @@
-"""Per-agent rewards and ends in the replay buffer."""
+"""Per-agent rewards and ends, sums of n rewards and the storage of the replay buffer."""
+
+import copy
+import pickle
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_maddpg import MADDPG, TeamReplayBuffer
 from sb3_maddpg.team_tasks import OwnBit
 
 N, D, K = 3, 2, 2
+BOX = spaces.Box(-9, 9, (N, D), np.float32)
 
 
-def buffer(size: int = 8, n_envs: int = 1, **kwargs) -> TeamReplayBuffer:
-    return TeamReplayBuffer(
-        size, spaces.Box(-9, 9, (N, D), np.float32), spaces.MultiBinary(N * K), device="cpu", n_envs=n_envs, **kwargs
-    )
+def buffer(size: int = 8, n_envs: int = 1, space: spaces.Space = BOX, **kwargs) -> TeamReplayBuffer:
+    return TeamReplayBuffer(size, space, spaces.MultiBinary(N * K), device="cpu", n_envs=n_envs, **kwargs)
 
 
 def add(memory: TeamReplayBuffer, index: int, reward: float = 0.0, done: bool = False, **info) -> None:
@@ -28,20 +33,24 @@ def transition(memory: TeamReplayBuffer, index: int):
     return memory._get_samples(np.array([index]))
 
 
-def test_agents_get_their_own_rewards_and_ends():
+def episodes(memory: TeamReplayBuffer, *steps: dict, start: int = 0) -> None:
+    """Transitions of one environment, each of which starts with the observation the one before ended with."""
+    for index, step in enumerate(steps, start):
+        obs = np.full((1, N, D), 10 * index, np.float32)
+        reward = np.array([10.0**index])
+        memory.add(obs, obs + 10, np.zeros((1, N * K), np.int8), reward, np.array([step.get("done", False)]), [step])
+
+
+OUT = {"agent_active": [True, False, True]}
+
+
+def test_agents_get_their_own_rewards_and_ends_or_else_the_teams():
     memory = buffer()
     add(memory, 0, 5.0, agent_rewards=np.array([1.0, 2.0, 3.0]), agent_terminated=np.array([False, True, False]))
-    sample = transition(memory, 0)
-    assert sample.rewards.tolist() == [[1.0, 2.0, 3.0]]
-    assert sample.dones.tolist() == [[0.0, 1.0, 0.0]]
-
-
-def test_without_them_agents_share_the_teams():
-    memory = buffer()
-    add(memory, 0, 5.0, done=True)
-    sample = transition(memory, 0)
-    assert sample.rewards.tolist() == [[5.0] * N]
-    assert sample.dones.tolist() == [[1.0] * N]
+    add(memory, 1, 5.0, done=True)
+    sample = memory._get_samples(np.arange(2))
+    assert sample.rewards.tolist() == [[1, 2, 3], [5, 5, 5]]
+    assert sample.dones.tolist() == [[0, 1, 0], [1, 1, 1]]
 
 
 @pytest.mark.parametrize(("handled", "ends"), [(True, [0.0, 1.0, 0.0]), (False, [1.0, 1.0, 1.0])])
@@ -91,25 +100,9 @@ def test_optimize_memory_usage_gives_the_next_observation_without_storing_it():
 def test_optimize_memory_usage_has_sb3s_condition():
     with pytest.raises(ValueError, match="handle_timeout_termination"):
         buffer(optimize_memory_usage=True)
-    env = OwnBit()
-    kwargs = {"handle_timeout_termination": False}
-    model = MADDPG(
-        "MlpPolicy",
-        env,
-        optimize_memory_usage=True,
-        replay_buffer_kwargs=kwargs,
-        buffer_size=100,
-        learning_starts=20,
-        train_freq=10,
-        batch_size=16,
-    )
+    kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    model = MADDPG("MlpPolicy", OwnBit(), **kwargs, buffer_size=100, learning_starts=20, train_freq=10, batch_size=16)
     assert model.learn(150).num_timesteps == 150
-
-
-@pytest.mark.parametrize("key", ["agent_rewards", "agent_terminated"])
-def test_a_wrong_number_of_agents_is_refused(key):
-    with pytest.raises(ValueError, match=rf"info\['{key}'\] has shape \(2,\).*3 agents"):
-        add(buffer(), 0, **{key: np.zeros(2)})
 
 
 def test_vec_normalize_scales_the_agents_rewards_like_the_teams():
@@ -120,3 +113,185 @@ def test_vec_normalize_scales_the_agents_rewards_like_the_teams():
     assert spread > 1.1
     assert np.allclose(scaled, raw / spread, atol=1e-5)
     assert raw.std(dim=1).max() > 0
+
+
+def test_the_samples_begin_as_sb3s_and_single_steps_cost_no_masks():
+    memory = buffer(gamma=0.9)
+    add(memory, 0, 1e30)  # large, not infinite
+    sample = memory.sample(4)
+    assert sample._fields[:6] == ("observations", "actions", "next_observations", "dones", "rewards", "discounts")
+    assert (sample.discounts, sample.active, sample.next_active, sample.pair_rewards) == (0.9, None, None, None)
+    assert all(value.is_contiguous() for value in sample if isinstance(value, th.Tensor))
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_masks_appear_once_an_agent_did_not_act(n_steps):
+    memory = buffer(n_steps=n_steps)
+    episodes(memory, {"agent_terminated": [False, True, False]})
+    assert transition(memory, 0).active is None
+    episodes(memory, {"agent_active": [True, False, True], "agent_terminated": [True, False, False]}, start=1)
+    first, second = transition(memory, 0), transition(memory, 1)
+    assert first.active.tolist() == [[1, 1, 1]]
+    assert first.next_active.tolist() == ([[1, 0, 1]] if n_steps == 1 else [[0, 0, 1]])
+    assert (second.active.tolist(), second.next_active.tolist()) == ([[1, 0, 1]], [[0, 0, 1]])
+    memory.reset()
+    episodes(memory, {})
+    assert transition(memory, 0).active is None
+
+
+@pytest.mark.parametrize(
+    ("steps", "rewards", "discounts", "dones", "end"),
+    [
+        ([{}] * 4, [31, 31, 31], [0.125] * N, [0, 0, 0], 30),
+        ([{}, {"agent_terminated": [0, 1, 0]}, OUT, OUT], [31, 6, 31], [0.125, 0.25, 0.125], [0, 1, 0], 30),
+        ([{}, {"done": True}, {}, {}], [6, 6, 6], [0.25] * N, [1, 1, 1], 20),
+        ([{}, {"done": True, "TimeLimit.truncated": True}, {}], [6, 6, 6], [0.25] * N, [0, 0, 0], 20),
+        # An agent that drops out alive stops all, one that was out before does not
+        ([{}, {}, OUT, {}], [6, 6, 6], [0.25] * N, [0, 0, 0], 20),
+        ([OUT, {}, {}, {}], [31, 1, 31], [0.125, 0.5, 0.125], [0, 0, 0], 30),
+        # The newest transition
+        ([{}, {}], [6, 6, 6], [0.25] * N, [0, 0, 0], 20),
+    ],
+)
+def test_where_windows_of_three_steps_stop(steps, rewards, discounts, dones, end):
+    memory = buffer(n_steps=3, gamma=0.5)
+    episodes(memory, *steps)
+    sample = transition(memory, 0)
+    for value, wanted in ((sample.rewards, rewards), (sample.discounts, discounts), (sample.dones, dones)):
+        assert value.tolist() == [wanted]
+    assert (sample.next_observations == end).all()
+
+
+def test_windows_wrap_round_up_to_the_newest_transition():
+    memory = buffer(size=4, n_steps=3, gamma=0.5)
+    episodes(memory, *[{}] * 6)
+    # In rows 0 to 3: transitions 4, 5, 2, 3
+    sums = [transition(memory, row).rewards[0, 0].item() for row in range(4)]
+    assert sums == [1e4 + 0.5e5, 1e5, 1e2 + 0.5e3 + 0.25e4, 1e3 + 0.5e4 + 0.25e5]
+    assert transition(memory, 3).next_observations[0, 0, 0] == 60
+
+
+def history(rng: np.random.Generator, length: int, obs: float) -> list[dict]:
+    """What happened in an environment, step by step."""
+    steps = []
+    for _ in range(length):
+        done, jump = rng.random(2) < (0.15, 0.05)
+        info = {
+            "TimeLimit.truncated": bool(done and rng.random() < 0.5),
+            "agent_rewards": rng.normal(size=N).astype(np.float32),
+            "agent_terminated": rng.random(N) < 0.15,
+            "agent_active": rng.random(N) < 0.85,
+            "pair_rewards": rng.normal(size=(N, 2)),
+        }
+        steps.append({"obs": obs, "next_obs": obs + 1, "done": bool(done), **info})
+        obs += 1 + (done or jump)
+    return steps
+
+
+def by_the_book(steps: list[dict], first: int, n_steps: int, gamma: float) -> list:
+    """One sample out of the transitions that the buffer still holds, in the words of its documentation."""
+    start = last = steps[first]
+    window, summing = [start], {agent for agent in range(N) if start["agent_active"][agent]}
+    for step in steps[first + 1 : first + n_steps]:
+        summing -= {agent for agent in summing if last["agent_terminated"][agent]}
+        if last["done"] or last["next_obs"] != step["obs"] or not all(step["agent_active"][i] for i in summing):
+            break
+        window.append(last := step)
+    rewards, pairs, discounts, dones = np.zeros(N), np.zeros((N, 2)), np.ones(N), np.zeros(N)
+    for agent in range(N):
+        for step in window:
+            rewards[agent] += discounts[agent] * step["agent_rewards"][agent]
+            pairs[agent] += discounts[agent] * step["pair_rewards"][agent]
+            discounts[agent] *= gamma
+            dones[agent] = step["agent_terminated"][agent]
+            if dones[agent] or not start["agent_active"][agent]:
+                break
+    if last["done"] and not last["TimeLimit.truncated"]:
+        dones[:] = 1
+    next_active = last["agent_active"] & ~last["agent_terminated"]
+    return [start["obs"], last["next_obs"], dones, rewards, discounts, start["agent_active"], next_active, pairs]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 12), st.integers(1, 30), st.integers(1, 6))
+def test_random_histories_give_what_the_documentation_says(seed, n_envs, rows, length, n_steps):
+    rng = np.random.default_rng(seed)
+    envs = [history(rng, length, 1000.0 * env) for env in range(n_envs)]
+    memory = buffer(rows * n_envs, n_envs, n_steps=n_steps, gamma=0.9, n_pairs=2)
+    for steps in zip(*envs, strict=True):
+        obs, next_obs, done = (np.array([step[key] for step in steps]) for key in ("obs", "next_obs", "done"))
+        obs, next_obs = (x[:, None, None] * np.ones((N, D)) for x in (obs, next_obs))
+        memory.add(obs, next_obs, np.zeros((n_envs, N * K)), np.zeros(n_envs), done, list(steps))
+    memory.all_active = False  # masks even where all happened to act
+    kept = min(rows, length)
+    first, env = (i.ravel() for i in np.meshgrid(np.arange(kept), np.arange(n_envs)))
+    got = memory.samples_at((first + length - kept) % rows, env)
+    discounts = th.full((len(env), N), got.discounts) if n_steps == 1 else got.discounts
+    values = (got.observations[:, 0, 0], got.next_observations[:, 0, 0], got.dones, got.rewards, discounts)
+    for index, (row, e) in enumerate(zip(first, env, strict=True)):
+        wanted = by_the_book(envs[e][length - kept :], row, n_steps, 0.9)
+        for value, want in zip((*values, got.active, got.next_active, got.pair_rewards), wanted, strict=True):
+            np.testing.assert_allclose(value[index].numpy(), want, rtol=1e-4, atol=1e-5)
+
+
+def test_rewards_are_normalised_before_they_are_summed():
+    env = VecNormalize(DummyVecEnv([OwnBit]), norm_obs=False, clip_reward=2.0)
+    env.ret_rms.var = np.array(100.0)
+    memory = buffer(n_steps=3, gamma=0.5, n_pairs=1)
+    episodes(memory, *[{"pair_rewards": np.full((N, 1), 20 * index)} for index in range(3)])
+    sample = memory.samples_at(np.array([0]), np.array([0]), env)
+    assert np.allclose(sample.rewards, 0.1 + 0.5 * 1 + 0.25 * 2)
+    assert np.allclose(sample.pair_rewards, 0 + 0.5 * 2 + 0.25 * 2)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"optimize_memory_usage": True, "handle_timeout_termination": False}])
+@pytest.mark.parametrize("size", [8, 100_000])
+def test_a_pickled_buffer_holds_what_is_filled_and_goes_on(kwargs, size):
+    memory = buffer(size, **kwargs)
+    for index in range(11):
+        add(memory, index, agent_active=[True, index != 5, True])
+    data = pickle.dumps(memory)
+    assert len(data) < 20_000
+    other = pickle.loads(data)
+    for name in ("observations", "actions", "agent_rewards", "agent_active", "dones", "timeouts", "records"):
+        assert np.array_equal(getattr(memory, name), getattr(other, name))
+        assert np.shares_memory(getattr(other, name), other.records)
+    assert (other.pos, other.full, other.all_active) == (memory.pos, memory.full, False)
+    add(memory, 40, 7.0)
+    add(other, 40, 7.0)
+    for one, two in zip(transition(memory, other.pos - 1), transition(other, other.pos - 1), strict=True):
+        assert one is two is None or np.array_equal(one, two)
+    assert not np.shares_memory(copy.deepcopy(memory).records, memory.records)
+
+
+def test_missing_keys_are_filled_in_environment_by_environment():
+    memory = buffer(n_envs=3)
+    obs = np.zeros((3, N, D), np.float32)
+    infos = [{}, {"agent_rewards": [1, 2, 3], "agent_active": [True, True, False]}, {"agent_terminated": [1, 0, 0]}]
+    memory.add(obs, obs, np.zeros((3, N * K)), np.array([7.0, 8.0, 9.0]), np.zeros(3), infos)
+    assert memory.agent_rewards[0].tolist() == [[7] * N, [1, 2, 3], [9] * N]
+    assert memory.agent_active[0].tolist() == [[1] * N, [1, 1, 0], [1] * N]
+    assert memory.agent_terminated[0].tolist() == [[0] * N, [0] * N, [1, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "info", "message"),
+    [
+        ({}, {"agent_rewards": np.zeros(2)}, r"info\['agent_rewards'\] has shape \(2,\).*3 agents"),
+        ({}, {"agent_terminated": np.zeros(2)}, r"info\['agent_terminated'\] has shape \(2,\).*3 agents"),
+        ({}, {"agent_rewards": {"agent_0": 1.0}}, r"has shape \(\), but there are 3 agents"),
+        ({}, {"agent_rewards": [0.0, np.nan, 0.0]}, r"'agent_rewards'\] of agent 1 \(agent_1\) is nan.*bound it"),
+        ({}, {"reward": np.inf}, "The team's reward is inf"),
+        ({"n_pairs": 2}, {}, r"'pair_rewards'\] is missing.*\(3, 2\).*leave n_pairs"),
+        ({"n_pairs": 2}, {"pair_rewards": np.zeros((3, 3))}, r"shape \(3, 3\).*n_pairs=2.*\(3, 2\)"),
+        ({"n_pairs": 1}, {"pair_rewards": [[0], [0], [-np.inf]]}, r"of agent 2 .* is -inf"),
+        ({"n_steps": 0}, {}, "n_steps=0"),
+        ({"gamma": 1.5}, {}, r"gamma=1\.5"),
+        ({"n_pairs": -1}, {}, "n_pairs=-1"),
+        ({"n_steps": 2, "optimize_memory_usage": True, "handle_timeout_termination": False}, {}, "Set n_steps=1"),
+        ({"space": spaces.Dict()}, {}, "Flatten each agent's dictionary"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(kwargs, info, message):
+    with pytest.raises(ValueError, match=message):
+        add(buffer(**kwargs), 0, **info)

@@ -40,7 +40,8 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     Terminated by a collision, truncated after `max_steps`.
 
     ## Info
-    `reward_terms`, `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
+    `reward_terms`, `pair_rewards` (n, n - 1: the part of the reward that belongs to a robot and one of the others),
+    `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
     `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and at the end `is_success`
     and `metrics`.
 
@@ -100,6 +101,9 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
             solver=solver,
         )
         self.config = self.task.swarm.config
+        self.agent_names = self.task.agent_names
+        self.observation_layout = self.task.observation_layout
+        self.action_cost = self.task.action_cost
         self.n_agents = n = self.config.n_robots
         self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
         self.action_space = spaces.MultiBinary(n * (n - 1))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .beliefs import Beliefs
+from .beliefs import Beliefs, other_indices
 from .planner import Planner, Plans, Problems, make_planner
 from .presets import SwarmConfig
 from .quadrotor import POSITION, VELOCITY
@@ -18,6 +18,8 @@ class StepReport(NamedTuple):
 
     :param min_separation: smallest distance between two robots after the step, (E,) (m)
     :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line, (E,) (m)
+    :param colliding: which of the others each robot collides with after the step, (E, n, n - 1) bool
+    :param colliding_continuous: the same at any time during the step
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
     :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
     :param moved: distance that each robot flew, (E, n) (m)
@@ -30,6 +32,8 @@ class StepReport(NamedTuple):
 
     min_separation: np.ndarray
     min_separation_continuous: np.ndarray
+    colliding: np.ndarray
+    colliding_continuous: np.ndarray
     collision: np.ndarray
     collision_continuous: np.ndarray
     moved: np.ndarray
@@ -59,6 +63,10 @@ class Swarm:
         self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
         self._noise_rngs = [np.random.default_rng(0) for _ in range(n_swarms)]
         self._pairs = np.triu_indices(n, k=1)
+        number = np.zeros((n, n), dtype=int)
+        number[self._pairs] = np.arange(len(self._pairs[0]))
+        # Which pair each robot is with each of the others
+        self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
 
     @property
     def n_swarms(self) -> int:
@@ -144,15 +152,16 @@ class Swarm:
         change = end - start
         along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
         closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
-        separation = np.sqrt(_dot(end, end).min(axis=-1))
-        separation_continuous = np.sqrt(_dot(closest, closest).min(axis=-1))
+        separation, separation_continuous = np.sqrt(_dot(end, end)), np.sqrt(_dot(closest, closest))
         limit = 2 * self.config.radius - self.config.collision_tolerance
         shape = self.state.shape[:2]
         return StepReport(
-            min_separation=separation,
-            min_separation_continuous=separation_continuous,
-            collision=separation < limit,
-            collision_continuous=separation_continuous < limit,
+            min_separation=separation.min(axis=-1),
+            min_separation_continuous=separation_continuous.min(axis=-1),
+            colliding=(separation < limit)[:, self._pair_of],
+            colliding_continuous=(separation_continuous < limit)[:, self._pair_of],
+            collision=(separation < limit).any(axis=-1),
+            collision_continuous=(separation_continuous < limit).any(axis=-1),
             moved=np.sqrt(_dot(pos - before, pos - before)),
             at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
             belief_source=source,

@@ -33,6 +33,8 @@ class Outcome(NamedTuple):
     """Result of one step of E swarms.
 
     :param reward: team rewards, (E,)
+    :param pair_rewards: the part of the reward that belongs to a robot and one of the others, (E, n, n - 1): its
+        request, their collision, and an equal share of the goal's reward
     :param reward_terms: the weighted terms "goal", "collision" and "requests", each (E,)
     :param terminated: ended by a collision, (E,) bool
     :param truncated: ended by the time limit, (E,) bool
@@ -41,6 +43,7 @@ class Outcome(NamedTuple):
     """
 
     reward: np.ndarray
+    pair_rewards: np.ndarray
     reward_terms: dict[str, np.ndarray]
     terminated: np.ndarray
     truncated: np.ndarray
@@ -91,6 +94,23 @@ class RequestTask:
         self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, 3 * (n - 1), 3 * (n - 1)])
 
     @property
+    def agent_names(self) -> tuple[str, ...]:
+        """The robots' names."""
+        return tuple(f"robot_{index}" for index in range(self.swarm.config.n_robots))
+
+    @property
+    def observation_layout(self) -> dict[str, Any]:
+        """Which columns of an observation are about the robot itself and which about each of the others."""
+        m = self.swarm.config.n_robots - 1
+        others = [[6 + 3 * k + axis + part for part in (0, 3 * m) for axis in range(3)] for k in range(m)]
+        return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+
+    @property
+    def action_cost(self) -> float:
+        """What a request costs."""
+        return self.reward.request
+
+    @property
     def observation_size(self) -> int:
         """Length of one robot's observation, 6n."""
         return len(self._scale)
@@ -129,6 +149,7 @@ class RequestTask:
         """One step of every swarm; ``requests`` as in `Swarm.step`."""
         report = self.swarm.step(requests)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
+        colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
         n_requests = requests.sum(axis=(1, 2))
         self.statistics.add(report, n_requests, collided)
         terms = {
@@ -136,8 +157,12 @@ class RequestTask:
             "collision": -self.reward.collision * collided,
             "requests": -self.reward.request * n_requests,
         }
+        share = terms["goal"] / max(requests.shape[2], 1)
         return Outcome(
             reward=terms["goal"] + terms["collision"] + terms["requests"],
+            pair_rewards=(
+                share[:, None, None] - self.reward.collision * colliding - self.reward.request * requests
+            ).astype(np.float32),
             reward_terms=terms,
             terminated=collided,
             truncated=~collided & (self.statistics.steps >= self.max_steps),
@@ -150,6 +175,7 @@ class RequestTask:
         report = outcome.report
         return {
             "scenario": np.array(self.scenario),
+            "pair_rewards": outcome.pair_rewards,
             "reward_terms": outcome.reward_terms,
             "n_requests": outcome.n_requests,
             "min_separation": report.min_separation,

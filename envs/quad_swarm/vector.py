@@ -35,6 +35,9 @@ class QuadSwarmVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode={render_mode!r}: the vector environment draws nothing; use QuadSwarmEnv.")
         self.num_envs = num_envs
         self.task = make_task(num_envs, **kwargs)
+        self.agent_names = self.task.agent_names
+        self.observation_layout = self.task.observation_layout
+        self.action_cost = self.task.action_cost
         self.n_agents = n = self.task.swarm.config.n_robots
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
         self.single_action_space = spaces.MultiBinary(n * (n - 1))

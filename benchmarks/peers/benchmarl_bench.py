@@ -1,0 +1,126 @@
+"""MADDPG of BenchMARL, see ``common``.
+
+Forced: the critic of an agent sees the global state and the actions of its own group, so in a task with two sides not
+the other side's; the limit on the gradient is that of a group's networks together; it learns from the first batch of
+``train_freq`` steps on. A shared critic has one value for the whole group and no agent's id: a third of the work of
+the other libraries.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from tensordict import TensorDict
+from torch import nn
+
+import common
+
+common.restore_pettingzoo_mpe()
+
+from benchmarl.algorithms import MaddpgConfig  # noqa: E402
+from benchmarl.environments import PettingZooTask  # noqa: E402
+from benchmarl.experiment import Callback, Experiment, ExperimentConfig  # noqa: E402
+from benchmarl.models.mlp import MlpConfig  # noqa: E402
+from torchrl.envs.utils import ExplorationType, set_exploration_type  # noqa: E402
+
+# All that its own configuration would set differently
+TASKS: dict[str, tuple[str, dict[str, Any]]] = {
+    "simple_spread_v3": ("SIMPLE_SPREAD", {"N": 3, "local_ratio": 0.5}),
+    "simple_tag_v3": ("SIMPLE_TAG", {"num_good": 1, "num_adversaries": 3, "num_obstacles": 2}),
+    "simple_adversary_v3": ("SIMPLE_ADVERSARY", {"N": 2}),
+    "simple_speaker_listener_v4": ("SIMPLE_SPEAKER_LISTENER", {}),
+}
+
+
+class StartClock(Callback):
+    """Start the clock after the warm-up."""
+
+    def __init__(self, warm_up: int, clock: common.Clock) -> None:
+        super().__init__()
+        self.warm_up, self.clock = warm_up, clock
+        self.started = False
+
+    def on_train_end(self, training_td: TensorDict, group: str) -> None:
+        if not self.started and self.experiment.total_frames >= self.warm_up:
+            self.started = True
+            self.clock.start()
+
+
+class BenchMARL:
+    """Its ``Experiment``, without loggers and evaluation."""
+
+    first_update = 0
+
+    def __init__(self, task: common.Task) -> None:
+        self.task = task
+        name, arguments = TASKS[task.env]
+        pettingzoo_task = PettingZooTask[name].get_from_yaml()
+        pettingzoo_task.config |= {"max_cycles": 25, **arguments}
+        config = ExperimentConfig.get_from_yaml()
+        for key, value in self.settings(task).items():
+            assert hasattr(config, key), key
+            setattr(config, key, value)
+        model = MlpConfig(num_cells=list(common.HIDDEN), layer_class=nn.Linear, activation_class=nn.ReLU)
+        self.experiment = Experiment(
+            pettingzoo_task,
+            MaddpgConfig(share_param_critic=task.shared, loss_function="l2", delay_value=True, use_tanh_mapping=True),
+            model,
+            task.seed,
+            config,
+            critic_model_config=MlpConfig(**vars(model)),
+        )
+
+    @staticmethod
+    def settings(task: common.Task) -> dict[str, Any]:
+        """What differs from the library's own configuration."""
+        return {
+            "share_policy_params": task.shared,
+            "gamma": common.GAMMA,
+            "lr": common.LEARNING_RATE,
+            "clip_grad_norm": True,
+            "clip_grad_val": common.MAX_GRAD_NORM,
+            "polyak_tau": common.TAU,
+            "exploration_eps_init": common.SIGMA_START,
+            "exploration_eps_end": common.SIGMA_END,
+            "exploration_anneal_frames": task.steps,
+            "max_n_frames": task.steps,
+            "off_policy_collected_frames_per_batch": task.train_freq,
+            "off_policy_n_envs_per_worker": 1,
+            "off_policy_n_optimizer_steps": 1,
+            "off_policy_train_batch_size": common.BATCH_SIZE,
+            "off_policy_memory_size": common.BUFFER_SIZE,
+            "evaluation": False,
+            "render": False,
+            "loggers": [],
+            "create_json": False,
+            "save_folder": str(Path.cwd()),
+        }
+
+    def train(self, warm_up: int, clock: common.Clock) -> None:
+        callback = StartClock(warm_up, clock)
+        callback.experiment = self.experiment
+        self.experiment.callbacks.append(callback)
+        if not warm_up:
+            callback.started = True
+            clock.start()
+        self.experiment.run()
+        clock.stop()
+
+    def update(self) -> None:
+        for group in self.experiment.group_map:
+            self.experiment._optimizer_loop(group)
+
+    def act(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        actions: dict[str, np.ndarray] = {}
+        with th.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            for group, agents in self.experiment.group_map.items():
+                rows = th.from_numpy(np.stack([observations[agent] for agent in agents]))
+                batch = TensorDict({group: TensorDict({"observation": rows}, [len(agents)])}, [])
+                chosen = self.experiment.algorithm.get_policy_for_loss(group)(batch)[group, "action"]
+                actions |= dict(zip(agents, chosen.numpy(), strict=True))
+        return actions
+
+
+if __name__ == "__main__":
+    common.main("BenchMARL", "benchmarl", BenchMARL)

@@ -1,0 +1,242 @@
+"""What the drivers of all libraries share: the settings, the clock, the evaluation and the command line.
+
+A driver runs in the Python of its own library and prints one line of JSON::
+
+    python benchmarks/peers/xuance_bench.py speed --networks separate
+    python benchmarks/peers/xuance_bench.py learn --env simple_tag_v3 --steps 100000 --seed 0
+
+It stays on one core and one thread, works in a scratch directory, and sends all that the library prints to stderr.
+"""
+
+import argparse
+import gc
+import importlib
+import json
+import os
+import random
+import sys
+import tempfile
+import time
+import warnings
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, Protocol
+
+import numpy as np
+import torch as th
+
+# Lowe et al. (2017) and https://github.com/openai/maddpg, but for the start: there it is 25,600 steps
+LEARNING_RATE = 1e-2
+GAMMA = 0.95
+TAU = 0.01
+MAX_GRAD_NORM = 0.5
+BATCH_SIZE = 1024
+BUFFER_SIZE = 1_000_000
+HIDDEN = (64, 64)
+LEARNING_STARTS = BATCH_SIZE
+# Gaussian exploration at the first and at the last step, in units of the actions, which lie in [0, 1]
+SIGMA_START, SIGMA_END = 0.3, 0.05
+
+EVALUATION_SEEDS = range(10_000, 10_100)
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    What to train.
+
+    :param env: name of a module of mpe2
+    :param steps: environment steps of the whole training, over which exploration declines
+    :param train_freq: environment steps per update
+    :param shared: one network for all agents instead of one each
+    :param seed: of environment, networks and exploration
+    """
+
+    env: str
+    steps: int
+    train_freq: int
+    shared: bool
+    seed: int
+
+
+class Clock:
+    """Processor and wall time of one stretch of work."""
+
+    def start(self) -> None:
+        """Begin now."""
+        gc.collect()
+        self.cpu, self.wall = time.process_time(), time.perf_counter()
+
+    def stop(self) -> None:
+        """End now."""
+        self.cpu, self.wall = time.process_time() - self.cpu, time.perf_counter() - self.wall
+
+
+class Driver(Protocol):
+    """
+    A library's MADDPG with its environment, networks and buffer.
+
+    ``first_update``: steps before the first update.
+    """
+
+    first_update: int
+
+    def __init__(self, task: Task) -> None: ...
+
+    def train(self, warm_up: int, clock: Clock) -> None:
+        """
+        Train for ``Task.steps`` with the library's own loop; ``clock`` times what comes after the warm-up.
+
+        :param warm_up: steps before the clock starts
+        """
+
+    def update(self) -> None:
+        """Sample from the buffer, make one step of every critic and every actor, move the target networks."""
+
+    def act(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """
+        :param observations: of every agent
+        :return: its action without exploration
+        """
+
+
+def parallel_env(name: str) -> Any:
+    """
+    :param name: of a module of mpe2
+    :return: its environment with continuous actions and the default episodes of 25 steps
+    """
+    return importlib.import_module(f"mpe2.{name}").parallel_env(continuous_actions=True)
+
+
+def restore_pettingzoo_mpe() -> None:
+    """Put mpe2 where PettingZoo had the environments until they moved: the library still imports them from there."""
+    mpe = importlib.import_module("mpe2")
+    sys.modules["pettingzoo.mpe"] = mpe
+    importlib.import_module("pettingzoo").mpe = mpe  # type: ignore[attr-defined]
+    for name in ("all_modules", "simple_adversary_v3", "simple_speaker_listener_v4", "simple_spread_v3",
+                 "simple_tag_v3"):  # fmt: skip
+        sys.modules[f"pettingzoo.mpe.{name}"] = importlib.import_module(f"mpe2.{name}")
+
+
+def sigma_at(progress: float) -> float:
+    """
+    :param progress: share of the training that is done
+    :return: standard deviation of the exploration
+    """
+    return SIGMA_START + min(progress, 1.0) * (SIGMA_END - SIGMA_START)
+
+
+def evaluate(driver: Driver, name: str) -> dict[str, float]:
+    """
+    :param driver: trained
+    :param name: environment
+    :return: mean return of each agent over the episodes of ``EVALUATION_SEEDS``
+    """
+    env = parallel_env(name)
+    returns = dict.fromkeys(env.possible_agents, 0.0)
+    for seed in EVALUATION_SEEDS:
+        observations, _ = env.reset(seed=seed)
+        while env.agents:
+            actions = {}
+            for agent, action in driver.act(observations).items():
+                space = env.action_space(agent)
+                actions[agent] = np.clip(np.asarray(action, space.dtype).reshape(space.shape), space.low, space.high)
+            observations, rewards, *_ = env.step(actions)
+            for agent, reward in rewards.items():
+                returns[agent] += float(reward) / len(EVALUATION_SEEDS)
+    return returns
+
+
+def rates(name: str, count: int, clock: Clock) -> dict[str, float]:
+    """
+    :param name: of the rate
+    :param count: what was done while the clock ran
+    :param clock: stopped
+    :return: the rate per second of processor time, and of wall time
+    """
+    return {name: count / clock.cpu, f"{name}_wall": count / clock.wall}
+
+
+def speed(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
+    """Updates per second, and steps per second of the library's own loop: an update every 100 steps, and every step."""
+    result: dict[str, Any] = {"networks": arguments.networks}
+    shared = arguments.networks == "shared"
+    clock = Clock()
+    for train_freq, steps in ((100, arguments.steps_100), (1, arguments.steps_1)):
+        warm_up = make.first_update + 100
+        driver = make(Task("simple_spread_v3", warm_up + steps, train_freq, shared, arguments.seed))
+        driver.train(warm_up, clock)
+        result |= rates(f"steps_per_s_{train_freq}", steps, clock)
+        if train_freq == 100:
+            for _ in range(10):
+                driver.update()
+            clock.start()
+            for _ in range(arguments.updates):
+                driver.update()
+            clock.stop()
+            result |= rates("updates_per_s", arguments.updates, clock)
+        del driver
+        gc.collect()
+    return result
+
+
+def learn(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
+    """Train with an update every ``--train-freq`` steps, then measure the return of each agent without exploration."""
+    clock = Clock()
+    shared = arguments.networks == "shared"
+    driver = make(Task(arguments.env, arguments.steps, arguments.train_freq, shared, arguments.seed))
+    driver.train(0, clock)
+    returns = evaluate(driver, arguments.env)
+    return {
+        "env": arguments.env,
+        "seed": arguments.seed,
+        "steps": arguments.steps,
+        "train_freq": arguments.train_freq,
+        "networks": arguments.networks,
+        "episodes": len(EVALUATION_SEEDS),
+        "returns": returns,
+        "mean_return": sum(returns.values()) / len(returns),
+        "training_cpu_s": clock.cpu,
+    }
+
+
+def main(library: str, distribution: str, make: type[Driver]) -> None:
+    """
+    The command line of a driver.
+
+    :param library: name in the tables
+    :param distribution: package whose version is reported
+    :param make: prepares a training
+    """
+    parser = argparse.ArgumentParser(description=f"{library}: speed or learning of MADDPG, one line of JSON")
+    modes = parser.add_subparsers(dest="mode", required=True)
+    measure = modes.add_parser("speed", help="updates and steps per second on simple_spread_v3")
+    measure.add_argument("--updates", type=int, default=300)
+    measure.add_argument("--steps-100", type=int, default=5_000, help="steps with an update every 100")
+    measure.add_argument("--steps-1", type=int, default=400, help="steps with an update each")
+    training = modes.add_parser("learn", help="train, then measure each agent's return")
+    training.add_argument("--env", default="simple_spread_v3", help="module of mpe2")
+    training.add_argument("--steps", type=int, default=100_000)
+    training.add_argument("--train-freq", type=int, default=100, help="environment steps per update (default 100)")
+    for mode in (measure, training):
+        mode.add_argument("--networks", choices=("separate", "shared"), default="separate")
+        mode.add_argument("--seed", type=int, default=0)
+        mode.add_argument("--core", type=int, help="pin to this core (default: the last one that is allowed)")
+    arguments = parser.parse_args()
+
+    if hasattr(os, "sched_setaffinity"):
+        core = max(os.sched_getaffinity(0)) if arguments.core is None else arguments.core
+        os.sched_setaffinity(0, {core})
+    th.set_num_threads(1)
+    random.seed(arguments.seed)
+    np.random.seed(arguments.seed)  # noqa: NPY002
+    th.manual_seed(arguments.seed)
+    warnings.filterwarnings("ignore")
+    # Below sys.stdout, which loggers may hold
+    answer = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        os.chdir(scratch)
+        result = (speed if arguments.mode == "speed" else learn)(make, arguments)
+        os.chdir("/")
+    print(json.dumps({"library": library, "version": version(distribution), **result}), file=answer, flush=True)

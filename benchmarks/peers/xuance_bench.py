@@ -1,0 +1,76 @@
+"""MADDPG of XuanCe, see ``common``.
+
+Forced: it always logs to TensorBoard. Networks start orthogonal. Shared networks are told the agent by an id, in one
+batch of all agents.
+"""
+
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import xuance
+import yaml
+
+import common
+
+common.restore_pettingzoo_mpe()
+
+from xuance.environment import make_envs  # noqa: E402
+from xuance.torch.agents import MADDPG_Agents  # noqa: E402
+
+
+class XuanCe:
+    """Its ``MADDPG_Agents`` with the environment through its own adapter."""
+
+    first_update = common.LEARNING_STARTS
+
+    def __init__(self, task: common.Task) -> None:
+        configs = Path(xuance.__file__).parent / "configs"
+        # Those of MADDPG in MPE are the same for each environment but for the sizes
+        settings = yaml.safe_load((configs / "basic.yaml").read_text())
+        settings |= yaml.safe_load((configs / "maddpg/mpe/simple_spread_v3.yaml").read_text())
+        settings |= {
+            "env_id": task.env,
+            "env_seed": task.seed,
+            "seed": task.seed,
+            "parallels": 1,
+            "render": False,
+            "actor_hidden_size": list(common.HIDDEN),
+            "critic_hidden_size": list(common.HIDDEN),
+            "activation": "relu",
+            "use_parameter_sharing": task.shared,
+            "buffer_size": common.BUFFER_SIZE,
+            "batch_size": common.BATCH_SIZE,
+            "learning_rate_actor": common.LEARNING_RATE,
+            "learning_rate_critic": common.LEARNING_RATE,
+            "end_factor_lr_decay": 1.0,
+            "gamma": common.GAMMA,
+            "tau": common.TAU,
+            "use_grad_clip": True,
+            "grad_clip_norm": common.MAX_GRAD_NORM,
+            "start_noise": common.SIGMA_START,
+            "end_noise": common.SIGMA_END,
+            "start_training": common.LEARNING_STARTS,
+            "training_frequency": task.train_freq,
+            "running_steps": task.steps,
+        }
+        config = Namespace(**settings)
+        self.task = task
+        self.agents = MADDPG_Agents(config, make_envs(config))
+
+    def train(self, warm_up: int, clock: common.Clock) -> None:
+        if warm_up:
+            self.agents.train(warm_up)
+        clock.start()
+        self.agents.train(self.task.steps - warm_up)
+        clock.stop()
+
+    def update(self) -> None:
+        self.agents.train_epochs(1)
+
+    def act(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return self.agents.get_actions([observations], test_mode=True)["actions"][0]
+
+
+if __name__ == "__main__":
+    common.main("XuanCe", "xuance", XuanCe)

@@ -1,0 +1,161 @@
+"""How fast MADDPG trains here and in other libraries.
+
+``python benchmarks/training.py [--json F]``; ``make bench-peers`` installs the other libraries first. One core, one
+thread, three agents of simple_spread (mpe2, continuous actions), networks of two hidden layers of 64, batches of 1024:
+
+- ``updates_per_s``: one step of all critics and all actors and of the target networks, with the sample for it,
+- ``steps_per_s_100``, ``steps_per_s_1``: environment steps of the library's own training loop, with an update every
+  100 steps (as Lowe et al. have it) and every step.
+
+Rates are per second of processor time, and with ``_wall`` of wall time. Each is the median of several rounds, in which
+the libraries take turns, each in a process of its own. Ratios are medians of those within a round. What a library does
+differently, above all with shared networks, is said in its driver in benchmarks/peers. JSON: one row a library and
+kind of networks.
+"""
+
+import argparse
+import importlib.util
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+DRIVERS = ROOT / "benchmarks" / "peers"
+OURS, REFERENCE, PEERS = "ours", "plain", ("agilerl", "benchmarl", "xuance")
+RATES = ("updates_per_s", "steps_per_s_100", "steps_per_s_1")
+AMOUNTS = {"updates": 300, "steps-100": 5_000, "steps-1": 400}
+QUICK = {"updates": 60, "steps-100": 1_000, "steps-1": 60}
+
+Row = dict[str, Any]
+Rounds = Mapping[tuple[str, str], Sequence[Row]]
+
+
+def python_of(name: str) -> Path:
+    """The interpreter that has the library of a driver."""
+    return ROOT / ".bench" / name / "bin" / "python" if name in PEERS else Path(sys.executable)
+
+
+def missing(name: str) -> str | None:
+    """How to install what a driver needs, if that is not there."""
+    if name in PEERS:
+        return None if (ROOT / ".bench" / name / ".installed").exists() else f"make .bench/{name}/.installed"
+    return None if importlib.util.find_spec("mpe2") else f"{sys.executable} -m pip install -c constraints.txt mpe2"
+
+
+def measure(name: str, networks: str, amounts: Mapping[str, int], core: int | None) -> Row:
+    """
+    Run a driver once.
+
+    :raises RuntimeError: it failed
+    """
+    command = [str(python_of(name)), str(DRIVERS / f"{name}_bench.py"), "speed", "--networks", networks]
+    for option, value in [*amounts.items(), *([] if core is None else [("core", core)])]:
+        command += [f"--{option}", str(value)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if run.returncode:
+        raise RuntimeError(f"{name}, {networks}: {' '.join(command)}\n{run.stderr[-2000:]}")
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def machine() -> str:
+    """The processor, by name."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def summarise(rounds: Rounds) -> list[Row]:
+    """One row a library and kind of networks: medians, and under ``rounds`` what they are medians of."""
+    rows = []
+    for runs in rounds.values():
+        rates = {key: [run[key] for run in runs] for key in runs[0] if key.startswith(RATES)}
+        labels = {key: runs[0][key] for key in ("library", "version", "networks")}
+        medians = {key: median(values) for key, values in rates.items()}
+        rows.append({**labels, **medians, "rounds": {key: rates[key] for key in RATES}, "machine": machine()})
+    return rows
+
+
+def ratios(rounds: Rounds, networks: str, rate: str) -> dict[str, float]:
+    """How many times as fast as each other library we are, medians over the rounds."""
+    ours = rounds.get((OURS, networks), ())
+    return {
+        name: median(our[rate] / other[rate] for our, other in zip(ours, runs, strict=True))
+        for (name, kind), runs in rounds.items()
+        if ours and kind == networks and name != OURS
+    }
+
+
+def report(rounds: Rounds) -> list[Row]:
+    """Print the table and the ratios, and return the rows."""
+    rows = summarise(rounds)
+    print(f"\nPer second of one core of {machine()}; medians of {max(map(len, rounds.values()))} rounds.")
+    print(f"{'library':14} {'version':12} {'networks':9}" + "".join(f"{rate:>17}" for rate in RATES))
+    for row in rows:
+        labels = f"{row['library']:14} {row['version']:12} {row['networks']:9}"
+        print(labels + "".join(f"{row[rate]:17.{0 if row[rate] >= 100 else 1}f}" for rate in RATES))
+    for networks in ("separate", "shared"):
+        for rate in RATES:
+            times = ratios(rounds, networks, rate)
+            if peers := {name: times[name] for name in PEERS if name in times}:
+                nearest = min(peers, key=lambda name: peers[name])
+                plain = f", {times[REFERENCE]:.2f} of the plain loop" if REFERENCE in times else ""
+                print(f"{networks} {rate}: {peers[nearest]:.2f} times the best peer, {nearest}{plain}")
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    everything = (OURS, REFERENCE, *PEERS)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a row")
+    parser.add_argument("--only", nargs="+", choices=everything, default=everything, help="these libraries")
+    parser.add_argument("--networks", nargs="+", choices=("separate", "shared"), default=("separate", "shared"))
+    parser.add_argument("--rounds", type=int, default=3, help="measurements of each (default 3)")
+    parser.add_argument("--quick", action="store_true", help="a fifth of the work, to see that all runs")
+    parser.add_argument("--core", type=int, help="pin to this core (default: the last one that is allowed)")
+    args = parser.parse_args()
+
+    names = []
+    for name in args.only:
+        if command := missing(name):
+            print(f"{name} is left out, it is not installed: {command}", flush=True)
+        else:
+            names.append(name)
+    rounds: dict[tuple[str, str], list[Row]] = {
+        (name, networks): []
+        for networks in args.networks
+        for name in names
+        if (name, networks) != (REFERENCE, "shared")
+    }
+    amounts = QUICK if args.quick else AMOUNTS
+    failures = []
+    for number in range(args.rounds):
+        for name, networks in list(rounds):
+            try:
+                row = measure(name, networks, amounts, args.core)
+            except RuntimeError as error:
+                failures.append(str(error))
+                print(f"FAILED {error}", flush=True)
+                del rounds[name, networks]
+                continue
+            rounds[name, networks].append(row)
+            cells = "  ".join(f"{rate} {row[rate]:.1f}" for rate in RATES)
+            print(f"round {number + 1}: {row['library']:14} {networks:9} {cells}", flush=True)
+    if not rounds:
+        sys.exit("Nothing was measured.")
+    rows = report(rounds)
+    if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    if failures:
+        sys.exit(f"{len(failures)} of {len(rounds) + len(failures)} failed, see above.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,388 @@
+"""The joint action of a team inside the networks: bits, continuous numbers and categories side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_maddpg.estimators import Estimator
+from sb3_maddpg.team import AgentActionSpace, heads_of
+
+Critic = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
+
+
+class ActionKind(nn.Module):
+    """
+    Those agents of a team that act in the same way.
+
+    Networks see an agent's action as ``width`` numbers: bits as 0 or 1, continuous ones in [-1, 1], categories one-hot.
+
+    :param agents: their numbers
+    :param action_spaces: their action spaces, all of one kind
+    """
+
+    real: th.Tensor
+    n_columns: th.Tensor
+    width: int
+    padded: bool
+
+    def __init__(self, agents: Sequence[int], action_spaces: Sequence[AgentActionSpace]):
+        super().__init__()
+        self.agents = list(agents)
+        self.sizes = [heads_of(space) for space in action_spaces]
+        real = self._real_columns()
+        self.width = real.shape[1]
+        self.padded = not bool(real.all())
+        self.register_buffer("real", real, persistent=False)
+        self.register_buffer("n_columns", real.sum(dim=1), persistent=False)
+
+    def _real_columns(self) -> th.Tensor:
+        """Which columns are no padding, (n_agents, width) bool."""
+        longest = max(map(len, self.sizes))
+        return th.tensor([[column < len(sizes) for column in range(longest)] for sizes in self.sizes])
+
+    def squash(self, logits: th.Tensor) -> th.Tensor:
+        """
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :return: what the outputs mean: scores in [0, 1], actions in [-1, 1], probabilities; the same shape
+        """
+        raise NotImplementedError
+
+    def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
+        """
+        :param logits: (batch, n_agents, width)
+        :param deterministic: the best action, otherwise one to explore with
+        :return: actions, (batch, n_agents, width)
+        """
+        raise NotImplementedError
+
+    def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
+        """
+        :param estimator: of the gradient
+        :param logits: (batch, n_agents, width)
+        :param q: values of alternatives for the own action, (batch, n_agents, M, width) -> (batch, n_agents, M)
+        :param temperature: of relaxations
+        :return: what the actors ascend, (batch, n_agents)
+        """
+        raise NotImplementedError
+
+    def regularization(self, logits: th.Tensor) -> th.Tensor:
+        """
+        :param logits: (batch, n_agents, width)
+        :return: mean square of each agent's outputs without padding, (batch, n_agents)
+        """
+        squares = logits.square()
+        return (squares * self.real).sum(dim=-1) / self.n_columns if self.padded else squares.mean(dim=-1)
+
+
+class Continuous(ActionKind):
+    """Numbers of a ``Box``, scaled to [-1, 1]. Exploration noise is the algorithm's."""
+
+    def squash(self, logits: th.Tensor) -> th.Tensor:
+        return th.tanh(logits) * self.real if self.padded else th.tanh(logits)
+
+    def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
+        return self.squash(logits)
+
+    def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
+        # The deterministic policy gradient (Silver et al. 2014), whatever the estimator
+        return q(self.squash(logits).unsqueeze(2)).squeeze(2)
+
+
+class Bits(ActionKind):
+    """
+    Threshold actions 1[f > delta] of scores f. To explore, delta' ~ U(0, 1) is drawn per agent and shared by its bits
+    (Serra-Gomez et al., IROS 2020, Sec. IV-C).
+
+    :param threshold: delta
+    :param shared_threshold: one delta' for all bits of an agent, otherwise one for each
+    """
+
+    def __init__(
+        self,
+        agents: Sequence[int],
+        action_spaces: Sequence[AgentActionSpace],
+        threshold: float,
+        shared_threshold: bool = True,
+    ):
+        super().__init__(agents, action_spaces)
+        self.threshold = threshold
+        self.shared_threshold = shared_threshold
+
+    def squash(self, logits: th.Tensor) -> th.Tensor:
+        return th.sigmoid(logits) * self.real if self.padded else th.sigmoid(logits)
+
+    def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
+        scores = self.squash(logits)
+        if deterministic:
+            return (scores > self.threshold).to(scores.dtype)
+        return (scores > th.rand_like(scores[..., :1] if self.shared_threshold else scores)).to(scores.dtype)
+
+    def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
+        return estimator.binary(self.squash(logits), q, temperature)
+
+
+class Categories(ActionKind):
+    """
+    ``Discrete`` and ``MultiDiscrete``: H sub-actions of K categories each, one-hot, padded to the largest. To explore,
+    categories are drawn with their probabilities.
+    """
+
+    allowed: th.Tensor
+    shape: tuple[int, int]
+
+    def _real_columns(self) -> th.Tensor:
+        self.shape = (max(map(len, self.sizes)), max(max(sizes) for sizes in self.sizes))
+        real = th.zeros(len(self.sizes), *self.shape, dtype=th.bool)
+        for agent, sizes in enumerate(self.sizes):
+            for head, size in enumerate(sizes):
+                real[agent, head, :size] = True
+        # A padded sub-action has one category, which its own columns do not show
+        allowed = real.clone()
+        allowed[..., 0] = True
+        self.register_buffer("allowed", allowed, persistent=False)
+        return real.flatten(1)
+
+    def _heads(self, logits: th.Tensor) -> th.Tensor:
+        """:return: (batch, n_agents, H, K), minus infinity where a category does not exist"""
+        logits = logits.unflatten(-1, self.shape)
+        return logits.masked_fill(~self.allowed, -th.inf) if self.padded else logits
+
+    def _columns(self, heads: th.Tensor) -> th.Tensor:
+        columns = heads.flatten(-2)
+        if not self.padded:
+            return columns
+        real = self.real if heads.dim() == 4 else self.real.unsqueeze(-2)  # with an axis of alternatives
+        return columns * real
+
+    def squash(self, logits: th.Tensor) -> th.Tensor:
+        return self._columns(self._heads(logits).softmax(dim=-1))
+
+    def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
+        heads = self._heads(logits)
+        if not deterministic:  # Gumbel's trick: the largest is distributed as the softmax
+            heads = heads - th.empty_like(heads).exponential_().clamp_min(th.finfo(heads.dtype).tiny).log()
+        return self._columns(nn.functional.one_hot(heads.argmax(dim=-1), self.shape[1]).to(logits.dtype))
+
+    def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
+        return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
+
+
+def make_kinds(
+    action_spaces: Sequence[AgentActionSpace], threshold: float, shared_threshold: bool = True
+) -> list[ActionKind]:
+    """
+    Group the agents of a team by how they act.
+
+    :param action_spaces: of all agents
+    :param threshold: for bits, see ``Bits``
+    :param shared_threshold: for bits, see ``Bits``
+    """
+    groups: dict[str, list[int]] = {}
+    for agent, space in enumerate(action_spaces):
+        name = "numbers" if isinstance(space, spaces.Box) else "categories"
+        groups.setdefault("bits" if isinstance(space, spaces.MultiBinary) else name, []).append(agent)
+    kinds: list[ActionKind] = []
+    for name, agents in groups.items():
+        members = [action_spaces[agent] for agent in agents]
+        if name == "numbers":
+            kinds.append(Continuous(agents, members))
+        elif name == "bits":
+            kinds.append(Bits(agents, members, threshold, shared_threshold))
+        else:
+            kinds.append(Categories(agents, members))
+    return kinds
+
+
+class TeamActions(nn.Module):
+    """
+    How a team acts: from the networks' outputs to actions, and from actions as the replay buffer keeps them (flat,
+    agent after agent, continuous ones in [-1, 1], a category as its index) to what critics read.
+
+    :param action_spaces: each agent's action space, categories counting from 0
+    :param threshold: for bits, see ``Bits``
+    :param shared_threshold: for bits, see ``Bits``
+    """
+
+    source: th.Tensor
+    value: th.Tensor
+    real: th.Tensor
+    target: th.Tensor
+    continuous_columns: th.Tensor
+    width: int
+    n_agents: int
+
+    def __init__(
+        self, action_spaces: Sequence[AgentActionSpace], threshold: float = 0.5, shared_threshold: bool = True
+    ):
+        super().__init__()
+        self.action_spaces = tuple(action_spaces)
+        self.n_agents = len(action_spaces)
+        self.kinds = make_kinds(action_spaces, threshold, shared_threshold)
+        self._modules_of_kinds = nn.ModuleList(self.kinds)  # so that their tables move with the module
+        self.width = max(kind.width for kind in self.kinds)
+        self._make_tables()
+        boxes = [
+            (space.low.ravel(), space.high.ravel())
+            if isinstance(space, spaces.Box)
+            else np.tile([[-1.0], [1.0]], len(heads_of(space)))
+            for space in action_spaces
+        ]
+        self.low, self.high = (np.concatenate(bound).astype(np.float32) for bound in zip(*boxes, strict=True))
+        self.is_continuous = np.concatenate([np.array(heads_of(space)) == 0 for space in action_spaces])
+        self.has_continuous = bool(self.is_continuous.any())
+
+    def _make_tables(self) -> None:
+        """Where each number that a critic reads stands in the flat action, and the other way round."""
+        starts = np.cumsum([0, *(len(heads_of(space)) for space in self.action_spaces)])
+        source = np.zeros((self.n_agents, self.width), int)
+        value = np.full((self.n_agents, self.width), -1)  # the category of a one-hot column, -1 for a plain number
+        real = np.zeros((self.n_agents, self.width), bool)
+        target = np.zeros(starts[-1], int)
+        for kind in self.kinds:
+            for row, agent in enumerate(kind.agents):
+                real[agent, : kind.width] = kind.real[row]
+                for head in range(len(kind.sizes[row])):
+                    column = head
+                    if isinstance(kind, Categories):
+                        column = head * kind.shape[1]
+                        value[agent, column : column + kind.shape[1]] = np.arange(kind.shape[1])
+                        source[agent, column : column + kind.shape[1]] = starts[agent] + head
+                    else:
+                        source[agent, column] = starts[agent] + head
+                    target[starts[agent] + head] = agent * self.width + column
+        self.plain = bool(real.all()) and bool((value == -1).all())
+        continuous = np.zeros((self.n_agents, self.width), bool)
+        for kind in self.kinds:
+            if isinstance(kind, Continuous):
+                continuous[kind.agents] = real[kind.agents]
+        for name, table in (
+            ("source", source),
+            ("value", value),
+            ("real", real),
+            ("target", target),
+            ("continuous_columns", continuous),
+        ):
+            self.register_buffer(name, th.as_tensor(table), persistent=False)
+
+    @property
+    def discrete(self) -> bool:
+        """Whether any agent has bits or categories."""
+        return any(not isinstance(kind, Continuous) for kind in self.kinds)
+
+    def columns_of(self, agent: int) -> list[int]:
+        """
+        :param agent: its number
+        :return: those of its columns that are left where it is by itself: padding to other agents' sizes is not
+        """
+        sizes = heads_of(self.action_spaces[agent])
+        (kind,) = (kind for kind in self.kinds if agent in kind.agents)
+        if not isinstance(kind, Categories):
+            return list(range(len(sizes)))
+        return [head * kind.shape[1] + category for head in range(len(sizes)) for category in range(max(sizes))]
+
+    def encode(self, flat: th.Tensor) -> th.Tensor:
+        """
+        :param flat: as in the replay buffer, (batch, length)
+        :return: as critics read it, (batch, n_agents, width) float
+        """
+        if self.plain:
+            return flat.float().view(len(flat), self.n_agents, self.width)
+        columns = flat.float()[:, self.source]
+        return th.where(self.value >= 0, (columns == self.value).float(), columns) * self.real
+
+    def decode(self, actions: th.Tensor) -> th.Tensor:
+        """
+        :param actions: (batch, n_agents, width)
+        :return: as in the replay buffer, (batch, length) float
+        """
+        if self.plain:
+            return actions.flatten(1)
+        # A one-hot column says how far it stands from the first of its sub-action
+        flat = actions.flatten(1)[:, self.target]
+        for kind in self.kinds:
+            if isinstance(kind, Categories):
+                chosen = actions[:, kind.agents, : kind.width].unflatten(-1, kind.shape).argmax(dim=-1)
+                for row, agent in enumerate(kind.agents):
+                    heads = len(kind.sizes[row])
+                    start = int(self.source[agent, 0])
+                    flat[:, start : start + heads] = chosen[:, row, :heads].to(flat.dtype)
+        return flat
+
+    def _by_kind(self, tensor: th.Tensor, function: Callable[[ActionKind, th.Tensor], th.Tensor]) -> th.Tensor:
+        """Apply to each kind's agents, (batch, n_agents, width), and put the results side by side."""
+        if len(self.kinds) == 1:
+            return function(self.kinds[0], tensor)
+        result = th.zeros_like(tensor)
+        for kind in self.kinds:
+            result[:, kind.agents, : kind.width] = function(kind, tensor[:, kind.agents, : kind.width])
+        return result
+
+    def squash(self, logits: th.Tensor) -> th.Tensor:
+        """
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :return: scores, continuous actions or probabilities, the same shape
+        """
+        return self._by_kind(logits, lambda kind, part: kind.squash(part))
+
+    def act(self, logits: th.Tensor, deterministic: bool = True) -> th.Tensor:
+        """
+        :param logits: (batch, n_agents, width)
+        :param deterministic: without exploration
+        :return: actions as critics read them, (batch, n_agents, width)
+        """
+        return self._by_kind(logits, lambda kind, part: kind.act(part, deterministic))
+
+    def objective(self, estimator: Estimator, logits: th.Tensor, q: Critic, temperature: float) -> th.Tensor:
+        """
+        :param estimator: of the gradient through bits and categories
+        :param logits: (batch, n_agents, width)
+        :param q: ``q(own, agents)``: values of alternatives for the own action, (batch, len(agents), M, width) ->
+            (batch, len(agents), M); ``agents`` is None for all
+        :param temperature: of relaxations
+        :return: what the actors ascend, (batch, n_agents)
+        """
+        if len(self.kinds) == 1:
+            return self.kinds[0].objective(estimator, logits, lambda own: q(own, None), temperature)
+        result = logits.new_zeros(logits.shape[:2])
+        for kind in self.kinds:
+            agents = th.tensor(kind.agents, device=logits.device)
+
+            def values(own: th.Tensor, agents: th.Tensor = agents) -> th.Tensor:
+                return q(nn.functional.pad(own, (0, self.width - own.shape[-1])), agents)
+
+            part = logits[:, agents, : kind.width]
+            result[:, agents] = kind.objective(estimator, part, values, temperature)
+        return result
+
+    def regularization(self, logits: th.Tensor) -> th.Tensor:
+        """
+        :param logits: (batch, n_agents, width)
+        :return: mean square of each agent's outputs, (batch, n_agents)
+        """
+        if len(self.kinds) == 1:
+            return self.kinds[0].regularization(logits)
+        result = logits.new_zeros(logits.shape[:2])
+        for kind in self.kinds:
+            result[:, kind.agents] = kind.regularization(logits[:, kind.agents, : kind.width])
+        return result
+
+    def scale(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: of the environment, (batch, length)
+        :return: the same with continuous numbers in [-1, 1], as the replay buffer keeps them
+        """
+        scaled = 2.0 * (actions - self.low) / (self.high - self.low) - 1.0
+        return np.where(self.is_continuous, scaled, actions)
+
+    def unscale(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: as the replay buffer keeps them, (batch, length)
+        :return: the same in the environment's units
+        """
+        unscaled = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+        return np.where(self.is_continuous, unscaled, actions)

@@ -1,0 +1,119 @@
+"""One agent's policy by itself: what a robot has to carry."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_maddpg.actions import ActionKind, Categories, Continuous, make_kinds
+from sb3_maddpg.team import AgentActionSpace
+from sb3_maddpg.utils import atomic_write
+
+if TYPE_CHECKING:
+    from sb3_maddpg.policies import MADDPGPolicy
+
+
+class AgentPolicy(nn.Module):
+    """
+    Maps one agent's observation to its action: no critic, no team, no exploration. Get one from
+    ``model.agent_policy("robot_2")``.
+
+    :param name: of the agent
+    :param network: maps observations, (batch, obs_dim), to outputs, (batch, width or more)
+    :param columns: which of the outputs are the agent's, see ``TeamActions.columns_of``
+    :param action_space: the agent's, categories counting from 0
+    :param obs_dim: length of its observation
+    :param threshold: for bits, see ``Bits``
+    """
+
+    columns: th.Tensor
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(
+        self,
+        name: str,
+        network: nn.Module,
+        columns: Sequence[int],
+        action_space: AgentActionSpace,
+        obs_dim: int,
+        threshold: float,
+    ):
+        super().__init__()
+        self.name = name
+        self.network = network
+        self.action_space = action_space
+        self.obs_dim = obs_dim
+        self.kind: ActionKind = make_kinds([action_space], threshold)[0]
+        self.register_buffer("columns", th.tensor(columns))
+        if isinstance(action_space, spaces.Box):
+            for bound in ("low", "high"):
+                self.register_buffer(bound, th.as_tensor(getattr(action_space, bound)).float().flatten())
+
+    @classmethod
+    def of(cls, policy: MADDPGPolicy, agent: str | int) -> AgentPolicy:
+        """
+        :param policy: of the team
+        :param agent: name or number
+        :raises ValueError: no such agent
+        """
+        team, index = policy.team, policy.team.index(agent)
+        network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
+        columns, space = policy.actions.columns_of(index), team.action_spaces[index]
+        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold)
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (batch, obs_dim)
+        :return: actions in the environment's units, (batch, length of the action): bits as int8, numbers as float32,
+            categories as int64
+        """
+        logits = self.network(obs)[:, self.columns].unsqueeze(1)
+        actions = self.kind.act(logits, deterministic=True).squeeze(1)
+        if isinstance(self.kind, Continuous):
+            return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+        if isinstance(self.kind, Categories):
+            return actions.unflatten(-1, self.kind.shape).argmax(dim=-1)
+        return actions.to(th.int8)
+
+    def predict(self, observation: np.ndarray) -> np.ndarray:
+        """
+        :param observation: flat, (obs_dim,), or several of them, (batch, obs_dim)
+        :return: an action of the agent's own space, or (batch, length of the action)
+        :raises ValueError: another length, NaN or infinity
+        """
+        obs = th.as_tensor(np.asarray(observation, dtype=np.float32))
+        if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
+            raise ValueError(f"An observation of {self.name} has length {self.obs_dim}, not shape {tuple(obs.shape)}.")
+        if not obs.isfinite().all():
+            raise ValueError(f"The observation of {self.name} holds NaN or infinity: clip or replace such values.")
+        with th.no_grad():
+            actions = self(obs.reshape(-1, self.obs_dim)).numpy()
+        if obs.dim() == 2:
+            return actions
+        if isinstance(self.action_space, spaces.Discrete):
+            return actions[0, 0]
+        return actions[0].reshape(self.action_space.shape)
+
+    def export(self, path: str | os.PathLike[str]) -> None:
+        """
+        Write the policy as a TorchScript program, which ``torch.jit.load`` and libtorch (C++) run without this package:
+        a function from (batch, obs_dim) float32 to actions as ``forward`` gives them.
+
+        :param path: of the file
+        """
+        example, other = th.zeros(2, self.obs_dim), th.linspace(-2.0, 2.0, 5 * self.obs_dim).view(5, -1)
+        with warnings.catch_warnings():
+            # What torch offers instead, torch.export, needs a compiler to run without Python
+            warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+            program = th.jit.trace(self, example, check_inputs=[(other,)])
+            with atomic_write(path, suffix="pt") as file:
+                th.jit.save(program, file)

@@ -1,0 +1,129 @@
+"""Multi-layer perceptrons of many agents, every layer in one tensor with a leading axis of networks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import torch as th
+from torch import nn
+
+
+class StackedMLP(nn.Module):
+    """
+    Many multi-layer perceptrons, evaluated together. Initialised like ``torch.nn.Linear``.
+
+    Features come before the batch: matrix products with few rows and many columns are much faster than the reverse.
+
+    :param groups: for each network, which set of parameters it uses; networks of one group share theirs
+    :param in_features: inputs of each
+    :param out_features: outputs of each
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    """
+
+    groups: th.Tensor
+
+    def __init__(
+        self,
+        groups: Sequence[int],
+        in_features: int,
+        out_features: int,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+    ):
+        super().__init__()
+        self.n_networks = len(groups)
+        self.n_groups = max(groups) + 1
+        self.separate = list(groups) == list(range(self.n_networks))
+        self.register_buffer("groups", th.tensor(groups), persistent=False)
+        # In place, which spares a copy of every hidden layer
+        self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for width, next_width in pairwise([in_features, *net_arch, out_features]):
+            bound = width**-0.5
+            self.weights.append(nn.init.uniform_(th.empty(self.n_groups, next_width, width), -bound, bound))
+            self.biases.append(nn.init.uniform_(th.empty(self.n_groups, next_width, 1), -bound, bound))
+        # A ParameterList is slow to index, which shows where an environment asks for one action at a time
+        self.layers = list(zip(self.weights, self.biases, strict=True))
+
+    def of_networks(self, parameter: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param parameter: a weight or a bias, with a leading axis of groups
+        :param networks: which networks, None for all
+        :return: the same with a leading axis of networks
+        """
+        if networks is not None:
+            return parameter[self.groups[networks]]
+        if self.separate:
+            return parameter
+        return parameter.expand(self.n_networks, -1, -1) if self.n_groups == 1 else parameter[self.groups]
+
+    def layer(self, index: int, networks: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param index: which layer
+        :param networks: which networks, None for all
+        :return: weights (n_networks, out, in) and biases (n_networks, out, 1)
+        """
+        weight, bias = self.layers[index]
+        return self.of_networks(weight, networks), self.of_networks(bias, networks)
+
+    def after_first(self, x: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param x: what the first layer gives before its activation, (n_networks, width, batch); not valid afterwards
+        :param networks: which networks, None for all
+        :return: what the networks give, (n_networks, out_features, batch)
+        """
+        for index in range(1, len(self.layers)):
+            weight, bias = self.layer(index, networks)
+            x = th.baddbmm(bias, weight, self.activation(x))
+        return x
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: (n_networks, in_features, batch)
+        :return: (n_networks, out_features, batch)
+        """
+        weight, bias = self.layer(0)
+        return self.after_first(th.baddbmm(bias, weight, x))
+
+    def single(self, network: int, n_inputs: int) -> nn.Sequential:
+        """
+        :param network: which one
+        :param n_inputs: leave out the inputs after so many
+        :return: that network by itself, with its own copy of the parameters; maps (batch, n_inputs) to (batch,
+            out_features)
+        """
+        modules: list[nn.Module] = []
+        group = int(self.groups[network])
+        for index, (weights, biases) in enumerate(self.layers):
+            weight = weights[group] if index else weights[group, :, :n_inputs]
+            linear = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0], device=weight.device)
+            with th.no_grad():
+                linear.weight.copy_(weight)
+                linear.bias.copy_(biases[group, :, 0])
+            modules += [linear] if index == 0 else [self.activation, linear]
+        return nn.Sequential(*modules)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        """
+        Clip the gradient of each set of parameters by its own norm, so that no agent slows another.
+
+        :param max_norm: largest Euclidean norm
+        """
+        gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
+        norm = th.stack([gradient.square().sum(dim=(1, 2)) for gradient in gradients]).sum(dim=0).sqrt()
+        scale = (max_norm / (norm + 1e-6)).clamp(max=1.0).view(-1, 1, 1)
+        th._foreach_mul_(gradients, [scale] * len(gradients))
+
+
+@th.no_grad()
+def polyak_update(parameters: Iterable[th.Tensor], targets: Iterable[th.Tensor], tau: float) -> None:
+    """
+    SB3's ``polyak_update`` in one call for all parameters.
+
+    :param parameters: of the network
+    :param targets: of its target, which move
+    :param tau: how far
+    """
+    th._foreach_lerp_(list(targets), list(parameters), tau)

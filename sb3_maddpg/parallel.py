@@ -1,0 +1,433 @@
+"""PettingZoo's parallel environments as team environments."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+import pkgutil
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.spaces.utils import flatten, flatten_space
+from pettingzoo import AECEnv, ParallelEnv
+
+from sb3_maddpg.team import ACTION_SPACES, TeamObservation, heads_of, joint_action_space
+
+ENTRY_POINT = f"{__name__}:make"
+
+
+class _Action(NamedTuple):
+    """Where an agent's action lies in the joint action, and what it has to become."""
+
+    begin: int
+    end: int
+    space: spaces.Space
+    clips: bool
+    """Whether to clip once more, in a precision other than the joint action's"""
+    start: Any
+
+
+class TeamEnv(gymnasium.Env):
+    """
+    A PettingZoo ``ParallelEnv`` as one environment for the whole team, see "The team convention" in CONTRIBUTING.md.
+
+    The observation, ``TeamObservation``, has a row per possible agent: its own observation, flattened as Gymnasium's
+    ``flatten`` does it. The action is that of ``joint_action_space``. The reward is the mean over all possible
+    agents, of which one that takes no part has none, so that the return is the mean of the agents' returns. An
+    agent that ends is shown its last observation once; from then on its row is zero and it is sent no action. The
+    episode ends with the last agent: by truncation, if it was truncated (or one that ended in the same step was).
+
+    ``info`` of a step, all but the last two with one entry per agent:
+
+    - ``agent_rewards``: float32
+    - ``agent_terminated``, ``agent_truncated``: whether it ended in this step
+    - ``agent_active``: whether it acted in this step
+    - ``agent_infos``: what the environment says about the agents, by name; left out where it says nothing
+    - ``metrics``: at the end of an episode, ``rollout/ep_rew_NAME`` of each agent that took part
+
+    :param env: the environment
+    :param state: append ``env.state()`` to the observation, for the critics
+    :raises ValueError: an environment or a space that cannot be treated so
+    """
+
+    def __init__(self, env: ParallelEnv, state: bool = False):
+        agents = _possible_agents(env)
+        self.parallel_env = env
+        self.metadata = {"render_modes": [], **getattr(env, "metadata", {})}
+        self.render_mode = getattr(env, "render_mode", None)
+        self.agent_names = tuple(map(str, agents))
+        self.observation_space = TeamObservation(
+            {str(agent): _flat_space(env.observation_space(agent), f"agent {agent!r} observes") for agent in agents},
+            _state_space(env) if state else None,
+        )
+        action_spaces = [env.action_space(agent) for agent in agents]
+        for agent, space in zip(agents, action_spaces, strict=True):
+            _check_action_space(agent, space)
+        self.action_space = joint_action_space(action_spaces)
+        self._agents = agents
+        self._rows = {agent: row for row, agent in enumerate(agents)}
+        self._observation_spaces = [env.observation_space(agent) for agent in agents]
+        self._state_space: Any = env.state_space if state else None
+        self._metric_names = [f"rollout/ep_rew_{name}" for name in self.agent_names]
+        self._lay_out(action_spaces)
+        self._live: list[int] = []
+        self._taking_part: list[int] = []
+        self._returns = [0.0] * len(agents)
+
+    def __getattr__(self, name: str) -> Any:
+        # What the environment offers besides PettingZoo's interface, such as a curriculum. Only asked for what is
+        # missing here; private names and "env" are what copying, pickling and the search for wrappers look for.
+        if name.startswith("_") or name in ("env", "parallel_env"):
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.parallel_env, name)
+
+    def _lay_out(self, action_spaces: Sequence[Any]) -> None:
+        ends = np.cumsum([len(heads_of(space)) for space in action_spaces]).tolist()
+        self._actions = []
+        # Only numbers of a Box are clipped
+        self._low = np.full(ends[-1], -np.inf, np.float32)
+        self._high = np.full(ends[-1], np.inf, np.float32)
+        for space, begin, end in zip(action_spaces, [0, *ends], ends, strict=False):
+            if isinstance(space, spaces.Box):
+                self._low[begin:end], self._high[begin:end] = space.low.ravel(), space.high.ravel()
+            clips = isinstance(space, spaces.Box) and space.dtype != np.float32
+            self._actions.append(_Action(begin, end, space, clips, getattr(space, "start", None)))
+        self._clip = any(isinstance(space, spaces.Box) for space in action_spaces)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """
+        :param seed: for the environment
+        :param options: for the environment
+        :return: observation, (n_agents, columns), and info
+        """
+        super().reset(seed=seed)
+        observations, infos = self.parallel_env.reset(seed=seed, options=options)
+        present = set(self.parallel_env.agents)
+        if unknown := present - self._rows.keys():
+            raise ValueError(self._unknown(unknown))
+        self._live = [row for row, agent in enumerate(self._agents) if agent in present]
+        if not self._live:
+            raise ValueError(f"After reset(), agents of {self.parallel_env} is empty: it must list who takes part.")
+        self._taking_part = self._live
+        self._returns = [0.0] * len(self._agents)
+        return self._observe(observations, self._live), _agent_infos(infos)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: joint action, flat
+        :return: observation, (n_agents, columns), mean reward, terminated, truncated, info
+        """
+        acted = self._live
+        if not acted:
+            raise gymnasium.error.ResetNeeded("No agent is left in this episode, or none has begun: call reset().")
+        observations, agent_rewards, terminations, truncations, infos = self.parallel_env.step(self._decode(action))
+        agents, n_agents = self._agents, len(self._agents)
+        rewards, active = [0.0] * n_agents, [False] * n_agents
+        terminated, truncated = [False] * n_agents, [False] * n_agents
+        left = set(self.parallel_env.agents)
+        seen, live = [], []
+        for row in acted:
+            agent = agents[row]
+            try:
+                rewards[row] = reward = float(agent_rewards[agent])
+                ends, cut = bool(terminations[agent]), bool(truncations[agent])
+            except KeyError:
+                raise ValueError(
+                    f"step() of {self.parallel_env} left out reward, termination or truncation of agent {agent!r}: "
+                    "it must give them for every agent that acted."
+                ) from None
+            active[row], terminated[row], truncated[row] = True, ends, cut
+            self._returns[row] += reward
+            if not (ends or cut):
+                live.append(row)
+            # Nothing is learned from what a terminated agent sees last, and some environments do not give it
+            if not ends or cut or agent in observations:
+                seen.append(row)
+        if len(left) != len(live) or not all(agents[row] in left for row in live):
+            self._check_left(left, live, acted, terminations, truncations)
+        total = sum(rewards)
+        if not math.isfinite(total):
+            self._refuse_rewards(rewards)
+        self._live = live
+        info = _agent_infos(infos)
+        info["agent_rewards"] = np.array(rewards, np.float32)
+        info["agent_terminated"] = np.array(terminated)
+        info["agent_truncated"] = np.array(truncated)
+        info["agent_active"] = np.array(active)
+        over = not live
+        cut = over and any(truncated[row] and not terminated[row] for row in acted)
+        if over:
+            info["metrics"] = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
+        return self._observe(observations, seen), total / n_agents, over and not cut, cut, info
+
+    def render(self) -> Any:
+        """What the environment renders."""
+        return self.parallel_env.render()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.parallel_env.close()
+
+    def _decode(self, action: Any) -> dict[Any, Any]:
+        """The actions of the live agents, each as its own space has it."""
+        values = np.asarray(action)
+        if values.shape != self.action_space.shape:
+            raise ValueError(
+                f"The joint action has shape {values.shape}, not {self.action_space.shape}: it is flat, agent after "
+                f"agent ({', '.join(self.agent_names)})."
+            )
+        if self._clip:
+            values = np.minimum(np.maximum(values, self._low), self._high, dtype=np.float32)
+        actions = {}
+        for row in self._live:
+            begin, end, space, clips, start = self._actions[row]
+            part: Any
+            if isinstance(space, spaces.Discrete):
+                part = int(values[begin]) + int(start)
+            elif isinstance(space, spaces.Box):
+                part = values[begin:end].reshape(space.shape)
+                if clips:
+                    part = np.rint(part) if np.issubdtype(space.dtype, np.integer) else part
+                    part = np.clip(part, space.low, space.high).astype(space.dtype)
+            else:
+                part = values[begin:end].astype(space.dtype).reshape(space.shape)
+                if start is not None:
+                    part += start
+            actions[self._agents[row]] = part
+        return actions
+
+    def _observe(self, observations: Mapping[Any, Any], rows: list[int]) -> np.ndarray:
+        """The team's observation, all rows but the given ones zero, (n_agents, columns)."""
+        team = self.observation_space
+        assert isinstance(team, TeamObservation)
+        matrix = np.zeros(team.shape, np.float32)
+        for row in rows:
+            agent, space, length = self._agents[row], self._observation_spaces[row], team.obs_dims[row]
+            if agent not in observations:
+                raise ValueError(
+                    f"{self.parallel_env} gave no observation for agent {agent!r}, which takes part or was just "
+                    "truncated: reset() and step() must return one."
+                )
+            if isinstance(space, spaces.Box):
+                observation = np.asarray(observations[agent])
+                if observation.shape != space.shape:
+                    raise ValueError(
+                        f"The observation of agent {agent!r} has shape {observation.shape}, but its space is {space}."
+                    )
+                matrix[row, :length] = observation.reshape(-1)
+            else:
+                matrix[row, :length] = np.asarray(flatten(space, observations[agent]))
+        if self._state_space is not None:
+            columns = matrix.shape[1] - team.obs_dim
+            state = np.zeros(len(matrix) * columns, np.float32)
+            state[: team.state_dim] = self._state(team.state_dim)
+            matrix[:, team.obs_dim :] = state.reshape(len(matrix), columns)
+        return matrix
+
+    def _state(self, size: int) -> np.ndarray:
+        try:
+            state = np.asarray(flatten(self._state_space, self.parallel_env.state()))
+        except NotImplementedError as error:
+            raise ValueError(f"{self.parallel_env} has a state_space but no state(): choose state=False.") from error
+        if state.size != size:
+            raise ValueError(f"state() of {self.parallel_env} has {state.size} numbers, its state_space {size}.")
+        return state
+
+    def _check_left(
+        self,
+        left: set[Any],
+        live: list[int],
+        acted: list[int],
+        terminations: Mapping[Any, bool],
+        truncations: Mapping[Any, bool],
+    ) -> None:
+        """Whether ``agents`` of the environment and the ends it reported go together."""
+        if unknown := left - self._rows.keys():
+            raise ValueError(self._unknown(unknown))
+        for row in live:
+            if (agent := self._agents[row]) not in left:
+                raise ValueError(
+                    f"Agent {agent!r} left {self.parallel_env} without an end: set its termination or its truncation "
+                    "in the step in which it is dropped from `agents`."
+                )
+        for agent in left - {self._agents[row] for row in acted}:
+            # An environment may go on listing an agent as long as it says that it has ended
+            if not (terminations.get(agent) or truncations.get(agent)):
+                how = "came back to life" if self._rows[agent] in self._taking_part else "joined"
+                raise ValueError(
+                    f"Agent {agent!r} {how} in the middle of an episode: the agents of an episode are those that "
+                    f"{self.parallel_env} lists after reset(), until they end."
+                )
+
+    def _unknown(self, agents: Iterable[Any]) -> str:
+        names = ", ".join(sorted(map(repr, agents)))
+        return (
+            f"{names} in `agents` of {self.parallel_env}, but possible_agents has only {', '.join(self.agent_names)}: "
+            "it must name every agent that can ever take part."
+        )
+
+    def _refuse_rewards(self, rewards: list[float]) -> None:
+        found = {
+            name: reward for name, reward in zip(self.agent_names, rewards, strict=True) if not math.isfinite(reward)
+        }
+        wrong = ", ".join(f"{reward} for agent {name!r}" for name, reward in found.items())
+        raise ValueError(f"{self.parallel_env} gave a reward of {wrong}: rewards must be finite.")
+
+
+def _agent_infos(infos: Mapping[Any, Any] | None) -> dict[str, Any]:
+    if not infos or not any(infos.values()):
+        return {}
+    return {"agent_infos": {str(agent): info for agent, info in infos.items() if info}}
+
+
+def _possible_agents(env: Any) -> tuple[Any, ...]:
+    if isinstance(env, AECEnv):
+        raise ValueError(
+            f"{env} is a PettingZoo environment with turns (AECEnv). Convert it with "
+            "pettingzoo.utils.conversions.aec_to_parallel, or take its parallel_env."
+        )
+    if not isinstance(env, ParallelEnv):
+        raise ValueError(f"{env!r} is no PettingZoo ParallelEnv.")
+    agents = tuple(getattr(env, "possible_agents", None) or ())
+    if not agents:
+        raise ValueError(f"{env} has no possible_agents: it must name every agent that can ever take part.")
+    if len(set(map(str, agents))) < len(agents):
+        raise ValueError(f"possible_agents of {env} has a name twice: {', '.join(map(str, agents))}.")
+    return agents
+
+
+def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
+    flat = flatten_space(space)
+    if not isinstance(flat, spaces.Box):
+        raise ValueError(f"The space that {what}, {space}, has no fixed length and cannot become a row of numbers.")
+    return flat
+
+
+def _state_space(env: Any) -> spaces.Box:
+    space = getattr(env, "state_space", None)
+    if space is None:
+        raise ValueError(f"{env} has no state_space, which state=True needs: choose state=False.")
+    return _flat_space(space, f"the state of {env} has")
+
+
+def _check_action_space(agent: Any, space: spaces.Space) -> None:
+    if not isinstance(space, ACTION_SPACES) or not heads_of(space):
+        raise ValueError(
+            f"Agent {agent!r} has the action space {space}: only Discrete, MultiDiscrete, MultiBinary and Box with at "
+            "least one number are supported. Flatten it with a wrapper."
+        )
+    if isinstance(space, spaces.Box) and not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise ValueError(
+            f"Agent {agent!r} has the action space {space} without bounds, which say how far actions reach. "
+            "Give it finite ones."
+        )
+
+
+def make(
+    entry: str, state: bool = False, wrappers: Iterable[str | Mapping[str, Any]] | None = None, **kwargs: Any
+) -> TeamEnv:
+    """
+    Make a team environment out of a module with a function ``parallel_env``, as PettingZoo's modules are.
+
+    :param entry: the module, e.g. "mpe2.simple_spread_v3"
+    :param state: append the global state to the observation, for the critics
+    :param wrappers: of the parallel environment, the innermost first: dotted paths, or dicts from such a path to the
+        wrapper's arguments, e.g. ``["supersuit.pad_observations_v0", {"supersuit.frame_stack_v2": {"stack_size": 2}}]``
+    :param kwargs: arguments of ``parallel_env``
+    """
+    env = _parallel_env(entry)(**kwargs)
+    for path, arguments in _wrappers(wrappers):
+        env = _load(path)(env, **arguments)
+    return TeamEnv(env, state=state)
+
+
+def _wrappers(wrappers: Iterable[str | Mapping[str, Any]] | None) -> list[tuple[str, dict[str, Any]]]:
+    pairs: list[tuple[str, dict[str, Any]]] = []
+    for wrapper in [wrappers] if isinstance(wrappers, (str, Mapping)) else wrappers or ():
+        if isinstance(wrapper, str):
+            pairs.append((wrapper, {}))
+        elif isinstance(wrapper, Mapping):
+            pairs.extend((path, dict(arguments or {})) for path, arguments in wrapper.items())
+        else:
+            raise ValueError(f"wrappers: {wrapper!r} is neither a dotted path nor a dict from one to its arguments.")
+    return pairs
+
+
+def _load(path: str) -> Callable[..., Any]:
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"The wrapper {path} cannot be imported: {error}") from error
+
+
+def _module(name: str) -> ModuleType | None:
+    """The module, or None if there is no such module."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+            return None
+        raise ValueError(f"{name} cannot be imported: {error}. Install what it needs.") from error
+
+
+def _parallel_env(entry: str) -> Callable[..., ParallelEnv]:
+    parallel_env = getattr(_module(entry), "parallel_env", None)
+    if not callable(parallel_env):
+        raise ValueError(f"There is no function parallel_env in {entry}: name a module that has one.")
+    return parallel_env
+
+
+def register(env_id: str) -> bool:
+    """
+    Make a module with a function ``parallel_env`` known to Gymnasium: "mpe2/simple_spread_v3" stands for
+    ``mpe2.simple_spread_v3``, and "quad_swarm/parallel_env" for the function of the package itself.
+
+    :param env_id: Gymnasium id
+    :return: whether Gymnasium knows the id now
+    :raises ValueError: a module that is there, but cannot be imported
+    """
+    if env_id in gymnasium.registry:
+        return True
+    entry = env_id.removesuffix("/parallel_env").replace("/", ".")
+    if "/" not in env_id or not all(part.isidentifier() for part in entry.split(".")):
+        return False
+    if not callable(getattr(_module(entry), "parallel_env", None)):
+        return False
+    # Gymnasium's checker would warn of padding, whose bounds are both zero
+    gymnasium.register(env_id, entry_point=ENTRY_POINT, kwargs={"entry": entry}, disable_env_checker=True)
+    return True
+
+
+def siblings(env_id: str) -> list[str]:
+    """
+    :param env_id: an id like those of ``register``, of a module that may not exist
+    :return: ids of the versioned modules beside it
+    """
+    package, _, _ = env_id.rpartition("/")
+    if not package.isidentifier():
+        return []
+    paths = getattr(_module(package), "__path__", [])
+    return [f"{package}/{found.name}" for found in pkgutil.iter_modules(paths) if re.search(r"_v\d+$", found.name)]
+
+
+def arguments(entry: str) -> set[str] | None:
+    """
+    Names of the arguments of ``make`` for a module. PettingZoo's modules take any in ``parallel_env`` and hand them
+    on to ``raw_env``, which is asked instead.
+
+    :param entry: see ``make``
+    :return: the names, or None if any is taken
+    """
+    for function in (_parallel_env(entry), getattr(_module(entry), "raw_env", None)):
+        if callable(function):
+            parameters = inspect.signature(function).parameters.values()
+            if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
+                return {parameter.name for parameter in parameters} | {"state", "wrappers"}
+    return None

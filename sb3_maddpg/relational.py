@@ -1,0 +1,410 @@
+"""Relational networks: actors and critics that look at an agent's neighbours one by one and share what they learn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from itertools import pairwise
+from typing import Any, ClassVar, TypedDict
+
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
+from sb3_maddpg.team import AgentActionSpace, Team
+
+
+class ObservationLayout(TypedDict, total=False):
+    """
+    What the numbers of an agent's observation are about, the same for all agents. An environment tells it by an
+    attribute ``observation_layout``.
+
+    - ``own``: columns about the agent itself;
+    - ``neighbours``: for each neighbour the columns about it, all of one length, in one order;
+    - ``who``: for each agent the numbers of its neighbours; all others in ascending order, unless given;
+    - ``acts_on_neighbours``: the action falls into equal parts, one for each neighbour.
+
+    A neighbour whose columns are all zero is absent.
+    """
+
+    own: Sequence[int]
+    neighbours: Sequence[Sequence[int]]
+    who: Sequence[Sequence[int]]
+    acts_on_neighbours: bool
+
+
+def _others(n_agents: int) -> list[list[int]]:
+    return [[other for other in range(n_agents) if other != agent] for agent in range(n_agents)]
+
+
+def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[int]]:
+    """:return: for each agent the numbers of its neighbours"""
+    if not {"own", "neighbours"} <= set(layout) <= set(ObservationLayout.__annotations__):
+        raise ValueError(
+            f"observation_layout has entries {sorted(layout)}, but needs `own` and `neighbours`, and beside them knows "
+            "`who` and `acts_on_neighbours` only."
+        )
+    neighbours = layout["neighbours"]
+    used = [*layout["own"], *(column for columns in neighbours for column in columns)]
+    if len({len(columns) for columns in neighbours}) != 1 or not all(0 <= column < team.obs_dim for column in used):
+        raise ValueError(
+            f"observation_layout={dict(layout)}: every neighbour needs as many columns as the next, each from 0 to "
+            f"{team.obs_dim - 1}."
+        )
+    who = layout.get("who") or _others(team.n_agents)
+    if {len(row) for row in who} != {len(neighbours)} or len(who) != team.n_agents:
+        raise ValueError(
+            f"observation_layout has columns for {len(neighbours)} neighbours, but the {team.n_agents} agents have "
+            f"{[len(row) for row in who]}: give `who` or the other columns."
+        )
+    if not all(set(row) <= set(others) for row, others in zip(who, _others(team.n_agents), strict=True)):
+        raise ValueError(f"observation_layout: who={who} must name others, by numbers from 0 to {team.n_agents - 1}.")
+    return who
+
+
+class Views(nn.Module):
+    """
+    An observation as an agent's own part and its views of its neighbours.
+
+    :param layout: see ``ObservationLayout``
+    :param team: a team of equal agents
+    :raises ValueError: a layout that does not fit the team
+    """
+
+    own_columns: th.Tensor
+    neighbour_columns: th.Tensor
+    who: th.Tensor
+    back: th.Tensor
+    n_neighbours: int
+    own_dim: int
+    neighbour_dim: int
+
+    def __init__(self, layout: ObservationLayout, team: Team):
+        super().__init__()
+        if len(set(team.obs_dims)) > 1 or len(set(map(str, team.action_spaces))) > 1:
+            raise ValueError("PairPolicy is for teams of equal agents, and these have unlike spaces: use MlpPolicy.")
+        who = _check_layout(layout, team)
+        self.n_neighbours = len(layout["neighbours"])
+        self.own_dim, self.neighbour_dim = len(layout["own"]), len(layout["neighbours"][0])
+        back = [[who[j].index(i) if i in who[j] else -1 for j in row] for i, row in enumerate(who)]
+        for name, table in (
+            ("own_columns", layout["own"]),
+            ("neighbour_columns", layout["neighbours"]),
+            ("who", who),
+            ("back", back),
+        ):
+            self.register_buffer(name, th.tensor(table, dtype=th.long), persistent=False)
+
+    def forward(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        :param obs: (batch, n_agents, obs_dim or more)
+        :return: own parts (batch, n_agents, own_dim), views of neighbours (batch, n_agents, n_neighbours,
+            neighbour_dim), and which neighbours are present (batch, n_agents, n_neighbours, 1)
+        """
+        neighbours = obs[..., self.neighbour_columns]
+        return obs[..., self.own_columns], neighbours, (neighbours != 0).any(dim=-1, keepdim=True).to(obs.dtype)
+
+
+class PairNet(nn.Module):
+    """
+    A function of every pair (agent, neighbour) and of the agent's whole neighbourhood: each view is encoded, the
+    encodings are pooled (mean and maximum, as in Deep Sets, Zaheer et al. 2017), and a second network reads the
+    encoding, the pool and further inputs.
+
+    :param in_features: length of a view
+    :param extras: lengths of the further inputs, see ``extra``
+    :param out_features: outputs for each pair
+    :param net_arch: widths of the hidden layers, the first of them that of the encoding
+    :param activation_fn: between the layers
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        extras: Sequence[int],
+        out_features: int,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module],
+    ):
+        super().__init__()
+        width, *later = net_arch
+        self.activation = activation_fn()
+        self.encoder = nn.Linear(in_features, width)
+        widths = [*later, out_features]
+        self.of_pair = nn.Linear(width, widths[0])
+        self.of_pool = nn.Linear(2 * width, widths[0], bias=False)
+        self.of_extras = nn.ModuleList(nn.Linear(length, widths[0], bias=False) for length in extras)
+        self.later = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
+
+    def encode(self, views: th.Tensor, present: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param views: (..., n_neighbours, in_features)
+        :param present: (..., n_neighbours, 1)
+        :return: what the second network makes of encoding and pool, before its activation, (..., n_neighbours, width),
+            and the pool, (..., 2 * the encoding's width)
+        """
+        encoded = self.activation(self.encoder(views)) * present
+        mean = encoded.sum(dim=-2) / present.sum(dim=-2).clamp(min=1.0)
+        pool = th.cat([mean, encoded.amax(dim=-2)], dim=-1)
+        return self.of_pair(encoded) + self.of_pool(pool).unsqueeze(-2), pool
+
+    def extra(self, index: int, x: th.Tensor) -> th.Tensor:
+        """
+        :param index: which of the further inputs
+        :param x: (..., its length)
+        :return: what it adds before the second network's first activation, (..., width)
+        """
+        return self.of_extras[index](x)
+
+    def decode(self, hidden: th.Tensor) -> th.Tensor:
+        """
+        :param hidden: before the activation, (..., width)
+        :return: (..., out_features)
+        """
+        for layer in self.later:
+            hidden = layer(self.activation(hidden))
+        return hidden
+
+
+class PairActor(Actor):
+    """
+    One actor for all agents that looks at its neighbours one by one; permutation-equivariant, and the same for any
+    number of agents. It acts on each neighbour, or by itself on what it makes of all of them.
+
+    :param views: the layout of observations
+    :param actions: how the team acts
+    :param on_neighbours: the action falls into parts, one for each neighbour
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    """
+
+    def __init__(
+        self,
+        views: Views,
+        actions: TeamActions,
+        on_neighbours: bool,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module],
+    ):
+        super().__init__(actions)
+        self.views = views
+        self.on_neighbours = on_neighbours
+        outputs = actions.width // views.n_neighbours if on_neighbours else actions.width
+        self.net = PairNet(views.own_dim + views.neighbour_dim, [views.own_dim], outputs, net_arch, activation_fn)
+
+    def logits(self, obs: th.Tensor) -> th.Tensor:
+        own, neighbours, present = self.views(obs)
+        each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
+        hidden, pool = self.net.encode(th.cat([each, neighbours], dim=-1), present)
+        if self.on_neighbours:
+            return self.net.decode(hidden + self.net.extra(0, each)).flatten(-2)
+        return self.net.decode(self.net.of_pool(pool) + self.net.extra(0, own) + self.net.of_pair.bias)
+
+    def single(self, agent: int) -> nn.Module:
+        alone = copy(self)
+        alone.__dict__.pop("optimizer", None)
+        return _SinglePairActor(alone)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        nn.utils.clip_grad_norm_(self.parameters(), max_norm)
+
+
+class _SinglePairActor(nn.Module):
+    """The actor of one agent: a team of one."""
+
+    def __init__(self, actor: PairActor):
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return self.actor.logits(obs.unsqueeze(1)).squeeze(1)
+
+
+class PairCritic(Critic):
+    """
+    An agent's value as a sum over its pairs, Q_i = sum_j Q_ij. Q_ij reads i's own part, i's view of j, j's own part,
+    the pool of i's neighbourhood, and the two agents' actions towards each other (or their whole actions). With
+    ``part_credit`` each Q_ij is fitted to the rewards that belong to the pair, ``info["pair_rewards"]``.
+
+    :param views: the layout of observations
+    :param units: how units act: pairs, or agents where they do not act on neighbours
+    :param width: numbers in an agent's action
+    :param on_neighbours: the action falls into parts, one for each neighbour
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    :param part_credit: pairs have rewards of their own
+    :param n_critics: number of critics
+    """
+
+    def __init__(
+        self,
+        views: Views,
+        units: TeamActions,
+        on_neighbours: bool,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module],
+        part_credit: bool = False,
+        n_critics: int = 1,
+    ):
+        m = views.n_neighbours
+        super().__init__(units, m if on_neighbours else 1, m, part_credit, n_critics)
+        self.views = views
+        self.on_neighbours = on_neighbours
+        features = 2 * views.own_dim + views.neighbour_dim
+        self.nets = [PairNet(features, [units.width] * 2, 1, net_arch, activation_fn) for _ in range(n_critics)]
+        self.modules_of_nets = nn.ModuleList(self.nets)
+
+    def _pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param actions: (batch, n_agents, width)
+        :return: i's action towards j and j's towards i, both (batch, n_agents, n_neighbours, the units' width)
+        """
+        who = self.views.who
+        if not self.on_neighbours:
+            return actions.unsqueeze(2).expand(-1, -1, self.views.n_neighbours, -1), actions[:, who]
+        parts = actions.unflatten(-1, (self.views.n_neighbours, -1))
+        # Where j does not see i it does nothing to it
+        return parts, parts[:, who, self.views.back.clamp(min=0)] * (self.views.back >= 0).unsqueeze(-1)
+
+    def _hidden(self, net: PairNet, obs: th.Tensor, theirs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """:return: the second network's first layer without i's own action, and which neighbours are present"""
+        own, neighbours, present = self.views(obs)
+        each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
+        hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.who]], dim=-1), present)
+        return hidden + net.extra(1, theirs), present
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        mine, theirs = self._pairs(actions)
+        values = []
+        for net in self.nets:
+            hidden, present = self._hidden(net, obs, theirs)
+            hidden = hidden + net.extra(0, mine)
+            values.append((net.decode(hidden) * present).flatten(1))
+        return th.stack(values)
+
+    def forward_alternatives(
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, units: th.Tensor | None = None
+    ) -> th.Tensor:
+        assert units is None, "equal agents have one kind of action"
+        net = self.nets[0]
+        hidden, present = self._hidden(net, obs, self._pairs(actions)[1])
+        own = own.unflatten(1, hidden.shape[1:3]) if self.on_neighbours else own.unsqueeze(2)
+        mine = net.extra(0, own)
+        values = net.decode(hidden.unsqueeze(3) + mine).squeeze(-1) * present
+        return values.flatten(1, 2) if self.on_neighbours else values.sum(dim=2)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        for net in self.nets:
+            nn.utils.clip_grad_norm_(net.parameters(), max_norm)
+
+
+class PairPolicy(MADDPGPolicy):
+    """
+    Policy for teams of equal agents that see each other: one relational actor and one relational critic for all. The
+    same parameters fit a team of any size: ``MADDPG("PairPolicy", larger_env).set_parameters("small_team.zip")``.
+
+    :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
+    :param action_space: flat joint action, see ``Team.from_spaces``
+    :param lr_schedule: learning rate schedule (could be constant)
+    :param observation_layout: see ``ObservationLayout``; MADDPG takes it from the environment unless given
+    :param pair_credit: fit the critic of each pair to ``info["pair_rewards"]``, (n_agents, n_neighbours), whose sums
+        over neighbours are the agents' rewards
+    :param shared_threshold: explore with one threshold for all bits of an agent; otherwise, where agents act on
+        neighbours, with one for each neighbour
+    :param kwargs: see ``MADDPGPolicy``; networks are always shared
+    """
+
+    env_attributes: ClassVar[tuple[str, ...]] = ("agent_names", "observation_layout")
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Any,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        observation_layout: ObservationLayout | None = None,
+        pair_credit: bool = False,
+        shared_threshold: bool = False,
+        threshold: float = 0.5,
+        n_critics: int = 1,
+        agent_names: Sequence[str] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ):
+        if observation_layout is None:
+            raise ValueError(
+                "PairPolicy has to know which part of an observation is about whom: give the environment an attribute "
+                "`observation_layout` (see sb3_maddpg.relational.ObservationLayout), or policy_kwargs one; or use "
+                "MlpPolicy."
+            )
+        self.observation_layout = observation_layout
+        self.pair_credit = pair_credit
+        self.shared_threshold = shared_threshold
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=net_arch,
+            activation_fn=activation_fn,
+            share_actor=True,
+            share_critic=True,
+            threshold=threshold,
+            n_critics=n_critics,
+            agent_names=agent_names,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+        )
+
+    def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
+        views = Views(self.observation_layout, self.team)
+        on_neighbours = self.observation_layout.get("acts_on_neighbours", False)
+        action_spaces = self.team.action_spaces
+        # Estimators take the bits of a unit to share their threshold
+        actions = TeamActions(action_spaces, self.threshold, self.shared_threshold or not on_neighbours)
+        units = actions
+        if on_neighbours:
+            parts = [part for space in action_spaces for part in _split(space, views.n_neighbours)]
+            units = TeamActions(parts, self.threshold)
+        return (
+            PairActor(views, actions, on_neighbours, actor_arch, self.activation_fn),
+            PairCritic(views, units, on_neighbours, critic_arch, self.activation_fn, self.pair_credit, self.n_critics),
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        parameters = super()._get_constructor_parameters()
+        for name in ("share_actor", "share_critic"):
+            del parameters[name]
+        return {
+            **parameters,
+            "observation_layout": self.observation_layout,
+            "pair_credit": self.pair_credit,
+            "shared_threshold": self.shared_threshold,
+        }
+
+
+def _split(space: AgentActionSpace, n_parts: int) -> list[AgentActionSpace]:
+    """
+    :param space: an agent's action space
+    :param n_parts: number of equal parts
+    :return: the spaces of the parts
+    """
+    length = 1 if isinstance(space, spaces.Discrete) else space.shape[0]  # type: ignore[index]
+    equal = not isinstance(space, spaces.MultiDiscrete) or len(set(space.nvec.tolist())) == 1
+    if length % n_parts or not equal:
+        raise ValueError(
+            f"observation_layout says that agents act on {n_parts} neighbours, but {space} does not fall into as many "
+            "equal parts."
+        )
+    k = length // n_parts
+    if isinstance(space, spaces.MultiBinary):
+        return [spaces.MultiBinary(k)] * n_parts
+    if isinstance(space, spaces.MultiDiscrete):
+        return [spaces.MultiDiscrete(part) for part in space.nvec.reshape(n_parts, k)]
+    assert isinstance(space, spaces.Box)
+    bounds = zip(space.low.reshape(n_parts, k), space.high.reshape(n_parts, k), strict=True)
+    return [spaces.Box(low, high) for low, high in bounds]

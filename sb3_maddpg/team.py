@@ -1,0 +1,229 @@
+"""What a team is: how many agents, what each observes, how each acts. Read out of an environment's two spaces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+AgentActionSpace = spaces.MultiBinary | spaces.Box | spaces.Discrete | spaces.MultiDiscrete
+ACTION_SPACES = (spaces.MultiBinary, spaces.Box, spaces.Discrete, spaces.MultiDiscrete)
+
+
+class TeamObservation(spaces.Box):
+    """
+    ``Box(n_agents, columns)`` that remembers whose rows it has. Each row is an agent's flat observation, padded with
+    zeros to the longest, then the agent's share of the global state, which is laid out row after row in as many
+    further columns as it needs.
+
+    :param agents: name and flat observation space of each agent
+    :param state: flat space of the global state, if critics are to read it
+    """
+
+    def __init__(self, agents: Mapping[str, spaces.Box], state: spaces.Box | None = None):
+        self.names = tuple(agents)
+        self.obs_dims = tuple(int(np.prod(space.shape)) for space in agents.values())
+        self.state_dim = 0 if state is None else int(np.prod(state.shape))
+        n_agents, self.obs_dim = len(agents), max(self.obs_dims)
+        columns = -(-self.state_dim // n_agents)
+        bounds = np.zeros((2, n_agents, self.obs_dim + columns), np.float32)
+        for row, (space, length) in enumerate(zip(agents.values(), self.obs_dims, strict=True)):
+            # A dead agent's row is zero, which the bounds have to admit
+            low, high = _bounds(space)
+            bounds[0, row, :length], bounds[1, row, :length] = np.minimum(low, 0), np.maximum(high, 0)
+        if state is not None:
+            low, high = _bounds(state)
+            padding = n_agents * columns - self.state_dim
+            for bound, values in zip(bounds, (np.minimum(low, 0), np.maximum(high, 0)), strict=True):
+                bound[:, self.obs_dim :] = np.pad(values, (0, padding)).reshape(n_agents, columns)
+        super().__init__(bounds[0], bounds[1], dtype=np.float32)
+
+    def __eq__(self, other: Any) -> bool:
+        return super().__eq__(other) and (
+            not isinstance(other, TeamObservation)
+            or (self.names, self.obs_dims, self.state_dim) == (other.names, other.obs_dims, other.state_dim)
+        )
+
+    def __repr__(self) -> str:
+        agents = ", ".join(f"{name}: {length}" for name, length in zip(self.names, self.obs_dims, strict=True))
+        return f"TeamObservation({agents}{f', state: {self.state_dim}' if self.state_dim else ''})"
+
+
+class MixedActions(spaces.Box):
+    """
+    The joint action of a team whose agents act in unlike ways, as one flat ``Box``: agent after agent, numbers of a
+    ``Box`` as they are, bits as 0 or 1, a category as its index.
+
+    :param agent_spaces: each agent's action space
+    """
+
+    def __init__(self, agent_spaces: Sequence[AgentActionSpace]):
+        self.agent_spaces = tuple(agent_spaces)
+        lows, highs = zip(*(_bounds(space) for space in agent_spaces), strict=True)
+        super().__init__(np.concatenate(lows), np.concatenate(highs), dtype=np.float32)
+
+    def seed(self, seed: int | None = None) -> Any:
+        for index, space in enumerate(self.agent_spaces):
+            space.seed(None if seed is None else seed + index)
+        return super().seed(seed)
+
+    def sample(self, mask: None = None, probability: None = None) -> np.ndarray:
+        """Uniform in each agent's own space."""
+        return np.concatenate([np.ravel(_from_zero(space, space.sample())) for space in self.agent_spaces]).astype(
+            np.float32
+        )
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, MixedActions) and self.agent_spaces == other.agent_spaces
+
+    def __repr__(self) -> str:
+        return f"MixedActions({', '.join(map(str, self.agent_spaces))})"
+
+
+def _from_zero(space: AgentActionSpace, action: Any) -> Any:
+    return action - space.start if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else action
+
+
+def _bounds(space: AgentActionSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Flat bounds in the networks' precision, in which a huge bound of double precision is infinite."""
+    if isinstance(space, spaces.Box):
+        with np.errstate(over="ignore"):
+            return space.low.ravel().astype(np.float32), space.high.ravel().astype(np.float32)
+    sizes = heads_of(space)
+    return np.zeros(len(sizes), np.float32), np.array(sizes, np.float32) - 1
+
+
+def heads_of(space: AgentActionSpace) -> tuple[int, ...]:
+    """
+    :param space: an agent's action space
+    :return: number of values of each of its sub-actions, 0 for a number of a ``Box``
+    """
+    if isinstance(space, spaces.Box):
+        return (0,) * int(np.prod(space.shape))
+    if isinstance(space, spaces.Discrete):
+        return (int(space.n),)
+    if isinstance(space, spaces.MultiDiscrete):
+        return tuple(int(size) for size in space.nvec.ravel())
+    return (2,) * int(np.prod(space.shape))
+
+
+def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
+    """
+    The joint action space of a team, flat, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` where all
+    agents have such a space of one length, else ``MixedActions``. Categories count from 0.
+
+    :param agent_spaces: each agent's action space
+    """
+    kinds = {type(space) for space in agent_spaces}
+    sizes = [heads_of(space) for space in agent_spaces]
+    if len({len(size) for size in sizes}) > 1:
+        return MixedActions(agent_spaces)
+    if kinds == {spaces.MultiBinary}:
+        return spaces.MultiBinary(sum(map(len, sizes)))
+    if kinds == {spaces.Box}:
+        lows, highs = zip(*map(_bounds, agent_spaces), strict=True)
+        return spaces.Box(np.concatenate(lows), np.concatenate(highs), dtype=np.float32)
+    if kinds <= {spaces.Discrete, spaces.MultiDiscrete}:
+        return spaces.MultiDiscrete(np.concatenate(sizes))
+    return MixedActions(agent_spaces)
+
+
+@dataclass(frozen=True)
+class Team:
+    """
+    A team as its networks see it.
+
+    :param names: of the agents
+    :param obs_dims: length of each agent's observation without padding
+    :param obs_dim: the longest of them
+    :param state_dim: length of the global state, 0 without
+    :param action_spaces: each agent's action space, categories counting from 0
+    """
+
+    names: tuple[str, ...]
+    obs_dims: tuple[int, ...]
+    obs_dim: int
+    state_dim: int
+    action_spaces: tuple[AgentActionSpace, ...]
+
+    @property
+    def n_agents(self) -> int:
+        """Number of agents."""
+        return len(self.names)
+
+    def index(self, agent: str | int) -> int:
+        """
+        :param agent: name or number of an agent
+        :return: its number
+        :raises ValueError: no such agent
+        """
+        if isinstance(agent, str) and agent in self.names:
+            return self.names.index(agent)
+        if not isinstance(agent, str) and 0 <= agent < self.n_agents:
+            return int(agent)
+        raise ValueError(
+            f"There is no agent {agent!r}: the agents are {', '.join(self.names)}, or 0 to {self.n_agents - 1}."
+        )
+
+    @classmethod
+    def from_spaces(
+        cls, observation_space: spaces.Space, action_space: spaces.Space, names: Sequence[str] | None = None
+    ) -> Team:
+        """
+        Read the team out of its spaces and refuse spaces that do not describe one.
+
+        :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
+        :param action_space: flat joint action, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` of
+            length ``n_agents * k``, or ``MixedActions``
+        :param names: of the agents; those of the observation space, or agent_0, agent_1, ..., unless given
+        :raises ValueError: other spaces
+        """
+        if isinstance(observation_space, spaces.Dict):
+            raise ValueError(
+                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. Flatten each "
+                "agent's dictionary, as the adapter for PettingZoo environments does (sb3_maddpg.parallel)."
+            )
+        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 2:
+            raise ValueError(
+                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. "
+                "Stack the agents' observations along a first axis; pad them if they differ in length."
+            )
+        n_agents, obs_dim = observation_space.shape
+        if isinstance(observation_space, TeamObservation):
+            shape = (observation_space.obs_dims, observation_space.obs_dim, observation_space.state_dim)
+            names = names or observation_space.names
+        else:
+            shape = ((obs_dim,) * n_agents, obs_dim, 0)
+            names = names or [f"agent_{index}" for index in range(n_agents)]
+        if len(names) != n_agents:
+            raise ValueError(f"There are {len(names)} names, {', '.join(names)}, for {n_agents} agents.")
+        return cls(tuple(names), *shape, _split(action_space, n_agents))
+
+
+def _split(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace, ...]:
+    if isinstance(action_space, MixedActions):
+        parts = action_space.agent_spaces
+        if len(parts) != n_agents:
+            raise ValueError(f"{action_space} has {len(parts)} agents, but the observation has {n_agents} rows.")
+        return parts
+    if not isinstance(action_space, ACTION_SPACES) or action_space.shape is None or len(action_space.shape) != 1:
+        raise ValueError(
+            f"A team action is flat, a MultiBinary, Box or MultiDiscrete of length n_agents * action_dim, not "
+            f"{action_space}. Flatten it in the environment and reshape it there to (n_agents, action_dim)."
+        )
+    (length,) = action_space.shape
+    if length % n_agents:
+        raise ValueError(
+            f"A joint action of {length} numbers cannot be shared out evenly among {n_agents} agents. "
+            "Give every agent the same number of actions, or describe the team with sb3_maddpg.team.MixedActions."
+        )
+    k = length // n_agents
+    if isinstance(action_space, spaces.MultiBinary):
+        return tuple(spaces.MultiBinary(k) for _ in range(n_agents))
+    if isinstance(action_space, spaces.MultiDiscrete):
+        return tuple(spaces.MultiDiscrete(nvec) for nvec in action_space.nvec.reshape(n_agents, k))
+    lows, highs = (bound.reshape(n_agents, k) for bound in _bounds(action_space))
+    return tuple(spaces.Box(low, high, dtype=np.float32) for low, high in zip(lows, highs, strict=True))

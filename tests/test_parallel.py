@@ -1,0 +1,249 @@
+"""Who takes part in an episode of a PettingZoo environment, how it ends, and what is refused."""
+
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from mpe2 import simple_spread_v3
+from pettingzoo import ParallelEnv
+
+from sb3_maddpg.parallel import TeamEnv
+
+TERMINATED, TRUNCATED, BOTH = (True, False), (False, True), (True, True)
+
+
+class Script(ParallelEnv):
+    """
+    Agents end when the script says so. After step t agent i sees t, i + 1 times, and gets (i + 1) * t.
+
+    :param ends: step at which each agent ends, and how
+    :param absent: agents that sit the episodes out
+    """
+
+    metadata = {"name": "script", "render_modes": []}  # noqa: RUF012
+
+    def __init__(self, ends: dict, absent: tuple = ()):
+        self.ends, self.absent = ends, absent
+        self.possible_agents = list(ends)
+        self.sizes = {agent: i + 1 for i, agent in enumerate(ends)}
+        self.sent: list[dict] = []
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 100, (self.sizes[agent],))
+
+    def action_space(self, agent):
+        return spaces.Discrete(3)
+
+    def observe(self, agents):
+        return {agent: np.full(self.sizes[agent], self.time, np.float32) for agent in agents}
+
+    def reset(self, seed=None, options=None):
+        self.time = 0
+        self.agents = [agent for agent in self.possible_agents if agent not in self.absent]
+        return self.observe(self.agents), {agent: {} for agent in self.agents}
+
+    def step(self, actions):
+        self.sent.append(actions)
+        self.time += 1
+        acted = self.agents
+        how = {agent: self.ends[agent][1] if self.ends[agent][0] == self.time else (False, False) for agent in acted}
+        self.agents = [agent for agent in acted if not any(how[agent])]
+        return (
+            self.observe(acted),
+            {agent: self.sizes[agent] * self.time for agent in acted},
+            {agent: how[agent][0] for agent in acted},
+            {agent: how[agent][1] for agent in acted},
+            {agent: {} for agent in acted},
+        )
+
+
+def play(env: TeamEnv) -> list[tuple]:
+    """Observations, rewards, ... of an episode."""
+    env.reset(seed=0)
+    steps = []
+    while not steps or not (steps[-1][2] or steps[-1][3]):
+        steps.append(env.step(np.zeros(env.action_space.shape, np.int64)))
+    return steps
+
+
+def test_an_agent_that_dies_early_by_hand():
+    """a0 terminates at step 5, a1 is truncated at step 10."""
+    script = Script({"a0": (5, TERMINATED), "a1": (10, TRUNCATED)})
+    env = TeamEnv(script)
+    for _ in range(2):  # nothing is left over from an episode
+        steps = play(env)
+        observations, rewards, terminations, truncations, infos = zip(*steps, strict=True)
+        # a0 sees 1, 2, ... 5, the last once, then nothing; a1 sees 1, ... 10, twice
+        assert [row.tolist() for row in observations[:2]] == [[[1, 0], [1, 1]], [[2, 0], [2, 2]]]
+        assert [row[0, 0] for row in observations] == [1, 2, 3, 4, 5, 0, 0, 0, 0, 0]
+        assert [row[1, 1] for row in observations] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
+        # (t + 2 t) / 2 with both, (0 + 2 t) / 2 without a0
+        assert rewards == (1.5, 3, 4.5, 6, 7.5, 6, 7, 8, 9, 10)
+        assert terminations == (False,) * 10
+        assert truncations == (False,) * 9 + (True,)
+        assert [info["agent_rewards"].tolist() for info in infos[4:6]] == [[5, 10], [0, 12]]
+        assert [info["agent_terminated"].tolist() for info in infos[3:6]] == [[0, 0], [1, 0], [0, 0]]
+        assert [info["agent_truncated"].tolist() for info in infos[8:]] == [[0, 0], [0, 1]]
+        assert [info["agent_active"].tolist() for info in infos[4:6]] == [[1, 1], [0, 1]]
+        assert all("metrics" not in info and "agent_infos" not in info for info in infos[:9])
+        # 1 + ... + 5 and 2 (1 + ... + 10); their mean is the team's return
+        assert infos[9]["metrics"] == {"rollout/ep_rew_a0": 15.0, "rollout/ep_rew_a1": 110.0}
+        assert sum(rewards) == 62.5
+        assert [sorted(actions) for actions in script.sent[-10:]] == [["a0", "a1"]] * 5 + [["a1"]] * 5
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("ends", "terminated"),
+    [
+        ({"a": (2, TERMINATED), "b": (3, TRUNCATED)}, False),
+        ({"a": (2, TRUNCATED), "b": (3, TERMINATED)}, True),
+        ({"a": (3, TRUNCATED), "b": (3, TERMINATED)}, False),
+        ({"a": (3, TERMINATED), "b": (3, TERMINATED)}, True),
+        # As everywhere in Gymnasium: who has terminated needs no more value, time limit or not
+        ({"a": (3, BOTH), "b": (1, TRUNCATED)}, True),
+        ({"a": (3, BOTH), "b": (3, TRUNCATED)}, False),
+    ],
+)
+def test_how_an_episode_ends(ends, terminated):
+    steps = play(TeamEnv(Script(ends)))
+    assert len(steps) == 3
+    assert [steps[-1][2], steps[-1][3]] == [terminated, not terminated]
+    assert all(type(flag) is bool for step in steps for flag in step[2:4])
+
+
+def test_agents_that_sit_an_episode_out():
+    env = TeamEnv(Script({"a": (2, TERMINATED), "b": (3, TRUNCATED), "c": (4, TRUNCATED)}, absent=("b",)))
+    steps = play(env)
+    assert len(steps) == 4
+    assert not any(step[0][1].any() or step[4]["agent_active"][1] for step in steps)
+    assert steps[0][1] == (1 + 0 + 3) / 3
+    assert steps[-1][4]["metrics"] == {"rollout/ep_rew_a": 3.0, "rollout/ep_rew_c": 30.0}
+
+
+def test_what_else_an_environment_offers_is_reached_through_the_adapter():
+    env = TeamEnv(Script({"a": (2, TRUNCATED)}))
+    env.parallel_env.n_curriculum_levels = 3
+    assert env.has_wrapper_attr("n_curriculum_levels")
+    assert env.get_wrapper_attr("n_curriculum_levels") == 3
+    assert not env.has_wrapper_attr("action_cost")
+    assert env.unwrapped is env
+    assert env.agent_names == ("a",)
+    again = pickle.loads(pickle.dumps(env))
+    assert [step[1] for step in play(again)] == [step[1] for step in play(env)]
+
+
+def test_what_an_environment_says_about_agents_is_passed_on():
+    env = TeamEnv(simple_spread_v3.parallel_env(benchmark_data=True))
+    assert env.reset(seed=1)[1] == {}
+    *_, info = env.step(np.zeros(3))
+    reward, *_ = info["agent_infos"]["agent_0"]["benchmark_data"]
+    assert reward < 0
+    assert list(info["agent_infos"]) == ["agent_0", "agent_1", "agent_2"]
+
+
+class Broken(Script):
+    """Two agents; what step() and reset() give is spoilt by a function."""
+
+    def __init__(self, spoil=None, ends=None, **attributes):
+        super().__init__(ends or {"a": (2, TRUNCATED), "b": (4, TRUNCATED)})
+        self.spoil = spoil
+        self.__dict__.update(attributes)
+
+    def step(self, actions):
+        given = super().step(actions)
+        if self.spoil is not None:
+            self.spoil(self, *given)
+        return given
+
+
+def renamed(env, observations, rewards, terminations, truncations, infos):
+    env.agents = ["a", "x"]
+
+
+def revived(env, observations, rewards, terminations, truncations, infos):
+    if env.time == 3:
+        env.agents = ["a", "b"]
+
+
+def forgotten(env, observations, rewards, terminations, truncations, infos):
+    env.agents = ["b"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (renamed, "'x' in `agents` of script, but possible_agents has only a, b"),
+        (revived, "'a' came back to life in the middle of an episode"),
+        (forgotten, "'a' left script without an end"),
+        (lambda env, observations, *_: observations.pop("b"), "no observation for agent 'b'"),
+        (lambda env, observations, *_: observations.update(a=np.zeros(2)), r"agent 'a' has shape \(2,\), but"),
+        (lambda env, observations, *_: env.time == 2 and observations.pop("a"), "no observation for agent 'a'"),
+        (lambda env, _, rewards, *__: rewards.update(b=np.nan), "reward of nan for agent 'b': rewards must be finite"),
+        (lambda env, _, rewards, *__: rewards.update(a=-np.inf, b=np.inf), "-inf for agent 'a', inf for agent 'b'"),
+        (lambda env, _, rewards, *__: rewards.pop("a"), "left out reward, termination or truncation of agent 'a'"),
+        (lambda env, _, __, terminations, *___: terminations.pop("b"), "truncation of agent 'b'"),
+    ],
+)
+def test_a_broken_step_is_refused(spoil, message):
+    with pytest.raises(ValueError, match=message):
+        play(TeamEnv(Broken(spoil)))
+
+
+def test_agents_that_join_late_are_refused():
+    script = Broken(lambda env, *_: setattr(env, "agents", ["a", "b"]), absent=("b",))
+    with pytest.raises(ValueError, match="'b' joined in the middle of an episode"):
+        play(TeamEnv(script))
+    with pytest.raises(ValueError, match="is empty"):
+        TeamEnv(Broken(absent=("a", "b"))).reset()
+
+
+def test_an_environment_may_go_on_listing_agents_that_ended():
+    def listed(env, observations, rewards, terminations, truncations, infos):
+        env.agents = ["a", "b"]
+        if env.time > 2:
+            truncations["a"] = True
+        rewards["a"] = 100  # nor is what they get their own any more
+
+    steps = play(TeamEnv(Broken(listed)))
+    assert [step[4]["agent_active"].tolist() for step in steps] == [[1, 1], [1, 1], [0, 1], [0, 1]]
+    assert steps[-1][4]["metrics"]["rollout/ep_rew_a"] == 200
+
+
+def test_a_terminated_agent_need_not_see_its_end():
+    ends = {"a": (2, TERMINATED), "b": (3, TRUNCATED)}
+    spoil = lambda env, observations, *_: env.time == 2 and observations.pop("a")  # noqa: E731
+    steps = play(TeamEnv(Broken(spoil, ends)))
+    assert [step[0][0, 0] for step in steps] == [1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (simple_spread_v3.env(), "aec_to_parallel"),
+        (gymnasium.make("CartPole-v1"), "no PettingZoo ParallelEnv"),
+        (Broken(possible_agents=[]), "possible_agents"),
+        (Broken(possible_agents=["a", "b", "a"]), "a name twice"),
+        (Broken(action_space=lambda agent: spaces.Text(3)), "'a' has the action space Text"),
+        (Broken(action_space=lambda agent: spaces.Box(-1, np.inf, (2,))), r"'a' has the action space Box.*bounds"),
+        (Broken(action_space=lambda agent: spaces.Box(0, 1, (0,))), "at least one number"),
+        (Broken(observation_space=lambda agent: spaces.Sequence(spaces.Discrete(2))), "agent 'a' observes.*no fixed"),
+    ],
+)
+def test_an_environment_that_does_not_fit_is_refused(env, message):
+    with pytest.raises(ValueError, match=message):
+        TeamEnv(env)
+
+
+def test_a_state_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match=r"script has no state_space.*state=False"):
+        TeamEnv(Broken(), state=True)
+    env = TeamEnv(Broken(state_space=spaces.Box(0, 1, (3,))), state=True)
+    with pytest.raises(ValueError, match=r"state_space but no state\(\)"):
+        env.reset()
+    env = TeamEnv(Broken(state_space=spaces.Box(0, 1, (3,)), state=lambda: np.zeros(4)), state=True)
+    with pytest.raises(ValueError, match="has 4 numbers, its state_space 3"):
+        env.reset()

@@ -1,0 +1,283 @@
+"""Relational networks: symmetry, who sees whom, credit by pairs, other team sizes, and that they learn."""
+
+import copy
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from mpe2 import simple_spread_v3
+
+import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
+from reference import assert_close, drawn
+from sb3_maddpg import MADDPG
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.relational import PairPolicy
+from toys import SMALL, Neighbours
+
+N, M, B = 5, 4, 6
+# Columns of a neighbour lie apart, as in the swarm
+LAYOUT = {"own": [0, 1], "neighbours": [[2 + j, 6 + j] for j in range(M)], "acts_on_neighbours": True}
+BY_ITSELF = {**LAYOUT, "acts_on_neighbours": False}
+SPREAD = {"own": list(range(10)), "neighbours": [[10, 11, 14, 15], [12, 13, 16, 17]]}
+ACTIONS = {
+    "bits": spaces.MultiBinary(N * M * 2),
+    "numbers": spaces.Box(-1, 1, (N * M,)),
+    "categories": spaces.MultiDiscrete([3] * (N * M * 2)),
+}
+each_mode = pytest.mark.parametrize("layout", [LAYOUT, BY_ITSELF], ids=["on neighbours", "by itself"])
+each_action = pytest.mark.parametrize("space", ACTIONS.values(), ids=ACTIONS)
+
+
+def policy(space=ACTIONS["bits"], layout=LAYOUT, columns: int = 10, **kwargs) -> PairPolicy:
+    observation_space = spaces.Box(-np.inf, np.inf, (N, columns), np.float32)
+    return PairPolicy(
+        observation_space, space, lambda _: 1e-3, net_arch=[8, 8], observation_layout=layout, **kwargs
+    )  # fmt: skip
+
+
+def batch(built: PairPolicy, columns: int = 10) -> tuple[th.Tensor, th.Tensor]:
+    th.manual_seed(0)
+    logits = th.randn(B, N, built.actions.width)
+    return th.randn(B, N, columns), built.actions.act(logits, deterministic=False)
+
+
+def others(agent: int) -> list[int]:
+    return [other for other in range(N) if other != agent]
+
+
+def renamed(names: list[int], rows: th.Tensor, slots: list[th.Tensor]) -> tuple[th.Tensor, list[th.Tensor]]:
+    """
+    The same team with agents in another order.
+
+    :param names: agent i is now the former agent names[i]
+    :param rows: (batch, n_agents, ...)
+    :param slots: something about each neighbour, (batch, n_agents, n_neighbours, ...)
+    """
+    moved = [slot[:, names] for slot in slots]
+    for agent, name in enumerate(names):
+        order = [others(name).index(names[other]) for other in others(agent)]
+        for new in moved:
+            new[:, agent] = new[:, agent, order]
+    return rows[:, names], moved
+
+
+@each_action
+@each_mode
+def test_the_order_of_agents_does_not_matter(layout, space):
+    built = policy(space, layout, n_critics=2)
+    obs, actions = batch(built)
+    names = [3, 0, 4, 2, 1]
+    _, (neighbours, parts) = renamed(
+        names, obs, [obs[..., LAYOUT["neighbours"]], actions.unflatten(-1, (M, -1))]
+    )  # fmt: skip
+    moved_obs = th.zeros_like(obs)
+    moved_obs[..., :2], moved_obs[..., LAYOUT["neighbours"]] = obs[:, names, :2], neighbours
+    moved_actions = parts.flatten(2) if layout is LAYOUT else actions[:, names]
+    scores, values = built.actor(obs), built.critic(obs, actions).unflatten(-1, (N, M))
+    if layout is LAYOUT:
+        _, (scores,) = renamed(names, obs, [scores.unflatten(-1, (M, -1))])
+        scores = scores.flatten(2)
+    else:
+        scores = scores[:, names]
+    assert th.allclose(built.actor(moved_obs), scores, atol=1e-6)
+    moved_values = built.critic(moved_obs, moved_actions).unflatten(-1, (N, M))
+    for mine, theirs in zip(moved_values, values, strict=True):
+        assert th.allclose(mine, renamed(names, obs, [theirs])[1][0], atol=1e-6)
+
+
+@each_mode
+def test_an_actor_sees_its_own_observation_only(layout):
+    built = policy(layout=layout, columns=12)
+    obs, _ = batch(built, 12)
+    for agent in range(N):
+        changed = obs.clone()
+        changed[:, agent, :10] += 1.0
+        moved = (built.actor(changed) != built.actor(obs)).any(dim=2).any(dim=0)
+        assert moved.tolist() == [other == agent for other in range(N)]
+    changed = obs.clone()
+    changed[..., 10:] += 1.0  # what the layout does not name
+    assert th.equal(built.actor(changed), built.actor(obs))
+
+
+@each_mode
+def test_a_critic_reads_the_agents_view_and_of_others_what_they_are_and_do_to_it(layout):
+    built = policy(layout=layout)
+    obs, actions = batch(built)
+    obs, actions = obs.requires_grad_(), actions.requires_grad_()
+    for agent in range(N):
+        value = built.critic.credited(built.critic(obs, actions))[0, :, agent].sum()
+        of_obs, of_actions = (g.abs().sum(dim=0) > 0 for g in th.autograd.grad(value, (obs, actions)))
+        for other in range(N):
+            assert of_obs[other].tolist() == [True, True] + [other == agent] * 8
+            towards = others(other).index(agent) if other != agent else None
+            read = [layout is BY_ITSELF or towards in (None, slot) for slot in range(M)]
+            assert of_actions[other].tolist() == np.repeat(read, 2).tolist()
+
+
+def test_what_a_neighbour_does_counts_only_where_it_sees_the_agent():
+    who = [[1, 2, 3, 4], [0, 2, 3, 4], [0, 1, 3, 4], [0, 1, 2, 4], [0, 1, 2, 3]]
+    space = spaces.MultiBinary(N * 2)
+    layout = {"own": [0, 1], "neighbours": [[2, 6], [3, 7]], "acts_on_neighbours": True}
+    ring = {**layout, "who": [[(i + 1) % N, (i + 2) % N] for i in range(N)]}  # nobody is seen back but ...
+    ring["who"][1] = [0, 2]  # ... agent 0 by agent 1
+    assert policy(layout={**LAYOUT, "who": who}).critic.views.back.tolist() == policy().critic.views.back.tolist()
+    built = policy(space, ring)
+    obs, actions = batch(built)
+    actions.requires_grad_()
+    (gradient,) = th.autograd.grad(built.critic(obs, actions)[0, :, :2].sum(), actions)
+    assert (gradient.abs().sum(dim=0) > 0).tolist() == [[True, True], [True, False]] + [[False, False]] * 3
+
+
+@each_action
+@each_mode
+def test_alternatives_equal_substituted_actions_and_pairs_sum_to_the_agents_value(layout, space):
+    built = policy(space, layout, n_critics=2)
+    obs, actions = batch(built)
+    obs[:, 1, LAYOUT["neighbours"][2]] = 0.0
+    critic = built.critic
+    parts = critic(obs, actions)
+    assert parts.shape == (2, B, N * M)
+    assert not parts[:, :, M + 2].any()  # nobody is there
+    assert th.allclose(critic.credited(parts), parts.unflatten(-1, (N, M)).sum(dim=-1))
+    units = critic.to_units(actions)
+    own = th.rand(B, units.shape[1], 3, units.shape[2])
+    values = critic.forward_alternatives(obs, actions, own)
+    for unit in range(units.shape[1]):
+        for alternative in range(3):
+            substituted = units.clone()
+            substituted[:, unit] = own[:, unit, alternative]
+            joint = critic(obs, substituted.reshape(actions.shape))[0]
+            expected = joint[:, unit] if layout is LAYOUT else joint.unflatten(-1, (N, M)).sum(dim=-1)[:, unit]
+            assert th.allclose(values[:, unit, alternative], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
+    built = policy(spaces.MultiBinary(N * M), shared_threshold=shared)
+    obs = th.randn(1, N, 10)
+    bits = built.actor.act(obs.expand(5000, -1, -1), deterministic=False)
+    order = built.actor(obs).argsort(dim=2, descending=True).expand_as(bits)
+    assert (bits.gather(2, order).diff(dim=2) <= 0).all() == shared
+
+
+@pytest.mark.parametrize("priced", [False, True])
+@pytest.mark.parametrize("pair_credit", [False, True])
+def test_one_update_is_that_of_plain_sums_over_pairs(pair_credit, priced):
+    env = Neighbours()
+    cost = 0.4 if priced else 0.0
+    if priced:
+        env.action_cost = cost
+    kwargs = {"net_arch": [8], "optimizer_class": th.optim.SGD, "pair_credit": pair_credit}
+    numbers = {"learning_rate": 0.1, "max_grad_norm": None, "policy_regularization": 0.0, "gamma": 0.9}
+    model = MADDPG("PairPolicy", env, **{**SMALL, **numbers, "policy_kwargs": kwargs}).learn(60)
+    old, data = copy.deepcopy(model.policy), drawn(model, 32)
+    model.train(1, batch_size=32)
+
+    bits = old.actions.encode(data.actions)
+    next_bits = old.actor_target.act(data.next_observations)
+    rewards = data.pair_rewards.flatten(1) if pair_credit else data.rewards
+    per = (lambda pairs: pairs) if pair_credit else (lambda pairs: pairs.unflatten(-1, (4, 3)).sum(dim=-1))
+    rest = per(old.critic_target(data.next_observations, next_bits)[0] - cost * next_bits.flatten(1))
+    dones = data.dones.repeat_interleave(3, dim=1) if pair_credit else data.dones
+    targets = rewards + per(cost * bits.flatten(1)) + 0.9 * (1 - dones) * rest
+    errors = per(old.critic(data.observations, bits)[0]) - targets.detach()
+    critic, actor = copy.deepcopy(old.critic), copy.deepcopy(old.actor)
+    for network, source, loss in ((critic, old.critic, errors.square().mean(dim=0).sum()), (actor, old.actor, None)):
+        if loss is None:
+            scores = old.actor(data.observations).flatten(1)
+            gain = th.zeros_like(scores)
+            for pair in range(12):
+                for bit, sign in ((1.0, 1.0), (0.0, -1.0)):
+                    joint = bits.flatten(1).clone()
+                    joint[:, pair] = bit
+                    value = critic(data.observations, joint.view_as(bits))[0, :, pair] - cost * bit
+                    gain[:, pair] += sign * value.detach()
+            loss = -(scores * gain).mean(dim=0).sum()
+        gradients = th.autograd.grad(loss, list(source.parameters()))
+        for parameter, gradient in zip(network.parameters(), gradients, strict=True):
+            parameter.data -= 0.1 * gradient
+    assert_close(model.critic, critic)
+    assert_close(model.actor, actor)
+
+
+def test_parameters_fit_a_swarm_of_another_size(tmp_path):
+    small = MADDPG("PairPolicy", gymnasium.make("QuadSwarm-v0", n_robots=3, max_steps=20), **SMALL).learn(60)
+    small.save(tmp_path / "three")
+    large = MADDPG("PairPolicy", gymnasium.make("QuadSwarm-v0", n_robots=5, max_steps=20), **SMALL)
+    large.set_parameters(tmp_path / "three.zip")
+    rng = np.random.default_rng(0)
+    obs = th.as_tensor(rng.normal(size=(B, 3, 18)), dtype=th.float32)
+    wide = th.zeros(B, 5, 30)
+    wide[:, :3, :6] = obs[..., :6]
+    layouts = [model.policy.observation_layout["neighbours"] for model in (small, large)]
+    for mine, theirs in zip(*layouts, strict=False):
+        wide[:, :3, theirs] = obs[..., mine]
+    acts = th.as_tensor(rng.integers(0, 2, (B, 3, 2)), dtype=th.float32)
+    wide_acts = th.zeros(B, 5, 4)
+    wide_acts[:, :3, :2] = acts
+    assert th.allclose(large.actor(wide)[:, :3, :2], small.actor(obs), atol=1e-6)
+    values = large.critic(wide, wide_acts)[0].view(B, 5, 4)
+    assert th.allclose(values[:, :3, :2], small.critic(obs, acts)[0].view(B, 3, 2), atol=1e-6)
+    assert not values[:, :3, 2:].any()
+    start, _ = large.env.reset(), large.learn(60)
+    assert large.action_space.contains(large.predict(start[0])[0])
+
+
+@pytest.mark.parametrize("algorithm", [MADDPG, MATD3])
+@pytest.mark.parametrize("continuous", [False, True])
+def test_a_team_that_acts_by_itself(algorithm, continuous, tmp_path):
+    env = TeamEnv(simple_spread_v3.parallel_env(max_cycles=10, continuous_actions=continuous))
+    kwargs = {**SMALL, "policy_kwargs": {"net_arch": [8], "observation_layout": SPREAD}}
+    model = algorithm("PairPolicy", env, **kwargs).learn(60)
+    before = algorithm("PairPolicy", env, **kwargs)
+    for old, new in zip(before.policy.parameters(), model.policy.parameters(), strict=True):
+        assert new.isfinite().all()
+        assert not th.equal(old, new)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
+    obs = np.random.default_rng(0).normal(size=(B, 3, 18)).astype(np.float32)
+    actions, _ = loaded.predict(obs, deterministic=True)
+    assert np.array_equal(actions, model.predict(obs, deterministic=True)[0])
+    assert all(model.action_space.contains(action) for action in actions)
+
+
+@pytest.mark.parametrize("pair_credit", [False, True])
+def test_what_holds_for_every_neighbour_is_learned_from_all_of_them(pair_credit):
+    recipe = {"learning_rate": 1e-2, "learning_starts": 100, "batch_size": 64, "train_freq": 4, "gamma": 0.5, "seed": 0}
+    env = Neighbours()
+    model = MADDPG("PairPolicy", env, **recipe, policy_kwargs={"pair_credit": pair_credit}).learn(400)
+    assert env.play(model) > 0.93
+    assert env.play(MADDPG("MlpPolicy", env, **recipe).learn(400)) < 0.7
+    if pair_credit:
+        obs = env.draw(np.random.default_rng(1), 200)
+        values = model.critic(th.as_tensor(obs), th.ones(200, 4, 3)).detach().numpy().ravel()
+        assert np.corrcoef(values, env.pair_rewards(obs, np.ones((200, 12))).ravel())[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("layout", "message"),
+    [
+        (None, "PairPolicy has to know .*`observation_layout`"),
+        ({"own": [0]}, r"has entries \['own'\], but needs `own` and `neighbours`"),
+        ({**LAYOUT, "owns": [0]}, "knows `who` and `acts_on_neighbours` only"),
+        ({**LAYOUT, "own": [10]}, "each from 0 to 9"),
+        ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "as many columns as the next"),
+        ({**LAYOUT, "neighbours": []}, "as many columns as the next"),
+        ({**LAYOUT, "neighbours": [[2], [3]]}, r"2 neighbours, but the 5 agents have \[4, 4, 4, 4, 4\]"),
+        ({**LAYOUT, "who": [[0, 1, 2, 3]] * 5}, "must name others, by numbers from 0 to 4"),
+    ],
+)
+def test_a_layout_that_does_not_fit_is_refused(layout, message):
+    with pytest.raises(ValueError, match=message):
+        policy(layout=layout)
+
+
+def test_spaces_that_do_not_fit_are_refused():
+    for space in (spaces.MultiBinary(N * 3), spaces.MultiDiscrete([3, 3, 3, 2] * N)):
+        with pytest.raises(ValueError, match="act on 4 neighbours, but .* does not fall into as many equal parts"):
+            policy(space)
+    with pytest.raises(ValueError, match="these have unlike spaces: use MlpPolicy"):
+        policy(spaces.MultiDiscrete([3] * 4 * (N - 1) + [2] * 4))

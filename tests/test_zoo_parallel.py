@@ -1,0 +1,80 @@
+"""The command line with PettingZoo modules as environments."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+
+from sb3_maddpg import MADDPG
+from sb3_maddpg.zoo import latest_model, main
+
+SPREAD = ["--env", "mpe2/simple_spread_v3"]
+
+
+def write(recipe: dict, env_id: str) -> str:
+    Path("recipe.yml").write_text(yaml.safe_dump({env_id: recipe}))
+    return "recipe.yml"
+
+
+@pytest.fixture
+def in_logs(tmp_path, monkeypatch):
+    """An empty folder to work in, and no window."""
+    known = dict(gymnasium.registry)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    yield tmp_path / "logs"
+    gymnasium.registry.clear()
+    gymnasium.registry.update(known)
+
+
+def test_a_pettingzoo_module_is_trained_watched_and_recorded(in_logs, capsys):
+    wrapped = {"continuous_actions": True, "state": True, "wrappers": [{"supersuit.frame_stack_v2": {"stack_size": 2}}]}
+    recipe = {"n_timesteps": 120, "learning_starts": 40, "train_freq": 10, "n_envs": 2, "policy": "MlpPolicy"}
+    conf = write({**recipe, "env_kwargs": wrapped}, SPREAD[1])
+    argv = ["train", *SPREAD, "--conf-file", conf, "--verbose", "0", "--eval-episodes", "1", "--save-replay-buffer"]
+    kwargs = ["--env-kwargs", "max_cycles:9", "--eval-env-kwargs", "max_cycles:7", "--eval-freq", "60"]
+    assert main([*argv, *kwargs, "--vec-env", "subproc"]) == 0
+    run = in_logs / "maddpg" / "mpe2-simple_spread_v3_1"
+    assert {float(row.split(",")[1]) for row in (run / "0.monitor.csv").read_text().splitlines()[2:]} == {9}
+    assert np.load(run / "evaluations.npz")["ep_lengths"].tolist() == [[7], [7]]
+    model = latest_model("latest:logs", "maddpg", SPREAD[1])
+    assert MADDPG.load(model).observation_space.state_dim == 54  # stacking is for the agents
+    assert MADDPG.load(model).observation_space.obs_dims == (36,) * 3
+
+    assert main([*argv, "--eval-freq", "-1", "-i", model, "-n", "40"]) == 0
+    assert MADDPG.load(latest_model("latest:logs", "maddpg", SPREAD[1])).num_timesteps == 160
+
+    capsys.readouterr()
+    assert main(["enjoy", *SPREAD, "--exp-id", "1", "-n", "20"]) == 0
+    assert "Mean episode length: 9.00" in capsys.readouterr().out
+    assert main(["record", *SPREAD, "--exp-id", "1", "-n", "15"]) == 0
+    (video,) = run.rglob("*.mp4")
+    assert video.stat().st_size > 500
+
+
+def test_a_pettingzoo_environment_without_a_window_is_watched_without(in_logs, capsys):
+    swarm = ["--env", "quad_swarm/parallel_env", "--env-kwargs", "max_steps:5"]
+    recipe = write({"n_timesteps": 10, "policy": "MlpPolicy"}, swarm[1])
+    assert main(["train", *swarm, "--conf-file", recipe, "--eval-freq", "-1", "--verbose", "0"]) == 0
+    assert main(["enjoy", *swarm[:2], "-n", "10"]) == 0
+    out = capsys.readouterr().out
+    assert "has no window" in out
+    assert "Mean episode length: 5.00" in out
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--env", "mpe2/simple_spred_v3"], "did you mean 'mpe2/simple_spread_v3'?"),
+        (["--env", "mpe3/simple_spread_v3"], "no module mpe3.simple_spread_v3 with a function parallel_env"),
+        (["--env", "QuadSwram-v0"], "did you mean 'QuadSwarm-v0'?"),
+        ([*SPREAD, "--env-kwargs", "continous_actions:True"], "did you mean 'continuous_actions'?"),
+        ([*SPREAD, "--eval-env-kwargs", "entry:'mpe2.simple_v3'"], "Unknown argument of mpe2/simple_spread_v3 'entry'"),
+        ([*SPREAD, "--env-kwargs", "wrappers:['supersuit.dtype_v1']"], "supersuit.dtype_v1 cannot be imported"),
+    ],
+)
+def test_what_is_no_pettingzoo_module_is_refused(in_logs, capsys, argv, message):
+    assert main(["train", *argv, "--verbose", "0"]) == 2
+    assert message in capsys.readouterr().err
