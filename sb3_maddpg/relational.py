@@ -129,8 +129,11 @@ class PairNet(nn.Module):
         activation_fn: type[nn.Module],
     ):
         super().__init__()
+        if not net_arch:
+            raise ValueError("net_arch=[]: PairPolicy needs a hidden layer, which encodes what an agent sees.")
         width, *later = net_arch
         self.activation = activation_fn()
+        self.goes_below_zero = bool((self.activation(th.linspace(-9.0, 9.0, 181)) < 0).any())
         self.encoder = nn.Linear(in_features, width)
         widths = [*later, out_features]
         self.of_pair = nn.Linear(width, widths[0])
@@ -147,7 +150,11 @@ class PairNet(nn.Module):
         """
         encoded = self.activation(self.encoder(views)) * present
         mean = encoded.sum(dim=-2) / present.sum(dim=-2).clamp(min=1.0)
-        pool = th.cat([mean, encoded.amax(dim=-2)], dim=-1)
+        if self.goes_below_zero:  # the zeros of absent neighbours could be the largest
+            largest = encoded.masked_fill(present == 0, -th.inf).amax(dim=-2).masked_fill(~present.any(dim=-2), 0.0)
+        else:
+            largest = encoded.amax(dim=-2)
+        pool = th.cat([mean, largest], dim=-1)
         return self.of_pair(encoded) + self.of_pool(pool).unsqueeze(-2), pool
 
     def extra(self, index: int, x: th.Tensor) -> th.Tensor:

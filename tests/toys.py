@@ -104,21 +104,23 @@ class Neighbours(gymnasium.Env):
     A bit for each of them pays 1 where both the own number and the neighbour's sign are positive, and costs 0.4.
 
     :param n_agents: size of the team
+    :param n_choices: instead of a bit one of so many, of which 1 is as the bit and the others are nothing
     """
 
     price = 0.4
 
-    def __init__(self, n_agents: int = 4):
+    def __init__(self, n_agents: int = 4, n_choices: int = 2):
         self.n_agents, self.m = n_agents, n_agents - 1
         self.observation_space = spaces.Box(-1, 1, (n_agents, 1 + 2 * self.m))
-        self.action_space = spaces.MultiBinary(n_agents * self.m)
+        length = n_agents * self.m
+        self.action_space = spaces.MultiBinary(length) if n_choices == 2 else spaces.MultiDiscrete([n_choices] * length)
         self.observation_layout = {
             "own": [0],
             "neighbours": [[1 + 2 * j, 2 + 2 * j] for j in range(self.m)],
             "acts_on_neighbours": True,
         }
-        # One of four cases pays 0.6; a random bit is set half the time
-        self.optimum, self.random = self.m * 0.25 * (1 - self.price), self.m * 0.5 * (0.25 - self.price)
+        # One of four cases pays 0.6
+        self.optimum, self.random = self.m * 0.25 * (1 - self.price), self.m / n_choices * (0.25 - self.price)
 
     def draw(self, rng: np.random.Generator, batch: int) -> np.ndarray:
         obs = rng.uniform(-1, 1, (batch, *self.observation_space.shape)).astype(np.float32)
@@ -128,7 +130,7 @@ class Neighbours(gymnasium.Env):
 
     def pair_rewards(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         useful = (obs[..., :1] > 0) & (obs[..., 1::2] > 0)
-        return actions.reshape(useful.shape) * (useful - self.price)
+        return (actions.reshape(useful.shape) == 1) * (useful - self.price)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

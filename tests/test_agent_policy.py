@@ -1,0 +1,157 @@
+"""One agent by itself: the same actions as in the team, as an object, in a file, and without this package."""
+
+import pickle
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
+from sb3_maddpg import MADDPG
+from sb3_maddpg.agent_policy import AgentPolicy
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.team import heads_of
+from toys import AGENT_SPACES, SMALL, Neighbours, Toy
+
+pytestmark = pytest.mark.filterwarnings("error::DeprecationWarning", "error::torch.jit.TracerWarning")
+
+
+class Alone(Neighbours):
+    """Neighbours who act by themselves, on numbers."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(-2, 1, (8,))
+        self.observation_layout["acts_on_neighbours"] = False
+
+    def pair_rewards(self, obs, actions):
+        return np.repeat(actions.reshape(-1, 4, 2)[..., :1], 3, axis=2) * obs[..., 1::2]
+
+
+MODELS = {kind: lambda kind=kind: MADDPG("MlpPolicy", TeamEnv(Toy(kind)), **SMALL) for kind in AGENT_SPACES}
+MODELS |= {
+    "threshold and sharing": lambda: MADDPG(
+        "MlpPolicy",
+        TeamEnv(Toy("bits"), state=True),
+        **{**SMALL, "policy_kwargs": {"threshold": 0.7, "share_actor": [["bits_2"]]}},
+    ),
+    "twins": lambda: MATD3("MlpPolicy", TeamEnv(Toy("mixed")), **SMALL),
+    "pairs": lambda: MADDPG("PairPolicy", Neighbours(), **SMALL),
+    "categories of pairs": lambda: MADDPG("PairPolicy", Neighbours(n_choices=3), **SMALL),
+    "pairs that act by themselves": lambda: MATD3("PairPolicy", Alone(), **SMALL),
+}
+each_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+
+
+def trained(make) -> MADDPG:
+    """With actions that are no longer all alike."""
+    model = make().learn(60)
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter *= 3
+    return model
+
+
+def team_actions(model: MADDPG, n: int = 40) -> list[tuple[AgentPolicy, np.ndarray, np.ndarray]]:
+    """:return: of each agent its policy, its observations and its part of the team's actions"""
+    model.observation_space.seed(0)
+    obs = np.array([model.observation_space.sample() for _ in range(n)])  # padding is zero
+    joint, _ = model.predict(obs, deterministic=True)
+    team = model.policy.team
+    ends = np.cumsum([len(heads_of(space)) for space in team.action_spaces])[:-1]
+    rows = zip(team.names, np.split(joint, ends, axis=1), strict=True)
+    policies = [(model.agent_policy(name), part) for name, part in rows]
+    return [(policy, obs[:, agent, : policy.obs_dim], part) for agent, (policy, part) in enumerate(policies)]
+
+
+@each_model
+def test_an_agent_acts_as_in_the_team(make):
+    for policy, obs, expected in team_actions(trained(make)):
+        actions = policy.predict(obs)
+        assert len(np.unique(expected, axis=0)) > 1
+        assert np.allclose(actions, expected, atol=1e-6)
+        for row, joint in zip(obs[:3], expected, strict=False):
+            single = policy.predict(row)
+            assert policy.action_space.contains(single)
+            assert np.allclose(np.ravel(single), joint, atol=1e-6)
+
+
+@each_model
+def test_an_agent_survives_pickling_and_carries_nothing_of_the_team(make):
+    model = make()
+    for policy, obs, expected in team_actions(model):
+        data = pickle.dumps(policy)
+        assert np.allclose(pickle.loads(data).predict(obs), expected, atol=1e-6)
+        for foreign in (b"optim", b"Critic", b"ReplayBuffer"):
+            assert foreign not in data
+    before = policy.predict(obs)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.zero_()
+    assert np.array_equal(policy.predict(obs), before)
+    assert not any(parameter.requires_grad for parameter in policy.parameters())
+
+
+RUN = """
+import sys
+import numpy as np
+import torch
+folder, count = sys.argv[1:]
+for agent in range(int(count)):
+    program = torch.jit.load(f"{folder}/{agent}.pt")
+    obs = torch.from_numpy(np.load(f"{folder}/obs_{agent}.npy"))
+    actions = program(obs)
+    assert torch.equal(actions[:1], program(obs[:1])) or torch.allclose(actions[:1], program(obs[:1]))
+    np.save(f"{folder}/actions_{agent}.npy", actions.numpy())
+assert "sb3_maddpg" not in sys.modules and "stable_baselines3" not in sys.modules
+"""
+
+
+def test_exported_agents_run_without_this_package(tmp_path):
+    cases = [case for make in MODELS.values() for case in team_actions(trained(make))]
+    state = th.random.get_rng_state()
+    for number, (policy, obs, _) in enumerate(cases):
+        policy.export(tmp_path / str(number))
+        np.save(tmp_path / f"obs_{number}.npy", obs)
+    assert th.equal(th.random.get_rng_state(), state)
+    subprocess.run([sys.executable, "-c", RUN, tmp_path, str(len(cases))], check=True, cwd=tmp_path, timeout=120)
+    for number, (policy, obs, expected) in enumerate(cases):
+        actions = np.load(tmp_path / f"actions_{number}.npy")
+        assert actions.dtype == policy.predict(obs).dtype
+        assert np.allclose(actions, expected, atol=1e-6)
+
+
+def test_agents_have_the_names_of_the_environment():
+    model = MADDPG("MlpPolicy", gymnasium.make("QuadSwarm-v0", n_robots=3), **SMALL)
+    obs = np.random.default_rng(0).normal(size=(20, 18)).astype(np.float32)
+    named, numbered = model.agent_policy("robot_2"), model.agent_policy(2)
+    assert named.name == numbered.name == "robot_2"
+    assert np.array_equal(named.predict(obs), numbered.predict(obs))
+    assert named.action_space == spaces.MultiBinary(2)
+    chosen = MADDPG("MlpPolicy", Neighbours(), **{**SMALL, "policy_kwargs": {"agent_names": list("abcd")}})
+    assert chosen.agent_policy("c").name == "c"
+    for unknown in ("robot_3", 3, -1):
+        with pytest.raises(ValueError, match=rf"There is no agent {unknown!r}: the agents are robot_0, .*, or 0 to 2"):
+            model.agent_policy(unknown)
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (np.zeros(3), r"An observation of bits_2 has length 4, not shape \(3,\)"),
+        (np.zeros((2, 5)), r"not shape \(2, 5\)"),
+        (np.zeros((1, 2, 4)), r"not shape \(1, 2, 4\)"),
+        (np.array(0.0), r"not shape \(\)"),
+        (np.array([0, 0, np.nan, 0]), "observation of bits_2 holds NaN or infinity"),
+        (np.array([[0, 0, np.inf, 0]]), "observation of bits_2 holds NaN or infinity"),
+    ],
+)
+def test_an_observation_that_does_not_fit_is_refused(observation, message):
+    policy = MODELS["bits"]().agent_policy("bits_2")
+    with pytest.raises(ValueError, match=message):
+        policy.predict(observation)
