@@ -1,11 +1,25 @@
-"""MADDPG for Stable-Baselines3: decentralised actors, centralised critics, bits through a threshold."""
+"""MADDPG for Stable-Baselines3: decentralised actors, centralised critics, every kind of action."""
 
 from importlib.metadata import version
 
+from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.callbacks import CurriculumCallback, MetricsCallback
 from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import MADDPGPolicy
+from sb3_maddpg.relational import PairPolicy
 
 __version__ = version("sb3-maddpg")
-__all__ = ["MADDPG", "CurriculumCallback", "MADDPGPolicy", "MetricsCallback", "TeamReplayBuffer"]
+__all__ = [
+    "MADDPG",
+    "MATD3",
+    "AgentPolicy",
+    "CurriculumCallback",
+    "MADDPGPolicy",
+    "MetricsCallback",
+    "PairPolicy",
+    "TeamEnv",
+    "TeamReplayBuffer",
+]

@@ -135,6 +135,8 @@ class Categories(ActionKind):
     """
 
     allowed: th.Tensor
+    real_heads: th.Tensor
+    flat_columns: th.Tensor
     shape: tuple[int, int]
 
     def _real_columns(self) -> th.Tensor:
@@ -147,6 +149,7 @@ class Categories(ActionKind):
         allowed = real.clone()
         allowed[..., 0] = True
         self.register_buffer("allowed", allowed, persistent=False)
+        self.register_buffer("real_heads", real.any(dim=2).flatten().nonzero().squeeze(1), persistent=False)
         return real.flatten(1)
 
     def _heads(self, logits: th.Tensor) -> th.Tensor:
@@ -169,6 +172,13 @@ class Categories(ActionKind):
         if not deterministic:  # Gumbel's trick: the largest is distributed as the softmax
             heads = heads - th.empty_like(heads).exponential_().clamp_min(th.finfo(heads.dtype).tiny).log()
         return self._columns(nn.functional.one_hot(heads.argmax(dim=-1), self.shape[1]).to(logits.dtype))
+
+    def chosen(self, actions: th.Tensor) -> th.Tensor:
+        """
+        :param actions: one-hot, (batch, n_agents, width)
+        :return: the categories, sub-action after sub-action without padding, (batch, number of all sub-actions)
+        """
+        return actions.unflatten(-1, self.shape).argmax(dim=-1).flatten(1)[:, self.real_heads]
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
         return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
@@ -246,6 +256,9 @@ class TeamActions(nn.Module):
         real = np.zeros((self.n_agents, self.width), bool)
         target = np.zeros(starts[-1], int)
         for kind in self.kinds:
+            if isinstance(kind, Categories):
+                columns = [np.arange(starts[agent], starts[agent + 1]) for agent in kind.agents]
+                kind.register_buffer("flat_columns", th.as_tensor(np.concatenate(columns)), persistent=False)
             for row, agent in enumerate(kind.agents):
                 real[agent, : kind.width] = kind.real[row]
                 for head in range(len(kind.sizes[row])):
@@ -304,15 +317,11 @@ class TeamActions(nn.Module):
         """
         if self.plain:
             return actions.flatten(1)
-        # A one-hot column says how far it stands from the first of its sub-action
         flat = actions.flatten(1)[:, self.target]
         for kind in self.kinds:
             if isinstance(kind, Categories):
-                chosen = actions[:, kind.agents, : kind.width].unflatten(-1, kind.shape).argmax(dim=-1)
-                for row, agent in enumerate(kind.agents):
-                    heads = len(kind.sizes[row])
-                    start = int(self.source[agent, 0])
-                    flat[:, start : start + heads] = chosen[:, row, :heads].to(flat.dtype)
+                part = actions if len(self.kinds) == 1 else actions[:, kind.agents, : kind.width]
+                flat[:, kind.flat_columns] = kind.chosen(part).to(flat.dtype)
         return flat
 
     def _by_kind(self, tensor: th.Tensor, function: Callable[[ActionKind, th.Tensor], th.Tensor]) -> th.Tensor:

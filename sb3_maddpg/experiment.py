@@ -1,15 +1,23 @@
-"""rl_zoo3's experiment manager, with its known faults around environment arguments and resuming mended."""
+"""rl_zoo3's experiment manager, with its known faults around environment arguments, resuming and tuning mended."""
 
 import inspect
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import optuna
+import rl_zoo3.exp_manager
 from gymnasium.envs.registration import load_env_creator
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import ALGOS
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import ALGOS, get_callback_list
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_maddpg import parallel
@@ -34,12 +42,12 @@ ZOO_KEYS = {
     "vec_env_wrapper",
 }
 # Arguments of the algorithm that the command line gives.
-COMMAND_LINE = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
+COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
+# Arguments of the policy that the algorithm gives.
+OF_ALGORITHM = {"observation_space", "action_space", "lr_schedule"}
 
 # Off-policy algorithms log every so many episodes, unless --log-interval says otherwise; SB3's four fill the screen.
 LOG_EPISODES = 20
-
-NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "large": [256, 256]}
 
 
 class TeamExperimentManager(ExperimentManager):
@@ -49,13 +57,23 @@ class TeamExperimentManager(ExperimentManager):
     - unknown keys are refused, with the nearest known one;
     - ``vec_env: gymnasium`` takes the environment's own Gymnasium vector environment, see ``GymnasiumVecEnv``;
     - every model, not only MADDPG's, carries the environment it was trained in as ``env_spec``;
-    - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up.
+    - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up;
+    - ``--trial-id`` takes any trial of a study, also the first, whose number is 0;
+    - tuning (``-optimize``) keeps the recipe's other ``policy_kwargs``, leaves no run folder behind and draws other
+      hyperparameters in each worker of a study. A trial is pruned if its networks diverged; any other error ends the
+      search, instead of being counted as a bad trial.
     """
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         # rl_zoo3 would replace the recipe's arguments by these
         given, self.env_kwargs = self.env_kwargs, {}
+        # and would take no trial for trial 0
+        trial_id, self.trial_id = self.trial_id, None
         hyperparams, _ = super().read_hyperparameters()
+        if trial_id is not None:
+            of_trial = self._read_trial(trial_id)
+            print(f"Hyperparameters of trial {trial_id} of {self.study_name}: {of_trial}")
+            hyperparams = {**update(hyperparams, of_trial), **(self.custom_hyperparams or {})}
         check_keys(self.algo, hyperparams)
         if hyperparams.get("noise_type") is None:
             hyperparams.pop("noise_type", None)
@@ -88,12 +106,37 @@ class TeamExperimentManager(ExperimentManager):
             )
         return vec_env is not None
 
+    def _read_trial(self, trial_id: int) -> dict[str, Any]:
+        """The arguments of the algorithm in a trial of the study that ``--storage`` and ``--study-name`` name."""
+        if not self.storage or not self.study_name:
+            raise ValueError(f"--trial-id {trial_id} needs to know of which study: give --storage and --study-name.")
+        storage: Any = self.storage
+        if self.storage.endswith(".log"):
+            if not Path(self.storage).is_file():  # optuna would make an empty one
+                raise FileNotFoundError(f"There is no file {self.storage}.")
+            storage = JournalStorage(JournalFileBackend(self.storage))
+        try:
+            study = optuna.load_study(storage=storage, study_name=self.study_name)
+        except KeyError:
+            names = optuna.get_all_study_names(storage)
+            raise ValueError(suggest(f"study in {self.storage}", self.study_name, names)) from None
+        for trial in study.get_trials(deepcopy=False):
+            if trial.number == trial_id:
+                return HYPERPARAMS_CONVERTER[self.algo](trial.params)
+        raise ValueError(f"Study {self.study_name} has no trial {trial_id}, only {len(study.trials)}, counted from 0.")
+
+    def create_log_folder(self) -> None:
+        """Make the run's folder; a search has none, each trial's log goes to ``--optimization-log-path``."""
+        if not self.optimize_hyperparameters:
+            super().create_log_folder()
+
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
         :param n_envs: number of environments
         :param eval_env: whether they are for evaluation
         :param no_log: write no monitor file
         """
+        no_log = no_log or self.optimize_hyperparameters
         if eval_env or not self.own_vec_env:
             return super().create_envs(n_envs, eval_env, no_log)
         envs = gymnasium.make_vec(self.env_name.gym_id, num_envs=n_envs, **self.env_kwargs)
@@ -135,6 +178,72 @@ class TeamExperimentManager(ExperimentManager):
             assert model.env is not None
             model.env.close()
 
+    def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
+        sampler: optuna.samplers.BaseSampler
+        if sampler_method == "tpe":
+            # In groups, because some hyperparameters exist only with certain values of others
+            sampler = optuna.samplers.TPESampler(
+                n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, group=True
+            )
+        else:
+            sampler = super()._create_sampler(sampler_method)
+        if self.storage is not None:
+            sampler.reseed_rng()  # workers with one --seed, or a search that is continued, would repeat trials
+        return sampler
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """
+        :param trial: to choose hyperparameters for
+        :return: last mean reward of the evaluation
+        """
+        env = self.create_envs(self.n_envs, no_log=True)
+        eval_env = self.create_envs(self.n_eval_envs, eval_env=True)
+        try:
+            arguments = {
+                "using_her_replay_buffer": self._hyperparams.get("replay_buffer_class") == HerReplayBuffer,
+                "her_kwargs": self._hyperparams.get("replay_buffer_kwargs", {}),
+                "env": env,
+                "hyperparams": self._hyperparams,
+                "policy_arguments": arguments_of(_policy(self.algo, self._hyperparams["policy"]) or BasePolicy),
+            }
+            sampled = HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments)
+            model = ALGOS[self.algo](
+                env=env,
+                seed=None,  # as in rl_zoo3: each trial draws other numbers
+                verbose=self.verbose if self.verbose >= 2 else 0,
+                device=self.device,
+                **update(self._hyperparams, sampled),
+            )
+            evaluation = self._trial_evaluation(trial, eval_env)
+            callbacks = get_callback_list({"callback": self.specified_callbacks})
+            try:
+                model.learn(self.n_timesteps, callback=[*callbacks, evaluation])
+            except (AssertionError, ValueError) as error:
+                if not diverged(model):
+                    raise
+                print(f"Trial {trial.number} diverged with {sampled}: {error}")
+                raise optuna.TrialPruned from error
+        finally:
+            env.close()
+            eval_env.close()
+        if evaluation.is_pruned:
+            raise optuna.TrialPruned
+        return evaluation.last_mean_reward
+
+    def _trial_evaluation(self, trial: optuna.Trial, eval_env: VecEnv) -> TrialEvalCallback:
+        path = None
+        if self.optimization_log_path is not None:
+            path = str(Path(self.optimization_log_path, f"trial_{trial.number}"))
+        return TrialEvalCallback(
+            eval_env,
+            trial,
+            best_model_save_path=path,
+            log_path=path,
+            n_eval_episodes=self.n_eval_episodes,
+            eval_freq=max(self.n_timesteps // self.n_evaluations // self.n_envs, 1),
+            deterministic=self.deterministic_eval,
+        )
+
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
         :param model: the trained model
@@ -146,6 +255,51 @@ class TeamExperimentManager(ExperimentManager):
             print(f"TensorBoard: tensorboard --logdir {self.tensorboard_log}")
 
 
+def update(hyperparams: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param hyperparams: of a recipe
+    :param changes: of a trial
+    :return: both, the changes over the recipe, also among the arguments of the policy
+    """
+    changed = {**hyperparams, **changes}
+    policy_kwargs = hyperparams.get("policy_kwargs") or {}
+    if isinstance(policy_kwargs, str):  # as rl_zoo3 does it, which comes to it only later
+        policy_kwargs = eval(policy_kwargs, vars(rl_zoo3.exp_manager))
+    if "policy_kwargs" in changes:
+        changed["policy_kwargs"] = {**policy_kwargs, **changes["policy_kwargs"]}
+    return changed
+
+
+def diverged(model: BaseAlgorithm) -> bool:
+    """
+    :param model: after an error
+    :return: whether a network has a weight that is no number
+    """
+    return any(not weight.isfinite().all() for weight in model.policy.parameters())
+
+
+def arguments_of(cls: type) -> set[str]:
+    """
+    :param cls: a class, which may hand ``**kwargs`` on to its base class
+    :return: names of the arguments of its constructor
+    """
+    names: set[str] = set()
+    for base in cls.__mro__:
+        if "__init__" in vars(base):
+            parameters = inspect.signature(vars(base)["__init__"]).parameters
+            names |= set(parameters)
+            further = {name for name, one in parameters.items() if one.kind is inspect.Parameter.VAR_KEYWORD}
+            names -= further
+            if not further:
+                break
+    return names - {"self"}
+
+
+def _policy(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | None:
+    """The policy that a recipe names, or None for a dotted path, which rl_zoo3 imports later."""
+    return ALGOS[algo].policy_aliases.get(name) if isinstance(name, str) else name
+
+
 def check_keys(algo: str, hyperparams: dict[str, Any]) -> None:
     """
     Refuse a recipe with keys that nothing reads.
@@ -153,15 +307,14 @@ def check_keys(algo: str, hyperparams: dict[str, Any]) -> None:
     :param algo: name of the algorithm
     :param hyperparams: the recipe
     """
-    arguments = inspect.signature(ALGOS[algo].__init__).parameters
-    known = ZOO_KEYS | (set(arguments) - COMMAND_LINE)
+    known = ZOO_KEYS | (arguments_of(ALGOS[algo]) - COMMAND_LINE)
     for key in hyperparams:
         if key not in known:
             raise ValueError(suggest(f"key in the recipe for {algo}", key, known))
-    policy = ALGOS[algo].policy_aliases.get(hyperparams.get("policy", ""))
+    policy = _policy(algo, hyperparams.get("policy", ""))
     policy_kwargs = hyperparams.get("policy_kwargs")
     if policy is not None and isinstance(policy_kwargs, dict):
-        known = set(inspect.signature(policy.__init__).parameters)
+        known = arguments_of(policy) - OF_ALGORITHM
         for key in policy_kwargs:
             if key not in known:
                 raise ValueError(suggest(f"key in policy_kwargs for {algo}", key, known))
@@ -192,36 +345,3 @@ def _env_arguments(env_id: str) -> set[str] | None:
     if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
         return None
     return {parameter.name for parameter in parameters}
-
-
-def sample_maddpg_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    Sampler for MADDPG hyperparameters.
-
-    :param trial: of the study
-    :param n_actions: unused, as the following, but part of rl_zoo3's interface
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: arguments of the algorithm
-    """
-    trial.suggest_float("learning_rate", 1e-4, 2e-2, log=True)
-    trial.suggest_categorical("batch_size", [256, 512, 1024, 2048])
-    trial.suggest_float("tau", 1e-3, 5e-2, log=True)
-    trial.suggest_float("one_minus_gamma", 1e-3, 1e-1, log=True)
-    trial.suggest_categorical("net_arch", list(NET_ARCHS))
-    trial.suggest_categorical("estimator", ["expected", "straight_through", "score"])
-    trial.suggest_float("policy_regularization", 1e-5, 1e-2, log=True)
-    return convert_maddpg_params(trial.params)
-
-
-def convert_maddpg_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: parameters of a trial
-    :return: arguments of the algorithm
-    """
-    params = dict(sampled_params)
-    params["gamma"] = 1 - params.pop("one_minus_gamma")
-    params["policy_kwargs"] = {"net_arch": NET_ARCHS[params.pop("net_arch")]}
-    return params

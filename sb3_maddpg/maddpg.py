@@ -9,7 +9,7 @@ import pathlib
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.agent_policy import AgentPolicy
-from sb3_maddpg.buffers import TeamReplayBuffer
+from sb3_maddpg.buffers import TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import record_metrics
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.networks import polyak_update
@@ -189,7 +189,7 @@ class MADDPG(OffPolicyAlgorithm):
         n_steps, buffer_size = self.n_steps, self.buffer_size
         self.n_steps, self.buffer_size = 1, buffer_size if self.env is not None else 1
         self.replay_buffer_class = self.replay_buffer_class or TeamReplayBuffer
-        self.replay_buffer_kwargs |= {"n_steps": n_steps, "gamma": self.gamma}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": n_steps, "gamma": self.gamma}
         try:
             super()._setup_model()
         finally:
@@ -201,28 +201,43 @@ class MADDPG(OffPolicyAlgorithm):
                 f"action_noise={self.action_noise} is for continuous actions, the action space is {self.action_space}. "
                 "Leave it out: bits explore by a random threshold, categories by their probabilities."
             )
-        self._action_cost: th.Tensor | None = None
-        if self.action_cost is not None:
-            shape = (self.policy.team.n_agents, actions.width)
-            try:
-                cost = np.broadcast_to(np.asarray(self.action_cost, np.float32), shape)
-            except ValueError as error:
-                raise ValueError(
-                    f"action_cost of shape {np.shape(self.action_cost)} does not fit (n_agents, width) = {shape}."
-                ) from error
-            self._action_cost = th.as_tensor(cost.copy(), device=self.device)
+        self._spread_action_cost()
 
     def _read_env(self, env: VecEnv) -> None:
         """What an environment says of itself beside its spaces."""
-        self.env_spec = describe_env(env)
-        if env.has_attr("action_cost"):
-            self.action_cost = env.get_attr("action_cost", indices=0)[0]
+        self._read_task(env)
+        self.policy_kwargs = dict(self.policy_kwargs)
         for name in self.policy_class.env_attributes:
             if name not in self.policy_kwargs and env.has_attr(name):
                 self.policy_kwargs[name] = env.get_attr(name, indices=0)[0]
-        if self.policy_kwargs.get("pair_credit"):
-            neighbours = self.policy_kwargs["observation_layout"]["neighbours"]
-            self.replay_buffer_kwargs["n_pairs"] = len(neighbours)
+        if self.policy_kwargs.get("pair_credit") and "observation_layout" in self.policy_kwargs:
+            n_pairs = len(self.policy_kwargs["observation_layout"]["neighbours"])
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_pairs": n_pairs}
+
+    def _read_task(self, env: VecEnv) -> None:
+        self.env_spec = describe_env(env)
+        self.action_cost = env.get_attr("action_cost", indices=0)[0] if env.has_attr("action_cost") else None
+
+    def _spread_action_cost(self) -> None:
+        """The price of every number that critics read, (n_agents, width)."""
+        self._action_cost: th.Tensor | None = None
+        if self.action_cost is None:
+            return
+        shape = (self.policy.team.n_agents, self.policy.actions.width)
+        try:
+            cost = np.broadcast_to(np.asarray(self.action_cost, np.float32), shape)
+        except ValueError as error:
+            raise ValueError(
+                f"action_cost of shape {np.shape(self.action_cost)} does not fit (n_agents, width) = {shape}."
+            ) from error
+        self._action_cost = th.as_tensor(cost.copy(), device=self.device)
+
+    def _present_action_cost(self) -> th.Tensor | None:
+        """:return: the price on the scale of the rewards that critics are fitted to, (n_agents, width)"""
+        env = self._vec_normalize_env
+        if self._action_cost is None or env is None or not env.norm_reward:
+            return self._action_cost
+        return self._action_cost / float(np.sqrt(env.ret_rms.var + env.epsilon))
 
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
@@ -296,7 +311,7 @@ class MADDPG(OffPolicyAlgorithm):
         actor_losses, critic_losses, q_values, outputs = [], [], [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            data = cast(TeamReplayBufferSamples, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env))
             obs = data.observations.float()
             actions = self.policy.actions.encode(data.actions)
             if data.active is not None:
@@ -327,19 +342,21 @@ class MADDPG(OffPolicyAlgorithm):
         if self.policy.actions.has_continuous and self.action_noise is None:
             self.logger.record("train/exploration_noise", self.noise_std)
 
-    def _critic_loss(self, data: Any, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _critic_loss(
+        self, data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """:return: the loss, summed over agents, and each agent's mean value, (n_agents,)"""
-        critic = self.critic
-        rewards = data.pair_rewards.flatten(1) if critic.part_credit else data.rewards
+        critic, action_cost = self.critic, self._present_action_cost()
+        rewards = data.rewards if data.pair_rewards is None else data.pair_rewards.flatten(1)
         with th.no_grad():
             next_obs = data.next_observations.float()
             next_actions = self._target_actions(next_obs)
             if data.next_active is not None:
                 next_actions = next_actions * data.next_active.unsqueeze(2)
             next_values = critic.credited(self.critic_target(next_obs, next_actions)).amin(dim=0)
-            if self._action_cost is not None:
-                next_values = next_values - critic.cost(next_actions, self._action_cost)
-                rewards = rewards + critic.cost(actions, self._action_cost)
+            if action_cost is not None:
+                next_values = next_values - critic.cost(next_actions, action_cost)
+                rewards = rewards + critic.cost(actions, action_cost)
             targets = rewards + critic.spread((1 - data.dones) * data.discounts) * next_values
 
         # A sum over agents: each gradient is that of the agent's own mean squared error
@@ -349,16 +366,18 @@ class MADDPG(OffPolicyAlgorithm):
         parts_left = critic.parts_per_agent if critic.part_credit else 1
         return loss, by_agent(values[0].detach(), parts_left).mean(dim=0)
 
-    def _actor_loss(self, data: Any, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _actor_loss(
+        self, data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """:return: the loss, summed over agents, and the actors' outputs, (batch, n_agents, width)"""
-        critic, team = self.critic, self.policy.actions
+        critic, team, action_cost = self.critic, self.policy.actions, self._present_action_cost()
         # The other agents' actions are those of the replay buffer, as in the original code
 
         def q(own: th.Tensor, units: th.Tensor | None) -> th.Tensor:
             values = critic.forward_alternatives(obs, actions, own, units)
-            if self._action_cost is None:
+            if action_cost is None:
                 return values
-            cost = critic.to_units(self._action_cost.unsqueeze(0))[0]
+            cost = critic.to_units(action_cost.unsqueeze(0))[0]
             return values - (own * (cost if units is None else cost[units]).unsqueeze(1)).sum(dim=-1)
 
         logits = self.actor.logits(obs)
@@ -411,9 +430,10 @@ class MADDPG(OffPolicyAlgorithm):
         with _remedy_for_other_team():
             super().set_env(env, force_reset)
         assert self.env is not None
-        assert self.replay_buffer is not None
         assert self.replay_buffer_class is not None
-        self.env_spec = describe_env(self.env)
+        assert issubclass(self.replay_buffer_class, TeamReplayBuffer)
+        self._read_task(self.env)
+        self._spread_action_cost()
         if self.replay_buffer.size() == 0 and self.replay_buffer.buffer_size < self.buffer_size // self.n_envs:
             # Loaded without an environment, see _setup_model()
             self.replay_buffer = self.replay_buffer_class(

@@ -400,7 +400,7 @@ def _split(space: AgentActionSpace, n_parts: int) -> list[AgentActionSpace]:
     :param n_parts: number of equal parts
     :return: the spaces of the parts
     """
-    length = 1 if isinstance(space, spaces.Discrete) else space.shape[0]  # type: ignore[index]
+    length = 1 if isinstance(space, spaces.Discrete) else space.shape[0]
     equal = not isinstance(space, spaces.MultiDiscrete) or len(set(space.nvec.tolist())) == 1
     if length % n_parts or not equal:
         raise ValueError(

@@ -176,7 +176,21 @@ class FollowTarget(TeamTask):
         return -np.square(actions - target).sum(axis=-1)
 
 
+class OwnCategory(TeamTask):
+    """One of four categories is to be chosen: the one that the two signs of the own observation count out. It pays 1."""
+
+    n_agents, action_dim, obs_dim = 3, 1, 2
+    optimum, random = 1.0, 1 / 4
+
+    def __init__(self, episode_length: int = 10, render_mode: str | None = None):
+        super().__init__(episode_length, render_mode)
+        self.action_space = spaces.MultiDiscrete([4] * self.n_agents)
+
+    def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return actions[..., 0] == (obs > 0) @ np.array([1, 2])
+
+
 BINARY_TASKS: tuple[type[TeamTask], ...] = (OwnBit, OtherBit, PricedBit, OneOfBits, AllBits)
 
-for _task in (*BINARY_TASKS, FollowTarget):
+for _task in (*BINARY_TASKS, FollowTarget, OwnCategory):
     gym.register(id=f"{_task.__name__}-v0", entry_point=f"{__name__}:{_task.__name__}")

@@ -1,4 +1,4 @@
-"""``python -m sb3_maddpg.zoo train|enjoy|record|evaluate``: rl_zoo3 with MADDPG and the installed environments."""
+"""``python -m sb3_maddpg.zoo train|enjoy|record|evaluate``: rl_zoo3 with MADDPG, MATD3, the installed environments."""
 
 import argparse
 import importlib
@@ -24,26 +24,31 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, StoreDict, get_latest_run_id, get_saved_hyperparams
 
 from sb3_maddpg import MADDPG, parallel
-from sb3_maddpg.experiment import TeamExperimentManager, convert_maddpg_params, sample_maddpg_params
+from sb3_maddpg.experiment import TeamExperimentManager
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.utils import suggest
 
 USAGE = """\
-Train, watch and compare teams with rl_zoo3, MADDPG and the installed environments registered.
+Train, watch and compare teams with rl_zoo3; MADDPG, MATD3 and the installed environments are registered.
 
   train     train a model and evaluate it now and then
   enjoy     watch a trained model
   record    record a trained model on video
   evaluate  compare policies with the environment's own evaluator; `latest:LOGDIR` stands for the newest model there
 
-`<command> --help` lists a command's options, which are those of rl_zoo3. What differs: --algo is maddpg unless given,
-the packaged recipe is used unless --conf-file is given, --env-kwargs are merged over the recipe's, --num-threads is 1
-unless given, and -i MODEL.zip continues the training where it ended. --env PACKAGE/MODULE is a PettingZoo environment;
-its --env-kwargs are those of its parallel_env, `state:True` for critics that read the global state, and `wrappers`."""
+`<command> --help` lists a command's options, which are those of rl_zoo3. What differs: --algo is maddpg unless given
+(or matd3), the packaged recipe is used unless --conf-file is given, --env-kwargs are merged over the recipe's,
+--num-threads is 1 unless given, and -i MODEL.zip continues the training where it ended. --env PACKAGE/MODULE is a
+PettingZoo environment; its --env-kwargs are those of its parallel_env, `state:True` for critics that read the global
+state, and `wrappers`."""
 EPILOG = """\
 examples:
   python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --progress --tensorboard-log logs/tensorboard
   python -m sb3_maddpg.zoo train --env OwnBit-v0
-  python -m sb3_maddpg.zoo train --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:True
+  python -m sb3_maddpg.zoo train --algo matd3 --env mpe2/simple_spread_v3
+  python -m sb3_maddpg.zoo train --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:False
+  python -m sb3_maddpg.zoo train -optimize --env OwnBit-v0 --n-trials 50 --storage logs/tune.log --study-name a
   python -m sb3_maddpg.zoo evaluate --env QuadSwarm-v0 --policy none full latest:logs --scenario all"""
 
 # Mistakes in what the user gave. Their messages say what to do, so one line is enough.
@@ -51,10 +56,10 @@ USER_ERRORS = (ValueError, FileNotFoundError, AssertionError, gymnasium.error.Er
 
 
 def register() -> None:
-    """Make MADDPG and every installed environment known to rl_zoo3, whose command line reads these dicts."""
-    ALGOS["maddpg"] = MADDPG
-    HYPERPARAMS_SAMPLER["maddpg"] = sample_maddpg_params
-    HYPERPARAMS_CONVERTER["maddpg"] = convert_maddpg_params
+    """Make the algorithms and every installed environment known to rl_zoo3, whose command line reads these dicts."""
+    ALGOS.update({"maddpg": MADDPG, "matd3": MATD3})
+    HYPERPARAMS_SAMPLER.update({"maddpg": sample_maddpg_params, "matd3": sample_matd3_params})
+    HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3"), convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
     importlib.import_module("sb3_maddpg.team_tasks")
     for entry_point in entry_points(group="sb3_maddpg.environments"):

@@ -1,0 +1,114 @@
+"""What ``python -m sb3_maddpg.zoo train -optimize`` searches: the hyperparameters of MADDPG and MATD3."""
+
+import json
+from typing import Any
+
+import optuna
+
+from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.estimators import ESTIMATORS
+from sb3_maddpg.team import Team
+
+NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "large": [256, 256]}
+WITHOUT_TEMPERATURE = ("expected", "score")
+# Transitions between two updates: many in the original code, few where samples are dear
+MOST_UPDATES, FEWEST_UPDATES = 4, 200
+
+
+def sample_maddpg_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Sampler for MADDPG hyperparameters: only those that matter to the team at hand.
+
+    :param trial: of the study
+    :param n_actions: unused, but part of rl_zoo3's interface
+    :param n_envs: number of environments
+    :param additional_args: as ``TeamExperimentManager`` gives them: ``env``, ``hyperparams`` (those of the
+        recipe) and ``policy_arguments`` (names of those the policy takes)
+    :return: arguments of the algorithm
+    """
+    _suggest(trial, n_envs, additional_args)
+    return convert_params(trial.params)
+
+
+def sample_matd3_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Sampler for MATD3 hyperparameters, see ``sample_maddpg_params``.
+
+    :param trial: of the study
+    :param n_actions: unused
+    :param n_envs: number of environments
+    :param additional_args: see ``sample_maddpg_params``
+    :return: arguments of the algorithm
+    """
+    actions = _suggest(trial, n_envs, additional_args)
+    trial.suggest_int("policy_delay", 1, 4)
+    if actions.has_continuous:
+        trial.suggest_float("target_policy_noise", 0.02, 0.5, log=True)
+    return convert_params(trial.params)
+
+
+def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: parameters of a trial
+    :return: arguments of the algorithm
+    """
+    params = dict(sampled_params)
+    if "one_minus_gamma" in params:
+        params["gamma"] = 1 - params.pop("one_minus_gamma")
+    if "first_noise" in params:
+        params["exploration_noise"] = [params.pop("first_noise"), params.pop("last_noise")]
+    policy_kwargs: dict[str, Any] = {
+        key: json.loads(params.pop(key)) for key in ("share_actor", "share_critic") if key in params
+    }
+    if "net_arch" in params:
+        policy_kwargs["net_arch"] = NET_ARCHS[params.pop("net_arch")]
+    return {**params, "policy_kwargs": policy_kwargs} if policy_kwargs else params
+
+
+def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) -> TeamActions:
+    """Suggest what both algorithms have. :return: how the team acts"""
+    env = additional_args["env"]
+    team = Team.from_spaces(env.observation_space, env.action_space)
+    actions = TeamActions(team.action_spaces)
+    trial.suggest_float("learning_rate", 1e-4, 3e-2, log=True)
+    trial.suggest_categorical("batch_size", [256, 512, 1024, 2048])
+    trial.suggest_float("tau", 1e-3, 5e-2, log=True)
+    one_minus_gamma = trial.suggest_float("one_minus_gamma", 5e-3, 2e-1, log=True)
+    trial.set_user_attr("gamma", 1 - one_minus_gamma)
+    # Counted in steps of all environments at once
+    trial.suggest_int("train_freq", max(MOST_UPDATES // n_envs, 1), max(FEWEST_UPDATES // n_envs, 1), log=True)
+    trial.suggest_categorical("gradient_steps", [1, 2, 4])
+    trial.suggest_int("n_steps", 1, 5)
+    trial.suggest_categorical("net_arch", list(NET_ARCHS))
+    trial.suggest_float("policy_regularization", 1e-5, 1e-2, log=True)
+    if actions.has_continuous and "action_noise" not in additional_args["hyperparams"]:
+        trial.suggest_float("first_noise", 0.1, 1.0, log=True)
+        trial.suggest_float("last_noise", 0.01, 0.3, log=True)
+    if actions.discrete:
+        estimator = trial.suggest_categorical("estimator", list(ESTIMATORS))
+        if estimator not in WITHOUT_TEMPERATURE:
+            trial.suggest_float("temperature", 0.2, 2.0, log=True)
+    if "share_actor" in additional_args["policy_arguments"] and (alike := _alike(team)):
+        # Optuna keeps no lists among its choices
+        sharing = ["false", "true" if len(alike[0]) == team.n_agents else json.dumps(alike)]
+        trial.suggest_categorical("share_actor", sharing)
+        trial.suggest_categorical("share_critic", sharing)
+    return actions
+
+
+def _alike(team: Team) -> list[list[int]]:
+    """:return: the agents that could share a network, with those they could share it with"""
+    groups: list[list[int]] = []
+    for agent in range(team.n_agents):
+        for group in groups:
+            same_obs = team.obs_dims[agent] == team.obs_dims[group[0]]
+            if same_obs and team.action_spaces[agent] == team.action_spaces[group[0]]:
+                group.append(agent)
+                break
+        else:
+            groups.append([agent])
+    return [group for group in groups if len(group) > 1]
