@@ -7,6 +7,7 @@ SEED ?= 0
 LOGS ?= logs
 EPISODES ?= 500
 JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
+BENCHMARKS ?= planner env training scaling estimators
 POLICIES ?= none full distance:4 cpa:0.7:1.5
 PEERS := agilerl benchmarl xuance
 
@@ -37,8 +38,8 @@ lint: install  ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: install  ## every script in benchmarks/, as a table and as JSON
-	for script in benchmarks/*.py; do $(BIN)/python $$script --json $(LOGS)/$$(basename $$script .py).json || exit 1; done
+bench: install  ## speed of planner, environment and learner, and the estimators, as tables and as JSON
+	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done
 
 bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against other libraries, each in its own environment
 	$(BIN)/python benchmarks/training.py --json benchmarks/results/training.json

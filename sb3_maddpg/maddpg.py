@@ -347,7 +347,9 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> tuple[th.Tensor, th.Tensor]:
         """:return: the loss, summed over agents, and each agent's mean value, (n_agents,)"""
         critic, action_cost = self.critic, self._present_action_cost()
-        rewards = data.rewards if data.pair_rewards is None else data.pair_rewards.flatten(1)
+        rewards = data.rewards
+        if critic.part_credit and data.pair_rewards is not None:
+            rewards = data.pair_rewards.flatten(1)
         with th.no_grad():
             next_obs = data.next_observations.float()
             next_actions = self._target_actions(next_obs)
