@@ -1,6 +1,8 @@
 """rl_zoo3's experiment manager, with its known faults around environment arguments, resuming and tuning mended."""
 
 import inspect
+import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, get_callback_list
+from sqlalchemy.exc import DBAPIError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -181,15 +184,23 @@ class TeamExperimentManager(ExperimentManager):
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         sampler: optuna.samplers.BaseSampler
         if sampler_method == "tpe":
-            # In groups, because some hyperparameters exist only with certain values of others
-            sampler = optuna.samplers.TPESampler(
-                n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, group=True
-            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+                # In groups, because some hyperparameters exist only with certain values of others
+                sampler = optuna.samplers.TPESampler(
+                    n_startup_trials=self.n_startup_trials, seed=self.seed, multivariate=True, group=True
+                )
         else:
             sampler = super()._create_sampler(sampler_method)
         if self.storage is not None:
             sampler.reseed_rng()  # workers with one --seed, or a search that is continued, would repeat trials
         return sampler
+
+    def hyperparameters_optimization(self) -> None:
+        """Search, alone or with other workers."""
+        if self.storage is not None and not self.storage.endswith(".log"):
+            _make_tables(self.storage)
+        super().hyperparameters_optimization()
 
     def objective(self, trial: optuna.Trial) -> float:
         """
@@ -253,6 +264,19 @@ class TeamExperimentManager(ExperimentManager):
         print(f"Logs:        {self.save_path}")
         if self.tensorboard_log:
             print(f"TensorBoard: tensorboard --logdir {self.tensorboard_log}")
+
+
+def _make_tables(url: str) -> None:
+    """Those of a study in a database. Workers that start together get in each other's way here, and only here."""
+    for attempt in range(20):
+        try:
+            optuna.storages.RDBStorage(url)
+        except DBAPIError:
+            if attempt == 19:
+                raise
+            time.sleep(0.25)
+        else:
+            return
 
 
 def update(hyperparams: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -129,6 +129,9 @@ def test_an_interrupted_training_is_saved(arena):
         ({}, ["-params", "taau:0.1"], "did you mean 'tau'?"),
         ({"policy_kwargs": {"net_arc": [8]}}, [], "did you mean 'net_arch'?"),
         ({"estimator": "expect"}, [], "did you mean 'expected'?"),
+        ({"estimatr": "score"}, ["--algo", "matd3"], "Unknown key in the recipe for matd3 'estimatr': did you mean"),
+        ({"target_policy_nois": 0.1}, ["--algo", "matd3"], "did you mean 'target_policy_noise'?"),
+        ({"policy": "PairPolicy", "policy_kwargs": {"pair_credt": True}}, [], "did you mean 'pair_credit'?"),
     ],
 )
 def test_a_name_that_nothing_reads_is_refused(arena, capsys, recipe, argv, message):
@@ -169,6 +172,8 @@ def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
     assert json.loads(capsys.readouterr().out) == [f"{newest}/Arena-v0.zip"]
     assert main(["evaluate", "--env", "Arena-v0", "--algo", "ppo", "none"]) == 3
     assert json.loads(capsys.readouterr().out) == ["none", "--algo", "stable_baselines3.ppo.ppo:PPO"]
+    assert main(["evaluate", "--env", "Arena-v0", "--algo", "matd3", "none"]) == 3
+    assert json.loads(capsys.readouterr().out) == ["none", "--algo", "sb3_maddpg.matd3:MATD3"]
 
 
 @pytest.mark.parametrize(
@@ -182,15 +187,6 @@ def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
 def test_evaluation_that_cannot_be_is_refused(arena, capsys, argv, message):
     assert main(["evaluate", *argv]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_hyperparameters_are_searched(arena, capsys):
-    recipe = {"n_timesteps": 150, "learning_rate": 0.01, "callback": None}
-    argv = ["-optimize", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
-    assert train(*argv, "--sampler", "random", "--pruner", "none", recipe=recipe) == 0
-    out = capsys.readouterr().out
-    assert "Number of finished trials:  2" in out
-    assert "policy_regularization:" in out
 
 
 @pytest.mark.parametrize("algo", ["maddpg", "ppo"])

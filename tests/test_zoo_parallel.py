@@ -8,7 +8,11 @@ import pytest
 import yaml
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.zoo import latest_model, main
+from sb3_maddpg.experiment import check_env_kwargs, check_keys
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.parallel import register
+from sb3_maddpg.zoo import latest_model, main, packaged_config
+from sb3_maddpg.zoo import register as register_all
 
 SPREAD = ["--env", "mpe2/simple_spread_v3"]
 
@@ -62,6 +66,38 @@ def test_a_pettingzoo_environment_without_a_window_is_watched_without(in_logs, c
     out = capsys.readouterr().out
     assert "has no window" in out
     assert "Mean episode length: 5.00" in out
+
+
+@pytest.mark.parametrize("algo", ["maddpg", "matd3"])
+def test_the_packaged_recipes_are_for_environments_that_are_there(in_logs, algo):
+    register_all()
+    recipes = yaml.safe_load(Path(packaged_config(algo, "default")).read_text())
+    for env_id in ("spread_v3", "speaker_listener_v4", "tag_v3", "adversary_v3"):
+        assert register(f"mpe2/simple_{env_id}")
+        recipe = recipes[f"mpe2/simple_{env_id}"]
+        check_keys(algo, recipe)
+        check_env_kwargs(f"mpe2/simple_{env_id}", recipe["env_kwargs"])
+        assert recipe["env_kwargs"] == {"continuous_actions": True}
+
+
+@pytest.mark.parametrize(("algorithm", "discrete"), [(MADDPG, True), (MATD3, False), (MATD3, True)])
+def test_the_packaged_recipes_train_both_kinds_of_actions(in_logs, capsys, algorithm, discrete):
+    algo = ["--algo", algorithm.__name__.lower(), *SPREAD]
+    argv = ["train", *algo, "-n", "60", "--eval-freq", "50", "--eval-episodes", "1", "--verbose", "0"]
+    small = ["-params", "learning_starts:10", "train_freq:10", "batch_size:8", "buffer_size:100"]
+    assert main([*argv, *small, *(["--env-kwargs", "continuous_actions:False"] if discrete else [])]) == 0
+    model = algorithm.load(latest_model("latest:logs", algo[1], SPREAD[1]))
+    assert isinstance(model.action_space, gymnasium.spaces.MultiDiscrete if discrete else gymnasium.spaces.Box)
+    assert (model.gamma, model.learning_rate(1), model.max_grad_norm) == (0.95, 0.01, 0.5)
+    assert model.noise_std == pytest.approx(0.1)  # at the end, on actions of [-1, 1]
+    assert model.policy.n_critics == (2 if algorithm is MATD3 else 1)
+    capsys.readouterr()
+    assert main(["enjoy", *algo, "-n", "30"]) == 0
+    assert "Mean episode length: 25.00" in capsys.readouterr().out
+    if not discrete:
+        assert main(["record", *algo, "-n", "5"]) == 0
+        (video,) = in_logs.rglob("*.mp4")
+        assert video.stat().st_size > 500
 
 
 @pytest.mark.parametrize(
