@@ -52,7 +52,7 @@ def objective(space: spaces.Space, logits: th.Tensor, q: Callable[[th.Tensor], t
     :param q: value of an action, (batch, number of columns) -> (batch,)
     """
     if isinstance(space, spaces.Box):
-        return q(logits.tanh())
+        return q(2 * logits.sigmoid() - 1)
     if isinstance(space, spaces.MultiBinary):  # the threshold falls between two neighbouring scores
         scores, order = logits.sigmoid().sort(dim=1, descending=True)
         bits = th.zeros_like(scores)

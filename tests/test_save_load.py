@@ -3,13 +3,16 @@
 import io
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_maddpg import MADDPG
+from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.team_tasks import OtherBit, OwnBit
 
 SMALL = {"learning_starts": 20, "batch_size": 16, "train_freq": 5, "buffer_size": 1000, "seed": 0}
@@ -26,10 +29,11 @@ def assert_equal_state(a: dict, b: dict) -> None:
         assert th.equal(x, y) if isinstance(x, th.Tensor) else x == y
 
 
-@pytest.mark.parametrize("share", [False, True])
+@pytest.mark.parametrize("share", [False, True, [["agent_0", 2]]])
 def test_a_loaded_model_is_the_saved_one(tmp_path, share):
     kwargs = {"net_arch": [8], "share_actor": share, "share_critic": share, "threshold": 0.3}
-    model = learned(policy_kwargs=kwargs, estimator="score", max_grad_norm=None)
+    noise = {"exploration_noise": (0.3, 0.1), "n_steps": 3}
+    model = learned(policy_kwargs=kwargs, estimator="score", max_grad_norm=None, temperature=lambda x: x + 0.1, **noise)
     model.curriculum_level = 2
     model.save(tmp_path / "model")
     loaded = MADDPG.load(tmp_path / "model.zip")
@@ -39,35 +43,21 @@ def test_a_loaded_model_is_the_saved_one(tmp_path, share):
     exploring = model.predict(OBS)[0]
     th.manual_seed(1)
     assert np.array_equal(exploring, loaded.predict(OBS)[0])
-    for name in ("estimator", "max_grad_norm", "buffer_size", "num_timesteps", "_n_updates", "curriculum_level"):
+    names = ("estimator", "max_grad_norm", "buffer_size", "num_timesteps", "_n_updates", "curriculum_level", "n_steps")
+    for name in (*names, "noise_std", "policy_kwargs", "replay_buffer_kwargs"):
         assert getattr(loaded, name) == getattr(model, name)
-    assert loaded.policy.threshold == loaded.policy.actor.threshold == 0.3
+    assert loaded.temperature(0.5) == 0.6
+    assert loaded.policy.threshold == 0.3
 
 
-def test_a_resumed_run_is_the_uninterrupted_one(tmp_path):
-    """With the buffer and the state of the random generators, parameter by parameter."""
-    whole = learned()
-    whole.save(tmp_path / "model")
-    whole.save_replay_buffer(tmp_path / "buffer")
+def test_a_resumed_run_has_the_memory_of_the_interrupted_one(tmp_path):
+    model = learned()
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
     resumed = MADDPG.load(tmp_path / "model", env=OwnBit(), force_reset=False)
     resumed.load_replay_buffer(tmp_path / "buffer")
     for name in ("observations", "actions", "agent_rewards", "agent_terminated", "dones", "timeouts"):
-        assert np.array_equal(getattr(whole.replay_buffer, name), getattr(resumed.replay_buffer, name))
-    results = []
-    for model in (whole, resumed):
-        model.set_env(OwnBit())
-        model.set_random_seed(7)
-        results.append(model.learn(100, reset_num_timesteps=False))
-    assert results[0].num_timesteps == results[1].num_timesteps == 200
-    assert_equal_state(results[0].get_parameters(), results[1].get_parameters())
-
-
-def test_set_parameters_restores_networks_and_optimizers(tmp_path):
-    model = learned()
-    model.save(tmp_path / "model")
-    other = learned(seed=1)
-    other.set_parameters(tmp_path / "model")
-    assert_equal_state(model.get_parameters(), other.get_parameters())
+        assert np.array_equal(getattr(model.replay_buffer, name), getattr(resumed.replay_buffer, name))
 
 
 def test_a_model_without_environment_takes_no_memory_until_it_gets_one(tmp_path):
@@ -140,6 +130,66 @@ def test_a_bad_file_is_refused(tmp_path, kind):
         path.write_bytes(path.read_bytes()[:5000] if kind == "truncated" else b"")
     with pytest.raises((ValueError, FileNotFoundError), match=r"model\.zip"):
         MADDPG.load(path)
+
+
+def rewritten(source: Path, target: Path, **changes) -> Path:
+    """:return: the model's file with other entries in its data, None to leave one out"""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == "data":
+                data = {**json.loads(content), **changes}
+                content = json.dumps({key: value for key, value in data.items() if value is not None}).encode()
+            new.writestr(name, content)
+    return target
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_models_of_other_algorithms_are_refused(tmp_path, stream):
+    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
+    TD3("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "td3.zip")
+    MATD3("MlpPolicy", OwnBit()).save(tmp_path / "matd3.zip")
+    learned().save(tmp_path / "maddpg.zip")
+    for algorithm, name, message in (
+        (MADDPG, "ppo", "holds a model of another algorithm than MADDPG"),
+        (MADDPG, "td3", "holds a model of another algorithm than MADDPG"),
+        (MATD3, "td3", "holds a model of another algorithm than MATD3"),
+        (MADDPG, "matd3", r"holds a model of MATD3: load it with `MATD3\.load`"),
+        (MATD3, "maddpg", r"holds a model of MADDPG: load it with `MADDPG\.load`"),
+    ):
+        path = tmp_path / f"{name}.zip"
+        with pytest.raises(ValueError, match=message):
+            algorithm.load(io.BytesIO(path.read_bytes()) if stream else path)
+    assert MATD3.load(tmp_path / "matd3").algorithm == "MATD3"
+
+
+@pytest.mark.parametrize("changes", [{"file_format": 1}, {"file_format": 99}, {"file_format": None, "algorithm": None}])
+def test_a_file_of_another_format_is_refused(tmp_path, changes):
+    model = learned()
+    model.save(tmp_path / "model.zip")
+    path = rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes)
+    written = changes["file_format"] or 1
+    with pytest.raises(ValueError, match=rf"other\.zip has format {written}, .* reads format 2: install the version"):
+        MADDPG.load(path)
+    same = MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "same.zip"))
+    assert_equal_state(same.get_parameters(), model.get_parameters())
+
+
+def test_the_price_of_actions_is_that_of_the_environment(tmp_path):
+    env = OwnBit()
+    env.action_cost = np.arange(9.0).reshape(3, 3)
+    model = learned(env)
+    model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model")
+    assert th.equal(loaded._action_cost, model._action_cost)
+    assert model._action_cost.tolist() == env.action_cost.tolist()
+    for env.action_cost in (0.5, 2.0):
+        loaded.set_env(env)
+        assert (loaded._action_cost == env.action_cost).all()
+        assert (MADDPG.load(tmp_path / "model", env=env)._action_cost == env.action_cost).all()
+    loaded.set_env(OwnBit())
+    assert loaded._action_cost is None
+    assert loaded.learn(30)._action_cost is None
 
 
 def test_another_team_is_refused_with_both_spaces_and_a_remedy(tmp_path):
