@@ -101,7 +101,7 @@ class Bits(ActionKind):
     (Serra-Gomez et al., IROS 2020, Sec. IV-C).
 
     :param threshold: delta
-    :param shared_threshold: one delta' for all bits of an agent, otherwise one for each
+    :param n_thresholds: how many delta' an agent draws, each for an equal part of its bits
     """
 
     def __init__(
@@ -109,11 +109,11 @@ class Bits(ActionKind):
         agents: Sequence[int],
         action_spaces: Sequence[AgentActionSpace],
         threshold: float,
-        shared_threshold: bool = True,
+        n_thresholds: int = 1,
     ):
         super().__init__(agents, action_spaces)
         self.threshold = threshold
-        self.shared_threshold = shared_threshold
+        self.n_thresholds = n_thresholds
 
     def squash(self, logits: th.Tensor) -> th.Tensor:
         return th.sigmoid(logits) * self.real if self.padded else th.sigmoid(logits)
@@ -122,7 +122,10 @@ class Bits(ActionKind):
         scores = self.squash(logits)
         if deterministic:
             return (scores > self.threshold).to(scores.dtype)
-        return (scores > th.rand_like(scores[..., :1] if self.shared_threshold else scores)).to(scores.dtype)
+        thresholds = th.rand_like(scores[..., : self.n_thresholds])
+        if self.n_thresholds > 1:
+            thresholds = thresholds.repeat_interleave(self.width // self.n_thresholds, dim=-1)
+        return (scores > thresholds).to(scores.dtype)
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
         return estimator.binary(self.squash(logits), q, temperature)
@@ -184,15 +187,13 @@ class Categories(ActionKind):
         return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
 
 
-def make_kinds(
-    action_spaces: Sequence[AgentActionSpace], threshold: float, shared_threshold: bool = True
-) -> list[ActionKind]:
+def make_kinds(action_spaces: Sequence[AgentActionSpace], threshold: float, n_thresholds: int = 1) -> list[ActionKind]:
     """
     Group the agents of a team by how they act.
 
     :param action_spaces: of all agents
     :param threshold: for bits, see ``Bits``
-    :param shared_threshold: for bits, see ``Bits``
+    :param n_thresholds: for bits, see ``Bits``
     """
     groups: dict[str, list[int]] = {}
     for agent, space in enumerate(action_spaces):
@@ -204,7 +205,7 @@ def make_kinds(
         if name == "numbers":
             kinds.append(Continuous(agents, members))
         elif name == "bits":
-            kinds.append(Bits(agents, members, threshold, shared_threshold))
+            kinds.append(Bits(agents, members, threshold, n_thresholds))
         else:
             kinds.append(Categories(agents, members))
     return kinds
@@ -217,7 +218,7 @@ class TeamActions(nn.Module):
 
     :param action_spaces: each agent's action space, categories counting from 0
     :param threshold: for bits, see ``Bits``
-    :param shared_threshold: for bits, see ``Bits``
+    :param n_thresholds: for bits, see ``Bits``
     """
 
     source: th.Tensor
@@ -225,16 +226,15 @@ class TeamActions(nn.Module):
     real: th.Tensor
     target: th.Tensor
     continuous_columns: th.Tensor
+    discrete_columns: th.Tensor
     width: int
     n_agents: int
 
-    def __init__(
-        self, action_spaces: Sequence[AgentActionSpace], threshold: float = 0.5, shared_threshold: bool = True
-    ):
+    def __init__(self, action_spaces: Sequence[AgentActionSpace], threshold: float = 0.5, n_thresholds: int = 1):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
-        self.kinds = make_kinds(action_spaces, threshold, shared_threshold)
+        self.kinds = make_kinds(action_spaces, threshold, n_thresholds)
         self._modules_of_kinds = nn.ModuleList(self.kinds)  # so that their tables move with the module
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()
@@ -281,6 +281,7 @@ class TeamActions(nn.Module):
             ("real", real),
             ("target", target),
             ("continuous_columns", continuous),
+            ("discrete_columns", real & ~continuous),
         ):
             self.register_buffer(name, th.as_tensor(table), persistent=False)
 

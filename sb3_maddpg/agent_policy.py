@@ -29,7 +29,7 @@ class AgentPolicy(nn.Module):
     :param name: of the agent
     :param network: maps observations, (batch, obs_dim), to outputs, (batch, width or more)
     :param columns: which of the outputs are the agent's, see ``TeamActions.columns_of``
-    :param action_space: the agent's, categories counting from 0
+    :param action_space: the agent's
     :param obs_dim: length of its observation
     :param threshold: for bits, see ``Bits``
     """
@@ -37,6 +37,7 @@ class AgentPolicy(nn.Module):
     columns: th.Tensor
     low: th.Tensor
     high: th.Tensor
+    start: th.Tensor
 
     def __init__(
         self,
@@ -54,6 +55,9 @@ class AgentPolicy(nn.Module):
         self.obs_dim = obs_dim
         self.kind: ActionKind = make_kinds([action_space], threshold)[0]
         self.register_buffer("columns", th.tensor(columns))
+        if isinstance(self.kind, Categories):
+            start = th.as_tensor(np.ravel(getattr(action_space, "start", 0)), dtype=th.int64)
+            self.register_buffer("start", start)
         if isinstance(action_space, spaces.Box):
             for bound in ("low", "high"):
                 self.register_buffer(bound, th.as_tensor(getattr(action_space, bound)).float().flatten())
@@ -81,7 +85,7 @@ class AgentPolicy(nn.Module):
         if isinstance(self.kind, Continuous):
             return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
         if isinstance(self.kind, Categories):
-            return actions.unflatten(-1, self.kind.shape).argmax(dim=-1)
+            return actions.unflatten(-1, self.kind.shape).argmax(dim=-1) + self.start
         return actions.to(th.int8)
 
     def predict(self, observation: np.ndarray) -> np.ndarray:

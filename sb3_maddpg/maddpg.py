@@ -20,7 +20,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped
 
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import TeamReplayBuffer, TeamReplayBufferSamples
@@ -183,6 +183,11 @@ class MADDPG(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         self._check_arguments()
         if self.env is not None:
+            if is_vecenv_wrapped(self.env, VecFrameStack):
+                raise ValueError(
+                    "VecFrameStack mixes up whose numbers are where. Stack the frames of each agent by "
+                    "supersuit.frame_stack_v2 on the PettingZoo environment, or in the environment itself."
+                )
             self._read_env(self.env)
         # SB3 knows n_steps of its own buffer only, and would make the buffer of a model that is loaded without an
         # environment, only to predict, at full size
@@ -371,7 +376,7 @@ class MADDPG(OffPolicyAlgorithm):
     def _actor_loss(
         self, data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """:return: the loss, summed over agents, and the actors' outputs, (batch, n_agents, width)"""
+        """:return: the loss, summed over agents, and all scores and probabilities, (batch, any number)"""
         critic, team, action_cost = self.critic, self.policy.actions, self._present_action_cost()
         # The other agents' actions are those of the replay buffer, as in the original code
 
@@ -389,7 +394,7 @@ class MADDPG(OffPolicyAlgorithm):
         with _no_gradients(critic):
             objective = critic.units.objective(ESTIMATORS[self.estimator], critic.to_units(logits), q, temperature)
         losses = self.policy_regularization * team.regularization(logits) - by_agent(objective, critic.units_per_agent)
-        return _mean_over_batch(losses, data.active).sum(), team.squash(logits.detach())
+        return _mean_over_batch(losses, data.active).sum(), team.squash(logits.detach())[:, team.discrete_columns]
 
     def _descend(self, network: Actor | Critic, loss: th.Tensor) -> None:
         network.optimizer.zero_grad()

@@ -164,6 +164,9 @@ class TeamEnv(gymnasium.Env):
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
         if over:
             info["metrics"] = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
+            successes = [told["is_success"] for told in infos.values() if "is_success" in told]
+            if successes:
+                info["is_success"] = all(successes)
         return self._observe(observations, seen), total / n_agents, over and not cut, cut, info
 
     def render(self) -> Any:

@@ -371,8 +371,8 @@ class PairPolicy(MADDPGPolicy):
         views = Views(self.observation_layout, self.team)
         on_neighbours = self.observation_layout.get("acts_on_neighbours", False)
         action_spaces = self.team.action_spaces
-        # Estimators take the bits of a unit to share their threshold
-        actions = TeamActions(action_spaces, self.threshold, self.shared_threshold or not on_neighbours)
+        apart = on_neighbours and not self.shared_threshold
+        actions = TeamActions(action_spaces, self.threshold, views.n_neighbours if apart else 1)
         units = actions
         if on_neighbours:
             parts = [part for space in action_spaces for part in _split(space, views.n_neighbours)]

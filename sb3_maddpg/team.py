@@ -83,6 +83,23 @@ class MixedActions(spaces.Box):
         return f"MixedActions({', '.join(map(str, self.agent_spaces))})"
 
 
+class CategoricalActions(spaces.MultiDiscrete):
+    """
+    The joint action of a team whose agents all choose categories: a ``MultiDiscrete`` of their indices from 0 that
+    remembers the agents' own spaces.
+
+    :param agent_spaces: each agent's action space, all of one length
+    """
+
+    def __init__(self, agent_spaces: Sequence[spaces.Discrete | spaces.MultiDiscrete]):
+        self.agent_spaces = tuple(agent_spaces)
+        super().__init__(np.concatenate([heads_of(space) for space in agent_spaces]))
+
+    def __eq__(self, other: Any) -> bool:
+        same = not isinstance(other, CategoricalActions) or self.agent_spaces == other.agent_spaces
+        return super().__eq__(other) and same
+
+
 def _from_zero(space: AgentActionSpace, action: Any) -> Any:
     return action - space.start if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) else action
 
@@ -127,7 +144,7 @@ def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space
         lows, highs = zip(*map(_bounds, agent_spaces), strict=True)
         return spaces.Box(np.concatenate(lows), np.concatenate(highs), dtype=np.float32)
     if kinds <= {spaces.Discrete, spaces.MultiDiscrete}:
-        return spaces.MultiDiscrete(np.concatenate(sizes))
+        return CategoricalActions(agent_spaces)  # type: ignore[arg-type]
     return MixedActions(agent_spaces)
 
 
@@ -204,7 +221,7 @@ class Team:
 
 
 def _split(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace, ...]:
-    if isinstance(action_space, MixedActions):
+    if isinstance(action_space, (MixedActions, CategoricalActions)):
         parts = action_space.agent_spaces
         if len(parts) != n_agents:
             raise ValueError(f"{action_space} has {len(parts)} agents, but the observation has {n_agents} rows.")

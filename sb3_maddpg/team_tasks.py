@@ -177,7 +177,7 @@ class FollowTarget(TeamTask):
 
 
 class OwnCategory(TeamTask):
-    """One of four categories is to be chosen: the one that the two signs of the own observation count out. It pays 1."""
+    """One of four categories is to be chosen, the one that the two signs of the own observation point to. It pays 1."""
 
     n_agents, action_dim, obs_dim = 3, 1, 2
     optimum, random = 1.0, 1 / 4

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -29,33 +28,6 @@ def suggest(kind: str, name: str, known: Iterable[str]) -> str:
     if nearest:
         return f"Unknown {kind} '{name}': did you mean '{nearest[0]}'?"
     return f"Unknown {kind} '{name}'. There are: {', '.join(known)}."
-
-
-def team_shape(observation_space: spaces.Space, action_space: spaces.Space) -> tuple[int, int, int]:
-    """
-    Read the team out of its spaces and refuse spaces that do not describe one.
-
-    :param observation_space: ``Box(n_agents, obs_dim)``
-    :param action_space: flat joint action, ``MultiBinary(n_agents * action_dim)`` or ``Box(n_agents * action_dim)``
-    :return: ``n_agents``, ``obs_dim`` and ``action_dim`` (both per agent)
-    """
-    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 2:
-        raise ValueError(
-            f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. "
-            "Stack the agents' observations along a first axis; pad them if they differ in length."
-        )
-    if action_space.shape is None or len(action_space.shape) != 1:
-        raise ValueError(
-            f"A team action is flat, of length n_agents * action_dim, not {action_space}. "
-            "Flatten it in the environment and reshape it there to (n_agents, action_dim)."
-        )
-    (n_agents, obs_dim), (n_actions,) = observation_space.shape, action_space.shape
-    if n_actions % n_agents:
-        raise ValueError(
-            f"A joint action of {n_actions} numbers cannot be shared out evenly among {n_agents} agents. "
-            "Give every agent the same number of actions; pad the shorter ones."
-        )
-    return n_agents, obs_dim, n_actions // n_agents
 
 
 def describe_env(env: VecEnv) -> dict[str, Any] | None:

@@ -138,7 +138,7 @@ def test_the_best_action_is_that_of_the_highest_score(kind):
 @pytest.mark.parametrize("shared", [True, False])
 def test_exploring_bits_are_drawn_with_their_scores(shared):
     n = 20_000
-    actions = TeamActions([spaces.MultiBinary(3)] * 4, shared_threshold=shared)
+    actions = TeamActions([spaces.MultiBinary(3)] * 4, n_thresholds=1 if shared else 3)
     th.manual_seed(0)
     logits = th.randn(1, 4, 3)
     scores, bits = actions.squash(logits)[0], actions.act(logits.expand(n, -1, -1), deterministic=False)
@@ -151,6 +151,14 @@ def test_exploring_bits_are_drawn_with_their_scores(shared):
     correlation = th.corrcoef(bits.flatten(1).T)
     independent = th.ones(12, 12) - (th.block_diag(*[th.ones(3, 3)] * 4) if shared else th.eye(12))
     assert (correlation * independent).abs().max() < 0.05
+
+
+def test_parts_of_an_agents_bits_may_have_thresholds_of_their_own():
+    actions = TeamActions([spaces.MultiBinary(4)], n_thresholds=2)
+    bits = actions.act(th.zeros(1000, 1, 4), deterministic=False)[:, 0]
+    assert th.equal(bits[:, 0], bits[:, 1])
+    assert th.equal(bits[:, 2], bits[:, 3])
+    assert not th.equal(bits[:, 0], bits[:, 2])
 
 
 def test_exploring_categories_are_drawn_with_their_probabilities():

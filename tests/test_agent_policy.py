@@ -66,7 +66,9 @@ def team_actions(model: MADDPG, n: int = 40) -> list[tuple[AgentPolicy, np.ndarr
     team = model.policy.team
     ends = np.cumsum([len(heads_of(space)) for space in team.action_spaces])[:-1]
     rows = zip(team.names, np.split(joint, ends, axis=1), strict=True)
-    policies = [(model.agent_policy(name), part) for name, part in rows]
+    # The joint action counts categories from 0, an agent's own as its space does
+    spaces_of = zip(rows, team.action_spaces, strict=True)
+    policies = [(model.agent_policy(name), part + getattr(space, "start", 0)) for (name, part), space in spaces_of]
     return [(policy, obs[:, agent, : policy.obs_dim], part) for agent, (policy, part) in enumerate(policies)]
 
 

@@ -39,7 +39,7 @@ def test_expected_solves_every_binary_task(task):
 
 @pytest.mark.parametrize("estimator", sorted(set(ESTIMATORS) - {"expected"}))
 def test_the_other_estimators_solve_a_task_without_interplay_of_bits(estimator):
-    assert learned(OwnBit, estimator=estimator) > 0.9
+    assert learned(OwnBit, estimator=estimator) > 0.85
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

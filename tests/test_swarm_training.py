@@ -129,5 +129,5 @@ def test_not_a_number_is_named(tmp_path):
     model = MADDPG("MlpPolicy", quad_swarm.QuadSwarmEnv(), **SMALL)
     observation = np.zeros((4, 24), dtype=np.float32)
     observation[2, 5] = np.nan
-    with pytest.raises(ValueError, match=r"agent\(s\) \[2\]"):
+    with pytest.raises(ValueError, match=r"agent\(s\) robot_2"):
         model.predict(observation)

@@ -26,8 +26,10 @@ class QuadSwarmParallelEnv(ParallelEnv):
     def __init__(self, render_mode: str | None = None, **kwargs: Any):
         self.team = QuadSwarmEnv(render_mode=render_mode, **kwargs)
         self.render_mode = render_mode
+        self.observation_layout = self.team.observation_layout
+        self.action_cost = self.team.action_cost
         n, size = self.team.observation_space.shape  # type: ignore[misc]
-        self.possible_agents = [f"robot_{i}" for i in range(n)]
+        self.possible_agents = list(self.team.agent_names)
         self.agents: list[str] = []
         self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, (size,), np.float32) for a in self.possible_agents}
         self.action_spaces = {a: spaces.MultiBinary(n - 1) for a in self.possible_agents}
