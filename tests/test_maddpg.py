@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
 from sb3_maddpg import MADDPG, parallel
@@ -198,3 +198,9 @@ class Misshapen(gymnasium.Env):
 def test_spaces_that_are_no_team_are_refused(observation_space, action_space, message):
     with pytest.raises(ValueError, match=message):
         MADDPG("MlpPolicy", Misshapen(observation_space, action_space))
+
+
+def test_stacked_frames_are_refused():
+    env = VecFrameStack(DummyVecEnv([OwnBit]), 2)
+    with pytest.raises(ValueError, match=r"supersuit\.frame_stack_v2"):
+        MADDPG("MlpPolicy", env)

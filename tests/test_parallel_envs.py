@@ -131,6 +131,9 @@ def test_the_swarm_is_the_same_from_both_sides():
         assert reward2 == pytest.approx(reward, rel=1e-12)
         assert ends == ends2
         assert info2["agent_infos"]["robot_3"]["metrics"].keys() == info["metrics"].keys()
+    assert info2["is_success"] == info["is_success"]
+    for name in ("agent_names", "observation_layout", "action_cost"):
+        assert getattr(env, name) == single.get_wrapper_attr(name)
 
 
 @pytest.mark.parametrize(
