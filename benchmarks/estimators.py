@@ -1,5 +1,5 @@
 """
-How well each estimator of the gradient through the threshold learns the binary team tasks.
+How well each estimator of the gradient through bits and categories learns the small team tasks.
 
 ``python benchmarks/estimators.py [--seeds 5] [--json FILE]``
 """
@@ -15,7 +15,7 @@ import torch as th
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.estimators import ESTIMATORS
-from sb3_maddpg.team_tasks import BINARY_TASKS, TeamTask
+from sb3_maddpg.team_tasks import BINARY_TASKS, OwnCategory, TeamTask
 from sb3_maddpg.utils import atomic_write
 
 # Same for every estimator; the steps after which the deterministic policy is measured.
@@ -65,13 +65,13 @@ def main() -> None:
     print(
         "Return of the deterministic policy after so many steps: 0 random actions, 1 optimum; mean and 95 % interval."
     )
-    print(f"{'task':10} {'estimator':17}" + "".join(f"{steps:>15}" for steps in CHECKPOINTS))
+    print(f"{'task':12} {'estimator':24}" + "".join(f"{steps:>15}" for steps in CHECKPOINTS))
     rows = []
-    for task in BINARY_TASKS:
+    for task in (*BINARY_TASKS, OwnCategory):
         for estimator in ESTIMATORS:
             curves = [learning_curve(task, estimator, seed) for seed in range(arguments.seeds)]
             cells = [cell(returns) for returns in zip(*curves, strict=True)]
-            print(f"{task.__name__:10} {estimator:17}" + "".join(f"{text:>15}" for text in cells), flush=True)
+            print(f"{task.__name__:12} {estimator:24}" + "".join(f"{text:>15}" for text in cells), flush=True)
             rows.append({"task": task.__name__, "estimator": estimator, "steps": CHECKPOINTS, "returns": curves})
     if arguments.json is not None:
         with atomic_write(arguments.json, suffix="json") as file:
