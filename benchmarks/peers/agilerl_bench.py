@@ -10,10 +10,12 @@ that did not terminate; and the loop evaluates, here once at the end.
 from typing import Any
 
 import numpy as np
+import torch as th
 from agilerl.algorithms import MADDPG
 from agilerl.components.replay_buffer import ReplayBuffer
 from agilerl.training.train_multi_agent_off_policy import train_multi_agent_off_policy
 from pettingzoo.utils.wrappers import BaseParallelWrapper
+from torch import nn
 
 import common
 
@@ -52,6 +54,17 @@ class Renamed(BaseParallelWrapper):
     def rename(self, values: dict) -> dict:
         """The same values under the new names."""
         return {self.names[agent]: value for agent, value in values.items()}
+
+
+class Policy(nn.Module):
+    """An actor and the scale of its actions."""
+
+    def __init__(self, actor: nn.Module):
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return self.actor.rescale_output_action(self.actor(obs))  # type: ignore[operator]
 
 
 class AgileRL:
@@ -121,6 +134,10 @@ class AgileRL:
         batch = {names[agent]: observation[None] for agent, observation in observations.items()}
         actions, _ = self.agent.get_action(batch)
         return {agent: actions[name][0] for agent, name in names.items()}
+
+    def network(self, agent: str) -> nn.Module:
+        self.agent.set_training_mode(False)
+        return Policy(self.agent.actors[agent.replace("_", "")])
 
 
 if __name__ == "__main__":

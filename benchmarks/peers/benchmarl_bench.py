@@ -47,6 +47,13 @@ class StartClock(Callback):
             self.clock.start()
 
 
+class Squash(nn.Module):
+    """Its ``TanhDelta`` on [0, 1], which adds the middle of the bounds before the hyperbolic tangent."""
+
+    def forward(self, outputs: th.Tensor) -> th.Tensor:
+        return 0.5 * ((outputs + 0.5).tanh() + 1.0)
+
+
 class BenchMARL:
     """Its ``Experiment``, without loggers and evaluation."""
 
@@ -120,6 +127,24 @@ class BenchMARL:
                 chosen = self.experiment.algorithm.get_policy_for_loss(group)(batch)[group, "action"]
                 actions |= dict(zip(agents, chosen.numpy(), strict=True))
         return actions
+
+    def network(self, agent: str) -> nn.Module:
+        group = next(group for group, agents in self.experiment.group_map.items() if agent in agents)
+        policy = self.experiment.algorithm.get_policy_for_loss(group)
+        row = self.experiment.group_map[group].index(agent)
+        # The parameters of the whole group, stacked; what comes after the last layer is its TanhDelta on [0, 1]
+        parameters = [
+            (name, weights[row].detach()) for name, weights in policy.named_parameters() if len(weights.shape) > 1
+        ]
+        biases = [values for name, values in parameters if name.endswith("bias")]
+        layers: list[nn.Module] = []
+        for weight, bias in zip(
+            (values for name, values in parameters if name.endswith("weight")), biases, strict=True
+        ):
+            linear = nn.Linear(weight.shape[1], weight.shape[0])
+            linear.load_state_dict({"weight": weight, "bias": bias})
+            layers += [linear, nn.ReLU()]
+        return nn.Sequential(*layers[:-1], Squash())
 
 
 if __name__ == "__main__":

@@ -3,9 +3,10 @@
 A driver runs in the Python of its own library and prints one line of JSON::
 
     python benchmarks/peers/xuance_bench.py speed --networks separate
-    python benchmarks/peers/xuance_bench.py learn --env simple_tag_v3 --steps 100000 --seed 0
+    python benchmarks/peers/xuance_bench.py learn --env simple_tag_v3 --steps 100000 --seed 0 --export actors
 
-It stays on one core and one thread, works in a scratch directory, and sends all that the library prints to stderr.
+With ``--export`` it leaves each agent's policy as a TorchScript program, so that other libraries' agents can play with
+it. It stays on one core and one thread, works in a scratch directory, and sends all that the library prints to stderr.
 """
 
 import argparse
@@ -20,10 +21,12 @@ import time
 import warnings
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch as th
+from torch import nn
 
 # Lowe et al. (2017) and https://github.com/openai/maddpg, but for the start: there it is 25,600 steps
 LEARNING_RATE = 1e-2
@@ -99,6 +102,12 @@ class Driver(Protocol):
         :return: its action without exploration
         """
 
+    def network(self, agent: str) -> nn.Module:
+        """
+        :param agent: of separate networks
+        :return: what ``act`` does for it, observations (batch, obs_dim) to actions in the environment's units
+        """
+
 
 def parallel_env(name: str) -> Any:
     """
@@ -147,6 +156,51 @@ def evaluate(driver: Driver, name: str) -> dict[str, float]:
     return returns
 
 
+class Clipped(nn.Module):
+    """A policy that keeps to the bounds of its actions, as ``evaluate`` does."""
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, network: nn.Module, low: np.ndarray, high: np.ndarray):
+        super().__init__()
+        self.network = network
+        self.register_buffer("low", th.from_numpy(low))
+        self.register_buffer("high", th.from_numpy(high))
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return self.network(obs).clamp(self.low, self.high)
+
+
+def export(driver: Driver, name: str, folder: Path) -> None:
+    """
+    Write the policy of each agent as ``agent.pt``: TorchScript, observations (batch, obs_dim) to actions.
+
+    :param driver: trained
+    :param name: environment
+    :param folder: for the files
+    :raises AssertionError: a program does not act as the driver does
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    env = parallel_env(name)
+    programs = {}
+    for agent in env.possible_agents:
+        space, obs_dim = env.action_space(agent), env.observation_space(agent).shape[0]
+        policy = Clipped(driver.network(agent), space.low, space.high).eval().requires_grad_(False)
+        example, other = th.zeros(2, obs_dim), th.linspace(-2.0, 2.0, 5 * obs_dim).view(5, -1)
+        th.jit.save(th.jit.trace(policy, example, check_inputs=[(other,)]), str(folder / f"{agent}.pt"))
+        programs[agent] = th.jit.load(str(folder / f"{agent}.pt"))
+    for seed in range(4):
+        observations, _ = env.reset(seed=seed)
+        while env.agents:
+            actions = {}
+            for agent, action in driver.act(observations).items():
+                space = env.action_space(agent)
+                actions[agent] = programs[agent](th.from_numpy(observations[agent])[None]).numpy()[0]
+                np.testing.assert_allclose(actions[agent], np.clip(action, space.low, space.high), atol=1e-5)
+            observations, *_ = env.step(actions)
+
+
 def rates(name: str, count: int, clock: Clock) -> dict[str, float]:
     """
     :param name: of the rate
@@ -187,6 +241,8 @@ def learn(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
     driver = make(Task(arguments.env, arguments.steps, arguments.train_freq, shared, arguments.seed))
     driver.train(0, clock)
     returns = evaluate(driver, arguments.env)
+    if arguments.export:
+        export(driver, arguments.env, arguments.export)
     return {
         "env": arguments.env,
         "seed": arguments.seed,
@@ -218,11 +274,15 @@ def main(library: str, distribution: str, make: type[Driver]) -> None:
     training.add_argument("--env", default="simple_spread_v3", help="module of mpe2")
     training.add_argument("--steps", type=int, default=100_000)
     training.add_argument("--train-freq", type=int, default=100, help="environment steps per update (default 100)")
+    training.add_argument("--export", type=lambda path: Path(path).resolve(), metavar="FOLDER",
+                          help="write each agent's policy there, separate networks only")  # fmt: skip
     for mode in (measure, training):
         mode.add_argument("--networks", choices=("separate", "shared"), default="separate")
         mode.add_argument("--seed", type=int, default=0)
         mode.add_argument("--core", type=int, help="pin to this core (default: the last one that is allowed)")
     arguments = parser.parse_args()
+    if arguments.mode == "learn" and arguments.export and arguments.networks == "shared":
+        parser.error("--export is for separate networks")
 
     if hasattr(os, "sched_setaffinity"):
         core = max(os.sched_getaffinity(0)) if arguments.core is None else arguments.core

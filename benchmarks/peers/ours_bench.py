@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from torch import nn
 
 import common
 from sb3_maddpg import MADDPG
@@ -11,11 +12,12 @@ from sb3_maddpg import MADDPG
 class Ours:
     """``MADDPG`` on the environment as PettingZoo has it."""
 
+    algorithm: type[MADDPG] = MADDPG
     first_update = common.LEARNING_STARTS
 
     def __init__(self, task: common.Task) -> None:
         self.task = task
-        self.model = MADDPG(
+        self.model = self.algorithm(
             "MlpPolicy",
             common.parallel_env(task.env),
             learning_rate=common.LEARNING_RATE,
@@ -52,6 +54,9 @@ class Ours:
 
     def act(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {agent: self.policies[agent].predict(observation) for agent, observation in observations.items()}
+
+    def network(self, agent: str) -> nn.Module:
+        return self.policies[agent]
 
 
 if __name__ == "__main__":

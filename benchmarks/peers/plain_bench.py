@@ -84,6 +84,9 @@ class Plain:
                 for agent, actor in zip(self.agents, self.actors, strict=True)
             }
 
+    def network(self, agent: str) -> nn.Module:
+        return nn.Sequential(*self.actors[self.agents.index(agent)], nn.Sigmoid())
+
     def update(self) -> None:
         rows = self.rng.integers(min(self.size, common.BUFFER_SIZE), size=common.BATCH_SIZE)
         obs, actions, next_obs, rewards, dones = (th.from_numpy(storage[rows]) for storage in self.buffer)

@@ -8,8 +8,10 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import torch as th
 import xuance
 import yaml
+from torch import nn
 
 import common
 
@@ -17,6 +19,17 @@ common.restore_pettingzoo_mpe()
 
 from xuance.environment import make_envs  # noqa: E402
 from xuance.torch.agents import MADDPG_Agents  # noqa: E402
+
+
+class Policy(nn.Module):
+    """An actor after its representation, which answers with a dictionary."""
+
+    def __init__(self, representation: nn.Module, actor: nn.Module):
+        super().__init__()
+        self.representation, self.actor = representation, actor
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return self.actor(self.representation(obs)["state"])
 
 
 class XuanCe:
@@ -70,6 +83,10 @@ class XuanCe:
 
     def act(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return self.agents.get_actions([observations], test_mode=True)["actions"][0]
+
+    def network(self, agent: str) -> nn.Module:
+        policy = self.agents.policy
+        return Policy(policy.actor_representation[agent], policy.actor[agent])
 
 
 if __name__ == "__main__":

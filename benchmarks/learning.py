@@ -1,0 +1,206 @@
+"""How well MADDPG learns here and in other libraries, on the tasks of Lowe et al. (mpe2, continuous actions).
+
+``python benchmarks/learning.py [--json F]`` trains ours and the plain loop; with ``--peers`` all libraries, which
+``make bench-peers`` installs. Every training has the settings of benchmarks/peers/common.py, one core and one thread.
+Each that has ended is a line of runs.jsonl in ``--folder``, beside its policies: the script trains only what is not
+there yet, so it can be stopped and called again. Rows, for each task, side and library:
+
+- ``return``: mean return of an agent over 100 episodes without exploration, the mean over the seeds of the training,
+  with a 95 % t-interval. On tag and adversary, where one side gains what the other loses, it is each side's return
+  against those it trained with, which says little: see crossplay.py.
+- ``ours_minus``: how much better ours does than this library, with a 95 % interval of Welch;
+- ``cpu_s``: processor time of a training, median.
+
+``--no-train`` only prints what is there.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats  # type: ignore[import-untyped]
+
+# So that scripts find each other by the names mypy knows them by
+sys.path[0] = str(Path(__file__).resolve().parent.parent)
+
+from benchmarks.training import DRIVERS, OURS, REFERENCE, ROOT, machine, missing, python_of  # noqa: E402
+
+TASKS = ("simple_speaker_listener_v4", "simple_tag_v3", "simple_adversary_v3", "simple_spread_v3")
+TWIN = "matd3"
+EVERYTHING = (OURS, REFERENCE, "xuance", "agilerl", "benchmarl", TWIN)
+# Seeds of each training; the slow ones have fewer
+SEEDS = {OURS: 5, REFERENCE: 5, "xuance": 5, "agilerl": 3, "benchmarl": 1, TWIN: 3}
+FOLDER = ROOT / "logs" / "learning"
+
+Row = dict[str, Any]
+
+
+def sides(agents: Iterable[str]) -> dict[str, list[str]]:
+    """The agents of each side: one for all, unless some are adversaries."""
+    teams: dict[str, list[str]] = {}
+    names = list(agents)
+    against = any(name.startswith("adversary") for name in names)
+    for name in names:
+        side = name.rpartition("_")[0] if against else "all"
+        teams.setdefault("good" if side == "agent" else side, []).append(name)
+    return teams
+
+
+def interval(values: Sequence[float]) -> tuple[float, float]:
+    """
+    :param values: independent, such as one a seed
+    :return: mean, and half the width of its 95 % t-interval; NaN for one value
+    """
+    if len(values) < 2:
+        return float(np.mean(values)), float("nan")
+    error = np.std(values, ddof=1) / len(values) ** 0.5
+    return float(np.mean(values)), float(stats.t.ppf(0.975, len(values) - 1) * error)
+
+
+def welch(first: Sequence[float], second: Sequence[float]) -> tuple[float, float]:
+    """
+    :return: difference of the means, and half the width of its 95 % interval; NaN where one has a single value
+    """
+    difference = float(np.mean(first) - np.mean(second))
+    if min(len(first), len(second)) < 2:
+        return difference, float("nan")
+    a, b = (np.var(values, ddof=1) / len(values) for values in (first, second))
+    freedom = (a + b) ** 2 / (a**2 / (len(first) - 1) + b**2 / (len(second) - 1))
+    return difference, float(stats.t.ppf(0.975, freedom) * (a + b) ** 0.5)
+
+
+def read(folder: Path) -> list[Row]:
+    """The trainings that have ended."""
+    path = folder / "runs.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def write(path: Path, rows: Iterable[Row]) -> None:
+    """One JSON object a row, null where there is no interval."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    clean = ({key: None if value != value else value for key, value in row.items()} for row in rows)
+    path.write_text("".join(json.dumps(row) + "\n" for row in clean))
+
+
+def actors_of(folder: Path, name: str, env: str, seed: int, steps: int) -> Path:
+    """Where a training leaves its policies."""
+    return folder / env / f"{name}_{seed}_{steps}"
+
+
+def train(name: str, env: str, seed: int, steps: int, folder: Path, core: int | None) -> Row:
+    """
+    Run a driver once.
+
+    :raises RuntimeError: it failed
+    """
+    command = [str(python_of(name)), str(DRIVERS / f"{name}_bench.py"), "learn", "--env", env]
+    command += ["--steps", str(steps), "--seed", str(seed), "--export", str(actors_of(folder, name, env, seed, steps))]
+    command += [] if core is None else ["--core", str(core)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if run.returncode:
+        raise RuntimeError(f"{name}, {env}, seed {seed}: {' '.join(command)}\n{run.stderr[-2000:]}")
+    return {"driver": name, **json.loads(run.stdout.splitlines()[-1]), "machine": machine()}
+
+
+def summarise(runs: Iterable[Row]) -> list[Row]:
+    """One row a task, side and library: the mean over the seeds."""
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for run in runs:
+        for side in sides(run["returns"]):
+            groups.setdefault((run["env"], side, run["driver"]), []).append(run)
+    scores = {
+        (env, side, name): [
+            float(np.mean([run["returns"][agent] for agent in sides(run["returns"])[side]])) for run in group
+        ]
+        for (env, side, name), group in groups.items()
+    }
+    rows = []
+    for (env, side, name), group in groups.items():
+        mean, half = interval(scores[env, side, name])
+        row = {
+            "env": env,
+            "side": side,
+            "driver": name,
+            **{key: group[0][key] for key in ("library", "version", "steps", "train_freq", "machine")},
+            "seeds": len(group),
+            "return": mean,
+            "interval": half,
+            "returns": scores[env, side, name],
+            "cpu_s": float(np.median([run["training_cpu_s"] for run in group])),
+        }
+        if name != OURS and (env, side, OURS) in scores:
+            row["ours_minus"], row["ours_minus_interval"] = welch(scores[env, side, OURS], scores[env, side, name])
+        rows.append(row)
+    return sorted(rows, key=lambda row: (TASKS.index(row["env"]), row["side"], EVERYTHING.index(row["driver"])))
+
+
+def report(rows: Iterable[Row]) -> None:
+    """Print the table."""
+    labels = f"{'task':27} {'side':10} {'library':17} seeds"
+    print(f"{labels} {'return':>8} {'+-':>6} {'ours_minus':>11} {'+-':>6} {'cpu_s':>6}")
+    for row in rows:
+        labels = f"{row['env']:27} {row['side']:10} {row['library']:17} {row['seeds']:5d}"
+        difference = f"{row['ours_minus']:11.2f} {row['ours_minus_interval']:6.2f}" if "ours_minus" in row else 18 * " "
+        print(f"{labels} {row['return']:8.2f} {row['interval']:6.2f} {difference} {row['cpu_s']:6.0f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a row")
+    parser.add_argument("--peers", action="store_true", help="the other libraries too, and MATD3")
+    parser.add_argument("--only", nargs="+", choices=EVERYTHING, help="these libraries")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS[:3])
+    parser.add_argument("--seeds", type=int, help="as many for each library (default: more for the fast ones)")
+    parser.add_argument("--steps", type=int, default=50_000, help="of the environment, of each training")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="where the trainings are (default logs/learning)")
+    parser.add_argument("--no-train", action="store_true", help="print what is there")
+    parser.add_argument("--core", type=int, help="pin to this core (default: the last one that is allowed)")
+    args = parser.parse_args()
+
+    names = args.only or (EVERYTHING if args.peers else (OURS, REFERENCE))
+    for name in names:
+        if not args.no_train and (command := missing(name)):
+            print(f"{name} is left out, it is not installed: {command}", file=sys.stderr, flush=True)
+    available = [name for name in names if not missing(name)]
+    wanted = {name: args.seeds or SEEDS[name] for name in available}
+    failures = 0
+    # Seed by seed, so that whatever is there at any time compares the same seeds
+    for seed in range(0 if args.no_train else max(wanted.values(), default=0)):
+        for name, env in [(name, env) for name in available for env in args.tasks if seed < wanted[name]]:
+            key = (name, env, seed, args.steps)
+            if key in {(run["driver"], run["env"], run["seed"], run["steps"]) for run in read(args.folder)}:
+                continue
+            started = time.perf_counter()
+            try:
+                run = train(name, env, seed, args.steps, args.folder, args.core)
+            except RuntimeError as error:
+                failures += 1
+                print(f"FAILED {error}", file=sys.stderr, flush=True)
+                continue
+            args.folder.mkdir(parents=True, exist_ok=True)
+            with (args.folder / "runs.jsonl").open("a") as file:
+                file.write(json.dumps(run) + "\n")
+            returns = "  ".join(f"{agent} {value:.2f}" for agent, value in run["returns"].items())
+            print(f"{time.perf_counter() - started:4.0f} s {name} {env} {seed}: {returns}", file=sys.stderr, flush=True)
+    rows = summarise(
+        run
+        for run in read(args.folder)
+        if run["steps"] == args.steps and run["driver"] in names and run["env"] in args.tasks
+    )
+    report(rows)
+    if args.json:
+        write(args.json, rows)
+    if failures:
+        sys.exit(f"{failures} failed, see above.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,304 @@
+"""It learns what others learn: the particle worlds of Lowe et al. (2017), by the packaged recipes.
+
+``python benchmarks/mpe.py [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
+runs ``python -m sb3_maddpg.zoo train`` for each environment, algorithm and seed, with an evaluation of 100 episodes
+without noise every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json. Finished runs in
+``--log-folder`` that were trained by the present recipe are not trained again. Actions are continuous, except where the
+environment is followed by ``:discrete``.
+
+Returns are means over the agents, as the zoo evaluates them: of teams with opponents (tag, adversary) the mean tells
+little, since all learn. Hence each run also says what the agents get by the last policy, ``agents``.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+MODULES = {
+    "simple_spread": "mpe2/simple_spread_v3",
+    "simple_speaker_listener": "mpe2/simple_speaker_listener_v4",
+    "simple_tag": "mpe2/simple_tag_v3",
+    "simple_adversary": "mpe2/simple_adversary_v3",
+}
+ENVS = (*MODULES, "simple_spread:discrete")
+EVAL_FREQ, EVAL_EPISODES = 10_000, 100
+SHOWN = (50_000, 100_000)
+# What a new implementation should reach, mean of the seeds: a little worse than XuanCe and a plain PyTorch loop
+BARS = {("simple_spread", 50_000): -21.0, ("simple_spread", 100_000): -19.5}
+PACKAGES = ("sb3-maddpg", "stable-baselines3", "rl_zoo3", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2")
+
+Row = dict[str, Any]
+
+
+class Run(NamedTuple):
+    """One training."""
+
+    env: str
+    algo: str
+    actions: str
+    seed: int
+    steps: int
+    log_folder: Path
+
+    @property
+    def folder(self) -> Path:
+        """Its own log folder."""
+        return self.log_folder / f"{self.env}-{self.actions}-{self.algo}-seed{self.seed}"
+
+    @property
+    def continuous(self) -> bool:
+        """Whether actions are continuous."""
+        return self.actions == "continuous"
+
+    @property
+    def command(self) -> list[str]:
+        """The command line behind ``python``, but for the log folder."""
+        command = ["-m", "sb3_maddpg.zoo", "train", "--algo", self.algo, "--env", MODULES[self.env]]
+        command += ["--seed", str(self.seed), "-n", str(self.steps), "--eval-freq", str(EVAL_FREQ)]
+        command += ["--eval-episodes", str(EVAL_EPISODES), "--log-interval", "-2"]
+        return command if self.continuous else [*command, "--env-kwargs", "continuous_actions:False"]
+
+    def finished(self) -> Path | None:
+        """Where it was trained to the end by the present recipe, if it was."""
+        name = MODULES[self.env].replace("/", "-")
+        recipe = {**_recipe(self.algo, MODULES[self.env]), "env_kwargs": {"continuous_actions": self.continuous}}
+        beside = {"eval_env_kwargs"} | ({"estimator", "temperature"} if self.continuous else set())
+        for folder in sorted((self.folder / self.algo).glob(f"{name}_*")):
+            model, curve, config = (folder / part for part in (f"{name}.zip", "evaluations.npz", f"{name}/config.yml"))
+            if not (model.exists() and curve.exists() and config.exists()):
+                continue
+            trained_by = yaml.load(config.read_text(), yaml.UnsafeLoader)  # our own; rl_zoo3 writes an OrderedDict
+            if any(trained_by.get(key) != recipe.get(key) for key in (trained_by.keys() | recipe.keys()) - beside):
+                continue
+            timesteps, results = (np.load(curve)[key] for key in ("timesteps", "results"))
+            expected = np.arange(EVAL_FREQ, self.steps + 1, EVAL_FREQ)
+            if np.array_equal(timesteps, expected) and results.shape[1] == EVAL_EPISODES:
+                return folder
+        return None
+
+    def train(self) -> None:
+        """
+        Train, unless that is done.
+
+        :raises RuntimeError: it failed
+        """
+        if self.finished():
+            print(f"{self.label}: done before", flush=True)
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "commit").write_text(_commit())
+        began = time.perf_counter()
+        with (self.folder / "train.log").open("w") as log:
+            environment = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", **os.environ}
+            command = [sys.executable, *self.command, "--log-folder", str(self.folder)]
+            code = subprocess.run(command, cwd=ROOT, env=environment, stdout=log, stderr=log, check=False).returncode
+        if code or not (folder := self.finished()):
+            raise RuntimeError(f"{self.label} ended with status {code}, see {log.name}")
+        last = np.load(folder / "evaluations.npz")["results"][-1].mean()
+        print(f"{self.label}: {last:.2f} after {time.perf_counter() - began:.0f} s", flush=True)
+
+    @property
+    def label(self) -> str:
+        """What to call it."""
+        return f"{self.env} {self.actions} {self.algo} seed {self.seed}"
+
+    def row(self) -> Row | None:
+        """What is reported of it, once it is finished."""
+        folder = self.finished()
+        if folder is None:
+            return None
+        evaluations = np.load(folder / "evaluations.npz")
+        agents = folder / "agents.json"
+        if not agents.exists():
+            returns = returns_by_agent(next(folder.glob("mpe2-*.zip")), self)
+            agents.write_text(json.dumps(returns))
+        return {
+            "env": MODULES[self.env],
+            "actions": self.actions,
+            "algo": self.algo,
+            "seed": self.seed,
+            "timesteps": evaluations["timesteps"].tolist(),
+            "mean_return": evaluations["results"].mean(axis=1).round(4).tolist(),
+            "agents": json.loads(agents.read_text()),
+            "command": " ".join(["python", *self.command]),
+            "commit": (self.folder / "commit").read_text(),
+        }
+
+
+def _recipe(algo: str, env_id: str) -> Row:
+    return yaml.safe_load((ROOT / "zoo_configs" / f"{algo}.yml").read_text())[env_id]
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
+    """
+    :param model: a trained model
+    :param run: how it was trained
+    :return: each agent's mean return over ``EVAL_EPISODES`` episodes without noise
+    """
+    from sb3_maddpg import MADDPG, parallel
+    from sb3_maddpg.matd3 import MATD3
+
+    team = parallel.make(MODULES[run.env].replace("/", "."), continuous_actions=run.continuous)
+    algorithm: type[MADDPG] = MATD3 if run.algo == "matd3" else MADDPG
+    policy = algorithm.load(model, device="cpu")
+    totals = np.zeros(len(team.agent_names))
+    for episode in range(EVAL_EPISODES):
+        obs, _ = team.reset(seed=EVAL_EPISODES * (run.seed + 1000) + episode)
+        over = False
+        while not over:
+            action, _ = policy.predict(obs, deterministic=True)
+            obs, _, terminated, truncated, info = team.step(action)
+            totals += info["agent_rewards"]
+            over = terminated or truncated
+    team.close()
+    return dict(zip(team.agent_names, (totals / EVAL_EPISODES).round(3).tolist(), strict=True))
+
+
+def interval(values: Sequence[float]) -> float:
+    """:return: half of the 95 % interval of the mean, by Student's t"""
+    from scipy.stats import t  # type: ignore[import-untyped]
+
+    return float(t.ppf(0.975, len(values) - 1)) * stdev(values) / len(values) ** 0.5 if len(values) > 1 else np.nan
+
+
+def grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
+    """:return: the seeds of each environment, kind of actions and algorithm"""
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["env"], row["actions"], row["algo"]), []).append(row)
+    return groups
+
+
+def report(rows: Sequence[Row]) -> None:
+    """Print the table."""
+    print(f"\nReturn, mean over the agents, of the policy without noise ({EVAL_EPISODES} episodes); 95 % t-interval.")
+    print(f"{'environment':32} {'actions':11} {'algorithm':9} {'seeds':>5}" + "".join(f"{at:>24,}" for at in SHOWN))
+    for (env, actions, algo), seeds in grouped(rows).items():
+        line = f"{env:32} {actions:11} {algo:9} {len(seeds):5}"
+        short = {module: name for name, module in MODULES.items()}[env]
+        for at in SHOWN:
+            values = [row["mean_return"][row["timesteps"].index(at)] for row in seeds if at in row["timesteps"]]
+            cell = f"{mean(values):.2f} ± {interval(values):.2f}" if values else "-"
+            if values and (bar := BARS.get((short, at))) is not None:
+                cell += f" ({'better' if mean(values) > bar else 'WORSE'} than {bar:g})"
+            line += f"{cell:>24}" if len(cell) < 24 else f"  {cell}"
+        print(line)
+        last = {name: [row["agents"][name] for row in seeds] for name in seeds[0]["agents"]}
+        print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))
+
+
+def plot(rows: Sequence[Row], file: Path) -> None:
+    """Draw the learning curves, a panel an environment, with 95 % t-intervals."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    groups = grouped(rows)
+    envs = list(dict.fromkeys(env for env, _, _ in groups))
+    # Okabe and Ito's colours
+    kinds = [("continuous", "maddpg"), ("discrete", "maddpg"), ("continuous", "matd3"), ("discrete", "matd3")]
+    styles = dict(zip(kinds, [("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#CC79A7", ":")], strict=True))
+    figure, axes = plt.subplots(1, len(envs), figsize=(3.6 * len(envs), 3.2), squeeze=False, layout="constrained")
+    for axis, env in zip(axes[0], envs, strict=True):
+        for (of, actions, algo), seeds in groups.items():
+            if of != env:
+                continue
+            colour, style = styles[actions, algo]
+            steps = np.array(seeds[0]["timesteps"]) / 1000
+            curves = np.array([row["mean_return"] for row in seeds])
+            middle, half = curves.mean(axis=0), [interval(values.tolist()) for values in curves.T]
+            name = f"{algo.upper()}, {actions} ({len(seeds)} seeds)"
+            axis.plot(steps, middle, style, color=colour, label=name)
+            axis.fill_between(steps, middle - half, middle + half, color=colour, alpha=0.2, linewidth=0)
+        axis.set(title=env.removeprefix("mpe2/"), xlabel="thousand steps")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize="x-small")
+    axes[0, 0].set_ylabel("return, mean over agents")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=150)
+    print(f"Figure: {file}")
+
+
+def write(rows: Sequence[Row], file: Path) -> None:
+    """Write the results, and with what they were obtained."""
+    about = {
+        "command": " ".join(["python", *sys.argv]),
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
+        "eval_freq": EVAL_FREQ,
+        "eval_episodes": EVAL_EPISODES,
+        "recipes": {
+            f"{algo} {env}": _recipe(algo, env)
+            for env, algo in dict.fromkeys((row["env"], row["algo"]) for row in rows)
+        },
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    runs = ",\n".join(f"    {json.dumps(row)}" for row in rows)
+    head = json.dumps(about, indent=2).removesuffix("\n}")
+    file.write_text(f'{head},\n  "runs": [\n{runs}\n  ]\n}}\n')
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--envs", nargs="+", default=ENVS, choices=[*MODULES, *(f"{env}:discrete" for env in MODULES)])
+    parser.add_argument("--algos", nargs="+", default=["maddpg"], choices=["maddpg", "matd3"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=range(5))
+    parser.add_argument("--steps", type=int, default=100_000, help="length of each training (default 100,000)")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, each with one thread")
+    parser.add_argument("--log-folder", type=Path, default=Path("logs/mpe2"), help="where the trainings are")
+    parser.add_argument("--json", type=Path, default=ROOT / "benchmarks/results/mpe2.json", metavar="FILE")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the learning curves")
+    parser.add_argument("--report", action="store_true", help="train nothing, report what is finished")
+    args = parser.parse_args()
+
+    folder = args.log_folder.resolve()
+    runs = []
+    for env in args.envs:
+        name, _, kind = env.partition(":")
+        runs += [
+            Run(name, algo, kind or "continuous", seed, args.steps, folder)
+            for algo in args.algos
+            for seed in args.seeds
+        ]
+    failures = []
+    if not args.report:
+        with ThreadPoolExecutor(args.jobs) as pool:
+            # Seed by seed, so that an early end leaves as many seeds of each
+            for future in [pool.submit(run.train) for run in sorted(runs, key=lambda run: run.seed)]:
+                try:
+                    future.result()
+                except RuntimeError as error:
+                    failures.append(str(error))
+                    print(f"FAILED {error}", flush=True)
+    rows = [row for run in runs if (row := run.row())]
+    if not rows:
+        sys.exit("Nothing is finished.")
+    report(rows)
+    write(rows, args.json)
+    if args.plot:
+        plot(rows, args.plot)
+    if len(rows) < len(runs):
+        sys.exit(f"{len(runs) - len(rows)} of {len(runs)} runs are missing.")
+
+
+if __name__ == "__main__":
+    main()
