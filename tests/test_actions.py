@@ -203,9 +203,24 @@ def test_numbers_reach_the_environment_with_noise_of_the_given_size(noise):
 
 
 def test_much_noise_is_clipped_at_the_bounds():
-    _, sent, _ = played("numbers", 200, exploration_noise=5.0)
+    model, sent, _ = played("numbers", 200, exploration_noise=5.0)
     assert np.abs(sent).max() == pytest.approx(1.0, abs=1e-6)
     assert (np.abs(sent) > 0.999).mean() > 0.7
+    assert np.abs(model.replay_buffer.actions).max() == 1.0
+
+
+@pytest.mark.parametrize("kind", ["bits", "mixed"])
+def test_bits_and_categories_reach_the_environment_as_they_are_drawn(kind):
+    model, sent, best = played(kind, 1000)
+    actions = model.policy.actions
+    with th.no_grad():
+        expected = model.actor(th.as_tensor(model.replay_buffer.observations[:, 0]))
+    deviation = (actions.encode(th.as_tensor(sent)) - expected).sum(dim=0) / (expected * (1 - expected)).sum(
+        dim=0
+    ).sqrt()
+    assert deviation[actions.discrete_columns].abs().max() < 4.5
+    assert (sent != best).any(axis=0).all()
+    assert np.allclose(model.replay_buffer.actions[:, 0], sent, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["numbers", "unlike"])
@@ -223,7 +238,8 @@ def test_action_noise_takes_the_place_of_exploration_noise(kind):
 
 
 def test_warm_up_is_uniform():
-    _, sent, _ = played("mixed", 2000, learning_starts=2000)
+    model, sent, _ = played("mixed", 2000, learning_starts=2000)
+    assert np.allclose(model.replay_buffer.actions[:, 0], sent, atol=1e-5)
     sizes = [size for space in AGENT_SPACES["mixed"] for size in heads_of(space)]
     for column, size in zip(sent.T, sizes, strict=True):
         if size:

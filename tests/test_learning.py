@@ -51,7 +51,7 @@ def test_every_estimator_solves_a_task_of_categories(estimator):
 def test_only_expected_finds_bits_that_pay_together_or_not_at_all(estimator):
     """The others stay with no bit at all, because none pays by itself."""
     none = -AllBits.random / (AllBits.optimum - AllBits.random)
-    assert learned(AllBits, 1500, estimator=estimator) == pytest.approx(none)
+    assert learned(AllBits, estimator=estimator) == pytest.approx(none)
 
 
 @pytest.mark.parametrize("task", [OwnBit, OwnCategory])

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
 from sb3_maddpg import MADDPG, parallel
@@ -53,9 +53,9 @@ def test_runs_with_every_estimator(estimator, kind):
         assert all(not th.equal(a, b) for a, b in zip(old, new, strict=True))
 
 
-@pytest.mark.parametrize("clip", [None, 0.05])
-@pytest.mark.parametrize("n_steps", [1, 3])
-@pytest.mark.parametrize("priced", [False, True])
+@pytest.mark.parametrize(
+    ("priced", "n_steps", "clip"), [(False, 1, None), (False, 3, 0.05), (True, 1, 0.05), (True, 3, None)]
+)
 @pytest.mark.parametrize("kind", ["bits", "numbers", "categories", "unlike"])
 def test_one_update_is_that_of_separate_agents(kind, clip, n_steps, priced):
     lr, tau, weight = 0.1, 0.3, 0.02
@@ -83,6 +83,21 @@ def test_one_update_is_that_of_separate_agents(kind, clip, n_steps, priced):
     assert_close(model.actor, actor)
     assert_moved(model.critic_target, model.critic, old.critic_target, tau)
     assert_moved(model.actor_target, model.actor, old.actor_target, tau)
+
+
+def test_a_price_is_on_the_scale_of_normalised_rewards():
+    env = TeamEnv(Toy("unlike"))
+    env.action_cost = 0.7
+    vec_env = VecNormalize(DummyVecEnv([lambda: env]))
+    model = learned(vec_env, 60, learning_rate=0.1, gamma=0.9, max_grad_norm=None, policy_kwargs=SGD)
+    scale = np.sqrt(vec_env.ret_rms.var + vec_env.epsilon)
+    assert abs(scale - 1) > 0.05
+    old, data = copy.deepcopy(model.policy), drawn(model, 32)
+    model.train(1, batch_size=32)
+    cost = np.full((old.team.n_agents, old.actions.width), 0.7 / scale)
+    reference = updated(old, data, old.actor_target.act(data.next_observations), 0.1, None, 1e-3, cost)
+    assert_close(model.critic, reference[0])
+    assert_close(model.actor, reference[1])
 
 
 class Recorder(KVWriter):

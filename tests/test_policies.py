@@ -162,6 +162,14 @@ def test_sharing_that_cannot_be_is_refused(share, message):
         MADDPGPolicy(env.observation_space, env.action_space, lambda _: 1e-3, share_actor=share)
 
 
+def test_agents_with_equal_observations_but_unlike_actions_do_not_share():
+    unlike = spaces.MultiDiscrete([3] * 2 + [4] * 2)
+    for argument in ("share_actor", "share_critic"):
+        with pytest.raises(ValueError, match=rf"{argument}=True: agent_0 and agent_2 have unlike spaces"):
+            policy(unlike, **{argument: True})
+        assert policy(unlike, **{argument: [[0, 1], [2, 3]]}).predict(batch()[0].numpy())[0].max() <= 3
+
+
 def test_net_arch_for_actor_and_critic():
     parts = policy(net_arch={"pi": [7], "qf": [9, 11]})
     assert [weight.shape[1] for weight in parts.actor.net.weights] == [7, K]
