@@ -8,6 +8,7 @@ import gymnasium
 import pytest
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+import quad_swarm  # noqa: F401 - registered before the first page, so that it stays so after it
 from sb3_maddpg import MADDPG, MATD3, MADDPGPolicy, PairPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 
