@@ -51,8 +51,8 @@ class MADDPG(OffPolicyAlgorithm):
     ``n_agents * k``), a scalar team reward, and, where agents differ, ``info["agent_rewards"]``,
     ``info["agent_terminated"]`` and ``info["agent_active"]``, all (n_agents,). Numbers in ``info["metrics"]`` are
     logged as means. Of the environment's attributes it reads ``agent_names``, ``observation_layout`` (see
-    ``PairPolicy``) and ``action_cost``: what an action costs as long as the reward holds that as a plain sum over
-    bits, numbers or categories, a float or (n_agents, width). Critics then learn the rest of the return.
+    ``PairPolicy``) and, with ``use_action_cost``, ``action_cost``: what an action costs as long as the reward holds
+    that as a plain sum over bits, numbers or categories, a float or (n_agents, width).
 
     :param policy: The policy model to use (MlpPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -72,6 +72,7 @@ class MADDPG(OffPolicyAlgorithm):
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
     :param n_steps: number of rewards in a return before the critic's estimate takes over
+    :param use_action_cost: take the environment's ``action_cost`` as known; critics then learn the rest of the return
     :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
         [-1, 1]; two numbers go from the first to the second over the training. Bits explore by a random threshold,
         categories by their probabilities.
@@ -117,6 +118,7 @@ class MADDPG(OffPolicyAlgorithm):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
+        use_action_cost: bool = False,
         exploration_noise: float | tuple[float, float] = 0.1,
         estimator: str = "expected",
         temperature: float | Schedule = 1.0,
@@ -157,6 +159,7 @@ class MADDPG(OffPolicyAlgorithm):
             supported_action_spaces=ACTION_SPACES,
             support_multi_env=True,
         )
+        self.use_action_cost = use_action_cost
         self.exploration_noise = exploration_noise
         self.estimator = estimator
         self.temperature = temperature
@@ -221,7 +224,11 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _read_task(self, env: VecEnv) -> None:
         self.env_spec = describe_env(env)
-        self.action_cost = env.get_attr("action_cost", indices=0)[0] if env.has_attr("action_cost") else None
+        self.action_cost = None
+        if self.use_action_cost:
+            if not env.has_attr("action_cost"):
+                raise ValueError("use_action_cost=True, but the environment has no attribute `action_cost`.")
+            self.action_cost = env.get_attr("action_cost", indices=0)[0]
 
     def _spread_action_cost(self) -> None:
         """The price of every number that critics read, (n_agents, width)."""

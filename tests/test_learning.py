@@ -68,7 +68,7 @@ def test_a_known_price_leads_to_the_same_policy():
     class KnownPrice(PricedBit):
         action_cost = PricedBit.price
 
-    assert learned(KnownPrice, 1500, learning_starts=800, policy_kwargs=SHARED) > 0.97
+    assert learned(KnownPrice, 1500, learning_starts=800, use_action_cost=True, policy_kwargs=SHARED) > 0.97
 
 
 def test_continuous_actions():

@@ -69,6 +69,7 @@ def test_one_update_is_that_of_separate_agents(kind, clip, n_steps, priced):
         tau=tau,
         gamma=0.9,
         n_steps=n_steps,
+        use_action_cost=priced,
         max_grad_norm=clip,
         policy_regularization=weight,
         policy_kwargs=SGD,
@@ -89,7 +90,8 @@ def test_a_price_is_on_the_scale_of_normalised_rewards():
     env = TeamEnv(Toy("unlike"))
     env.action_cost = 0.7
     vec_env = VecNormalize(DummyVecEnv([lambda: env]))
-    model = learned(vec_env, 60, learning_rate=0.1, gamma=0.9, max_grad_norm=None, policy_kwargs=SGD)
+    numbers = {"learning_rate": 0.1, "gamma": 0.9, "max_grad_norm": None, "policy_kwargs": SGD}
+    model = learned(vec_env, 60, use_action_cost=True, **numbers)
     scale = np.sqrt(vec_env.ret_rms.var + vec_env.epsilon)
     assert abs(scale - 1) > 0.05
     old, data = copy.deepcopy(model.policy), drawn(model, 32)
@@ -192,7 +194,15 @@ def test_a_cost_of_another_shape_is_refused():
     env = OwnBit()
     env.action_cost = np.ones((3, 2))
     with pytest.raises(ValueError, match=r"action_cost of shape \(3, 2\) does not fit \(n_agents, width\) = \(3, 3\)"):
-        MADDPG("MlpPolicy", env)
+        MADDPG("MlpPolicy", env, use_action_cost=True)
+
+
+def test_a_cost_is_known_only_if_wanted():
+    env = OwnBit()
+    env.action_cost = 0.4
+    assert MADDPG("MlpPolicy", env).action_cost is None
+    with pytest.raises(ValueError, match="no attribute `action_cost`"):
+        MADDPG("MlpPolicy", OwnBit(), use_action_cost=True)
 
 
 class Misshapen(gymnasium.Env):

@@ -28,6 +28,7 @@ def test_one_update_is_that_of_plain_sums_over_pairs(pair_credit, priced):
         env.action_cost = cost
     kwargs = {"net_arch": [8, 8], "optimizer_class": th.optim.SGD, "pair_credit": pair_credit}
     numbers = {"learning_rate": 0.02, "max_grad_norm": None, "policy_regularization": 0.0, "gamma": 0.9}
+    numbers["use_action_cost"] = priced
     model = MADDPG("PairPolicy", env, **{**SMALL, **numbers, "policy_kwargs": kwargs}).learn(60)
     old, data = copy.deepcopy(model.policy), drawn(model, 32)
     model.train(1, batch_size=32)
