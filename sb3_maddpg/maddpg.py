@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import pathlib
 import zipfile
@@ -13,6 +14,7 @@ from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -73,6 +75,9 @@ class MADDPG(OffPolicyAlgorithm):
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
     :param n_steps: number of rewards in a return before the critic's estimate takes over
     :param use_action_cost: take the environment's ``action_cost`` as known; critics then learn the rest of the return
+    :param threshold_price: for bits: a price of every set bit that no reward holds and no critic sees. It rises
+        geometrically with the threshold, from the first number at 0 to the second at 1. A score then says up to which
+        price its bit is worth setting, and the policy's ``threshold`` chooses the price after the training.
     :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
         [-1, 1]; two numbers go from the first to the second over the training. Bits explore by a random threshold,
         categories by their probabilities.
@@ -119,6 +124,7 @@ class MADDPG(OffPolicyAlgorithm):
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
         use_action_cost: bool = False,
+        threshold_price: tuple[float, float] | None = None,
         exploration_noise: float | tuple[float, float] = 0.1,
         estimator: str = "expected",
         temperature: float | Schedule = 1.0,
@@ -160,6 +166,7 @@ class MADDPG(OffPolicyAlgorithm):
             support_multi_env=True,
         )
         self.use_action_cost = use_action_cost
+        self.threshold_price = threshold_price
         self.exploration_noise = exploration_noise
         self.estimator = estimator
         self.temperature = temperature
@@ -260,6 +267,12 @@ class MADDPG(OffPolicyAlgorithm):
             raise ValueError(f"max_grad_norm={self.max_grad_norm} must be positive, or None for no limit.")
         if self.n_steps < 1 or self.policy_delay < 1:
             raise ValueError(f"n_steps={self.n_steps} and policy_delay={self.policy_delay} must be at least 1.")
+        if self.threshold_price is not None:
+            first, last = self.threshold_price
+            if not 0 < first < last:
+                raise ValueError(f"threshold_price={self.threshold_price} is a positive price and a higher one.")
+            if not isinstance(self.action_space, spaces.MultiBinary):
+                raise ValueError(f"threshold_price is for bits, the action space is {self.action_space}.")
         noise = np.asarray(self.exploration_noise)
         if noise.shape not in ((), (2,)) or not (noise >= 0).all():
             raise ValueError(
@@ -401,6 +414,8 @@ class MADDPG(OffPolicyAlgorithm):
         with _no_gradients(critic):
             objective = critic.units.objective(ESTIMATORS[self.estimator], critic.to_units(logits), q, temperature)
         losses = self.policy_regularization * team.regularization(logits) - by_agent(objective, critic.units_per_agent)
+        if self.threshold_price is not None:
+            losses = losses + _price_up_to(team.squash(logits), self.threshold_price).sum(dim=-1)
         return _mean_over_batch(losses, data.active).sum(), team.squash(logits.detach())[:, team.discrete_columns]
 
     def _descend(self, network: Actor | Critic, loss: th.Tensor) -> None:
@@ -520,6 +535,17 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def _price_up_to(scores: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
+    """
+    :param scores: any shape
+    :param prices: at the thresholds 0 and 1, geometric in between
+    :return: the mean price that bits with these scores pay where the threshold is uniform in [0, 1]: its integral from
+        0 to the score
+    """
+    first, growth = prices[0], math.log(prices[1] / prices[0])
+    return first * th.expm1(growth * scores) / growth
 
 
 def _mean_over_batch(values: th.Tensor, active: th.Tensor | None) -> th.Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, ClassVar, TypedDict
 
 import torch as th
@@ -24,15 +24,20 @@ class ObservationLayout(TypedDict, total=False):
     - ``own``: columns about the agent itself;
     - ``neighbours``: for each neighbour the columns about it, all of one length, in one order;
     - ``who``: for each agent the numbers of its neighbours; all others in ascending order, unless given;
-    - ``acts_on_neighbours``: the action falls into equal parts, one for each neighbour.
+    - ``acts_on_neighbours``: the action falls into equal parts, one for each neighbour;
+    - ``critic``: for each neighbour further columns that critics read and actors do not, because no agent knows them
+      when it acts;
+    - ``complete``: every neighbour is always there. Otherwise one whose columns are all zero is absent.
 
-    A neighbour whose columns are all zero is absent.
+    Columns that lie side by side, neighbour after neighbour, are read fastest.
     """
 
     own: Sequence[int]
     neighbours: Sequence[Sequence[int]]
     who: Sequence[Sequence[int]]
     acts_on_neighbours: bool
+    critic: Sequence[Sequence[int]]
+    complete: bool
 
 
 def _others(n_agents: int) -> list[list[int]]:
@@ -44,11 +49,13 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
     if not {"own", "neighbours"} <= set(layout) <= set(ObservationLayout.__annotations__):
         raise ValueError(
             f"observation_layout has entries {sorted(layout)}, but needs `own` and `neighbours`, and beside them knows "
-            "`who` and `acts_on_neighbours` only."
+            "`who`, `acts_on_neighbours`, `critic` and `complete` only."
         )
     neighbours = layout["neighbours"]
-    used = [*layout["own"], *(column for columns in neighbours for column in columns)]
-    if len({len(columns) for columns in neighbours}) != 1 or not all(0 <= column < team.obs_dim for column in used):
+    hidden = layout.get("critic", [[]] * len(neighbours))
+    used = [*layout["own"], *chain(*neighbours, *hidden)]
+    alike = len({len(columns) for columns in neighbours}) == len({len(columns) for columns in hidden}) == 1
+    if not alike or len(hidden) != len(neighbours) or not all(0 <= column < team.obs_dim for column in used):
         raise ValueError(
             f"observation_layout={dict(layout)}: every neighbour needs as many columns as the next, each from 0 to "
             f"{team.obs_dim - 1}."
@@ -70,41 +77,72 @@ class Views(nn.Module):
 
     :param layout: see ``ObservationLayout``
     :param team: a team of equal agents
+    :param of_critic: with the columns that only critics read
     :raises ValueError: a layout that does not fit the team
     """
 
-    own_columns: th.Tensor
-    neighbour_columns: th.Tensor
     who: th.Tensor
     back: th.Tensor
     n_neighbours: int
     own_dim: int
     neighbour_dim: int
 
-    def __init__(self, layout: ObservationLayout, team: Team):
+    def __init__(self, layout: ObservationLayout, team: Team, of_critic: bool = False):
         super().__init__()
         if len(set(team.obs_dims)) > 1 or len(set(map(str, team.action_spaces))) > 1:
             raise ValueError("PairPolicy is for teams of equal agents, and these have unlike spaces: use MlpPolicy.")
         who = _check_layout(layout, team)
         self.n_neighbours = len(layout["neighbours"])
-        self.own_dim, self.neighbour_dim = len(layout["own"]), len(layout["neighbours"][0])
+        neighbours = [list(columns) for columns in layout["neighbours"]]
+        if of_critic and "critic" in layout:
+            neighbours = [[*seen, *hidden] for seen, hidden in zip(neighbours, layout["critic"], strict=True)]
+        self.own_dim, self.neighbour_dim = len(layout["own"]), len(neighbours[0])
+        self.complete = layout.get("complete", False)
+        self.own = _Columns([list(layout["own"])])
+        self.neighbours = _Columns(neighbours)
         back = [[who[j].index(i) if i in who[j] else -1 for j in row] for i, row in enumerate(who)]
-        for name, table in (
-            ("own_columns", layout["own"]),
-            ("neighbour_columns", layout["neighbours"]),
-            ("who", who),
-            ("back", back),
-        ):
+        for name, table in (("who", who), ("back", back)):
             self.register_buffer(name, th.tensor(table, dtype=th.long), persistent=False)
 
-    def forward(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    def forward(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """
         :param obs: (batch, n_agents, obs_dim or more)
         :return: own parts (batch, n_agents, own_dim), views of neighbours (batch, n_agents, n_neighbours,
-            neighbour_dim), and which neighbours are present (batch, n_agents, n_neighbours, 1)
+            neighbour_dim), and which neighbours are present (batch, n_agents, n_neighbours, 1), None if all are
         """
-        neighbours = obs[..., self.neighbour_columns]
-        return obs[..., self.own_columns], neighbours, (neighbours != 0).any(dim=-1, keepdim=True).to(obs.dtype)
+        neighbours = self.neighbours(obs)
+        present = None if self.complete else (neighbours != 0).any(dim=-1, keepdim=True).to(obs.dtype)
+        return self.own(obs).squeeze(-2), neighbours, present
+
+
+class _Columns(nn.Module):
+    """
+    Reads columns of observations.
+
+    :param table: rows of columns, all of one length
+    """
+
+    table: th.Tensor
+
+    def __init__(self, table: Sequence[Sequence[int]]):
+        super().__init__()
+        columns = th.tensor(table, dtype=th.long).reshape(len(table), -1)
+        self.register_buffer("table", columns, persistent=False)
+        self.rows, self.width = columns.shape
+        self.first = int(columns[0, 0]) if self.width else 0
+        self.step = int(columns[1, 0] - columns[0, 0]) if self.rows > 1 and self.width else self.width
+        regular = self.first + self.step * th.arange(self.rows)[:, None] + th.arange(self.width)
+        self.regular = self.width > 0 and self.step >= self.width and bool((columns == regular).all())
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (..., obs_dim)
+        :return: (..., rows, width)
+        """
+        if not self.regular:
+            return obs[..., self.table]
+        end = self.first + (self.rows - 1) * self.step + self.width
+        return obs[..., self.first : end].unfold(-1, self.width, self.step)
 
 
 class PairNet(nn.Module):
@@ -141,16 +179,20 @@ class PairNet(nn.Module):
         self.of_extras = nn.ModuleList(nn.Linear(length, widths[0], bias=False) for length in extras)
         self.later = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
 
-    def encode(self, views: th.Tensor, present: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def encode(self, views: th.Tensor, present: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
         """
         :param views: (..., n_neighbours, in_features)
-        :param present: (..., n_neighbours, 1)
+        :param present: (..., n_neighbours, 1), None for all
         :return: what the second network makes of encoding and pool, before its activation, (..., n_neighbours, width),
             and the pool, (..., 2 * the encoding's width)
         """
-        encoded = self.activation(self.encoder(views)) * present
-        mean = encoded.sum(dim=-2) / present.sum(dim=-2).clamp(min=1.0)
-        if self.goes_below_zero:  # the zeros of absent neighbours could be the largest
+        encoded = self.activation(self.encoder(views))
+        if present is None:
+            mean = encoded.mean(dim=-2)
+        else:
+            encoded = encoded * present
+            mean = encoded.sum(dim=-2) / present.sum(dim=-2).clamp(min=1.0)
+        if present is not None and self.goes_below_zero:  # the zeros of absent neighbours could be the largest
             largest = encoded.masked_fill(present == 0, -th.inf).amax(dim=-2).masked_fill(~present.any(dim=-2), 0.0)
         else:
             largest = encoded.amax(dim=-2)
@@ -275,12 +317,12 @@ class PairCritic(Critic):
         # Where j does not see i it does nothing to it
         return parts, parts[:, who, self.views.back.clamp(min=0)] * (self.views.back >= 0).unsqueeze(-1)
 
-    def _hidden(self, net: PairNet, obs: th.Tensor, theirs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _hidden(self, net: PairNet, obs: th.Tensor, theirs: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
         """:return: the second network's first layer without i's own action, and which neighbours are present"""
         own, neighbours, present = self.views(obs)
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
         hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.who]], dim=-1), present)
-        return hidden + net.extra(1, theirs), present
+        return hidden + net.extra(1, theirs), 1.0 if present is None else present
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         mine, theirs = self._pairs(actions)
@@ -368,9 +410,10 @@ class PairPolicy(MADDPGPolicy):
         )
 
     def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
-        views = Views(self.observation_layout, self.team)
-        on_neighbours = self.observation_layout.get("acts_on_neighbours", False)
+        layout = self.observation_layout
+        on_neighbours = layout.get("acts_on_neighbours", False)
         action_spaces = self.team.action_spaces
+        views, of_critic = Views(layout, self.team), Views(layout, self.team, of_critic=True)
         apart = on_neighbours and not self.shared_threshold
         actions = TeamActions(action_spaces, self.threshold, views.n_neighbours if apart else 1)
         units = actions
@@ -379,7 +422,9 @@ class PairPolicy(MADDPGPolicy):
             units = TeamActions(parts, self.threshold)
         return (
             PairActor(views, actions, on_neighbours, actor_arch, self.activation_fn),
-            PairCritic(views, units, on_neighbours, critic_arch, self.activation_fn, self.pair_credit, self.n_critics),
+            PairCritic(
+                of_critic, units, on_neighbours, critic_arch, self.activation_fn, self.pair_credit, self.n_critics
+            ),
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

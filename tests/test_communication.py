@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
-from quad_swarm.communication import View, parse_rule
+from quad_swarm.communication import parse_rule
+from quad_swarm.presets import make_config
+from quad_swarm.quadrotor import POSITION, VELOCITY
+from quad_swarm.swarm import Swarm
+from quad_swarm.view import View
 
 
 def view(pos, vel, n_swarms: int = 1) -> View:
-    pos, vel = (np.broadcast_to(np.array(a, float), (n_swarms, len(a), 3)) for a in (pos, vel))
-    return View.of(pos, vel, [np.random.default_rng(k) for k in range(n_swarms)])
+    swarm = Swarm(make_config("paper", n_robots=len(pos)), n_swarms)
+    swarm.state[..., POSITION], swarm.state[..., VELOCITY] = pos, vel
+    return View(swarm, [np.random.default_rng(k) for k in range(n_swarms)])
 
 
 # Robot 1 comes towards robot 0 and passes it at 0.5 m after 2 s; robot 2 stands 3 m away.
@@ -28,6 +33,13 @@ SCENE = view([[0, 0, 0], [4, 0.5, 0], [0, -3, 0]], [[0, 0, 0], [-2, 0, 0], [0, 0
         ("cpa:3.1:0", [[0, 1], [0, 0], [1, 0]]),
         ("random:0", [[0, 0], [0, 0], [0, 0]]),
         ("random:1", [[1, 1], [1, 1], [1, 1]]),
+        ("soon:2.1", [[1, 1], [1, 1], [1, 1]]),
+        ("soon:1.9", [[0, 1], [0, 0], [1, 0]]),  # robots at rest are at their closest already
+        ("distance:3.5&cpa:0.6:3", [[0, 0], [0, 0], [0, 0]]),
+        ("distance:3.5|cpa:0.6:3", [[1, 1], [1, 0], [1, 0]]),
+        ("none&full|cpa:0.6:3", [[1, 0], [1, 0], [0, 0]]),
+        ("event:0.1", [[1, 1], [1, 1], [1, 1]]),  # nobody has been asked yet
+        ("stale:3", [[1, 1], [1, 1], [1, 1]]),
     ],
 )
 def test_whom_a_rule_asks(text, asked):
@@ -59,6 +71,8 @@ def test_robots_at_the_same_place_do_not_divide_by_zero():
         ("distance:-1", "non-negative"),
         ("distance:nan", "finite"),
         ("none:1", "takes 0"),
+        ("none&distnace:4", "Did you mean 'distance'"),
+        ("cpa:0.6:3|", "Unknown rule ''"),
         ("random:2", r"\[0, 1\]"),
     ],
 )

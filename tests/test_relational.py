@@ -158,7 +158,7 @@ def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
     [
         (None, "PairPolicy has to know .*`observation_layout`"),
         ({"own": [0]}, r"has entries \['own'\], but needs `own` and `neighbours`"),
-        ({**LAYOUT, "owns": [0]}, "knows `who` and `acts_on_neighbours` only"),
+        ({**LAYOUT, "owns": [0]}, "`critic` and `complete` only"),
         ({**LAYOUT, "own": [10]}, "each from 0 to 9"),
         ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "as many columns as the next"),
         ({**LAYOUT, "neighbours": []}, "as many columns as the next"),

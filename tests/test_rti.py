@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from quad_swarm.communication import View, parse_rule
+from quad_swarm.communication import parse_rule
 from quad_swarm.evaluation import Cell, first_episode, run_episodes
 from quad_swarm.planner import FatropSolver, OptimalControlProblem, Problems, RtiSolver
 from quad_swarm.presets import PRESETS, make_config
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 from quad_swarm.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.swarm import Swarm
+from quad_swarm.view import View
 
 QUADROTOR = QuadrotorParams()
 RULES = ("full", "none", "cpa:0.7:1.5")
@@ -36,7 +37,7 @@ class Recorded:
 
         swarm.planner.solver = Recorder(self.problem)
         for _ in range(steps.stop):
-            view = View.of(swarm.pos, swarm.vel, rngs)
+            view = View(swarm, rngs)
             requests = [parse_rule(rule)(view) for rule in RULES]
             swarm.step(np.stack([requests[k % len(RULES)][k] for k in range(swarm.n_swarms)]))
         calls = [calls[k] for k in steps]

@@ -10,6 +10,7 @@ ascending order.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,21 @@ def advance(trajectory: np.ndarray) -> np.ndarray:
     """A trajectory (..., K, 3) seen one step later; its last piece goes on in a straight line."""
     end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
     return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
+
+
+class Outlook(NamedTuple):
+    """What robots believe of those they do not ask.
+
+    :param believed: positions at the next N steps, (E, n, n - 1, N, 3), world frame (m)
+    :param remembers: whether an earlier plan is believed, else a constant velocity, (E, n, n - 1) bool
+    :param age: steps since the newest plan received was made, N or more: none, (E, n, n - 1)
+    :param error: how far off that plan is by now, (E, n, n - 1) (m)
+    """
+
+    believed: np.ndarray
+    remembers: np.ndarray
+    age: np.ndarray
+    error: np.ndarray
 
 
 class Beliefs:
@@ -70,28 +86,42 @@ class Beliefs:
         """Drop all but the given swarms (indices or mask)."""
         self._remembered, self._age = self._remembered[swarms], self._age[swarms]
 
+    def outlook(self, pos: np.ndarray, vel: np.ndarray) -> Outlook:
+        """What the robots would believe in this step if they did not ask; `update` has not been called for it.
+
+        :param pos: present positions, (E, n, 3), world frame (m)
+        :param vel: present velocities, (E, n, 3), world frame (m/s)
+        """
+        steady = constant_velocity(pos, vel, self.horizon, self.dt)[:, self.others]
+        if not self.memory:
+            never = np.full(self._age.shape, self.horizon)
+            return Outlook(steady, np.zeros(never.shape, bool), never, np.zeros(never.shape))
+        remembered, age = advance(self._remembered), self._age + 1
+        error = np.linalg.norm(remembered[..., 0, :] - pos[:, self.others], axis=-1)
+        remembers = (age < self.horizon) & (error <= self.memory)
+        believed = np.where(remembers[..., None, None], remembered[..., 1:, :], steady)
+        return Outlook(believed, remembers, age, error)
+
     def update(
-        self, requests: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray
+        self, requests: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray, age: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         """Believed trajectories after this step's requests.
 
-        :param requests: whom each robot asks, (E, n, n - 1) bool
+        :param requests: whose plans each robot receives, (E, n, n - 1) bool
         :param pos: present positions, (E, n, 3), world frame (m)
         :param vel: present velocities, (E, n, 3), world frame (m/s)
         :param plans: positions that each robot planned one step ago, stages 0..N, (E, n, N + 1, 3) (m)
+        :param age: steps since these plans were made, if they are older and were advanced to one step ago
         :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
             1)
         """
-        current = advance(plans)  # now, and the next N steps
-        steady = constant_velocity(pos, vel, self.horizon, self.dt)
+        outlook = self.outlook(pos, vel)
+        current = advance(plans)[:, self.others]  # now, and the next N steps
         asked = requests[..., None, None]
-        believed = np.where(asked, current[:, self.others, 1:], steady[:, self.others])
-        source = np.where(requests, BeliefSource.REQUESTED, BeliefSource.CONSTANT_VELOCITY)
-        if self.memory > 0:
-            self._remembered = np.where(asked, current[:, self.others], advance(self._remembered))
-            self._age = np.where(requests, 1, self._age + 1)
-            error = np.linalg.norm(self._remembered[..., 0, :] - pos[:, self.others], axis=-1)
-            usable = ~requests & (self._age < self.horizon) & (error <= self.memory)
-            believed = np.where(usable[..., None, None], self._remembered[..., 1:, :], believed)
-            source = np.where(usable, BeliefSource.REMEMBERED, source)
+        believed = np.where(asked, current[..., 1:, :], outlook.believed)
+        unasked = np.where(outlook.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
+        source = np.where(requests, BeliefSource.REQUESTED, unasked)
+        if self.memory:
+            self._remembered = np.where(asked, current, advance(self._remembered))
+            self._age = np.where(requests, age, outlook.age)
         return believed, source

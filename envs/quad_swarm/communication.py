@@ -1,38 +1,17 @@
 """Hand-made rules for whom to ask: the baselines of Sec. V-C and stronger ones.
 
-A rule maps what the robots of E swarms observe to requests. To add one, write the function and name it in `RULES`.
+A rule maps what the robots of E swarms know to requests. To add one, write the function and name it in `RULES`.
+"&" joins rules of which both must want to ask, "|" rules of which one is enough; "&" binds tighter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 
-from .beliefs import other_indices
 from .errors import unknown_name
-
-
-@dataclass(frozen=True)
-class View:
-    """What a rule may look at.
-
-    :param pos: positions of the others relative to each robot, (E, n, n - 1, 3) (m)
-    :param vel: velocities of the others relative to each robot, (E, n, n - 1, 3) (m/s)
-    :param rngs: one generator for each swarm, so that an episode's draws do not depend on what else is in the batch
-    """
-
-    pos: np.ndarray
-    vel: np.ndarray
-    rngs: Sequence[np.random.Generator]
-
-    @classmethod
-    def of(cls, pos: np.ndarray, vel: np.ndarray, rngs: Sequence[np.random.Generator]) -> View:
-        """The view of robots at positions and with velocities (E, n, 3), world frame."""
-        others = other_indices(pos.shape[1])
-        return cls(pos[:, others] - pos[:, :, None], vel[:, others] - vel[:, :, None], rngs)
-
+from .view import View
 
 Rule = Callable[[View], np.ndarray]
 
@@ -55,13 +34,28 @@ def distance(threshold: float) -> Rule:
 def cpa(threshold: float, look_ahead: float) -> Rule:
     """Asks whoever would come closer than ``threshold`` (m) within ``look_ahead`` (s) if both kept their velocity."""
 
-    def rule(view: View) -> np.ndarray:
-        closing = -(view.pos * view.vel).sum(axis=-1)
-        speed2 = (view.vel**2).sum(axis=-1)
-        time = np.clip(closing / np.maximum(speed2, 1e-12), 0.0, look_ahead)
-        return np.linalg.norm(view.pos + time[..., None] * view.vel, axis=-1) < threshold
+    return lambda view: view.approach(look_ahead)[0] < threshold
 
-    return rule
+
+def soon(time: float) -> Rule:
+    """Asks whoever comes closest, with constant velocities, within ``time`` (s); those who draw apart too."""
+    return lambda view: view.approach(np.inf)[1] < time
+
+
+def event(drift: float) -> Rule:
+    """Event-triggered: asks again when the newest plan is off by more than ``drift`` (m) or has run out, and whoever
+    never was asked."""
+    return lambda view: (view.drift > drift) | (view.age >= view.horizon)
+
+
+def stale(age: float) -> Rule:
+    """Asks again when the newest plan was made at least ``age`` steps ago or is no longer believed."""
+    return lambda view: (view.age >= age) | ~view.outlook.remembers
+
+
+def plan(distance: float) -> Rule:
+    """Asks whoever, as far as is known without asking, comes closer to the own plan than ``distance`` (m)."""
+    return lambda view: view.plan_separation.min(axis=-1) < distance
 
 
 def random(probability: float) -> Rule:
@@ -77,15 +71,30 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
     "full": (full, ()),
     "distance": (distance, ("EPS",)),
     "cpa": (cpa, ("DIST", "LOOKAHEAD")),
+    "soon": (soon, ("TIME",)),
+    "event": (event, ("EPS",)),
+    "stale": (stale, ("STEPS",)),
+    "plan": (plan, ("DIST",)),
     "random": (random, ("P",)),
 }
 
 
 def parse_rule(text: str) -> Rule:
-    """The rule that a text such as ``"cpa:0.7:1.5"`` names.
+    """The rule that a text such as ``"cpa:0.7:1.5"`` or ``"cpa:0.7:1.5&stale:3|distance:1"`` names.
 
     :raises ValueError: unknown rule, or arguments that are missing, superfluous or no numbers
     """
+    either = [[_parse_one(part.strip()) for part in joined.split("&")] for joined in text.split("|")]
+    if len(either) == len(either[0]) == 1:
+        return either[0][0]
+
+    def rule(view: View) -> np.ndarray:
+        return np.logical_or.reduce([np.logical_and.reduce([part(view) for part in joined]) for joined in either])
+
+    return rule
+
+
+def _parse_one(text: str) -> Rule:
     name, *values = text.split(":")
     if name not in RULES:
         raise unknown_name("rule", name, RULES)

@@ -27,7 +27,8 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Observation Space
     `Box(n, 6n)`, one row a robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the
-    others (3(n-1), m), their relative velocities (3(n-1), m/s); others in ascending order.
+    others (3(n-1), m), their relative velocities (3(n-1), m/s); others in ascending order. ``observation`` chooses
+    another one, see `observation.GROUPS`.
 
     ## Rewards
     The team's: +1.3 in each step in which all robots are at their goals, -150 for a collision, -0.1 for each request.
@@ -50,13 +51,15 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     :param scenario: a name of `scenarios.SCENARIOS`, "mixed" or "curriculum"
     :param n_robots: number of robots; None: the preset's
     :param max_steps: time limit (steps)
-    :param scale_observation: divide distances by 4 m and velocities by 4 m/s
+    :param observation: "paper", or names of `observation.GROUPS` joined by "+", for example "state+memory+plan"
+    :param scale_observation: of the paper's: divide distances by 4 m and velocities by 4 m/s
     :param continuous_collisions: end episodes at collisions between steps too
     :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the
         preset's
     :param reward: values of `RewardConfig` to replace
     :param planner: values of `PlannerConfig` to replace
     :param noise: values of `ProcessNoise` to replace
+    :param radio: values of `Radio` to replace
     :param space: values of `ScenarioSpace` to replace
     :param solver: "auto" or a name of `planner.SOLVERS`
     :param render_mode: None or "rgb_array"
@@ -75,12 +78,14 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         scenario: str = "mixed",
         n_robots: int | None = None,
         max_steps: int = 100,
+        observation: str = "paper",
         scale_observation: bool = False,
         continuous_collisions: bool = False,
         memory: float | None = None,
         reward: Mapping[str, float] | None = None,
         planner: Mapping[str, Any] | None = None,
         noise: Mapping[str, float] | None = None,
+        radio: Mapping[str, float] | None = None,
         space: Mapping[str, Any] | None = None,
         solver: str = "auto",
         render_mode: str | None = None,
@@ -91,12 +96,14 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
             scenario=scenario,
             n_robots=n_robots,
             max_steps=max_steps,
+            observation=observation,
             scale_observation=scale_observation,
             continuous_collisions=continuous_collisions,
             memory=memory,
             reward=reward,
             planner=planner,
             noise=noise,
+            radio=radio,
             space=space,
             solver=solver,
         )

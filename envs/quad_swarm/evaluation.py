@@ -20,16 +20,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from .communication import View, parse_rule
+from .communication import parse_rule
 from .presets import SwarmConfig
 from .scenarios import ScenarioSampler
 from .swarm import Swarm
 from .task import RequestTask, RewardConfig
+from .view import View
 
 Requests = Callable[[RequestTask, list[np.random.Generator]], np.ndarray]
 
 # Arguments of the environment that shape what a model sees: they are the model's, everything else is the evaluation's.
-OBSERVATION_ARGUMENTS = ("scale_observation",)
+OBSERVATION_ARGUMENTS = ("observation", "scale_observation")
 # Held-out episodes begin here; training seeds count from 0.
 _FIRST_SEED = 10**9
 # Fixed, so that neither the batches nor the results depend on the number of processes.
@@ -96,7 +97,7 @@ def make_policy(cell: Cell) -> tuple[Requests, dict[str, Any]]:
             rule = parse_rule(cell.policy)
         except ValueError as error:
             raise ValueError(f"{error} A model is given by the path of its .zip.") from None
-        return (lambda task, rngs: rule(View.of(task.swarm.pos, task.swarm.vel, rngs))), {}
+        return (lambda task, rngs: rule(View(task.swarm, rngs))), {}
 
     model = load_model(cell.policy, cell.algo)
     spec = getattr(model, "env_spec", None) or {}

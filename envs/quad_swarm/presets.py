@@ -36,6 +36,22 @@ class ProcessNoise:
 
 
 @dataclass(frozen=True)
+class Radio:
+    """How plans travel. A request counts whether or not its answer arrives. Perfect by default.
+
+    :param loss: share of the answers that get lost, each for itself
+    :param delay: steps by which answers are late: with 0 a robot receives the plan that was made one step ago
+    """
+
+    loss: float = 0.0
+    delay: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.loss <= 1 or self.delay < 0:
+            raise ValueError(f"radio.loss={self.loss} lies in [0, 1], and radio.delay={self.delay} is not negative.")
+
+
+@dataclass(frozen=True)
 class SwarmConfig:
     """Everything that defines a world but the scenario.
 
@@ -49,6 +65,7 @@ class SwarmConfig:
     :param planner: horizon, limits and weights
     :param space: room of the scenarios
     :param noise: disturbances
+    :param radio: how plans travel
     """
 
     n_robots: int = 4
@@ -60,6 +77,12 @@ class SwarmConfig:
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     space: ScenarioSpace = field(default_factory=ScenarioSpace)
     noise: ProcessNoise = field(default_factory=ProcessNoise)
+    radio: Radio = field(default_factory=Radio)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether the world itself draws random numbers during an episode."""
+        return bool(self.noise) or self.radio.loss > 0
 
 
 PRESETS: dict[str, SwarmConfig] = {

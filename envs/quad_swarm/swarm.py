@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .beliefs import Beliefs, other_indices
+from .beliefs import Beliefs, advance, other_indices
 from .planner import Planner, Plans, Problems, make_planner
 from .presets import SwarmConfig
 from .quadrotor import POSITION, VELOCITY
@@ -18,6 +18,7 @@ class StepReport(NamedTuple):
 
     :param min_separation: smallest distance between two robots after the step, (E,) (m)
     :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line, (E,) (m)
+    :param separation: distance of each robot to each of the others after the step, (E, n, n - 1) (m)
     :param colliding: which of the others each robot collides with after the step, (E, n, n - 1) bool
     :param colliding_continuous: the same at any time during the step
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
@@ -32,6 +33,7 @@ class StepReport(NamedTuple):
 
     min_separation: np.ndarray
     min_separation_continuous: np.ndarray
+    separation: np.ndarray
     colliding: np.ndarray
     colliding_continuous: np.ndarray
     collision: np.ndarray
@@ -61,6 +63,8 @@ class Swarm:
         self.wind = np.zeros((n_swarms, n, 2))
         self.beliefs = Beliefs(n_swarms, n, horizon, config.planner.dt, config.memory)
         self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
+        # Positions planned in the last steps, the oldest first: what a late answer holds
+        self._earlier = [self.plans[..., POSITION].copy() for _ in range(config.radio.delay)]
         self._noise_rngs = [np.random.default_rng(0) for _ in range(n_swarms)]
         self._pairs = np.triu_indices(n, k=1)
         number = np.zeros((n, n), dtype=int)
@@ -106,7 +110,9 @@ class Swarm:
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
         for mine, fresh in zip(self._plans, hover, strict=True):
             mine[swarm * n : (swarm + 1) * n] = fresh
-        if self.config.noise:
+        for plans in self._earlier:
+            plans[swarm] = self.plans[swarm, ..., POSITION]
+        if self.config.is_random:
             rng = self._noise_rngs[swarm] = np.random.default_rng(noise_seed)
             direction = rng.uniform(0, 2 * np.pi)
             self.wind[swarm] = self.config.noise.wind * np.array([np.cos(direction), np.sin(direction)])
@@ -116,6 +122,7 @@ class Swarm:
         self.state, self.goal, self.wind = self.state[swarms], self.goal[swarms], self.wind[swarms]
         self.beliefs.keep(swarms)
         self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
+        self._earlier = [plans[swarms] for plans in self._earlier]
         self._noise_rngs = [rng for rng, kept in zip(self._noise_rngs, swarms, strict=True) if kept]
 
     def step(self, requests: np.ndarray) -> StepReport:
@@ -123,7 +130,7 @@ class Swarm:
 
         :param requests: whom each robot asks, (E, n, n - 1) bool, the others of a robot in ascending order
         """
-        believed, source = self.beliefs.update(requests, self.pos, self.vel, self.plans[..., POSITION])
+        believed, source = self.beliefs.update(*self._answers(requests), age=1 + self.config.radio.delay)
         problems = Problems(
             x=self.state.reshape(-1, 9), goal=self.goal.reshape(-1, 3), others=believed.reshape(-1, *believed.shape[2:])
         )
@@ -137,6 +144,19 @@ class Swarm:
         if self.config.noise:
             self.state = self.state + self._disturbances()
         return self._report(before, source, solve_seconds)
+
+    def _answers(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What `Beliefs.update` needs: whose plans arrive where, positions, velocities, and the plans."""
+        radio, plans = self.config.radio, self.plans[..., POSITION]
+        if radio.loss:
+            kept = [rng.random(requests.shape[1:]) >= radio.loss for rng in self._noise_rngs]
+            requests = requests & np.stack(kept)
+        if radio.delay:
+            self._earlier.append(plans.copy())
+            plans = self._earlier.pop(0)
+            for _ in range(radio.delay):
+                plans = advance(plans)
+        return requests, self.pos, self.vel, plans
 
     def _disturbances(self) -> np.ndarray:
         noise = self.config.noise
@@ -158,6 +178,7 @@ class Swarm:
         return StepReport(
             min_separation=separation.min(axis=-1),
             min_separation_continuous=separation_continuous.min(axis=-1),
+            separation=separation[:, self._pair_of],
             colliding=(separation < limit)[:, self._pair_of],
             colliding_continuous=(separation_continuous < limit)[:, self._pair_of],
             collision=(separation < limit).any(axis=-1),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .beliefs import other_indices
+from .observation import Observation, PaperObservation, make_observation
 from .presets import make_config, replace_fields
 from .scenarios import ScenarioSampler
 from .statistics import EpisodeStatistics
@@ -22,11 +22,18 @@ class RewardConfig:
     :param goal: w_g r_g, paid in each step in which all robots are at their goals
     :param collision: w_coll r_coll, taken when two robots collide
     :param request: w_c, taken for each request
+    :param near_miss: not in the paper: taken in each step for each pair closer than ``near_miss_distance``, in full at
+        ``near_miss_width`` less than that and in proportion before; a signal that is less rare than collisions
+    :param near_miss_distance: see there (m)
+    :param near_miss_width: see there (m)
     """
 
     goal: float = 1.3
     collision: float = 150.0
     request: float = 0.1
+    near_miss: float = 0.0
+    near_miss_distance: float = 0.6
+    near_miss_width: float = 0.01
 
 
 class Outcome(NamedTuple):
@@ -35,7 +42,8 @@ class Outcome(NamedTuple):
     :param reward: team rewards, (E,)
     :param pair_rewards: the part of the reward that belongs to a robot and one of the others, (E, n, n - 1): its
         request, their collision, and an equal share of the goal's reward
-    :param reward_terms: the weighted terms "goal", "collision" and "requests", each (E,)
+    :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" where it has a
+        weight, each (E,)
     :param terminated: ended by a collision, (E,) bool
     :param truncated: ended by the time limit, (E,) bool
     :param n_requests: requests made, (E,)
@@ -51,11 +59,6 @@ class Outcome(NamedTuple):
     report: StepReport
 
 
-# About the largest speed (m/s) and the usual distance (m): divides observations to unit size.
-_VELOCITY_SCALE = 4.0
-_POSITION_SCALE = 4.0
-
-
 class RequestTask:
     """Episodes of E swarms.
 
@@ -65,7 +68,7 @@ class RequestTask:
     :param sampler: draws episodes
     :param reward: weights of the reward
     :param max_steps: time limit (steps)
-    :param scale_observation: divide distances by 4 m and velocities by 4 m/s
+    :param observation: what robots observe, the paper's without scaling if None
     :param continuous_collisions: end episodes at collisions between steps too; the paper looks at the steps alone
     """
 
@@ -75,7 +78,7 @@ class RequestTask:
         sampler: ScenarioSampler,
         reward: RewardConfig,
         max_steps: int = 100,
-        scale_observation: bool = False,
+        observation: Observation | None = None,
         continuous_collisions: bool = False,
     ):
         if max_steps < 1:
@@ -88,10 +91,7 @@ class RequestTask:
         n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, n)
-        self._others = other_indices(n)
-        distance = _POSITION_SCALE if scale_observation else 1.0
-        velocity = _VELOCITY_SCALE if scale_observation else 1.0
-        self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, 3 * (n - 1), 3 * (n - 1)])
+        self.observation = observation or PaperObservation(n, scaled=False)
 
     @property
     def agent_names(self) -> tuple[str, ...]:
@@ -101,9 +101,7 @@ class RequestTask:
     @property
     def observation_layout(self) -> dict[str, Any]:
         """Which columns of an observation are about the robot itself and which about each of the others."""
-        m = self.swarm.config.n_robots - 1
-        others = [[6 + 3 * k + axis + part for part in (0, 3 * m) for axis in range(3)] for k in range(m)]
-        return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+        return self.observation.layout
 
     @property
     def action_cost(self) -> float:
@@ -112,8 +110,8 @@ class RequestTask:
 
     @property
     def observation_size(self) -> int:
-        """Length of one robot's observation, 6n."""
-        return len(self._scale)
+        """Length of one robot's observation."""
+        return self.observation.size
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
         """Draw a new episode for one swarm; every random number of the episode comes from ``rng``."""
@@ -121,7 +119,7 @@ class RequestTask:
 
     def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, rng: np.random.Generator) -> None:
         """Begin a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
-        noise_seed = int(rng.integers(2**63)) if self.swarm.config.noise else 0
+        noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
         self.swarm.reset(swarm, starts, goals, noise_seed)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
@@ -133,17 +131,8 @@ class RequestTask:
         self.scenario = [name for name, kept in zip(self.scenario, swarms, strict=True) if kept]
 
     def observe(self) -> np.ndarray:
-        """z_i = [v_i, p_ig, {p_ij}, {v_ij}] of every robot, (E, n, 6n) float32.
-
-        Own velocity, goal relative to the robot, then all relative positions of the others, then all their relative
-        velocities, others in ascending order.
-        """
-        pos, vel = self.swarm.pos, self.swarm.vel
-        relative_pos = pos[:, self._others] - pos[:, :, None]
-        relative_vel = vel[:, self._others] - vel[:, :, None]
-        flat = (*pos.shape[:2], -1)
-        parts = (vel, self.swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
-        return (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        """What every robot observes, (E, n, observation_size) float32."""
+        return self.observation(self.swarm)
 
     def step(self, requests: np.ndarray) -> Outcome:
         """One step of every swarm; ``requests`` as in `Swarm.step`."""
@@ -157,11 +146,16 @@ class RequestTask:
             "collision": -self.reward.collision * collided,
             "requests": -self.reward.request * n_requests,
         }
+        near_misses = np.zeros_like(report.separation)
+        if self.reward.near_miss:
+            shortfall = (self.reward.near_miss_distance - report.separation) / self.reward.near_miss_width
+            near_misses = self.reward.near_miss * np.clip(shortfall, 0.0, 1.0)
+            terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
         share = terms["goal"] / max(requests.shape[2], 1)
         return Outcome(
-            reward=terms["goal"] + terms["collision"] + terms["requests"],
+            reward=sum(terms.values(), start=np.zeros(len(n_requests))),
             pair_rewards=(
-                share[:, None, None] - self.reward.collision * colliding - self.reward.request * requests
+                share[:, None, None] - self.reward.collision * colliding - self.reward.request * requests - near_misses
             ).astype(np.float32),
             reward_terms=terms,
             terminated=collided,
@@ -199,12 +193,14 @@ def make_task(
     scenario: str = "mixed",
     n_robots: int | None = None,
     max_steps: int = 100,
+    observation: str = "paper",
     scale_observation: bool = False,
     continuous_collisions: bool = False,
     memory: float | None = None,
     reward: Mapping[str, float] | None = None,
     planner: Mapping[str, Any] | None = None,
     noise: Mapping[str, float] | None = None,
+    radio: Mapping[str, float] | None = None,
     space: Mapping[str, Any] | None = None,
     solver: str = "auto",
 ) -> RequestTask:
@@ -213,8 +209,11 @@ def make_task(
     :param n_swarms: number of swarms E
     :raises ValueError: a wrong value; the message names it and the remedy
     """
-    config = make_config(preset, n_robots=n_robots, memory=memory, planner=planner, noise=noise, space=space)
+    config = make_config(
+        preset, n_robots=n_robots, memory=memory, planner=planner, noise=noise, radio=radio, space=space
+    )
     sampler = ScenarioSampler(scenario, config.n_robots, config.space)
     weights = replace_fields(RewardConfig(), reward or {}, "reward")
     swarm = Swarm(config, n_swarms, solver)
-    return RequestTask(swarm, sampler, weights, max_steps, scale_observation, continuous_collisions)
+    seen = make_observation(config, observation, scale_observation)
+    return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions)
