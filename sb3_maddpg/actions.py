@@ -285,6 +285,14 @@ class TeamActions(nn.Module):
         ):
             self.register_buffer(name, th.as_tensor(table), persistent=False)
 
+    def set_threshold(self, threshold: float) -> None:
+        """
+        :param threshold: delta, of all bits
+        """
+        for kind in self.kinds:
+            if isinstance(kind, Bits):
+                kind.threshold = threshold
+
     @property
     def discrete(self) -> bool:
         """Whether any agent has bits or categories."""

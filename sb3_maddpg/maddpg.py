@@ -31,7 +31,7 @@ from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, by_agent
-from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.relational import ObservationLayout, PairPolicy
 from sb3_maddpg.team import ACTION_SPACES, Team
 from sb3_maddpg.utils import atomic_write, describe_env, suggest
 
@@ -432,6 +432,38 @@ class MADDPG(OffPolicyAlgorithm):
         :param agent: its name or its number
         """
         return AgentPolicy.of(self.policy, agent)
+
+    def set_threshold(self, threshold: float) -> None:
+        """
+        Set the threshold delta over which bits are set, in this model and in what it saves.
+
+        :param threshold: in [0, 1)
+        """
+        self.policy.set_threshold(threshold)
+        self.policy_kwargs = {**self.policy_kwargs, "threshold": threshold}
+
+    def policy_for(
+        self, observation_space: spaces.Space, action_space: spaces.Space, observation_layout: ObservationLayout
+    ) -> PairPolicy:
+        """
+        The same policy for a team of another size, which can act at once.
+
+        :param observation_space: of that team
+        :param action_space: of that team
+        :param observation_layout: of that team, see ``ObservationLayout``
+        :raises ValueError: the policy is no ``PairPolicy``, or observations hold something else
+        """
+        if not isinstance(self.policy, PairPolicy):
+            raise ValueError(f"{type(self.policy).__name__} fits one size of team; train with PairPolicy.")
+        kwargs = {**self.policy_kwargs, "observation_layout": observation_layout}
+        kwargs.pop("agent_names", None)
+        policy = type(self.policy)(observation_space, action_space, self.lr_schedule, **kwargs).to(self.device)
+        try:
+            policy.load_state_dict(self.policy.state_dict())
+        except RuntimeError as error:
+            raise ValueError(f"The team observes something else than this model was trained with: {error}") from error
+        policy.set_training_mode(False)
+        return policy
 
     def learn(
         self: SelfMADDPG,

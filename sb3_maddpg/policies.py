@@ -384,8 +384,7 @@ class MADDPGPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             squash_output=isinstance(action_space, spaces.Box) and not isinstance(action_space, MixedActions),
         )
-        if not 0.0 <= threshold < 1.0:
-            raise ValueError(f"threshold={threshold}: scores lie in [0, 1], choose 0 <= threshold < 1.")
+        _check_threshold(threshold)
         if n_critics < 1:
             raise ValueError(f"n_critics={n_critics}: an agent needs at least one.")
         self.team = Team.from_spaces(observation_space, action_space, agent_names)
@@ -433,6 +432,15 @@ class MADDPGPolicy(BasePolicy):
             "optimizer_kwargs": self.optimizer_kwargs,
         }
 
+    def set_threshold(self, threshold: float) -> None:
+        """
+        :param threshold: delta in [0, 1), for the bits of all agents from now on
+        """
+        _check_threshold(threshold)
+        self.threshold = threshold
+        for actions in {self.actor.actions, self.actor_target.actions, self.actions}:
+            actions.set_threshold(threshold)
+
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         self.check_finite(np.asarray(observation))
         return super().obs_to_tensor(observation)
@@ -469,3 +477,8 @@ class MADDPGPolicy(BasePolicy):
         if isinstance(self.action_space, MixedActions):
             return th.as_tensor(self.actions.unscale(flat.cpu().numpy()))
         return flat.to(th.int8 if isinstance(self.action_space, spaces.MultiBinary) else th.int64)
+
+
+def _check_threshold(threshold: float) -> None:
+    if not 0.0 <= threshold < 1.0:
+        raise ValueError(f"threshold={threshold}: scores lie in [0, 1], choose 0 <= threshold < 1.")

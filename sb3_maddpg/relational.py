@@ -170,7 +170,7 @@ class PairNet(nn.Module):
         if not net_arch:
             raise ValueError("net_arch=[]: PairPolicy needs a hidden layer, which encodes what an agent sees.")
         width, *later = net_arch
-        self.activation = activation_fn()
+        self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
         self.goes_below_zero = bool((self.activation(th.linspace(-9.0, 9.0, 181)) < 0).any())
         self.encoder = nn.Linear(in_features, width)
         widths = [*later, out_features]
@@ -197,7 +197,7 @@ class PairNet(nn.Module):
         else:
             largest = encoded.amax(dim=-2)
         pool = th.cat([mean, largest], dim=-1)
-        return self.of_pair(encoded) + self.of_pool(pool).unsqueeze(-2), pool
+        return self.of_pair(encoded).add_(self.of_pool(pool).unsqueeze(-2)), pool
 
     def extra(self, index: int, x: th.Tensor) -> th.Tensor:
         """
@@ -248,7 +248,7 @@ class PairActor(Actor):
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
         hidden, pool = self.net.encode(th.cat([each, neighbours], dim=-1), present)
         if self.on_neighbours:
-            return self.net.decode(hidden + self.net.extra(0, each)).flatten(-2)
+            return self.net.decode(hidden.add_(self.net.extra(0, own).unsqueeze(-2))).flatten(-2)
         return self.net.decode(self.net.of_pool(pool) + self.net.extra(0, own) + self.net.of_pair.bias)
 
     def single(self, agent: int) -> nn.Module:
@@ -322,15 +322,14 @@ class PairCritic(Critic):
         own, neighbours, present = self.views(obs)
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
         hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.who]], dim=-1), present)
-        return hidden + net.extra(1, theirs), 1.0 if present is None else present
+        return hidden.add_(net.extra(1, theirs)), 1.0 if present is None else present
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         mine, theirs = self._pairs(actions)
         values = []
         for net in self.nets:
             hidden, present = self._hidden(net, obs, theirs)
-            hidden = hidden + net.extra(0, mine)
-            values.append((net.decode(hidden) * present).flatten(1))
+            values.append((net.decode(hidden.add_(net.extra(0, mine))) * present).flatten(1))
         return th.stack(values)
 
     def forward_alternatives(

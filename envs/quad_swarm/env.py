@@ -38,7 +38,7 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     (n, 3), m.
 
     ## Episode End
-    Terminated by a collision, truncated after `max_steps`.
+    Terminated by a collision, with `end_at_arrival` also by the arrival of all; truncated after `max_steps`.
 
     ## Info
     `reward_terms`, `pair_rewards` (n, n - 1: the part of the reward that belongs to a robot and one of the others),
@@ -54,6 +54,7 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     :param observation: "paper", or names of `observation.GROUPS` joined by "+", for example "state+memory+plan"
     :param scale_observation: of the paper's: divide distances by 4 m and velocities by 4 m/s
     :param continuous_collisions: end episodes at collisions between steps too
+    :param end_at_arrival: end episodes as soon as all robots are at their goals
     :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the
         preset's
     :param reward: values of `RewardConfig` to replace
@@ -81,6 +82,7 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         observation: str = "paper",
         scale_observation: bool = False,
         continuous_collisions: bool = False,
+        end_at_arrival: bool = False,
         memory: float | None = None,
         reward: Mapping[str, float] | None = None,
         planner: Mapping[str, Any] | None = None,
@@ -99,6 +101,7 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
             observation=observation,
             scale_observation=scale_observation,
             continuous_collisions=continuous_collisions,
+            end_at_arrival=end_at_arrival,
             memory=memory,
             reward=reward,
             planner=planner,

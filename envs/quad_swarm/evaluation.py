@@ -1,6 +1,7 @@
 """Fly policies over the same held-out episodes and count what happens.
 
-A policy is a rule (`communication.RULES`) or the zip of a trained model, loaded by the class that ``algo`` names.
+A policy is a rule (`communication.RULES`) or the zip of a trained model, loaded by the class that ``algo`` names;
+``MODEL.zip@0.3`` acts with the threshold 0.3 instead of its own.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from tqdm import tqdm
 
 from .communication import parse_rule
+from .observation import Observation, PaperObservation, make_observation
 from .presets import SwarmConfig
 from .scenarios import ScenarioSampler
 from .swarm import Swarm
@@ -34,7 +37,7 @@ OBSERVATION_ARGUMENTS = ("observation", "scale_observation")
 # Held-out episodes begin here; training seeds count from 0.
 _FIRST_SEED = 10**9
 # Fixed, so that neither the batches nor the results depend on the number of processes.
-_CHUNK = 25
+_CHUNK = 100
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class Cell:
     :param max_steps: time limit (steps)
     :param algo: ``module:Class`` that loads models
     :param solver: see `make_planner`
+    :param linger: steps that are flown on after all have arrived; None: until the time limit
     """
 
     policy: str
@@ -55,22 +59,25 @@ class Cell:
     max_steps: int
     algo: str
     solver: str
+    linger: int | None = None
 
 
 def is_model(policy: str) -> bool:
     """Whether a policy's text names a model's file instead of a rule."""
-    return policy.endswith(".zip") or os.sep in policy
+    return policy.partition("@")[0].endswith(".zip") or os.sep in policy
 
 
 @functools.lru_cache(maxsize=4)
-def load_model(path: str, algo: str) -> Any:
+def load_model(policy: str, algo: str) -> Any:
     """A trained model.
 
-    :param path: its zip
-    :param algo: ``module:Class`` with a ``load(path, device=...)`` as in Stable-Baselines3
+    :param policy: its zip, with a threshold where that is not to be its own: ``MODEL.zip@0.3``
+    :param algo: ``module:Class`` with a ``load(path, device=...)`` as in Stable-Baselines3, and a ``set_threshold`` if
+        one is given
     :raises FileNotFoundError: no such file
-    :raises ValueError: the class does not exist, or it cannot read the file
+    :raises ValueError: the class does not exist, or it cannot read the file, or the threshold is none
     """
+    path, at, threshold = policy.partition("@")
     if not Path(path).is_file():
         raise FileNotFoundError(f"No model at {path!r}: train one first, or give the zip's full path.")
     module_name, _, class_name = algo.partition(":")
@@ -79,16 +86,28 @@ def load_model(path: str, algo: str) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"--algo {algo!r} is no importable module:Class ({error}).") from error
     try:
-        return loader.load(path, device="cpu")
+        model = loader.load(path, device="cpu")
     except Exception as error:  # whatever the loader raises for a damaged or foreign file
         raise ValueError(
             f"{path} cannot be loaded by {algo} ({type(error).__name__}: {error}). "
             "Is the file complete, and was it saved by that class?"
         ) from error
+    if at:
+        if not hasattr(model, "set_threshold"):
+            raise ValueError(f"{policy}: {algo} has no threshold; leave out '@{threshold}'.")
+        model.set_threshold(_number(threshold, policy))
+    return model
 
 
-def make_policy(cell: Cell) -> tuple[Requests, dict[str, Any]]:
-    """The policy of a cell, and the observation arguments that it needs.
+def _number(text: str, policy: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{policy}: the threshold {text!r} is no number; write MODEL.zip@0.3.") from None
+
+
+def make_policy(cell: Cell) -> tuple[Requests, Observation]:
+    """The policy of a cell, and the observation that it needs.
 
     :raises ValueError: unknown rule, or a model that was trained for another number of robots or another space
     """
@@ -97,37 +116,44 @@ def make_policy(cell: Cell) -> tuple[Requests, dict[str, Any]]:
             rule = parse_rule(cell.policy)
         except ValueError as error:
             raise ValueError(f"{error} A model is given by the path of its .zip.") from None
-        return (lambda task, rngs: rule(View(task.swarm, rngs))), {}
+        return (lambda task, rngs: rule(View(task.swarm, rngs))), PaperObservation(cell.config.n_robots)
 
     model = load_model(cell.policy, cell.algo)
     spec = getattr(model, "env_spec", None) or {}
     arguments = {k: v for k, v in spec.get("kwargs", {}).items() if k in OBSERVATION_ARGUMENTS}
     n = cell.config.n_robots
-    expected, trained = (n, 6 * n), tuple(model.observation_space.shape)
+    seen = make_observation(cell.config, **arguments)
+    expected, trained = (n, seen.size), tuple(model.observation_space.shape)
+    predictor = model
     if trained != expected:
-        robots = f"{trained[0]} robots" if len(trained) == 2 and trained[1] == 6 * trained[0] else "another environment"
-        raise ValueError(
-            f"{cell.policy} was trained for {robots} (observation {trained}); "
-            f"this world has {n} robots (observation {expected}). "
-            "Choose the preset or --n-robots that it was trained with."
+        if not hasattr(model, "policy_for") or not hasattr(model.policy, "observation_layout"):
+            robots = f"{trained[0]} robots" if len(trained) == 2 else "another environment"
+            raise ValueError(
+                f"{cell.policy} was trained for {robots} (observation {trained}); "
+                f"this world has {n} robots (observation {expected}). "
+                "Choose the preset or --n-robots that it was trained with."
+            )
+        # A policy that looks at its neighbours one by one fits any number of them
+        predictor = model.policy_for(
+            spaces.Box(-np.inf, np.inf, expected, np.float32), spaces.MultiBinary(n * (n - 1)), seen.layout
         )
 
     def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
-        bits, _ = model.predict(task.observe(), deterministic=True)
+        bits, _ = predictor.predict(task.observe(), deterministic=True)
         return np.asarray(bits).reshape(-1, n, n - 1) > 0.5
 
-    return request, arguments
+    return request, seen
 
 
 def _begin(cell: Cell, episodes: Sequence[int]) -> tuple[Requests, RequestTask, list[np.random.Generator]]:
-    policy, arguments = make_policy(cell)
+    policy, seen = make_policy(cell)
     config = cell.config
     task = RequestTask(
         Swarm(config, len(episodes), cell.solver),
         ScenarioSampler(cell.scenario, config.n_robots, config.space),
         RewardConfig(),
         cell.max_steps,
-        **arguments,
+        seen,
     )
     for k, seed in enumerate(episodes):
         task.reset(k, np.random.default_rng(seed))
@@ -172,16 +198,19 @@ def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
     :return: for each episode its figures, see `EpisodeStatistics`
     """
     policy, task, rngs = _begin(cell, episodes)
-    index = np.arange(len(episodes))
+    index, since = np.arange(len(episodes)), np.zeros(len(episodes), dtype=int)
     rows: dict[int, dict[str, float]] = {}
     while index.size:
         outcome = task.step(policy(task, rngs))
         done = outcome.terminated | outcome.truncated
+        if cell.linger is not None:
+            since += task.statistics.arrived
+            done |= since > cell.linger
         if done.any():
             rows |= {int(index[k]): task.statistics.row(int(k)) for k in np.flatnonzero(done)}
             task.keep(~done)
             rngs = [rng for rng, over in zip(rngs, done, strict=True) if not over]
-            index = index[~done]
+            index, since = index[~done], since[~done]
     return [rows[k] for k in range(len(episodes))]
 
 
@@ -196,6 +225,45 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2)) / (1 + z**2 / trials)
     return max(0.0, centre - half), min(1.0, centre + half)
+
+
+class Comparison(NamedTuple):
+    """Collisions of two policies over the same episodes.
+
+    :param episodes: number of episodes
+    :param only_first: episodes in which only the first policy collided
+    :param only_second: episodes in which only the second did
+    """
+
+    episodes: int
+    only_first: int
+    only_second: int
+
+    @classmethod
+    def of(cls, first: Sequence[Mapping[str, float]], second: Sequence[Mapping[str, float]]) -> Comparison:
+        """From the figures of the same episodes, see `run_episodes`."""
+        pairs = [(bool(a["collided"]), bool(b["collided"])) for a, b in zip(first, second, strict=True)]
+        return cls(len(pairs), sum(a and not b for a, b in pairs), sum(b and not a for a, b in pairs))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the difference of the rates, first minus second (Agresti and Min 2005: half an episode is
+        added to each of the four counts)."""
+        n, b, c = self.episodes + 2, self.only_first + 0.5, self.only_second + 0.5
+        half = 1.959964 / n * math.sqrt(b + c - (b - c) ** 2 / n)
+        return (b - c) / n - half, (b - c) / n + half
+
+    @property
+    def p_value(self) -> float:
+        """Of McNemar's exact test that both collide equally often."""
+        n = self.only_first + self.only_second
+        tail = sum(math.comb(n, k) for k in range(min(self.only_first, self.only_second) + 1)) / 2**n
+        return min(1.0, 2 * tail)
+
+    @property
+    def as_safe(self) -> bool:
+        """Whether the first policy collides at most 0.3 percentage points more often, with 97.5 % confidence."""
+        return self.interval[1] < 0.003
 
 
 def summarise(rows: Sequence[Mapping[str, float]], n_robots: int) -> dict[str, Any]:
@@ -233,6 +301,20 @@ def evaluate(cells: Sequence[Cell], episodes: int, seed: int = 0, jobs: int = 1)
     :param jobs: processes
     :return: one row a cell, see `summarise`
     """
+    flown = fly_all(cells, episodes, seed, jobs)
+    return [
+        {
+            "policy": cell.policy,
+            "scenario": cell.scenario,
+            **summarise(rows, cell.config.n_robots),
+            "n_robots": cell.config.n_robots,
+        }
+        for cell, rows in flown.items()
+    ]
+
+
+def fly_all(cells: Sequence[Cell], episodes: int, seed: int = 0, jobs: int = 1) -> dict[Cell, list[dict[str, float]]]:
+    """`evaluate`, episode by episode: the figures of each, see `EpisodeStatistics`."""
     if episodes < 1 or jobs < 1:
         raise ValueError(f"episodes={episodes} and jobs={jobs} must be at least 1.")
     for cell in cells:
@@ -243,15 +325,7 @@ def evaluate(cells: Sequence[Cell], episodes: int, seed: int = 0, jobs: int = 1)
     flown: dict[Cell, list[dict[str, float]]] = {cell: [] for cell in cells}
     for (cell, _), rows in zip(work, _run_all(work, jobs), strict=True):
         flown[cell] += rows
-    return [
-        {
-            "policy": cell.policy,
-            "scenario": cell.scenario,
-            **summarise(rows, cell.config.n_robots),
-            "n_robots": cell.config.n_robots,
-        }
-        for cell, rows in flown.items()
-    ]
+    return flown
 
 
 def _run_all(work: Sequence[tuple[Cell, range]], jobs: int) -> Iterable[list[dict[str, float]]]:

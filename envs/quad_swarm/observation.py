@@ -47,7 +47,7 @@ class PaperObservation:
     :param scaled: divide distances by 4 m and velocities by 4 m/s
     """
 
-    def __init__(self, n_robots: int, scaled: bool):
+    def __init__(self, n_robots: int, scaled: bool = False):
         self.n_robots, self.size = n_robots, 6 * n_robots
         distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
         self._others = other_indices(n_robots)
@@ -70,7 +70,8 @@ class PaperObservation:
 
 
 class PairView:
-    """A view with vectors turned so that x points horizontally to the other robot and z up.
+    """A view with vectors turned so that x points horizontally to the other robot and z up, and mirrored so that the
+    other moves to the left: what is to be learned about a pair does not depend on either.
 
     :param view: what the robots know
     :param swarm: everything, for what only critics see
@@ -85,13 +86,14 @@ class PairView:
         above = flat < 1e-6
         self.cos = np.where(above, 1.0, view.pos[..., 0] / np.maximum(flat, 1e-6))
         self.sin = np.where(above, 0.0, view.pos[..., 1] / np.maximum(flat, 1e-6))
+        self.side = np.where(self.cos * view.vel[..., 1] < self.sin * view.vel[..., 0], -1.0, 1.0)
 
     def turn(self, vectors: np.ndarray) -> np.ndarray:
         """Vectors along the world's axes, (E, n, n - 1, ..., 3), seen from the pair's frame."""
         more = (1,) * (vectors.ndim - self.cos.ndim - 1)
-        cos, sin = (a.reshape(a.shape + more) for a in (self.cos, self.sin))
+        cos, sin, side = (a.reshape(a.shape + more) for a in (self.cos, self.sin, self.side))
         x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-        return np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
+        return np.stack([cos * x + sin * y, side * (cos * y - sin * x), z], axis=-1)
 
     def closeness(self, distance: np.ndarray) -> np.ndarray:
         """A distance at several magnifications around contact, (..., 3)."""
@@ -249,14 +251,14 @@ class PairObservation:
         return np.concatenate([_own(pair.view), _flat(blocks, 2)], axis=-1, dtype=np.float32)
 
 
-def make_observation(config: SwarmConfig, observation: str, scaled: bool) -> Observation:
+def make_observation(config: SwarmConfig, observation: str = "paper", scale_observation: bool = False) -> Observation:
     """What robots observe.
 
     :param config: the world
     :param observation: "paper", or names of `GROUPS` joined by "+"
-    :param scaled: of the paper's, see there
+    :param scale_observation: of the paper's, see there
     :raises ValueError: unknown name, or scaling of what is scaled
     """
     if observation == "paper":
-        return PaperObservation(config.n_robots, scaled)
+        return PaperObservation(config.n_robots, scale_observation)
     return PairObservation(config, observation.split("+"))

@@ -44,7 +44,7 @@ class Outcome(NamedTuple):
         request, their collision, and an equal share of the goal's reward
     :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" where it has a
         weight, each (E,)
-    :param terminated: ended by a collision, (E,) bool
+    :param terminated: ended by a collision, or by the arrival of all where that ends episodes, (E,) bool
     :param truncated: ended by the time limit, (E,) bool
     :param n_requests: requests made, (E,)
     :param report: what happened in the world
@@ -70,6 +70,7 @@ class RequestTask:
     :param max_steps: time limit (steps)
     :param observation: what robots observe, the paper's without scaling if None
     :param continuous_collisions: end episodes at collisions between steps too; the paper looks at the steps alone
+    :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class RequestTask:
         max_steps: int = 100,
         observation: Observation | None = None,
         continuous_collisions: bool = False,
+        end_at_arrival: bool = False,
     ):
         if max_steps < 1:
             raise ValueError(f"max_steps={max_steps}: an episode needs at least one step.")
@@ -88,6 +90,7 @@ class RequestTask:
         self.reward = reward
         self.max_steps = max_steps
         self.continuous_collisions = continuous_collisions
+        self.end_at_arrival = end_at_arrival
         n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, n)
@@ -151,6 +154,7 @@ class RequestTask:
             shortfall = (self.reward.near_miss_distance - report.separation) / self.reward.near_miss_width
             near_misses = self.reward.near_miss * np.clip(shortfall, 0.0, 1.0)
             terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
+        terminated = collided | self.statistics.arrived if self.end_at_arrival else collided
         share = terms["goal"] / max(requests.shape[2], 1)
         return Outcome(
             reward=sum(terms.values(), start=np.zeros(len(n_requests))),
@@ -158,8 +162,8 @@ class RequestTask:
                 share[:, None, None] - self.reward.collision * colliding - self.reward.request * requests - near_misses
             ).astype(np.float32),
             reward_terms=terms,
-            terminated=collided,
-            truncated=~collided & (self.statistics.steps >= self.max_steps),
+            terminated=terminated,
+            truncated=~terminated & (self.statistics.steps >= self.max_steps),
             n_requests=n_requests,
             report=report,
         )
@@ -196,6 +200,7 @@ def make_task(
     observation: str = "paper",
     scale_observation: bool = False,
     continuous_collisions: bool = False,
+    end_at_arrival: bool = False,
     memory: float | None = None,
     reward: Mapping[str, float] | None = None,
     planner: Mapping[str, Any] | None = None,
@@ -216,4 +221,4 @@ def make_task(
     weights = replace_fields(RewardConfig(), reward or {}, "reward")
     swarm = Swarm(config, n_swarms, solver)
     seen = make_observation(config, observation, scale_observation)
-    return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions)
+    return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival)

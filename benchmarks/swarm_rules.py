@@ -1,0 +1,119 @@
+"""Tune every family of hand-made rules as hard as a learner: the cheapest of each that is as safe as asking everybody.
+
+``python benchmarks/swarm_rules.py [--quick] [--preset paper dense] [--json F]``, on the validation set. In each
+scenario all rules of a family fly a few episodes, which tell their requests. Then they are tried from the cheapest on,
+in stages of more and more episodes, until one is as safe as full communication in the last stage
+(`Comparison.as_safe`). One that collides significantly more often in an earlier stage is out. JSON: one row for each
+rule and scenario with the keys of `quad_swarm.evaluation.summarise` over the episodes that it flew, and preset,
+scenario, family, rule, and safe: True or False, or None for those dearer than the one that was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from quad_swarm.evaluate import write_json
+from quad_swarm.evaluation import Cell, Comparison, fly_all, summarise
+from quad_swarm.presets import PRESETS, SwarmConfig, make_config
+from quad_swarm.scenarios import SCENARIOS
+
+# Sets of held-out episodes, see `first_episode`: rules and thresholds are tuned on one and reported on the other.
+VALIDATION, TEST = 1, 2
+# Steps flown on after arrival.
+LINGER = 10
+STAGES, QUICK_STAGES = (50, 250, 1000, 4000), (10, 20)
+
+DISTANCES = (0.62, 0.65, 0.7, 0.8, 0.9, 1.05, 1.2, 1.5)
+LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
+
+
+def families() -> dict[str, list[str]]:
+    """The rules of each family."""
+    cpa = [f"cpa:{d:g}:{t:g}" for d, t in itertools.product((0.6, *DISTANCES, 2.0), LOOK_AHEADS)]
+    some = [f"cpa:{d:g}:{t:g}" for d, t in itertools.product(DISTANCES[:-1], (1.5, 2.0, 3.0, 4.0))]
+    return {
+        "distance": [f"distance:{d:g}" for d in (1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 6)],
+        "cpa": cpa,
+        "random": [f"random:{p:g}" for p in (0.1, 0.25, 0.5, 0.75, 0.9)],
+        "event": [f"event:{e:g}" for e in (0, 0.001, 0.003, 0.01, 0.02, 0.03)],
+        "plan": [f"plan:{d:g}" for d in (*DISTANCES, 2.0)],
+        "cpa and stale": [f"{rule}&stale:{k}" for rule in some for k in (3, 4, 5)],
+        "cpa and event": [f"{rule}&event:{e:g}" for rule in some for e in (0.003, 0.01)],
+        "cpa and plan": [f"{rule}&plan:{d:g}" for rule in some[::2] for d in (0.8, 1.0)],
+        "cpa, soon or stale": [
+            f"{rule}&soon:{t:g}|{rule}&stale:{k}" for rule in some for t in (0.15, 0.3, 0.6) for k in (3, 4, 6)
+        ],
+        "two cpa": [
+            f"cpa:{near}|cpa:{far}&stale:{k}"
+            for near in ("0.65:1", "0.65:1.5", "0.7:1.5", "0.8:1")
+            for far in ("0.8:3", "0.9:2", "0.9:3", "1.05:3", "1.05:4", "1.2:3", "1.5:3")
+            for k in (3, 4, 6)
+        ],
+    }
+
+
+def fly(rules: list[str], preset: str, scenario: str, episodes: int) -> dict[str, list[dict[str, float]]]:
+    """:return: for each rule the figures of its validation episodes"""
+    config = make_config(preset)
+    cells = [cell(rule, scenario, config) for rule in rules]
+    return {cell.policy: rows for cell, rows in fly_all(cells, episodes, VALIDATION).items()}
+
+
+def cell(policy: str, scenario: str, config: SwarmConfig) -> Cell:
+    """A policy in a scenario as all results here fly it."""
+    return Cell(policy, scenario, config, 100, "sb3_maddpg:MADDPG", "rti", LINGER)
+
+
+def tune(preset: str, scenario: str, quick: bool) -> list[dict[str, Any]]:
+    """The rows of one scenario."""
+    stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
+    n = make_config(preset).n_robots
+    full = fly(["full"], preset, scenario, stages[-1])["full"]
+    table = []
+    for family, rules in families().items():
+        flown = fly(rules[::thin], preset, scenario, stages[0])
+        safe: dict[str, bool] = {}
+        for rule in sorted(flown, key=lambda rule: summarise(flown[rule], n)["request_share"]):
+            for episodes in stages:
+                if episodes > stages[0]:
+                    flown[rule] = fly([rule], preset, scenario, episodes)[rule]
+                comparison = Comparison.of(flown[rule], full[:episodes])
+                if comparison.interval[0] > 0:
+                    break
+            # So few episodes as in a quick run prove nothing
+            safe[rule] = episodes == stages[-1] and (comparison.as_safe or quick)
+            if safe[rule]:
+                break
+        keys = {"preset": preset, "scenario": scenario, "family": family}
+        table += [keys | {"rule": rule, "safe": safe.get(rule)} | summarise(flown[rule], n) for rule in flown]
+        best = [rule for rule in safe if safe[rule]]
+        share = f"{summarise(flown[best[0]], n)['request_share']:.2%}" if best else "-"
+        print(f"{preset:6} {scenario:16} {family:20} {best[0] if best else 'none':45} {share:>8}", flush=True)
+    return table
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS))
+    parser.add_argument("--quick", action="store_true", help="few episodes and rules, to see that it runs")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    work = [(preset, scenario, args.quick) for preset in args.preset for scenario in SCENARIOS]
+    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+        rows = [row for table in pool.map(tune, *zip(*work, strict=True)) for row in table]
+    if args.json:
+        write_json(args.json, rows)
+
+
+if __name__ == "__main__":
+    main()
