@@ -10,6 +10,7 @@ from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.shipped import pretrained
 
 __version__ = version("sb3-maddpg")
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "PairPolicy",
     "TeamEnv",
     "TeamReplayBuffer",
+    "pretrained",
 ]

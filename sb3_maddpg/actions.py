@@ -102,6 +102,7 @@ class Bits(ActionKind):
 
     :param threshold: delta
     :param n_thresholds: how many delta' an agent draws, each for an equal part of its bits
+    :param random_thresholds: share of these that are drawn; the others are delta
     """
 
     def __init__(
@@ -110,10 +111,12 @@ class Bits(ActionKind):
         action_spaces: Sequence[AgentActionSpace],
         threshold: float,
         n_thresholds: int = 1,
+        random_thresholds: float = 1.0,
     ):
         super().__init__(agents, action_spaces)
         self.threshold = threshold
         self.n_thresholds = n_thresholds
+        self.random_thresholds = random_thresholds
 
     def squash(self, logits: th.Tensor) -> th.Tensor:
         return th.sigmoid(logits) * self.real if self.padded else th.sigmoid(logits)
@@ -123,6 +126,9 @@ class Bits(ActionKind):
         if deterministic:
             return (scores > self.threshold).to(scores.dtype)
         thresholds = th.rand_like(scores[..., : self.n_thresholds])
+        if self.random_thresholds < 1:
+            drawn = th.rand_like(thresholds) < self.random_thresholds
+            thresholds = thresholds.where(drawn, th.as_tensor(self.threshold, dtype=scores.dtype))
         if self.n_thresholds > 1:
             thresholds = thresholds.repeat_interleave(self.width // self.n_thresholds, dim=-1)
         return (scores > thresholds).to(scores.dtype)
@@ -187,13 +193,16 @@ class Categories(ActionKind):
         return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
 
 
-def make_kinds(action_spaces: Sequence[AgentActionSpace], threshold: float, n_thresholds: int = 1) -> list[ActionKind]:
+def make_kinds(
+    action_spaces: Sequence[AgentActionSpace], threshold: float, n_thresholds: int = 1, random_thresholds: float = 1.0
+) -> list[ActionKind]:
     """
     Group the agents of a team by how they act.
 
     :param action_spaces: of all agents
     :param threshold: for bits, see ``Bits``
     :param n_thresholds: for bits, see ``Bits``
+    :param random_thresholds: for bits, see ``Bits``
     """
     groups: dict[str, list[int]] = {}
     for agent, space in enumerate(action_spaces):
@@ -205,7 +214,7 @@ def make_kinds(action_spaces: Sequence[AgentActionSpace], threshold: float, n_th
         if name == "numbers":
             kinds.append(Continuous(agents, members))
         elif name == "bits":
-            kinds.append(Bits(agents, members, threshold, n_thresholds))
+            kinds.append(Bits(agents, members, threshold, n_thresholds, random_thresholds))
         else:
             kinds.append(Categories(agents, members))
     return kinds
@@ -219,6 +228,7 @@ class TeamActions(nn.Module):
     :param action_spaces: each agent's action space, categories counting from 0
     :param threshold: for bits, see ``Bits``
     :param n_thresholds: for bits, see ``Bits``
+    :param random_thresholds: for bits, see ``Bits``
     """
 
     source: th.Tensor
@@ -230,11 +240,17 @@ class TeamActions(nn.Module):
     width: int
     n_agents: int
 
-    def __init__(self, action_spaces: Sequence[AgentActionSpace], threshold: float = 0.5, n_thresholds: int = 1):
+    def __init__(
+        self,
+        action_spaces: Sequence[AgentActionSpace],
+        threshold: float = 0.5,
+        n_thresholds: int = 1,
+        random_thresholds: float = 1.0,
+    ):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
-        self.kinds = make_kinds(action_spaces, threshold, n_thresholds)
+        self.kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
         self._modules_of_kinds = nn.ModuleList(self.kinds)  # so that their tables move with the module
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()

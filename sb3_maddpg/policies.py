@@ -343,6 +343,7 @@ class MADDPGPolicy(BasePolicy):
         numbers) that share one
     :param share_critic: the same for critics
     :param threshold: delta in [0, 1): a bit is set where its score exceeds it. For ``MultiBinary`` alone.
+    :param random_thresholds: share of the thresholds that are drawn to explore, the others are delta
     :param n_critics: number of critics of each agent
     :param agent_names: by default those of the observation space, or agent_0, agent_1, ...
     :param normalize_images: kept for Stable-Baselines3, a team observation is never an image
@@ -367,6 +368,7 @@ class MADDPGPolicy(BasePolicy):
         share_actor: Sharing = False,
         share_critic: Sharing = False,
         threshold: float = 0.5,
+        random_thresholds: float = 1.0,
         n_critics: int = 1,
         agent_names: Sequence[str] | None = None,
         normalize_images: bool = True,
@@ -385,6 +387,8 @@ class MADDPGPolicy(BasePolicy):
             squash_output=isinstance(action_space, spaces.Box) and not isinstance(action_space, MixedActions),
         )
         _check_threshold(threshold)
+        if not 0.0 < random_thresholds <= 1.0:
+            raise ValueError(f"random_thresholds={random_thresholds} is a share above 0: without it nothing is tried.")
         if n_critics < 1:
             raise ValueError(f"n_critics={n_critics}: an agent needs at least one.")
         self.team = Team.from_spaces(observation_space, action_space, agent_names)
@@ -393,6 +397,7 @@ class MADDPGPolicy(BasePolicy):
         self.share_actor = share_actor
         self.share_critic = share_critic
         self.threshold = threshold
+        self.random_thresholds = random_thresholds
         self.n_critics = n_critics
         self._build(lr_schedule)
 
@@ -409,7 +414,7 @@ class MADDPGPolicy(BasePolicy):
             target.requires_grad_(False)
 
     def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
-        actions = TeamActions(self.team.action_spaces, self.threshold)
+        actions = TeamActions(self.team.action_spaces, self.threshold, random_thresholds=self.random_thresholds)
         actor_groups = sharing_groups(self.share_actor, self.team, "share_actor")
         critic_groups = sharing_groups(self.share_critic, self.team, "share_critic")
         return (
@@ -426,6 +431,7 @@ class MADDPGPolicy(BasePolicy):
             "share_actor": self.share_actor,
             "share_critic": self.share_critic,
             "threshold": self.threshold,
+            "random_thresholds": self.random_thresholds,
             "n_critics": self.n_critics,
             "agent_names": self.team.names,
             "optimizer_class": self.optimizer_class,

@@ -377,6 +377,7 @@ class PairPolicy(MADDPGPolicy):
         pair_credit: bool = False,
         shared_threshold: bool = False,
         threshold: float = 0.5,
+        random_thresholds: float = 1.0,
         n_critics: int = 1,
         agent_names: Sequence[str] | None = None,
         normalize_images: bool = True,
@@ -401,6 +402,7 @@ class PairPolicy(MADDPGPolicy):
             share_actor=True,
             share_critic=True,
             threshold=threshold,
+            random_thresholds=random_thresholds,
             n_critics=n_critics,
             agent_names=agent_names,
             normalize_images=normalize_images,
@@ -414,7 +416,8 @@ class PairPolicy(MADDPGPolicy):
         action_spaces = self.team.action_spaces
         views, of_critic = Views(layout, self.team), Views(layout, self.team, of_critic=True)
         apart = on_neighbours and not self.shared_threshold
-        actions = TeamActions(action_spaces, self.threshold, views.n_neighbours if apart else 1)
+        n_thresholds = views.n_neighbours if apart else 1
+        actions = TeamActions(action_spaces, self.threshold, n_thresholds, self.random_thresholds)
         units = actions
         if on_neighbours:
             parts = [part for space in action_spaces for part in _split(space, views.n_neighbours)]

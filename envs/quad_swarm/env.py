@@ -48,7 +48,7 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Arguments
     :param preset: "paper" or "dense" (`presets.PRESETS`)
-    :param scenario: a name of `scenarios.SCENARIOS`, "mixed" or "curriculum"
+    :param scenario: a name of `scenarios.SCENARIOS`, "mixed" or "curriculum", or names with weights
     :param n_robots: number of robots; None: the preset's
     :param max_steps: time limit (steps)
     :param observation: "paper", or names of `observation.GROUPS` joined by "+", for example "state+memory+plan"
@@ -76,7 +76,7 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     def __init__(
         self,
         preset: str = "paper",
-        scenario: str = "mixed",
+        scenario: str | Mapping[str, float] = "mixed",
         n_robots: int | None = None,
         max_steps: int = 100,
         observation: str = "paper",

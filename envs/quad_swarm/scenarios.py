@@ -6,7 +6,7 @@ the function and name it in `SCENARIOS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,27 +136,34 @@ class ScenarioSampler:
     """Draws episodes of one scenario, or of a mixture of all.
 
     :param name: a name of `SCENARIOS`; "mixed" draws uniformly among them; "curriculum" draws uniformly among the first
-        ``level + 1`` of them
+        ``level + 1`` of them; names with weights, as in ``{"symmetric_swap": 3, "random": 1}``, draw in proportion
     :param n_robots: number of robots, at least 2
     :param space: the room
     :raises ValueError: unknown name, fewer than two robots, or more robots than fit (`DoesNotFit`)
     """
 
-    def __init__(self, name: str, n_robots: int, space: ScenarioSpace):
-        if name not in SCENARIOS and name not in MIXTURES:
-            raise unknown_name("scenario", name, [*SCENARIOS, *MIXTURES])
+    def __init__(self, name: str | Mapping[str, float], n_robots: int, space: ScenarioSpace):
+        for one in [name] if isinstance(name, str) else name:
+            if one not in SCENARIOS and (one not in MIXTURES or not isinstance(name, str)):
+                raise unknown_name("scenario", one, [*SCENARIOS, *MIXTURES])
+        weights = [] if isinstance(name, str) else [float(weight) for weight in name.values()]
+        if not isinstance(name, str) and not (all(weight >= 0 for weight in weights) and sum(weights) > 0):
+            raise ValueError(f"scenario={dict(name)}: weights are not negative, and one of them is positive.")
         if n_robots < 2:
             raise ValueError(f"n_robots={n_robots}: a swarm needs at least 2 robots.")
         self.name = name
         self.n_robots = n_robots
         self.space = space
         self.level = 0
+        self._weights = np.array(weights) / sum(weights) if weights else None
         for scenario in self._names:
             # Find out at construction, not in the middle of a training, that the robots do not fit.
             SCENARIOS[scenario](n_robots, space, np.random.default_rng(0))
 
     @property
     def _names(self) -> list[str]:
+        if not isinstance(self.name, str):
+            return list(self.name)
         return list(SCENARIOS) if self.name in MIXTURES else [self.name]
 
     @property
@@ -181,5 +188,8 @@ class ScenarioSampler:
     def sample(self, rng: Rng) -> tuple[str, np.ndarray, np.ndarray]:
         """Draw an episode: the scenario's name, starts (n, 3) and goals (n, 3), world frame (m)."""
         active = self._active()
-        name = active[int(rng.integers(len(active)))] if len(active) > 1 else active[0]
+        if self._weights is not None:
+            name = active[int(rng.choice(len(active), p=self._weights))]
+        else:
+            name = active[int(rng.integers(len(active)))] if len(active) > 1 else active[0]
         return name, *SCENARIOS[name](self.n_robots, self.space, rng)

@@ -92,6 +92,14 @@ class Swarm:
         """Planned states at stages 0..N, (E, n, N + 1, 9), as of the last step."""
         return self._plans.x.reshape(*self.state.shape[:2], *self._plans.x.shape[1:])
 
+    def planned_separation(self, steps: int) -> np.ndarray:
+        """How close each robot comes to each of the others by their plans in the ``steps`` after the present one,
+        (E, n, n - 1) (m)."""
+        i, j = self._pairs
+        plans = self.plans[..., 2 : 2 + steps, POSITION]
+        between = plans[:, i] - plans[:, j]
+        return np.sqrt(_dot(between, between)).min(axis=-1)[:, self._pair_of]
+
     def reset(self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
         """Put one swarm's robots at rest at ``starts`` and give them ``goals``, both (n, 3), world frame (m).
 

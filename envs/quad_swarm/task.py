@@ -26,6 +26,7 @@ class RewardConfig:
         ``near_miss_width`` less than that and in proportion before; a signal that is less rare than collisions
     :param near_miss_distance: see there (m)
     :param near_miss_width: see there (m)
+    :param near_miss_ahead: count also how close the two come by their plans within so many further steps
     """
 
     goal: float = 1.3
@@ -34,6 +35,7 @@ class RewardConfig:
     near_miss: float = 0.0
     near_miss_distance: float = 0.6
     near_miss_width: float = 0.01
+    near_miss_ahead: int = 0
 
 
 class Outcome(NamedTuple):
@@ -151,7 +153,10 @@ class RequestTask:
         }
         near_misses = np.zeros_like(report.separation)
         if self.reward.near_miss:
-            shortfall = (self.reward.near_miss_distance - report.separation) / self.reward.near_miss_width
+            closest = report.separation
+            if self.reward.near_miss_ahead:
+                closest = np.minimum(closest, self.swarm.planned_separation(self.reward.near_miss_ahead))
+            shortfall = (self.reward.near_miss_distance - closest) / self.reward.near_miss_width
             near_misses = self.reward.near_miss * np.clip(shortfall, 0.0, 1.0)
             terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
         terminated = collided | self.statistics.arrived if self.end_at_arrival else collided
@@ -194,7 +199,7 @@ class RequestTask:
 def make_task(
     n_swarms: int = 1,
     preset: str = "paper",
-    scenario: str = "mixed",
+    scenario: str | Mapping[str, float] = "mixed",
     n_robots: int | None = None,
     max_steps: int = 100,
     observation: str = "paper",

@@ -1,0 +1,56 @@
+"""Trained models that come with the package."""
+
+from __future__ import annotations
+
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.utils import suggest
+
+
+def shipped_models() -> list[str]:
+    """Names of the models that ``pretrained`` knows."""
+    return sorted(entry.name for entry in files("sb3_maddpg.models").iterdir() if (entry / "model.zip").is_file())
+
+
+def pretrained(name: str, env: GymEnv | None = None, **kwargs) -> MADDPG:
+    """
+    A trained model that comes with the package. Beside its ``model.zip`` lie the recipe and the command that made it,
+    its training's curve and its results, see ``pretrained_folder``.
+
+    :param name: see ``shipped_models``
+    :param env: to fly in or to train on; a team of another size is welcome where the policy is a ``PairPolicy``
+    :param kwargs: further arguments of ``MADDPG.load``; with a team of another size, of ``MADDPG``
+    :raises ValueError: no such model, or an environment that it does not fit
+    """
+    path = pretrained_folder(name) / "model.zip"
+    model = MADDPG.load(path, device=kwargs.get("device", "auto"))
+    if env is None:
+        return model if not kwargs else MADDPG.load(path, **kwargs)
+    wrapped = MADDPG._wrap_env(env)
+    same = (wrapped.observation_space, wrapped.action_space) == (model.observation_space, model.action_space)
+    if same or not isinstance(model.policy, PairPolicy):
+        return MADDPG.load(path, env=wrapped, **kwargs)
+    own = {key: value for key, value in model.policy_kwargs.items() if key not in PairPolicy.env_attributes}
+    resized = MADDPG("PairPolicy", wrapped, policy_kwargs=own, **kwargs)
+    try:
+        resized.set_parameters(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{name} was trained with other observations than this environment gives: {error}") from error
+    return resized
+
+
+def pretrained_folder(name: str) -> Path:
+    """
+    :param name: see ``shipped_models``
+    :return: the folder with ``model.zip`` and what belongs to it
+    :raises ValueError: no such model
+    """
+    if name not in shipped_models():
+        raise ValueError(suggest("pretrained model", name, shipped_models()))
+    with as_file(files("sb3_maddpg.models") / name) as folder:
+        return Path(folder)
