@@ -60,10 +60,12 @@ def families() -> dict[str, list[str]]:
     }
 
 
-def fly(rules: list[str], preset: str, scenario: str, episodes: int) -> dict[str, list[dict[str, float]]]:
-    """:return: for each rule the figures of its validation episodes"""
-    config = make_config(preset)
-    cells = [cell(rule, scenario, config) for rule in rules]
+def fly(
+    policies: list[str], preset: str, scenario: str, episodes: int, n_robots: int | None = None
+) -> dict[str, list[dict[str, float]]]:
+    """:return: for each policy the figures of its validation episodes"""
+    config = make_config(preset, n_robots=n_robots)
+    cells = [cell(policy, scenario, config) for policy in policies]
     return {cell.policy: rows for cell, rows in fly_all(cells, episodes, VALIDATION).items()}
 
 

@@ -1,0 +1,89 @@
+"""Choose the thresholds of trained models: the highest with which each is as safe as asking everybody.
+
+``python benchmarks/swarm_models.py MODEL.zip ... --preset dense [--scenario ...] [--n-robots ...] [--json F]``, on the
+validation set, on which rules are tuned too. Thresholds are tried from the highest on, in stages of more and more
+episodes, until the model is as safe as full communication in every scenario (`Comparison.as_safe`); that one is written
+into the model's file. JSON: one row a model, threshold and scenario with the keys of
+`quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# So that scripts find each other by the names mypy knows them by
+sys.path[0] = str(Path(__file__).resolve().parent.parent)
+
+from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly  # noqa: E402
+from quad_swarm.evaluate import write_json  # noqa: E402
+from quad_swarm.evaluation import Comparison, summarise  # noqa: E402
+from quad_swarm.presets import PRESETS, make_config  # noqa: E402
+from quad_swarm.scenarios import SCENARIOS  # noqa: E402
+from sb3_maddpg import MADDPG  # noqa: E402
+
+THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7, 0.65, 0.6, 0.55, 0.5, 0.4, 0.3, 0.2]
+
+
+def tune(path: str, preset: str, n_robots: list[int | None], scenarios: list[str], quick: bool) -> list[dict[str, Any]]:
+    """The rows of one model."""
+    stages = QUICK_STAGES if quick else STAGES
+    worlds = [(n, scenario) for n in n_robots for scenario in scenarios]
+    full = {world: fly(["full"], preset, world[1], stages[-1], world[0])["full"] for world in worlds}
+    table: list[dict[str, Any]] = []
+    for threshold in THRESHOLDS:
+        policy = f"{path}@{threshold:g}"
+        safe = True
+        for episodes in stages[1:]:
+            rows: list[dict[str, Any]] = []
+            for n, scenario in worlds:
+                figures = fly([policy], preset, scenario, episodes, n)[policy]
+                comparison = Comparison.of(figures, full[n, scenario][:episodes])
+                last = episodes == stages[-1]
+                safe = comparison.interval[0] <= 0 and (not last or comparison.as_safe or quick)
+                keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
+                robots = make_config(preset, n_robots=n).n_robots
+                rows.append(keys | {"n_robots": robots} | summarise(figures, robots))
+                if not safe:
+                    break
+            if not safe:
+                break
+        table += rows
+        if safe:
+            model = MADDPG.load(path, device="cpu")
+            model.set_threshold(threshold)
+            model.save(path)
+            shares = ", ".join(f"{row['scenario']} {row['request_share']:.2%}" for row in rows)
+            print(f"{path}: threshold {threshold:g}; {shares}", flush=True)
+            return table
+    print(f"{path}: no threshold is as safe as full communication", flush=True)
+    return table
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="+", metavar="MODEL.zip")
+    parser.add_argument("--preset", required=True, choices=list(PRESETS))
+    parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS)[::-1], choices=list(SCENARIOS))
+    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
+    parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    work = [(path, args.preset, args.n_robots, args.scenario, args.quick) for path in args.models]
+    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+        rows = [row for table in pool.map(tune, *zip(*work, strict=True)) for row in table]
+    if args.json:
+        write_json(args.json, rows)
+
+
+if __name__ == "__main__":
+    main()
