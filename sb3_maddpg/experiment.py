@@ -23,7 +23,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from sb3_maddpg import parallel
+from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.team import Team
 from sb3_maddpg.utils import describe_env, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
@@ -60,7 +61,8 @@ class TeamExperimentManager(ExperimentManager):
     - unknown keys are refused, with the nearest known one;
     - ``vec_env: gymnasium`` takes the environment's own Gymnasium vector environment, see ``GymnasiumVecEnv``;
     - every model, not only MADDPG's, carries the environment it was trained in as ``env_spec``;
-    - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up;
+    - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up; with a team of
+      another size a ``PairPolicy`` goes on with its networks alone;
     - ``--trial-id`` takes any trial of a study, also the first, whose number is 0;
     - tuning (``-optimize``) keeps the recipe's other ``policy_kwargs``, leaves no run folder behind and draws other
       hyperparameters in each worker of a study. A trial is pruned if its networks diverged; any other error ends the
@@ -148,6 +150,18 @@ class TeamExperimentManager(ExperimentManager):
         return self._maybe_normalize(env, eval_env)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
+        algorithm = ALGOS[self.algo]
+        if hyperparams.get("policy") == "PairPolicy" and issubclass(algorithm, MADDPG):
+            team = algorithm.load(self.trained_agent, device=self.device).policy.team.n_agents
+            new = Team.from_spaces(env.observation_space, env.action_space).n_agents
+            if team != new:
+                # Its parameters fit any size of team, its counters and its memory do not
+                resized = algorithm(
+                    env=env, tensorboard_log=self.tensorboard_log, seed=self.seed, verbose=self.verbose, **hyperparams
+                )
+                resized.set_parameters(self.trained_agent)
+                print(f"Going on with a team of {new} instead of {team}, from step 0")
+                return resized
         model = super()._load_pretrained_agent(hyperparams, env)
         print(f"Continuing at step {model.num_timesteps}")
         buffer = getattr(model, "replay_buffer", None)

@@ -176,9 +176,9 @@ class Flight(NamedTuple):
     requests: np.ndarray
 
 
-def fly(cell: Cell, seed: int) -> Flight:
-    """The first held-out episode of set ``seed``, step by step."""
-    policy, task, rngs = _begin(cell, [first_episode(seed)])
+def fly(cell: Cell, seed: int, number: int = 0) -> Flight:
+    """A held-out episode of set ``seed``, the first unless ``number`` says otherwise, step by step."""
+    policy, task, rngs = _begin(cell, [first_episode(seed) + number])
     state, plans, asked = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], []
     over = False
     while not over:

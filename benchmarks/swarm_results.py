@@ -1,0 +1,245 @@
+"""Fly everything that docs/results.md says again, from the models and rules in benchmarks/results/swarm.
+
+``python benchmarks/swarm_results.py [--quick] [--out FOLDER]`` flies the test set, which neither training nor tuning
+has seen, and writes test.json, sweep.json, robustness.json, teams.json and asking.json; parts can be chosen by name.
+``--quick`` flies few episodes and checks only that everything runs. `docs/results.py` makes the page of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+# So that scripts find each other by the names mypy knows them by
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[0] = str(ROOT)
+
+from benchmarks.swarm_rules import TEST, cell  # noqa: E402
+from quad_swarm.beliefs import other_indices  # noqa: E402
+from quad_swarm.evaluate import write_json  # noqa: E402
+from quad_swarm.evaluation import Comparison, fly, fly_all, summarise  # noqa: E402
+from quad_swarm.presets import SwarmConfig, make_config  # noqa: E402
+from quad_swarm.scenarios import SCENARIOS  # noqa: E402
+
+FOLDER = ROOT / "benchmarks" / "results" / "swarm"
+NAMES = list(SCENARIOS)
+EPISODES = {"test": 4000, "sweep": 1000, "robustness": 1000, "teams": 4000, "asking": 200}
+QUICK = 20
+# The rule that the paper compares with
+DBCP = "distance:4"
+TEAMS = (4, 6, 8, 12, 16)
+# Sixteen robots do not fit on the circle of eight.
+WIDER = {"circle_radius": (3.0, 3.5)}
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "as trained": {},
+    "state noise": {"noise": {"pos": 0.004, "vel": 0.02, "attitude": 0.006}},
+    "wind 1 m/s": {"noise": {"wind": 1.0}},
+    "10 % of plans lost": {"radio": {"loss": 0.1}},
+    "30 % of plans lost": {"radio": {"loss": 0.3}},
+    "50 % of plans lost": {"radio": {"loss": 0.5}},
+    "plans 1 step late": {"radio": {"delay": 1}},
+    "plans 2 steps late": {"radio": {"delay": 2}},
+    "plans 3 steps late": {"radio": {"delay": 3}},
+    "faster robots": {"planner": {"max_tilt": 0.44}},
+}
+
+
+def models(recipe: str) -> list[str]:
+    """The trained models of a recipe, by seed."""
+    return [str(path.relative_to(ROOT)) for path in sorted(FOLDER.glob(f"{recipe}_seed*.zip"))]
+
+
+def read(name: str, folder: Path = FOLDER) -> list[dict[str, Any]]:
+    """Rows that a script wrote."""
+    return [json.loads(line) for line in (folder / f"{name}.json").read_text().splitlines()]
+
+
+def best_rules(preset: str) -> dict[str, str]:
+    """For each scenario the rule with the fewest requests that was as safe as full communication in validation."""
+    best: dict[str, dict[str, Any]] = {}
+    for row in read("rules"):
+        if row["preset"] == preset and row["safe"]:
+            known = best.setdefault(row["scenario"], row)
+            if row["request_share"] < known["request_share"]:
+                best[row["scenario"]] = row
+    return {scenario: best[scenario]["rule"] if scenario in best else "full" for scenario in NAMES}
+
+
+def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> list[dict[str, Any]]:
+    """Fly policies over the same test episodes; the first is full communication, the second the rule to beat.
+
+    :param job: keys of every row, policies, scenario, world, number of episodes
+    :return: a row for each policy
+    """
+    keys, policies, scenario, config, episodes = job
+    unique = list(dict.fromkeys(policies))
+    flown = fly_all([cell(policy, scenario, config) for policy in unique], episodes, TEST)
+    by_name = {c.policy: rows for c, rows in flown.items()}
+    table = []
+    for policy in unique:
+        row = keys | {"scenario": scenario, "policy": policy, **summarise(by_name[policy], config.n_robots)}
+        for name, rival in (("full", policies[0]), ("rule", policies[1])):
+            comparison = Comparison.of(by_name[policy], by_name[rival])
+            low, high = comparison.interval
+            row[f"against_{name}"] = {
+                "rival": rival,
+                "only_policy": comparison.only_first,
+                "only_rival": comparison.only_second,
+                "low": low,
+                "high": high,
+                "p_value": comparison.p_value,
+                "as_safe": comparison.as_safe,
+            }
+        table.append(row)
+    return table
+
+
+def test(episodes: int) -> list[Any]:
+    """Jobs of the main table."""
+    jobs = []
+    for preset in ("paper", "dense"):
+        rules, config = best_rules(preset), make_config(preset)
+        others = ["none", DBCP, *models(preset), *(models("faithful") if preset == "paper" else [])]
+        others += [path for path in models("ablation") if preset == "paper"]
+        jobs += [({"preset": preset}, ["full", rules[name], *others], name, config, episodes) for name in NAMES]
+    return jobs
+
+
+def sweep(episodes: int) -> list[Any]:
+    """Jobs of the sweep of the threshold, first seeds only."""
+    deltas = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+    return [
+        (
+            {"preset": preset},
+            ["full", best_rules(preset)[name], *(f"{path}@{delta}" for path in models(preset)[:1] for delta in deltas)],
+            name,
+            make_config(preset),
+            episodes,
+        )
+        for preset in ("paper", "dense")
+        for name in NAMES
+    ]
+
+
+def robustness(episodes: int) -> list[Any]:
+    """Jobs of the disturbed worlds, first seeds only."""
+    return [
+        (
+            {"preset": preset, "condition": condition},
+            ["full", best_rules(preset)[name], *models(preset)[:1]],
+            name,
+            make_config(preset, **changes),
+            episodes,
+        )
+        for preset in ("paper", "dense")
+        for condition, changes in CONDITIONS.items()
+        for name in NAMES
+    ]
+
+
+def teams(episodes: int) -> list[Any]:
+    """Jobs of other sizes of the team; the rules are those of eight robots."""
+    rules = best_rules("dense")
+    return [
+        (
+            {"preset": "dense"},
+            ["full", rules[name], *models("any")],
+            name,
+            make_config("dense", n_robots=n, space=WIDER if n > 12 else None),
+            episodes,
+        )
+        for n in TEAMS
+        for name in NAMES
+    ]
+
+
+def asking(episodes: int) -> list[Any]:
+    """Jobs of the look at whom policies ask: pairs and steps counted by what the robots saw."""
+    return [
+        (preset, policy, name, episodes)
+        for preset in ("paper", "dense")
+        for name in NAMES
+        for policy in (best_rules(preset)[name], *models(preset)[:1])
+    ]
+
+
+def ask(job: tuple[str, str, str, int]) -> list[dict[str, Any]]:
+    """For some quantities how often a policy asks at each of their values."""
+    preset, policy, scenario, episodes = job
+    config = make_config(preset)
+    others = other_indices(config.n_robots)
+    seen: dict[str, list[np.ndarray]] = {}
+    asked = []
+    for number in range(episodes):
+        flight = fly(cell(policy, scenario, config), TEST, number)
+        arrived = (np.linalg.norm(flight.state[1:, :, :3] - flight.goal, axis=-1) <= config.goal_radius).all(axis=1)
+        steps = int(arrived.argmax()) + 1 if arrived.any() else len(flight.requests)
+        pos, vel = flight.state[:steps, :, :3], flight.state[:steps, :, 3:6]
+        relative, moving = pos[:, others] - pos[:, :, None], vel[:, others] - vel[:, :, None]
+        time = np.clip(-(relative * moving).sum(-1) / np.maximum((moving**2).sum(-1), 1e-12), 0, 4.0)
+        distance = np.linalg.norm(relative, axis=-1)
+        to_goal = np.broadcast_to(np.linalg.norm(flight.goal - pos, axis=-1)[..., None], distance.shape)
+        crowd = np.broadcast_to((distance < 2.0).sum(-1, keepdims=True), distance.shape)
+        for name, values in {
+            "distance (m)": distance,
+            "closest approach (m)": np.linalg.norm(relative + time[..., None] * moving, axis=-1),
+            "time to closest approach (s)": time,
+            "distance to the goal (m)": to_goal,
+            "others within 2 m": crowd,
+        }.items():
+            seen.setdefault(name, []).append(values.ravel())
+        asked.append(flight.requests[:steps].ravel())
+    requests = np.concatenate(asked)
+    rows = []
+    for name, parts in seen.items():
+        values = np.concatenate(parts)
+        edges = np.arange(-0.5, config.n_robots) if "others" in name else np.linspace(0, 4 if "(s)" in name else 5, 21)
+        for low, high in pairwise(edges):
+            inside = (values >= low) & (values < high)
+            row = {"preset": preset, "policy": policy, "scenario": scenario, "quantity": name}
+            rows.append(row | {"low": low, "high": high, "n": int(inside.sum()), "asked": int(requests[inside].sum())})
+    return rows
+
+
+PARTS: dict[str, tuple[Callable[[int], list[Any]], Callable[[Any], list[dict[str, Any]]]]] = {
+    "test": (test, compare),
+    "sweep": (sweep, compare),
+    "robustness": (robustness, compare),
+    "teams": (teams, compare),
+    "asking": (asking, ask),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each cell")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the JSON files (default %(default)s)")
+    args = parser.parse_args(argv)
+    os.chdir(ROOT)
+    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+        for part in args.parts or PARTS:
+            make_jobs, run = PARTS[part]
+            rows: list[dict[str, Any]] = []
+            for table in pool.map(run, make_jobs(QUICK if args.quick else EPISODES[part])):
+                rows += table
+                write_json(args.out / f"{part}.json", rows)
+            print(f"wrote {args.out / part}.json, {len(rows)} rows", flush=True)
+
+
+if __name__ == "__main__":
+    main()
