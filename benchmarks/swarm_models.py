@@ -22,7 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # So that scripts find each other by the names mypy knows them by
 sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly  # noqa: E402
+from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, hopeless  # noqa: E402
 from quad_swarm.evaluate import write_json  # noqa: E402
 from quad_swarm.evaluation import Comparison, summarise  # noqa: E402
 from quad_swarm.presets import PRESETS, make_config  # noqa: E402
@@ -47,7 +47,7 @@ def tune(path: str, preset: str, n_robots: list[int | None], scenarios: list[str
                 figures = fly([policy], preset, scenario, episodes, n)[policy]
                 comparison = Comparison.of(figures, full[n, scenario][:episodes])
                 last = episodes == stages[-1]
-                safe = comparison.interval[0] <= 0 and (not last or comparison.as_safe or quick)
+                safe = comparison.as_safe or quick if last else not hopeless(comparison)
                 keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
                 robots = make_config(preset, n_robots=n).n_robots
                 rows.append(keys | {"n_robots": robots} | summarise(figures, robots))

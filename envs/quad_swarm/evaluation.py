@@ -272,13 +272,17 @@ def summarise(rows: Sequence[Mapping[str, float]], n_robots: int) -> dict[str, A
     arrived = figures["arrived"].astype(bool)
     collisions = int(figures["collided"].sum())
     low, high = wilson_interval(collisions, len(rows))
-    share = float(figures["requests"].sum() / (figures["steps_counted"].sum() * n_robots * (n_robots - 1)))
+    requests = int(figures["requests"].sum())
+    possible = int(figures["steps_counted"].sum()) * n_robots * (n_robots - 1)
+    share = requests / possible
     return {
         "episodes": len(rows),
         "collisions": collisions,
         "collision_low": low,
         "collision_high": high,
         "collisions_continuous": int(figures["collided_continuous"].sum()),
+        "requests": requests,
+        "possible_requests": possible,
         "requests_per_step": float(figures["requests"].sum() / figures["steps_counted"].sum()),
         "request_share": share,
         "reduction": 1.0 - share,

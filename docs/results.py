@@ -1,0 +1,249 @@
+"""Put tables and figures of the swarm's results into docs/results.md: ``python docs/results.py [--data FOLDER]``.
+
+The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
+come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py` and `benchmarks/swarm_results.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from quad_swarm.colours import colour_of
+from quad_swarm.evaluation import is_model
+from quad_swarm.scenarios import SCENARIOS
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "benchmarks" / "results" / "swarm"
+PAGE = ROOT / "docs" / "results.md"
+IMAGES = ROOT / "docs" / "images"
+NAMES = list(SCENARIOS)[::-1]
+Rows = list[dict[str, Any]]
+
+
+def read(folder: Path, name: str) -> Rows:
+    """Rows of one of the scripts; none if it has not run."""
+    path = folder / f"{name}.json"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def label(policy: str) -> str:
+    """How a policy is called in tables."""
+    return Path(policy).stem.replace("_seed", ", seed ") if is_model(policy) else f"`{policy}`".replace("|", "\\|")
+
+
+def rate(row: dict[str, Any]) -> str:
+    """Collisions with their interval."""
+    low, high = 100 * row["collision_low"], 100 * row["collision_high"]
+    return f"{row['collisions']}/{row['episodes']} [{low:.2f}, {high:.2f}] %"
+
+
+def versus(row: dict[str, Any], rival: str) -> str:
+    """Paired difference of the collision rates."""
+    against = row[f"against_{rival}"]
+    if against["rival"] == row["policy"]:
+        return "-"
+    sign = "**" if against["as_safe"] and rival == "full" else ""
+    return f"{sign}[{100 * against['low']:+.2f}, {100 * against['high']:+.2f}]{sign}, p = {against['p_value']:.2g}"
+
+
+def main_table(rows: Rows, preset: str) -> str:
+    """All policies of a preset in all scenarios."""
+    chosen = [row for row in rows if row["preset"] == preset and "ablation" not in row["policy"]]
+    chosen.sort(key=lambda row: NAMES.index(row["scenario"]))
+    head = ["scenario", "policy", "collisions, 95 %", "against full (points)", "against the rule", "requests"]
+    head += ["of the rule's", "arrived", "steps", "path (m)", "between steps"]
+    lines = []
+    for row in chosen:
+        key = (row["scenario"], row["against_rule"]["rival"])
+        rule = next(r for r in chosen if (r["scenario"], r["policy"]) == key)
+        ratio = f"{row['request_share'] / rule['request_share']:.0%}" if rule["request_share"] else "-"
+        steps, path = row["steps_to_arrival"], row["path_length"]
+        line = [row["scenario"].replace("_", " "), label(row["policy"]), rate(row), versus(row, "full")]
+        line += [versus(row, "rule"), f"{row['request_share']:.2%}", ratio, f"{row['arrived']}/{row['episodes']}"]
+        line += ["-" if steps is None else f"{steps:.1f}", "-" if path is None else f"{path:.2f}"]
+        lines.append([*line, str(row["collisions_continuous"])])
+    return table(head, lines)
+
+
+def pooled(rows: Rows, keep: Callable[[dict[str, Any]], bool]) -> float:
+    """Requests of all scenarios together, of all that were possible."""
+    chosen = [row for row in rows if keep(row)]
+    return sum(row["requests"] for row in chosen) / max(sum(row["possible_requests"] for row in chosen), 1)
+
+
+def targets(rows: Rows) -> str:
+    """What was asked for and what came out, for every seed."""
+    lines = []
+    for preset in ("dense", "paper"):
+        seeds = dict.fromkeys(r["policy"] for r in rows if r["preset"] == preset and f"/{preset}_seed" in r["policy"])
+        for policy in seeds:
+            mine = {r["scenario"]: r for r in rows if r["preset"] == preset and r["policy"] == policy}
+            shares = []
+            for name in NAMES:
+                rival = mine[name]["against_rule"]["rival"]
+                rule = next(r for r in rows if (r["preset"], r["scenario"], r["policy"]) == (preset, name, rival))
+                shares.append(f"{mine[name]['request_share'] / rule['request_share']:.0%}")
+            safe = sum(mine[name]["against_full"]["as_safe"] for name in NAMES)
+            saved = 1 - pooled(rows, lambda r, p=policy, w=preset: r["preset"] == w and r["policy"] == p)
+            lines.append([preset, label(policy), f"{safe} of {len(NAMES)}", *shares, f"{saved:.1%}"])
+    head = ["preset", "policy", "as safe as full in", *(f"{name.replace('_', ' ')}" for name in NAMES)]
+    return table([*head, "fewer than full, pooled"], lines)
+
+
+def family_table(rules: Rows, preset: str) -> str:
+    """The cheapest safe rule of each family, in validation."""
+    families = list(dict.fromkeys(row["family"] for row in rules))
+    lines = []
+    for family in families:
+        line = [family]
+        for name in NAMES:
+            safe = [
+                r for r in rules if (r["preset"], r["scenario"], r["family"]) == (preset, name, family) and r["safe"]
+            ]
+            best = min(safe, key=lambda r: r["request_share"], default=None)
+            line.append(f"{best['request_share']:.2%} {label(best['rule'])}" if best else "none is safe")
+        lines.append(line)
+    return table(["family", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def wide_table(rows: Rows, first: str, preset: str) -> str:
+    """Collisions and requests of every policy, scenarios side by side."""
+    chosen = [row for row in rows if row["preset"] == preset]
+    kinds = dict.fromkeys((row[first], kind_of(row)) for row in chosen)
+    lines = []
+    for value, kind in kinds:
+        line = [str(value), kind]
+        for name in NAMES:
+            row = next((r for r in chosen if r[first] == value and r["scenario"] == name and kind_of(r) == kind), None)
+            line.append(f"{row['collisions']}/{row['episodes']}, {row['request_share']:.1%}" if row else "-")
+        lines.append(line)
+    return table([first.replace("_", " "), "policy", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def kind_of(row: dict[str, Any]) -> str:
+    """A policy by its part in a comparison."""
+    return label(row["policy"]) if is_model(row["policy"]) or row["policy"] in ("full", "none") else "best rule"
+
+
+def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
+    """Requests against collisions: rule families, the learned policy at all thresholds, and the tested policies."""
+    figure, panels = plt.subplots(2, 4, figsize=(15, 7), layout="constrained", sharey="row")
+    families = list(dict.fromkeys(row["family"] for row in rules))
+    for line, preset in zip(panels, ("paper", "dense"), strict=True):
+        for axes, name in zip(line, NAMES, strict=True):
+            here = [r for r in rules if (r["preset"], r["scenario"]) == (preset, name) and r["episodes"] >= 250]
+            for k, family in enumerate(families):
+                points = sorted((r["request_share"], rate_of(r)) for r in here if r["family"] == family)
+                front = [(s, c) for s, c in points if not any(s2 <= s and c2 < c for s2, c2 in points)]
+                if front:
+                    axes.plot(*zip(*front, strict=True), ".-", color=colour_of(k + 1), linewidth=0.8, label=family)
+            learned = sorted(
+                (r["request_share"], rate_of(r))
+                for r in sweep
+                if (r["preset"], r["scenario"]) == (preset, name) and is_model(r["policy"])
+            )
+            if learned:
+                axes.plot(*zip(*learned, strict=True), "o-", color="black", label="learned, one model, all thresholds")
+            seeds = [
+                (r["request_share"], rate_of(r))
+                for r in tests
+                if (r["preset"], r["scenario"]) == (preset, name) and f"/{preset}_seed" in r["policy"]
+            ]
+            if seeds:
+                axes.plot(*zip(*seeds, strict=True), "*", color="#d55e00", markersize=11, label="learned, five seeds")
+            axes.set_xscale("log")
+            axes.set_yscale("symlog", linthresh=1e-3)
+            axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("episodes with a collision")
+    for axes in panels[1]:
+        axes.set_xlabel("requests, of all possible")
+    legends = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels.flat]
+    handles = {text: handle for legend in legends for handle, text in legend}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=8)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def rate_of(row: dict[str, Any]) -> float:
+    """Share of the episodes with a collision."""
+    return row["collisions"] / row["episodes"]
+
+
+def draw_asking(rows: Rows, path: Path) -> None:
+    """How often policies ask at what they see."""
+    quantities = list(dict.fromkeys(row["quantity"] for row in rows))
+    figure, panels = plt.subplots(2, len(quantities), figsize=(15, 5.5), layout="constrained", sharey="row")
+    for line, preset in zip(panels, ("paper", "dense"), strict=True):
+        for axes, quantity in zip(line, quantities, strict=True):
+            for learned in (False, True):
+                sums: dict[float, list[int]] = {}
+                for row in rows:
+                    if (row["preset"], row["quantity"], is_model(row["policy"])) == (preset, quantity, learned):
+                        total = sums.setdefault((row["low"] + row["high"]) / 2, [0, 0])
+                        total[0] += row["asked"]
+                        total[1] += row["n"]
+                points = [(x, asked / n) for x, (asked, n) in sorted(sums.items()) if n >= 100]
+                if points:
+                    name, colour = ("learned", "#d55e00") if learned else ("best rule of each scenario", "#555555")
+                    axes.plot(*zip(*points, strict=True), ".-", color=colour, label=name)
+            axes.set_xlabel(quantity)
+            axes.spines[["top", "right"]].set_visible(False)
+        line[0].set_ylabel(f"{preset}: asked, of all pairs and steps")
+        line[0].legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the JSON files (default %(default)s)")
+    parser.add_argument("--page", type=Path, default=PAGE, help="page to fill (default %(default)s)")
+    parser.add_argument("--images", type=Path, default=IMAGES, help="folder of the figures (default %(default)s)")
+    args = parser.parse_args()
+    names = ("rules", "test", "sweep", "robustness", "teams", "asking")
+    rules, test, sweep, robustness, teams, asking = (read(args.data, name) for name in names)
+    blocks = {
+        "targets": targets(test),
+        "paper": main_table(test, "paper"),
+        "dense": main_table(test, "dense"),
+        "rules paper": family_table(rules, "paper"),
+        "rules dense": family_table(rules, "dense"),
+        "ablations": wide_table([r for r in test if "ablation" in r["policy"]], "preset", "paper"),
+        "sweep paper": wide_table([r for r in sweep if is_model(r["policy"])], "policy", "paper"),
+        "sweep dense": wide_table([r for r in sweep if is_model(r["policy"])], "policy", "dense"),
+        "robustness paper": wide_table(robustness, "condition", "paper"),
+        "robustness dense": wide_table(robustness, "condition", "dense"),
+        "teams": wide_table(teams, "n_robots", "dense"),
+    }
+    page = PAGE.read_text()
+    for name, block in blocks.items():
+        before, opening, rest = page.partition(f"<!-- {name} -->\n")
+        _, closing, after = rest.partition("<!-- end -->")
+        if not closing:
+            raise ValueError(f"{PAGE} has no place '<!-- {name} --> ... <!-- end -->'.")
+        page = f"{before}{opening}\n{block}\n\n{closing}{after}"
+    args.page.write_text(page)
+    args.images.mkdir(parents=True, exist_ok=True)
+    draw_fronts(rules, sweep, test, args.images / "fronts.png")
+    draw_asking(asking, args.images / "asking.png")
+
+
+if __name__ == "__main__":
+    main()
