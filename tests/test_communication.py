@@ -79,3 +79,33 @@ def test_robots_at_the_same_place_do_not_divide_by_zero():
 def test_says_how_to_write_a_rule(text, message):
     with pytest.raises(ValueError, match=message):
         parse_rule(text)
+
+
+def test_rules_that_remember_ask_again_when_a_plan_is_old_or_wrong():
+    swarm = Swarm(make_config("paper", n_robots=2), 1)
+    swarm.reset(0, np.array([[-3.0, 0, 1], [3, 0, 1]]), np.array([[-3.0, 0, 1], [3, 0, 1]]))
+    ask, rest = np.ones((1, 2, 1), bool), np.zeros((1, 2, 1), bool)
+    swarm.step(ask)
+    ages = []
+    for _ in range(4):
+        view = View(swarm)
+        ages.append(int(view.age[0, 0, 0]))
+        assert not parse_rule("event:0.1")(view).any()
+        assert parse_rule("stale:4")(view).all() == (ages[-1] >= 4)
+        swarm.step(rest)
+    assert ages == [2, 3, 4, 5]
+    swarm.state[..., POSITION] += [0.0, 0.5, 0.0]
+    assert parse_rule("event:0.1")(View(swarm)).all()
+    assert parse_rule("stale:9")(View(swarm)).all(), "no longer believed"
+
+
+def test_plan_looks_at_the_own_plan():
+    swarm = Swarm(make_config("paper", n_robots=2), 1)
+    # Robot 0 flies to where robot 1 rests
+    swarm.reset(0, np.array([[-1.5, 0, 1], [1.5, 0, 1]]), np.array([[1.5, 0.2, 1], [1.5, 0, 1]]))
+    for _ in range(6):
+        swarm.step(np.zeros((1, 2, 1), bool))
+    near = View(swarm).plan_separation.min(axis=-1)
+    assert near[0, 0, 0] < 1.5
+    assert np.array_equal(parse_rule("plan:1.5")(View(swarm)), near < 1.5)
+    assert not parse_rule("plan:0.1")(View(swarm)).any()

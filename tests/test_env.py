@@ -252,3 +252,36 @@ def test_info_names_the_scenario(scenario):
     _, info = env.reset(seed=0)
     assert info["scenario"] in SCENARIOS
     assert env.n_curriculum_levels == (4 if scenario == "curriculum" else 1)
+
+
+def test_near_misses_cost_in_proportion():
+    weights = {"near_miss": 2.0, "near_miss_distance": 0.8, "near_miss_width": 0.1}
+    env = QuadSwarmEnv(n_robots=2, reward=weights)
+    for distance, cost in ((0.9, 0.0), (0.75, 1.0), (0.65, 2.0)):
+        line = np.array([[0, 0, 1.0], [distance, 0, 1.0]])
+        env.reset(options={"starts": line, "goals": line})
+        *_, info = env.step(np.array([1, 1]))
+        separation = info["min_separation"]
+        assert info["reward_terms"]["near_miss"] == pytest.approx(-2 * np.clip((0.8 - separation) / 0.1, 0, 1))
+        assert -info["reward_terms"]["near_miss"] == pytest.approx(cost, abs=0.3)
+
+
+def test_near_misses_may_look_ahead_along_the_plans():
+    weights = {"near_miss": 1.0, "near_miss_distance": 0.6, "near_miss_width": 0.3}
+    costs = []
+    for ahead in (0, 8):
+        env = QuadSwarmEnv(n_robots=2, reward={**weights, "near_miss_ahead": ahead})
+        # Head-on, and neither knows of the other's plan
+        ends = np.array([[-2.0, 0, 1], [2.0, 0.02, 1]])
+        env.reset(options={"starts": ends, "goals": ends[::-1]})
+        rows = [env.step(np.array([0, 0]))[-1]["reward_terms"]["near_miss"] for _ in range(12)]
+        costs.append(np.flatnonzero(np.array(rows) < 0)[:1].tolist() or [99])
+    assert costs[1] < costs[0]
+
+
+def test_episodes_may_end_at_arrival():
+    env = QuadSwarmEnv(n_robots=2, end_at_arrival=True)
+    line = np.array([[-1.0, 0, 1], [1, 0, 1]])
+    env.reset(options={"starts": line, "goals": line})
+    *_, terminated, truncated, info = env.step(np.array([0, 0]))
+    assert (terminated, truncated, info["is_success"]) == (True, False, True)

@@ -93,3 +93,21 @@ def test_bad_names_and_numbers():
         ScenarioSampler("asymetric", 4, SPACE)
     with pytest.raises(ValueError, match="n_robots=1"):
         ScenarioSampler("random", 1, SPACE)
+
+
+def test_weights_are_shares():
+    sampler = ScenarioSampler({"symmetric_swap": 3, "random": 1, "random_swap": 0}, 3, SPACE)
+    rng = np.random.default_rng(0)
+    names = [sampler.sample(rng)[0] for _ in range(400)]
+    assert set(names) == {"symmetric_swap", "random"}
+    assert abs(names.count("symmetric_swap") / 400 - 0.75) < 0.07
+    assert sampler.n_levels == 1
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [({"random": -1, "random_swap": 2}, "not negative"), ({"rnadom": 1}, "Did you mean 'random'")],
+)
+def test_senseless_weights_are_refused(weights, message):
+    with pytest.raises(ValueError, match=message):
+        ScenarioSampler(weights, 4, SPACE)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_swarm.beliefs import BeliefSource
+from quad_swarm.beliefs import BeliefSource, advance
 from quad_swarm.planner import PlanStatus
 from quad_swarm.presets import PRESETS, make_config
 from quad_swarm.scenarios import ScenarioSampler
@@ -148,3 +148,44 @@ def test_presets_take_replacements_and_name_what_they_do_not_know():
             make_config("paper", **values)
     with pytest.raises(ValueError, match="Did you mean 'dense'"):
         make_config("dens")
+
+
+def test_lost_answers_count_as_not_received_and_repeat_with_the_seed():
+    sources = []
+    for _ in range(2):
+        swarm = make_swarm(2, radio={"loss": 0.5}, memory=0.0)
+        sources.append(np.array([swarm.step(all_ask(swarm)).belief_source for _ in range(20)]))
+    assert np.array_equal(*sources)
+    assert abs((sources[0] == BeliefSource.REQUESTED).mean() - 0.5) < 0.1
+    swarm = make_swarm(1, radio={"loss": 1.0}, memory=0.0)
+    silent = make_swarm(1, memory=0.0)
+    assert np.array_equal(fly(swarm, 15), fly(silent, 15, ask=False))
+
+
+def test_late_answers_are_older_plans():
+    swarm, late = make_swarm(1), make_swarm(1, radio={"delay": 2})
+    plans = []
+    for _ in range(6):
+        plans.append(late.plans[..., :3].copy())
+        late.step(all_ask(late))
+    # Asked in the last step, two steps late: the plan of three steps ago, three steps on
+    expected = plans[-3]
+    for _ in range(3):
+        expected = advance(expected)
+    remembered = late.beliefs._remembered
+    np.testing.assert_allclose(remembered, expected[:, late.beliefs.others])
+    assert (late.beliefs._age == 3).all()
+    assert not np.allclose(fly(swarm, 20)[-1], fly(late, 14)[-1])
+
+
+def test_wrong_radios_are_refused():
+    with pytest.raises(ValueError, match=r"radio\.loss=2"):
+        make_config("paper", radio={"loss": 2.0})
+
+
+def test_planned_separation_is_the_smallest_distance_between_plans():
+    swarm = make_swarm(1)
+    fly(swarm, 8)
+    plans = swarm.plans[0, :, 2:5, :3]
+    between = np.linalg.norm(plans[0] - plans[2], axis=-1).min()
+    assert swarm.planned_separation(3)[0, 0, 1] == pytest.approx(between)
