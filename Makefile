@@ -2,16 +2,17 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-STEPS ?= 1000000
+RECIPE ?= zoo_configs/quad_swarm_paper.yml
+STEPS ?= 200000
 SEED ?= 0
 LOGS ?= logs
 EPISODES ?= 500
 JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
 BENCHMARKS ?= planner env training scaling estimators
-POLICIES ?= none full distance:4 cpa:0.7:1.5
+POLICIES ?= none full distance:4 cpa:0.65:1.5
 PEERS := agilerl benchmarl xuance
 
-.PHONY: help install train test lint bench bench-peers clean
+.PHONY: help install train test lint bench bench-peers results results-quick clean
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
@@ -25,7 +26,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 train: install  ## train MADDPG on the swarm, then print the table of policies (STEPS=20000 for a short run)
-	$(BIN)/python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --n-timesteps $(STEPS) --seed $(SEED) \
+	$(BIN)/python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --conf-file $(RECIPE) --n-timesteps $(STEPS) --seed $(SEED) \
 		--log-folder $(LOGS) --tensorboard-log $(LOGS)/tensorboard --progress
 	$(BIN)/python -m sb3_maddpg.zoo evaluate --env QuadSwarm-v0 --policy $(POLICIES) latest:$(LOGS) --scenario all \
 		--episodes $(EPISODES) --jobs $(JOBS) --json $(LOGS)/table.json --plot $(LOGS)/plots
@@ -40,6 +41,16 @@ lint: install  ## ruff and mypy
 
 bench: install  ## speed of planner, environment and learner, and the estimators, as tables and as JSON
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done
+
+results: install  ## fly everything that docs/results.md says again: tuned rules, test set, tables and figures (hours)
+	$(BIN)/python benchmarks/swarm_rules.py --jobs $(JOBS) --json benchmarks/results/swarm/rules.json
+	$(BIN)/python benchmarks/swarm_results.py --jobs $(JOBS)
+	$(BIN)/python docs/results.py
+
+results-quick: install  ## the same with few episodes and rules, into $(LOGS)/results
+	$(BIN)/python benchmarks/swarm_rules.py --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json
+	$(BIN)/python benchmarks/swarm_results.py --quick --jobs $(JOBS) --out $(LOGS)/results
+	$(BIN)/python docs/results.py --data $(LOGS)/results --page $(LOGS)/results/results.md --images $(LOGS)/results
 
 bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against other libraries, each in its own environment
 	$(BIN)/python benchmarks/training.py --json benchmarks/results/training.json

@@ -563,7 +563,10 @@ class MADDPG(OffPolicyAlgorithm):
             super().save_replay_buffer(file)  # type: ignore[arg-type]
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "critic", "actor_target", "critic_target", "_action_cost"]
+        # The last observations of many environments are larger than the networks, and loading begins new episodes
+        last = ["_last_obs", "_last_original_obs"]
+        networks = ["actor", "critic", "actor_target", "critic_target"]
+        return [*super()._excluded_save_params(), *last, *networks, "_action_cost"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
