@@ -37,7 +37,7 @@ OBSERVATION_ARGUMENTS = ("observation", "scale_observation")
 # Held-out episodes begin here; training seeds count from 0.
 _FIRST_SEED = 10**9
 # Fixed, so that neither the batches nor the results depend on the number of processes.
-_CHUNK = 100
+_CHUNK = 250
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
 
 from ...errors import unknown_name
-from ...quadrotor import N_INPUTS, N_STATES
+from ...quadrotor import N_INPUTS, N_STATES, QuadrotorParams
 from ..base import Problems, Solution
-from ..problem import OptimalControlProblem
+from ..problem import OptimalControlProblem, PlannerConfig
 from .build import build, load
 from .codegen import generate_model
 
@@ -63,7 +64,8 @@ class RtiSolver:
         :raises BuildError: it cannot be compiled here
         """
         if self._kernel is None:
-            self._kernel = load(str(build(generate_model(self.problem), self.precision))).quad_swarm_rti
+            model = _generated(self.problem.config, self.problem.quadrotor, self.problem.n_others)
+            self._kernel = load(str(build(model, self.precision))).quad_swarm_rti
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """See `Solver.solve`."""
@@ -93,6 +95,12 @@ class RtiSolver:
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"_kernel": None}  # loaded again in the process that needs it
+
+
+@functools.lru_cache(maxsize=64)
+def _generated(config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int) -> str:
+    """`generate_model` takes most of a second, and a process makes many swarms of the same world."""
+    return generate_model(OptimalControlProblem(config, quadrotor, n_others))
 
 
 def _array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
