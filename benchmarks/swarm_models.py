@@ -1,10 +1,11 @@
 """Choose the thresholds of trained models: the highest with which each is as safe as asking everybody.
 
 ``python benchmarks/swarm_models.py MODEL.zip ... --preset dense [--scenario ...] [--n-robots ...] [--json F]``, on the
-validation set, on which rules are tuned too. Thresholds are tried from the highest on, in stages of more and more
-episodes, until the model is as safe as full communication in every scenario (`Comparison.as_safe`); that one is written
-into the model's file. JSON: one row a model, threshold and scenario with the keys of
-`quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe.
+validation set, on which rules are tuned too. In each scenario thresholds are tried from the highest on, in stages of
+more and more episodes, until the model is as safe as full communication (`Comparison.as_safe`). The smallest of them,
+with which it is safe everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with
+the keys of `quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario,
+safe.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ import multiprocessing
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # So that scripts find each other by the names mypy knows them by
-sys.path[0] = str(Path(__file__).resolve().parent.parent)
+if not __package__:
+    sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
 from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, hopeless  # noqa: E402
 from quad_swarm.evaluate import write_json  # noqa: E402
@@ -35,35 +38,31 @@ THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7
 def tune(path: str, preset: str, n_robots: list[int | None], scenarios: list[str], quick: bool) -> list[dict[str, Any]]:
     """The rows of one model."""
     stages = QUICK_STAGES if quick else STAGES
-    worlds = [(n, scenario) for n in n_robots for scenario in scenarios]
-    full = {world: fly(["full"], preset, world[1], stages[-1], world[0])["full"] for world in worlds}
     table: list[dict[str, Any]] = []
-    for threshold in THRESHOLDS:
-        policy = f"{path}@{threshold:g}"
-        safe = True
-        for episodes in stages[1:]:
-            rows: list[dict[str, Any]] = []
-            for n, scenario in worlds:
+    chosen = []
+    for n, scenario in product(n_robots, scenarios):
+        full = fly(["full"], preset, scenario, stages[-1], n)["full"]
+        robots = make_config(preset, n_robots=n).n_robots
+        for threshold in THRESHOLDS:
+            policy = f"{path}@{threshold:g}"
+            for episodes in stages[1:]:
                 figures = fly([policy], preset, scenario, episodes, n)[policy]
-                comparison = Comparison.of(figures, full[n, scenario][:episodes])
-                last = episodes == stages[-1]
-                safe = comparison.as_safe or quick if last else not hopeless(comparison)
-                keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
-                robots = make_config(preset, n_robots=n).n_robots
-                rows.append(keys | {"n_robots": robots} | summarise(figures, robots))
-                if not safe:
+                comparison = Comparison.of(figures, full[:episodes])
+                if hopeless(comparison):
                     break
-            if not safe:
+            safe = episodes == stages[-1] and (comparison.as_safe or quick)
+            keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
+            table.append(keys | {"n_robots": robots} | summarise(figures, robots))
+            if safe:
+                chosen.append(threshold)
+                print(f"{path} {scenario} {robots}: {threshold:g}, {table[-1]['request_share']:.2%}", flush=True)
                 break
-        table += rows
-        if safe:
-            model = MADDPG.load(path, device="cpu")
-            model.set_threshold(threshold)
-            model.save(path)
-            shares = ", ".join(f"{row['scenario']} {row['request_share']:.2%}" for row in rows)
-            print(f"{path}: threshold {threshold:g}; {shares}", flush=True)
-            return table
-    print(f"{path}: no threshold is as safe as full communication", flush=True)
+        else:
+            print(f"{path} {scenario} {robots}: no threshold is as safe as full communication", flush=True)
+            chosen.append(THRESHOLDS[-1])
+    model = MADDPG.load(path, device="cpu")
+    model.set_threshold(min(chosen))
+    model.save(path)
     return table
 
 

@@ -24,7 +24,8 @@ import numpy as np
 
 # So that scripts find each other by the names mypy knows them by
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[0] = str(ROOT)
+if not __package__:
+    sys.path[0] = str(ROOT)
 
 from benchmarks.swarm_rules import TEST, cell  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
@@ -39,6 +40,8 @@ EPISODES = {"test": 4000, "sweep": 1000, "robustness": 1000, "teams": 4000, "ask
 QUICK = 20
 # The rule that the paper compares with
 DBCP = "distance:4"
+# Those with trained models
+PRESETS_TESTED = tuple(preset for preset in ("paper", "dense") if any(FOLDER.glob(f"{preset}_seed*.zip")))
 TEAMS = (4, 6, 8, 12, 16)
 # Sixteen robots do not fit on the circle of eight.
 WIDER = {"circle_radius": (3.0, 3.5)}
@@ -77,6 +80,13 @@ def best_rules(preset: str) -> dict[str, str]:
     return {scenario: best[scenario]["rule"] if scenario in best else "full" for scenario in NAMES}
 
 
+def tuned(recipe: str, scenario: str) -> list[str]:
+    """The models of a recipe with the threshold that was chosen for this scenario alone, as rules are."""
+    rows = {(row["model"], row["scenario"]): row for row in read("thresholds") if row["safe"]}
+    found = [rows[path, scenario] for path in models(recipe) if (path, scenario) in rows]
+    return [f"{row['model']}@{row['threshold']:g}" for row in found]
+
+
 def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> list[dict[str, Any]]:
     """Fly policies over the same test episodes; the first is full communication, the second the rule to beat.
 
@@ -109,11 +119,15 @@ def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> lis
 def test(episodes: int) -> list[Any]:
     """Jobs of the main table."""
     jobs = []
-    for preset in ("paper", "dense"):
+    for preset in PRESETS_TESTED:
         rules, config = best_rules(preset), make_config(preset)
-        others = ["none", DBCP, *models(preset), *(models("faithful") if preset == "paper" else [])]
-        others += [path for path in models("ablation") if preset == "paper"]
-        jobs += [({"preset": preset}, ["full", rules[name], *others], name, config, episodes) for name in NAMES]
+        others = ["none", DBCP, *models(preset)]
+        if preset == "paper":
+            others += [*models("faithful"), *models("ablation")]
+        jobs += [
+            ({"preset": preset}, ["full", rules[name], *others, *tuned(preset, name)], name, config, episodes)
+            for name in NAMES
+        ]
     return jobs
 
 
@@ -128,7 +142,7 @@ def sweep(episodes: int) -> list[Any]:
             make_config(preset),
             episodes,
         )
-        for preset in ("paper", "dense")
+        for preset in PRESETS_TESTED
         for name in NAMES
     ]
 
@@ -143,7 +157,7 @@ def robustness(episodes: int) -> list[Any]:
             make_config(preset, **changes),
             episodes,
         )
-        for preset in ("paper", "dense")
+        for preset in PRESETS_TESTED
         for condition, changes in CONDITIONS.items()
         for name in NAMES
     ]
@@ -162,6 +176,7 @@ def teams(episodes: int) -> list[Any]:
         )
         for n in TEAMS
         for name in NAMES
+        if models("any")
     ]
 
 
@@ -169,7 +184,7 @@ def asking(episodes: int) -> list[Any]:
     """Jobs of the look at whom policies ask: pairs and steps counted by what the robots saw."""
     return [
         (preset, policy, name, episodes)
-        for preset in ("paper", "dense")
+        for preset in PRESETS_TESTED
         for name in NAMES
         for policy in (best_rules(preset)[name], *models(preset)[:1])
     ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +37,19 @@ def read(folder: Path, name: str) -> Rows:
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
+    body = list(rows)
+    if not body:
+        return "Not flown yet."
+    lines = [head, ["---"] * len(head), *body]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def label(policy: str) -> str:
     """How a policy is called in tables."""
-    return Path(policy).stem.replace("_seed", ", seed ") if is_model(policy) else f"`{policy}`".replace("|", "\\|")
+    if not is_model(policy):
+        return f"`{policy}`".replace("|", "\\|")
+    path, _, threshold = policy.partition("@")
+    return Path(path).stem.replace("_seed", ", seed ") + (f", δ = {threshold}" if threshold else "")
 
 
 def rate(row: dict[str, Any]) -> str:
@@ -80,29 +86,42 @@ def main_table(rows: Rows, preset: str) -> str:
     return table(head, lines)
 
 
-def pooled(rows: Rows, keep: Callable[[dict[str, Any]], bool]) -> float:
-    """Requests of all scenarios together, of all that were possible."""
-    chosen = [row for row in rows if keep(row)]
-    return sum(row["requests"] for row in chosen) / max(sum(row["possible_requests"] for row in chosen), 1)
+def pooled(rows: Rows) -> float:
+    """Requests of all rows together, of all that were possible."""
+    return sum(row["requests"] for row in rows) / max(sum(row["possible_requests"] for row in rows), 1)
 
 
 def targets(rows: Rows) -> str:
     """What was asked for and what came out, for every seed."""
     lines = []
-    for preset in ("dense", "paper"):
-        seeds = dict.fromkeys(r["policy"] for r in rows if r["preset"] == preset and f"/{preset}_seed" in r["policy"])
-        for policy in seeds:
-            mine = {r["scenario"]: r for r in rows if r["preset"] == preset and r["policy"] == policy}
-            shares = []
-            for name in NAMES:
-                rival = mine[name]["against_rule"]["rival"]
-                rule = next(r for r in rows if (r["preset"], r["scenario"], r["policy"]) == (preset, name, rival))
-                shares.append(f"{mine[name]['request_share'] / rule['request_share']:.0%}")
-            safe = sum(mine[name]["against_full"]["as_safe"] for name in NAMES)
-            saved = 1 - pooled(rows, lambda r, p=policy, w=preset: r["preset"] == w and r["policy"] == p)
-            lines.append([preset, label(policy), f"{safe} of {len(NAMES)}", *shares, f"{saved:.1%}"])
-    head = ["preset", "policy", "as safe as full in", *(f"{name.replace('_', ' ')}" for name in NAMES)]
+    for preset in ("paper", "dense"):
+        learned = [row for row in rows if row["preset"] == preset and f"/{preset}_seed" in row["policy"]]
+        for path in dict.fromkeys(row["policy"].partition("@")[0] for row in learned):
+            for how, marked in (("one threshold", False), ("tuned like rules", True)):
+                mine = {
+                    row["scenario"]: row
+                    for row in learned
+                    if row["policy"].partition("@")[0] == path and ("@" in row["policy"]) == marked
+                }
+                if len(mine) < len(NAMES):
+                    continue
+                ratios = [f"{mine[name]['request_share'] / share_of_rule(rows, mine[name]):.0%}" for name in NAMES]
+                safe = sum(mine[name]["against_full"]["as_safe"] for name in NAMES)
+                saved = 1 - pooled(list(mine.values()))
+                lines.append([label(path), how, f"{safe} of {len(NAMES)}", *ratios, f"{saved:.1%}"])
+        rules = [row for row in rows if row["preset"] == preset and row["policy"] == row["against_rule"]["rival"]]
+        if rules:
+            saved = 1 - pooled(rules)
+            safe = sum(row["against_full"]["as_safe"] for row in rules)
+            lines.append([f"{preset}, rules", "tuned", f"{safe} of {len(NAMES)}", *["100%"] * 4, f"{saved:.1%}"])
+    head = ["policy", "threshold", "as safe as full in", *(name.replace("_", " ") for name in NAMES)]
     return table([*head, "fewer than full, pooled"], lines)
+
+
+def share_of_rule(rows: Rows, row: dict[str, Any]) -> float:
+    """Share of the requests of the rule that a policy is compared with."""
+    key = (row["preset"], row["scenario"], row["against_rule"]["rival"])
+    return next(r["request_share"] for r in rows if (r["preset"], r["scenario"], r["policy"]) == key)
 
 
 def family_table(rules: Rows, preset: str) -> str:
@@ -142,9 +161,11 @@ def kind_of(row: dict[str, Any]) -> str:
 
 def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
     """Requests against collisions: rule families, the learned policy at all thresholds, and the tested policies."""
-    figure, panels = plt.subplots(2, 4, figsize=(15, 7), layout="constrained", sharey="row")
+    presets = list(dict.fromkeys(row["preset"] for row in rules))
+    size = (15, 3.5 * len(presets))
+    figure, panels = plt.subplots(len(presets), 4, figsize=size, layout="constrained", sharey="row", squeeze=False)
     families = list(dict.fromkeys(row["family"] for row in rules))
-    for line, preset in zip(panels, ("paper", "dense"), strict=True):
+    for line, preset in zip(panels, presets, strict=True):
         for axes, name in zip(line, NAMES, strict=True):
             here = [r for r in rules if (r["preset"], r["scenario"]) == (preset, name) and r["episodes"] >= 250]
             for k, family in enumerate(families):
@@ -171,7 +192,7 @@ def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
             axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
     for axes in panels[:, 0]:
         axes.set_ylabel("episodes with a collision")
-    for axes in panels[1]:
+    for axes in panels[-1]:
         axes.set_xlabel("requests, of all possible")
     legends = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels.flat]
     handles = {text: handle for legend in legends for handle, text in legend}
@@ -188,8 +209,12 @@ def rate_of(row: dict[str, Any]) -> float:
 def draw_asking(rows: Rows, path: Path) -> None:
     """How often policies ask at what they see."""
     quantities = list(dict.fromkeys(row["quantity"] for row in rows))
-    figure, panels = plt.subplots(2, len(quantities), figsize=(15, 5.5), layout="constrained", sharey="row")
-    for line, preset in zip(panels, ("paper", "dense"), strict=True):
+    presets = list(dict.fromkeys(row["preset"] for row in rows))
+    size = (15, 2.8 * len(presets))
+    figure, panels = plt.subplots(
+        len(presets), len(quantities), figsize=size, layout="constrained", sharey="row", squeeze=False
+    )
+    for line, preset in zip(panels, presets, strict=True):
         for axes, quantity in zip(line, quantities, strict=True):
             for learned in (False, True):
                 sums: dict[float, list[int]] = {}
@@ -241,8 +266,10 @@ def main() -> None:
         page = f"{before}{opening}\n{block}\n\n{closing}{after}"
     args.page.write_text(page)
     args.images.mkdir(parents=True, exist_ok=True)
-    draw_fronts(rules, sweep, test, args.images / "fronts.png")
-    draw_asking(asking, args.images / "asking.png")
+    if rules:
+        draw_fronts(rules, sweep, test, args.images / "fronts.png")
+    if asking:
+        draw_asking(asking, args.images / "asking.png")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from quad_swarm.presets import make_config
 from sb3_maddpg import pretrained
 from sb3_maddpg.shipped import pretrained_folder, shipped_models
 
-# Model -> world, number of robots, and the largest share of requests in the symmetric swap (about 1.3 times what it needs).
+# Model -> world, number of robots, and the largest share of requests in the symmetric swap, 1.3 times what it needs.
 SHIPPED = {"quad-swarm-paper": ("paper", 4, 0.08)}
 
 

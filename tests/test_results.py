@@ -1,0 +1,63 @@
+"""The scripts behind docs/results.md, with few episodes."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT))
+
+from benchmarks import swarm_results, swarm_rules  # noqa: E402
+from docs import results as page  # noqa: E402
+from quad_swarm.communication import parse_rule  # noqa: E402
+from quad_swarm.evaluation import Comparison  # noqa: E402
+from quad_swarm.presets import make_config  # noqa: E402
+
+
+def test_every_rule_of_every_family_can_be_read():
+    families = swarm_rules.families()
+    assert {"distance", "cpa", "random", "event"} <= set(families)
+    for rules in families.values():
+        assert len(set(rules)) == len(rules)
+        for rule in rules:
+            parse_rule(rule)
+
+
+def test_comparison_counts_episodes_in_which_one_collided():
+    first = [{"collided": c} for c in (1, 1, 0, 0, 1)]
+    second = [{"collided": c} for c in (1, 0, 0, 1, 0)]
+    assert Comparison.of(first, second) == Comparison(5, 2, 1)
+
+
+def test_comparison_of_known_numbers():
+    # Agresti and Min (2005) for 4,000 pairs of which 5 and 1 differ; McNemar's exact p of 5 against 1 is 14/64
+    low, high = Comparison(4000, 5, 1).interval
+    assert (low, high) == (pytest.approx(-0.00030, abs=2e-5), pytest.approx(0.00230, abs=2e-5))
+    assert Comparison(4000, 5, 1).p_value == pytest.approx(14 / 64)
+    assert Comparison(4000, 0, 0).p_value == 1.0
+    assert Comparison(4000, 0, 0).interval[1] > 0, "no collisions in 4,000 episodes do not prove that there are none"
+    assert Comparison(4000, 5, 1).as_safe
+    assert not Comparison(4000, 12, 1).as_safe
+    assert not Comparison(100, 0, 0).as_safe, "too few episodes"
+    assert swarm_rules.hopeless(Comparison(800, 9, 0))
+    assert not swarm_rules.hopeless(Comparison(800, 1, 0))
+
+
+def test_tables_of_flown_episodes(tmp_path):
+    rows = swarm_results.compare(
+        ({"preset": "paper"}, ["full", "cpa:0.65:1.5", "none"], "symmetric_swap", make_config("paper"), 30)
+    )
+    assert [row["policy"] for row in rows] == ["full", "cpa:0.65:1.5", "none"]
+    full, rule, none = rows
+    assert full["against_full"]["only_policy"] == rule["against_rule"]["only_policy"] == 0
+    assert (
+        none["against_full"]["only_policy"]
+        == none["collisions"] - full["collisions"] + none["against_full"]["only_rival"]
+    )
+    assert none["requests"] == 0 < rule["requests"] < full["requests"] == full["possible_requests"]
+    (tmp_path / "test.json").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    text = page.main_table(page.read(tmp_path, "test"), "paper")
+    assert f"| symmetric swap | `none` | {none['collisions']}/30 [" in text
+    assert page.read(tmp_path, "nothing") == []
