@@ -25,12 +25,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 if not __package__:
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, hopeless  # noqa: E402
-from quad_swarm.evaluate import write_json  # noqa: E402
-from quad_swarm.evaluation import Comparison, summarise  # noqa: E402
-from quad_swarm.presets import PRESETS, make_config  # noqa: E402
-from quad_swarm.scenarios import SCENARIOS  # noqa: E402
-from sb3_maddpg import MADDPG  # noqa: E402
+from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, hopeless
+from quad_swarm.evaluate import write_json
+from quad_swarm.evaluation import Comparison, summarise
+from quad_swarm.presets import PRESETS, make_config
+from quad_swarm.scenarios import SCENARIOS
+from sb3_maddpg import MADDPG
 
 THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7, 0.65, 0.6, 0.55, 0.5, 0.4, 0.3, 0.2]
 
