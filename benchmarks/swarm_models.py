@@ -79,9 +79,11 @@ def main() -> None:
     args = parser.parse_args()
     work = [(path, args.preset, args.n_robots, args.scenario, args.quick) for path in args.models]
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
-        rows = [row for table in pool.map(tune, *zip(*work, strict=True)) for row in table]
-    if args.json:
-        write_json(args.json, rows)
+        rows: list[dict[str, Any]] = []
+        for table in pool.map(tune, *zip(*work, strict=True)):
+            rows += table
+            if args.json:
+                write_json(args.json, rows)
 
 
 if __name__ == "__main__":
