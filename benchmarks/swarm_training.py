@@ -1,0 +1,91 @@
+"""How long a training of a swarm's recipe takes, and where the time goes.
+
+``python benchmarks/swarm_training.py [--recipe RECIPE.yml ...] [--steps N] [--json F]`` trains on one core. Planner: its
+batch calls. Learner: updates. Acting: the policy while exploring. Rest: the swarm around its planner, observations,
+infos, the replay buffer and logging. JSON: one row a recipe with recipe, steps, updates, episodes, seconds, and the
+share of each part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import torch as th
+import yaml
+from stable_baselines3.common.vec_env import VecMonitor
+
+import quad_swarm  # noqa: F401 - registers the environment
+from quad_swarm.evaluate import write_json
+from sb3_maddpg import MADDPG
+from sb3_maddpg.vec_env import GymnasiumVecEnv
+
+
+def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
+    """The function, which adds the seconds it takes to a total."""
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        started = time.perf_counter()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            total[0] += time.perf_counter() - started
+
+    return call
+
+
+def measure(recipe: str, steps: int | None) -> dict[str, Any]:
+    """Train once."""
+    hyperparams = yaml.safe_load(Path(recipe).read_text())["QuadSwarm-v0"]
+    for key in ("vec_env", "eval_env_kwargs", "callback"):
+        hyperparams.pop(key, None)
+    steps = steps or hyperparams["n_timesteps"]
+    del hyperparams["n_timesteps"]
+    rate = float(str(hyperparams.pop("learning_rate")).removeprefix("lin_"))
+    envs = gymnasium.make_vec("QuadSwarm-v0", hyperparams.pop("n_envs"), **hyperparams.pop("env_kwargs"))
+    env = VecMonitor(GymnasiumVecEnv(envs))
+    model = MADDPG(hyperparams.pop("policy"), env, learning_rate=rate, seed=0, **hyperparams)
+    planner, learner, acting = [0.0], [0.0], [0.0]
+    solver = envs.unwrapped.task.swarm.planner  # type: ignore[attr-defined]
+    solver.plan = timed(solver.plan, planner)
+    model.train = timed(model.train, learner)  # type: ignore[method-assign]
+    model._sample_action = timed(model._sample_action, acting)  # type: ignore[method-assign]
+    started = time.perf_counter()
+    model.learn(steps)
+    seconds = time.perf_counter() - started
+    parts = {"planner": planner[0], "learner": learner[0], "acting": acting[0]}
+    parts["rest"] = seconds - sum(parts.values())
+    row: dict[str, Any] = {"recipe": recipe, "steps": model.num_timesteps, "updates": model._n_updates}
+    row |= {"episodes": model._episode_num, "seconds": seconds}
+    return row | {f"share_{name}": part / seconds for name, part in parts.items()}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    default = ["zoo_configs/quad_swarm_paper.yml", "zoo_configs/quad_swarm_dense.yml", "zoo_configs/maddpg.yml"]
+    parser.add_argument("--recipe", nargs="+", default=default)
+    parser.add_argument("--steps", type=int, help="the recipe's unless given")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    rows = []
+    for recipe in args.recipe:
+        rows.append(measure(recipe, args.steps))
+        row = rows[-1]
+        shares = ", ".join(f"{key.removeprefix('share_')} {row[key]:.0%}" for key in row if key.startswith("share_"))
+        print(f"{recipe}: {row['steps']} steps, {row['updates']} updates, {row['episodes']} episodes in", end=" ")
+        print(f"{row['seconds']:.0f} s; {shares}", flush=True)
+    if args.json:
+        write_json(args.json, rows)
+
+
+if __name__ == "__main__":
+    main()
