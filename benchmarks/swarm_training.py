@@ -1,7 +1,7 @@
 """How long a training of a swarm's recipe takes, and where the time goes.
 
-``python benchmarks/swarm_training.py [--recipe RECIPE.yml ...] [--steps N] [--json F]`` trains on one core. Planner: its
-batch calls. Learner: updates. Acting: the policy while exploring. Rest: the swarm around its planner, observations,
+``python benchmarks/swarm_training.py [--recipe RECIPE.yml ...] [--steps N] [--json F]`` trains on one core. Planner:
+its batch calls. Learner: updates. Acting: the policy while exploring. Rest: the swarm around its planner, observations,
 infos, the replay buffer and logging. JSON: one row a recipe with recipe, steps, updates, episodes, seconds, and the
 share of each part.
 """
