@@ -126,7 +126,7 @@ def share_of_rule(rows: Rows, row: dict[str, Any]) -> float:
 
 def family_table(rules: Rows, preset: str) -> str:
     """The cheapest safe rule of each family, in validation."""
-    families = list(dict.fromkeys(row["family"] for row in rules))
+    families = list(dict.fromkeys(row["family"] for row in rules if row["preset"] == preset))
     lines = []
     for family in families:
         line = [family]
@@ -257,6 +257,8 @@ def main() -> None:
         "robustness dense": wide_table(robustness, "condition", "dense"),
         "teams": wide_table(teams, "n_robots", "dense"),
     }
+    picture = "![How often policies ask: distance, approach, time, way to go, crowd](images/asking.png)"
+    blocks["asking"] = picture if asking else "Not flown yet."
     page = PAGE.read_text()
     for name, block in blocks.items():
         before, opening, rest = page.partition(f"<!-- {name} -->\n")
