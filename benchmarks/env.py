@@ -78,11 +78,13 @@ def attach_timers(task: RequestTask) -> dict[str, list[float]]:
         ("reset", task, "reset"),
     ]:
         timers[name] = [0.0]
-        setattr(owner, method, _timed(getattr(owner, method), timers[name]))
+        setattr(owner, method, timed(getattr(owner, method), timers[name]))
     return timers
 
 
-def _timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
+def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
+    """The function, which adds the seconds it takes to a total."""
+
     def call(*args: Any, **kwargs: Any) -> Any:
         started = time.perf_counter()
         try:

@@ -25,9 +25,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 if not __package__:
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, hopeless
+from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, in_stages
 from quad_swarm.evaluate import write_json
-from quad_swarm.evaluation import Comparison, summarise
+from quad_swarm.evaluation import summarise
 from quad_swarm.presets import PRESETS, make_config
 from quad_swarm.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
@@ -37,20 +37,14 @@ THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7
 
 def tune(path: str, preset: str, n_robots: list[int | None], scenarios: list[str], quick: bool) -> list[dict[str, Any]]:
     """The rows of one model."""
-    stages = QUICK_STAGES if quick else STAGES
     table: list[dict[str, Any]] = []
     chosen = []
     for n, scenario in product(n_robots, scenarios):
-        full = fly(["full"], preset, scenario, stages[-1], n)["full"]
+        full = fly(["full"], preset, scenario, (QUICK_STAGES if quick else STAGES)[-1], n)["full"]
         robots = make_config(preset, n_robots=n).n_robots
         for threshold in THRESHOLDS:
             policy = f"{path}@{threshold:g}"
-            for episodes in stages[1:]:
-                figures = fly([policy], preset, scenario, episodes, n)[policy]
-                comparison = Comparison.of(figures, full[:episodes])
-                if hopeless(comparison):
-                    break
-            safe = episodes == stages[-1] and (comparison.as_safe or quick)
+            figures, safe = in_stages(policy, preset, scenario, full, quick, n)
             keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
             table.append(keys | {"n_robots": robots} | summarise(figures, robots))
             if safe:

@@ -80,6 +80,27 @@ def hopeless(comparison: Comparison) -> bool:
     return comparison.interval[0] > 0 or (excess >= 4 and excess / comparison.episodes > 0.003)
 
 
+def in_stages(
+    policy: str,
+    preset: str,
+    scenario: str,
+    full: list[dict[str, float]],
+    quick: bool,
+    n_robots: int | None = None,
+) -> tuple[list[dict[str, float]], bool]:
+    """Fly a policy in the later stages, as far as there is hope.
+
+    :param full: figures of full communication in the same episodes
+    :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
+    """
+    for episodes in (QUICK_STAGES if quick else STAGES)[1:]:
+        figures = fly([policy], preset, scenario, episodes, n_robots)[policy]
+        comparison = Comparison.of(figures, full[:episodes])
+        if hopeless(comparison):
+            return figures, False
+    return figures, comparison.as_safe or quick
+
+
 def tune(preset: str, scenario: str, quick: bool) -> list[dict[str, Any]]:
     """The rows of one scenario."""
     stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
@@ -90,14 +111,10 @@ def tune(preset: str, scenario: str, quick: bool) -> list[dict[str, Any]]:
         flown = fly(rules[::thin], preset, scenario, stages[0])
         safe: dict[str, bool] = {}
         for rule in sorted(flown, key=lambda rule: summarise(flown[rule], n)["request_share"]):
-            for episodes in stages:
-                if episodes > stages[0]:
-                    flown[rule] = fly([rule], preset, scenario, episodes)[rule]
-                comparison = Comparison.of(flown[rule], full[:episodes])
-                if hopeless(comparison):
-                    break
-            # So few episodes as in a quick run prove nothing
-            safe[rule] = episodes == stages[-1] and (comparison.as_safe or quick)
+            if hopeless(Comparison.of(flown[rule], full[: stages[0]])):
+                safe[rule] = False
+                continue
+            flown[rule], safe[rule] = in_stages(rule, preset, scenario, full, quick)
             if safe[rule]:
                 break
         keys = {"preset": preset, "scenario": scenario, "family": family}

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +22,13 @@ import torch as th
 import yaml
 from stable_baselines3.common.vec_env import VecMonitor
 
-import quad_swarm  # noqa: F401 - registers the environment
+if not __package__:
+    sys.path[0] = str(Path(__file__).resolve().parent.parent)
+
+from benchmarks.env import timed
 from quad_swarm.evaluate import write_json
 from sb3_maddpg import MADDPG
 from sb3_maddpg.vec_env import GymnasiumVecEnv
-
-
-def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
-    """The function, which adds the seconds it takes to a total."""
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        started = time.perf_counter()
-        try:
-            return function(*args, **kwargs)
-        finally:
-            total[0] += time.perf_counter() - started
-
-    return call
 
 
 def measure(recipe: str, steps: int | None) -> dict[str, Any]:
