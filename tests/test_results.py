@@ -45,6 +45,19 @@ def test_comparison_of_known_numbers():
     assert not swarm_rules.hopeless(Comparison(800, 1, 0))
 
 
+def test_stages_fly_every_episode_once_and_stop_where_there_is_no_hope(monkeypatch):
+    monkeypatch.setattr(swarm_rules, "STAGES", (10, 30, 60))
+    flown = {policy: swarm_rules.fly([policy], "paper", "random", 60)[policy] for policy in ("full", "cpa:0.7:1.5")}
+    full, all_60 = flown.values()
+    figures, safe = swarm_rules.in_stages("cpa:0.7:1.5", "paper", "random", full, False, flown=all_60[:10])
+    same = [{key: row[key] for key in row if key != "solve_seconds"} for row in (*figures, *all_60)]
+    assert same[:60] == same[60:]
+    assert not safe, "60 episodes prove nothing"
+    collisions = swarm_rules.fly(["full"], "paper", "symmetric_swap", 60)["full"]
+    figures, safe = swarm_rules.in_stages("none", "paper", "symmetric_swap", collisions, False)
+    assert (len(figures), safe) == (10, False)
+
+
 def test_tables_of_flown_episodes(tmp_path):
     rows = swarm_results.compare(
         ({"preset": "paper"}, ["full", "cpa:0.65:1.5", "none"], "symmetric_swap", make_config("paper"), 30)

@@ -317,14 +317,19 @@ def evaluate(cells: Sequence[Cell], episodes: int, seed: int = 0, jobs: int = 1)
     ]
 
 
-def fly_all(cells: Sequence[Cell], episodes: int, seed: int = 0, jobs: int = 1) -> dict[Cell, list[dict[str, float]]]:
-    """`evaluate`, episode by episode: the figures of each, see `EpisodeStatistics`."""
-    if episodes < 1 or jobs < 1:
-        raise ValueError(f"episodes={episodes} and jobs={jobs} must be at least 1.")
+def fly_all(
+    cells: Sequence[Cell], episodes: int, seed: int = 0, jobs: int = 1, skip: int = 0
+) -> dict[Cell, list[dict[str, float]]]:
+    """`evaluate`, episode by episode: the figures of each, see `EpisodeStatistics`.
+
+    :param skip: leave out that many of the ``episodes``, which have been flown before
+    """
+    if episodes <= skip or jobs < 1:
+        raise ValueError(f"episodes={episodes} must be at least {skip + 1}, jobs={jobs} at least 1.")
     for cell in cells:
         make_policy(cell)  # say what is wrong before anything is flown
     first = first_episode(seed)
-    chunks = [range(first + k, first + min(k + _CHUNK, episodes)) for k in range(0, episodes, _CHUNK)]
+    chunks = [range(first + k, first + min(k + _CHUNK, episodes)) for k in range(skip, episodes, _CHUNK)]
     work = [(cell, chunk) for cell in cells for chunk in chunks]
     flown: dict[Cell, list[dict[str, float]]] = {cell: [] for cell in cells}
     for (cell, _), rows in zip(work, _run_all(work, jobs), strict=True):
