@@ -59,6 +59,11 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 }
 
 
+def absolute_path(text: str) -> Path:
+    """An argument of the command line: what it names here, also after a change of the working directory."""
+    return Path(text).resolve()
+
+
 def models(recipe: str) -> list[str]:
     """The trained models of a recipe, by seed."""
     return [str(path.relative_to(ROOT)) for path in sorted(FOLDER.glob(f"{recipe}_seed*.zip"))]
@@ -243,7 +248,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each cell")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the JSON files (default %(default)s)")
+    parser.add_argument("--out", type=absolute_path, default=FOLDER, help="folder of the JSON files (%(default)s)")
     args = parser.parse_args(argv)
     os.chdir(ROOT)
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:

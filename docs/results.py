@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,22 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
 
-from quad_swarm.colours import colour_of
-from quad_swarm.evaluation import is_model
-from quad_swarm.scenarios import SCENARIOS
-
+# So that scripts find each other by the names mypy knows them by
 ROOT = Path(__file__).resolve().parent.parent
+if not __package__:
+    sys.path[0] = str(ROOT)
+
+from benchmarks.swarm_results import absolute_path, best_rules, models  # noqa: E402
+from benchmarks.swarm_rules import TEST, cell  # noqa: E402
+from quad_swarm.beliefs import other_indices  # noqa: E402
+from quad_swarm.colours import colour_of  # noqa: E402
+from quad_swarm.evaluation import Flight, fly, is_model  # noqa: E402
+from quad_swarm.plots import draw_flight  # noqa: E402
+from quad_swarm.presets import make_config  # noqa: E402
+from quad_swarm.scenarios import SCENARIOS  # noqa: E402
+
 DATA = ROOT / "benchmarks" / "results" / "swarm"
 PAGE = ROOT / "docs" / "results.md"
 IMAGES = ROOT / "docs" / "images"
@@ -201,6 +213,48 @@ def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
     plt.close(figure)
 
 
+def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
+    """The first test episode of each scenario as a model flies it, and whom a rule would have asked on its way."""
+    config = make_config(preset)
+    return {name: fly(cell(model, name, config), TEST, beside=rule) for name in NAMES}
+
+
+def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
+    """The paper's Fig. 2: the flights of each preset from above."""
+    size = (15, 4 * len(flown))
+    figure, panels = plt.subplots(len(flown), len(NAMES), figsize=size, layout="constrained", squeeze=False)
+    for line, (preset, by_name) in zip(panels, flown.items(), strict=True):
+        for axes, (name, flight) in zip(line, by_name.items(), strict=True):
+            draw_flight(axes, flight)
+            axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def told(flight: Flight) -> str:
+    """A flight step by step: who asks whom, what it sees of it, and whom the rule would have asked."""
+    n = len(flight.goal)
+    others = other_indices(n)
+    pos, vel = flight.state[..., :3], flight.state[..., 3:6]
+    last: dict[tuple[int, int], int] = {}
+    lines = []
+    for k, (asked, by_rule) in enumerate(zip(flight.requests, flight.beside, strict=True)):
+        texts = []
+        for i, m in np.argwhere(asked):
+            j = others[i, m]
+            away, moving = pos[k, j] - pos[k, i], vel[k, j] - vel[k, i]
+            time = max(0.0, -(away @ moving) / max(moving @ moving, 1e-12))
+            age = f"asked {k - last[i, j]} steps ago" if (i, j) in last else "not asked before"
+            near = np.linalg.norm(away + time * moving)
+            texts.append(f"**{i} → {j}** {np.linalg.norm(away):.1f} m away, {near:.2f} m in {time:.1f} s, {age}")
+            last[i, j] = k
+        rule = ", ".join(f"{i} → {others[i, m]}" for i, m in np.argwhere(by_rule))
+        if texts or rule:
+            apart = min(np.linalg.norm(pos[k, i] - pos[k, j]) for i in range(n) for j in range(i))
+            lines.append([str(k), f"{apart:.2f}", "<br>".join(texts) or "-", rule or "-"])
+    return table(["step", "closest two (m)", "asks", "the rule would ask"], lines)
+
+
 def rate_of(row: dict[str, Any]) -> float:
     """Share of the episodes with a collision."""
     return row["collisions"] / row["episodes"]
@@ -238,10 +292,11 @@ def draw_asking(rows: Rows, path: Path) -> None:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the JSON files (default %(default)s)")
-    parser.add_argument("--page", type=Path, default=PAGE, help="page to fill (default %(default)s)")
-    parser.add_argument("--images", type=Path, default=IMAGES, help="folder of the figures (default %(default)s)")
+    parser.add_argument("--data", type=absolute_path, default=DATA, help="folder of the JSON files (%(default)s)")
+    parser.add_argument("--page", type=absolute_path, default=PAGE, help="page to fill (default %(default)s)")
+    parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
+    os.chdir(ROOT)
     names = ("rules", "test", "sweep", "robustness", "teams", "asking")
     rules, test, sweep, robustness, teams, asking = (read(args.data, name) for name in names)
     blocks = {
@@ -257,6 +312,12 @@ def main() -> None:
         "robustness dense": wide_table(robustness, "condition", "dense"),
         "teams": wide_table(teams, "n_robots", "dense"),
     }
+    flown = {
+        preset: flights(models(preset)[0], best_rules(preset)["symmetric_swap"], preset)
+        for preset in dict.fromkeys(row["preset"] for row in asking)
+    }
+    for name in ("symmetric_swap", "asymmetric_swap"):
+        blocks[f"told {name}"] = told(flown["paper"][name]) if "paper" in flown else "Not flown yet."
     picture = "![How often policies ask: distance, approach, time, way to go, crowd](images/asking.png)"
     blocks["asking"] = picture if asking else "Not flown yet."
     page = PAGE.read_text()
@@ -270,6 +331,8 @@ def main() -> None:
     args.images.mkdir(parents=True, exist_ok=True)
     if rules:
         draw_fronts(rules, sweep, test, args.images / "fronts.png")
+    if flown:
+        draw_trajectories(flown, args.images / "flights.png")
     if asking:
         draw_asking(asking, args.images / "asking.png")
 

@@ -168,26 +168,37 @@ class Flight(NamedTuple):
     :param plans: planned states as of each step, stages 0..N, (T + 1, n, N + 1, 9)
     :param goal: goals, (n, 3), world frame (m)
     :param requests: who asked whom in each step, (T, n, n - 1) bool
+    :param beside: whom another rule would have asked in each step, (T, n, n - 1) bool
     """
 
     state: np.ndarray
     plans: np.ndarray
     goal: np.ndarray
     requests: np.ndarray
+    beside: np.ndarray
 
 
-def fly(cell: Cell, seed: int, number: int = 0) -> Flight:
-    """A held-out episode of set ``seed``, the first unless ``number`` says otherwise, step by step."""
+def fly(cell: Cell, seed: int, number: int = 0, beside: str = "none") -> Flight:
+    """Fly a held-out episode of a set, step by step.
+
+    :param cell: policy, scenario and world
+    :param seed: which set
+    :param number: which episode of it
+    :param beside: a rule that is asked in every step too, but not heeded
+    """
     policy, task, rngs = _begin(cell, [first_episode(seed) + number])
-    state, plans, asked = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], []
+    rule = parse_rule(beside)
+    state, plans, asked, unheeded = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], [], []
     over = False
     while not over:
+        unheeded.append(rule(View(task.swarm, rngs)))
         asked.append(policy(task, rngs))
         outcome = task.step(asked[-1])
         state.append(task.swarm.state[0].copy())
         plans.append(task.swarm.plans[0].copy())
         over = bool(outcome.terminated[0] | outcome.truncated[0])
-    return Flight(np.array(state), np.array(plans), task.swarm.goal[0], np.concatenate(asked))
+    requests, others = np.concatenate(asked), np.concatenate(unheeded)
+    return Flight(np.array(state), np.array(plans), task.swarm.goal[0], requests, others)
 
 
 def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:

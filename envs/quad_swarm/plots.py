@@ -15,9 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from .colours import colour_of
+from .colours import OKABE_ITO, colour_of
 from .evaluation import Cell, Flight, fly, is_model
 from .render import Renderer
+
+# Of a path, where a robot asks and where it does not: yellow and blue, as in the paper
+ASKING, SILENT = OKABE_ITO[6], OKABE_ITO[0]
 
 
 def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int, folder: Path) -> list[Path]:
@@ -85,12 +88,12 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
 
 
 def draw_flights(cells: Sequence[Cell], flights: Sequence[Flight]) -> Figure:
-    """One flight of a policy in each scenario, from above: where robots asked, and where they did not."""
+    """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2)."""
     figure, panels = plt.subplots(1, len(cells), figsize=(3.4 * len(cells), 3.8), layout="constrained", squeeze=False)
     for axes, cell, flight in zip(panels[0], cells, flights, strict=True):
-        _draw_flight(axes, flight)
+        draw_flight(axes, flight)
         axes.set_title(cell.scenario.replace("_", " "), fontsize=10)
-    figure.suptitle(f"{_label(cells[-1].policy)}: dots mark steps with a request", fontsize=9)
+    figure.suptitle(f"{_label(cells[-1].policy)}: yellow where a robot asks, blue where it does not", fontsize=9)
     return figure
 
 
@@ -108,15 +111,16 @@ def animate(cell: Cell, flight: Flight, path: Path) -> None:
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
 
 
-def _draw_flight(axes: Axes, flight: Flight) -> None:
+def draw_flight(axes: Axes, flight: Flight) -> None:
+    """A flight from above: yellow where a robot asks, blue where it does not."""
+    asks = flight.requests.sum(axis=2) > 0
     for i in range(len(flight.goal)):
-        colour = colour_of(i)
-        path = flight.state[:, i, :3]
-        axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=1)
-        asked = path[:-1][flight.requests[:, i].any(axis=1)]
-        axes.scatter(asked[:, 0], asked[:, 1], s=14, color=colour)
-        axes.plot(*path[0, :2], "o", color=colour, markersize=7, markerfacecolor="white")
-        axes.plot(*flight.goal[i, :2], "*", color=colour, markersize=11)
+        path = flight.state[:, i, :2]
+        axes.plot(path[:, 0], path[:, 1], color=SILENT, linewidth=1)
+        asking = path[:-1][asks[:, i]]
+        axes.scatter(asking[:, 0], asking[:, 1], s=16, color=ASKING, edgecolor="#7a6000", linewidth=0.4, zorder=3)
+        axes.plot(*path[0], "o", color=colour_of(i), markersize=7, markerfacecolor="white")
+        axes.plot(*flight.goal[i, :2], "*", color=colour_of(i), markersize=11)
     axes.set_aspect("equal")
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
