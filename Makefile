@@ -42,8 +42,9 @@ lint: install  ## ruff and mypy
 bench: install  ## speed of planner, environment and learner, and the estimators, as tables and as JSON
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done
 
-results: install  ## fly everything that docs/results.md says again: tuned rules, test set, tables and figures (hours)
+results: install  ## fly everything that docs/results.md says again: tuned rules and thresholds, test set, tables and figures (hours)
 	$(BIN)/python benchmarks/swarm_rules.py --jobs $(JOBS) --json benchmarks/results/swarm/rules.json
+	$(BIN)/python benchmarks/swarm_models.py --jobs $(JOBS) --json benchmarks/results/swarm/thresholds.json
 	$(BIN)/python benchmarks/swarm_results.py --jobs $(JOBS)
 	$(BIN)/python docs/results.py
 

@@ -1,11 +1,11 @@
 """Choose the thresholds of trained models: the highest with which each is as safe as asking everybody.
 
-``python benchmarks/swarm_models.py MODEL.zip ... --preset dense [--scenario ...] [--n-robots ...] [--json F]``, on the
-validation set, on which rules are tuned too. In each scenario thresholds are tried from the highest on, in stages of
-more and more episodes, until the model is as safe as full communication (`Comparison.as_safe`). The smallest of them,
-with which it is safe everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with
-the keys of `quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario,
-safe.
+``python benchmarks/swarm_models.py [MODEL.zip ...] [--scenario ...] [--n-robots ...] [--json F]``, on the validation
+set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds are tried from
+the highest on, in stages of more and more episodes, until the model is as safe as full communication
+(`Comparison.as_safe`). The smallest of them, with which it is safe everywhere, is written into the model's file. JSON:
+one row a model, scenario and threshold with the keys of `quad_swarm.evaluation.summarise` over the episodes that it
+flew, and model, threshold, preset, scenario, safe; rows of other models stay.
 """
 
 from __future__ import annotations
@@ -25,18 +25,24 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 if not __package__:
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, in_stages
-from quad_swarm.evaluate import write_json
+from benchmarks.swarm_results import models
+from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, in_stages, replace_rows
 from quad_swarm.evaluation import summarise
-from quad_swarm.presets import PRESETS, make_config
+from quad_swarm.presets import make_config
 from quad_swarm.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 
+# The recipes whose threshold is free; the paper's is one half.
+TUNED = ("paper", "dense", "any", "ablation*")
 THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7, 0.65, 0.6, 0.55, 0.5, 0.4, 0.3, 0.2]
 
 
-def tune(path: str, preset: str, n_robots: list[int | None], scenarios: list[str], quick: bool) -> list[dict[str, Any]]:
+def tune(path: str, n_robots: list[int | None], scenarios: list[str], quick: bool) -> list[dict[str, Any]]:
     """The rows of one model."""
+    model = MADDPG.load(path, device="cpu")
+    if model.env_spec is None:
+        raise ValueError(f"{path} does not say in which world it was trained.")
+    preset = model.env_spec["kwargs"]["preset"]
     table: list[dict[str, Any]] = []
     chosen = []
     for n, scenario in product(n_robots, scenarios):
@@ -54,7 +60,6 @@ def tune(path: str, preset: str, n_robots: list[int | None], scenarios: list[str
         else:
             print(f"{path} {scenario} {robots}: no threshold is as safe as full communication", flush=True)
             chosen.append(THRESHOLDS[-1])
-    model = MADDPG.load(path, device="cpu")
     model.set_threshold(min(chosen))
     model.save(path)
     return table
@@ -63,21 +68,19 @@ def tune(path: str, preset: str, n_robots: list[int | None], scenarios: list[str
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="+", metavar="MODEL.zip")
-    parser.add_argument("--preset", required=True, choices=list(PRESETS))
+    parser.add_argument("models", nargs="*", metavar="MODEL.zip", help="all that swarm_results flies unless given")
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS)[::-1], choices=list(SCENARIOS))
     parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
     parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
-    work = [(path, args.preset, args.n_robots, args.scenario, args.quick) for path in args.models]
+    paths = args.models or [path for recipe in TUNED for path in models(recipe)]
+    work = [(path, args.n_robots, args.scenario, args.quick) for path in paths]
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
-        rows: list[dict[str, Any]] = []
         for table in pool.map(tune, *zip(*work, strict=True)):
-            rows += table
             if args.json:
-                write_json(args.json, rows)
+                replace_rows(args.json, table, ("model",))
 
 
 if __name__ == "__main__":

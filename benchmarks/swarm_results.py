@@ -8,7 +8,6 @@ has seen, and writes test.json, sweep.json, robustness.json, teams.json and aski
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import sys
@@ -27,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 if not __package__:
     sys.path[0] = str(ROOT)
 
-from benchmarks.swarm_rules import TEST, cell  # noqa: E402
+from benchmarks.swarm_rules import TEST, cell, read_rows  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.evaluate import write_json  # noqa: E402
 from quad_swarm.evaluation import Comparison, fly, fly_all, summarise  # noqa: E402
@@ -69,15 +68,10 @@ def models(recipe: str) -> list[str]:
     return [str(path.relative_to(ROOT)) for path in sorted(FOLDER.glob(f"{recipe}_seed*.zip"))]
 
 
-def read(name: str, folder: Path = FOLDER) -> list[dict[str, Any]]:
-    """Rows that a script wrote."""
-    return [json.loads(line) for line in (folder / f"{name}.json").read_text().splitlines()]
-
-
 def best_rules(preset: str) -> dict[str, str]:
     """For each scenario the rule with the fewest requests that was as safe as full communication in validation."""
     best: dict[str, dict[str, Any]] = {}
-    for row in read("rules"):
+    for row in read_rows(FOLDER / "rules.json"):
         if row["preset"] == preset and row["safe"]:
             known = best.setdefault(row["scenario"], row)
             if row["request_share"] < known["request_share"]:
@@ -87,7 +81,7 @@ def best_rules(preset: str) -> dict[str, str]:
 
 def tuned(recipe: str, scenario: str) -> list[str]:
     """The models of a recipe with the threshold that was chosen for this scenario alone, as rules are."""
-    rows = {(row["model"], row["scenario"]): row for row in read("thresholds") if row["safe"]}
+    rows = {(row["model"], row["scenario"]): row for row in read_rows(FOLDER / "thresholds.json") if row["safe"]}
     found = [rows[path, scenario] for path in models(recipe) if (path, scenario) in rows]
     return [f"{row['model']}@{row['threshold']:g}" for row in found]
 
@@ -128,7 +122,7 @@ def test(episodes: int) -> list[Any]:
         rules, config = best_rules(preset), make_config(preset)
         others = ["none", DBCP, *models(preset)]
         if preset == "paper":
-            others += [*models("faithful"), *models("ablation")]
+            others += [*models("faithful"), *models("ablation*")]
         jobs += [
             ({"preset": preset}, ["full", rules[name], *others, *tuned(preset, name)], name, config, episodes)
             for name in NAMES

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
@@ -126,6 +127,18 @@ def tune(preset: str, scenario: str, quick: bool) -> list[dict[str, Any]]:
     return table
 
 
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """What a script wrote; nothing if it has not run."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+
+
+def replace_rows(path: Path, rows: list[dict[str, Any]], keys: tuple[str, ...]) -> None:
+    """Write rows instead of those with the same keys; the file's other rows stay."""
+    new = {tuple(row[key] for key in keys) for row in rows}
+    kept = [row for row in read_rows(path) if tuple(row[key] for key in keys) not in new]
+    write_json(path, [*kept, *rows])
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -137,11 +150,9 @@ def main() -> None:
     args = parser.parse_args()
     work = [(preset, scenario, args.quick) for preset in args.preset for scenario in args.scenario]
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
-        rows: list[dict[str, Any]] = []
         for table in pool.map(tune, *zip(*work, strict=True)):
-            rows += table
             if args.json:
-                write_json(args.json, rows)
+                replace_rows(args.json, table, ("preset", "scenario"))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py` and `benchma
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -26,7 +25,7 @@ if not __package__:
     sys.path[0] = str(ROOT)
 
 from benchmarks.swarm_results import absolute_path, best_rules, models  # noqa: E402
-from benchmarks.swarm_rules import TEST, cell  # noqa: E402
+from benchmarks.swarm_rules import TEST, cell, read_rows  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.colours import colour_of  # noqa: E402
 from quad_swarm.evaluation import Flight, fly, is_model  # noqa: E402
@@ -39,12 +38,6 @@ PAGE = ROOT / "docs" / "results.md"
 IMAGES = ROOT / "docs" / "images"
 NAMES = list(SCENARIOS)[::-1]
 Rows = list[dict[str, Any]]
-
-
-def read(folder: Path, name: str) -> Rows:
-    """Rows of one of the scripts; none if it has not run."""
-    path = folder / f"{name}.json"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -298,7 +291,7 @@ def main() -> None:
     args = parser.parse_args()
     os.chdir(ROOT)
     names = ("rules", "test", "sweep", "robustness", "teams", "asking")
-    rules, test, sweep, robustness, teams, asking = (read(args.data, name) for name in names)
+    rules, test, sweep, robustness, teams, asking = (read_rows(args.data / f"{name}.json") for name in names)
     blocks = {
         "targets": targets(test),
         "paper": main_table(test, "paper"),

@@ -71,6 +71,13 @@ def test_tables_of_flown_episodes(tmp_path):
     )
     assert none["requests"] == 0 < rule["requests"] < full["requests"] == full["possible_requests"]
     (tmp_path / "test.json").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    text = page.main_table(page.read(tmp_path, "test"), "paper")
+    text = page.main_table(swarm_rules.read_rows(tmp_path / "test.json"), "paper")
     assert f"| symmetric swap | `none` | {none['collisions']}/30 [" in text
-    assert page.read(tmp_path, "nothing") == []
+
+
+def test_rows_of_other_keys_stay(tmp_path):
+    path = tmp_path / "rows.json"
+    assert swarm_rules.read_rows(path) == []
+    swarm_rules.replace_rows(path, [{"a": 1, "b": 1}, {"a": 1, "b": 2}, {"a": 2, "b": 3}], ("a",))
+    swarm_rules.replace_rows(path, [{"a": 1, "b": 4}], ("a",))
+    assert swarm_rules.read_rows(path) == [{"a": 2, "b": 3}, {"a": 1, "b": 4}]
