@@ -54,6 +54,15 @@ def test_a_robot_does_not_see_the_plans_and_goals_of_others():
     assert not np.array_equal(before[:, others], after[:, others]), "critics see the plans"
 
 
+def test_without_critics_only_their_columns_are_empty():
+    groups, swarm = EVERYTHING.split("+"), flown()
+    seen, blind = PairObservation(CONFIG, groups), PairObservation(CONFIG, groups, critics=False)
+    assert (seen.size, seen.layout) == (blind.size, blind.layout)
+    rows = blind(swarm)
+    assert np.array_equal(columns_of_actor(seen, seen(swarm)), columns_of_actor(blind, rows))
+    assert not rows[..., np.ravel(blind.layout["critic"])].any()
+
+
 def test_the_order_of_groups_does_not_matter_and_a_group_can_be_left_out():
     swarm = flown()
     assert np.array_equal(make_observation(CONFIG, "plan+state")(swarm), make_observation(CONFIG, "state+plan")(swarm))

@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .geometry import length
+
 
 class BeliefSource(IntEnum):
     """Where a believed trajectory comes from."""
@@ -77,14 +79,18 @@ class Beliefs:
         # Remembered positions of now and of the next N steps; age in steps since they were planned, N or more: none.
         self._remembered = np.zeros((*shape, horizon + 1, 3))
         self._age = np.full(shape, horizon, dtype=np.int64)
+        # Positions, velocities and what was made of them: who decides looks first, and the step looks again.
+        self._known: tuple[np.ndarray, np.ndarray, Outlook] | None = None
 
     def forget(self, swarms: np.ndarray) -> None:
         """Forget every received plan in the given swarms (indices or mask)."""
         self._age[swarms] = self.horizon
+        self._known = None
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (indices or mask)."""
         self._remembered, self._age = self._remembered[swarms], self._age[swarms]
+        self._known = None
 
     def outlook(self, pos: np.ndarray, vel: np.ndarray) -> Outlook:
         """What the robots would believe in this step if they did not ask; `update` has not been called for it.
@@ -92,12 +98,18 @@ class Beliefs:
         :param pos: present positions, (E, n, 3), world frame (m)
         :param vel: present velocities, (E, n, 3), world frame (m/s)
         """
+        if self._known is not None and np.array_equal(self._known[0], pos) and np.array_equal(self._known[1], vel):
+            return self._known[2]
+        self._known = (pos.copy(), vel.copy(), self._look(pos, vel))
+        return self._known[2]
+
+    def _look(self, pos: np.ndarray, vel: np.ndarray) -> Outlook:
         steady = constant_velocity(pos, vel, self.horizon, self.dt)[:, self.others]
         if not self.memory:
             never = np.full(self._age.shape, self.horizon)
             return Outlook(steady, np.zeros(never.shape, bool), never, np.zeros(never.shape))
         remembered, age = advance(self._remembered), self._age + 1
-        error = np.linalg.norm(remembered[..., 0, :] - pos[:, self.others], axis=-1)
+        error = length(remembered[..., 0, :] - pos[:, self.others])
         remembers = (age < self.horizon) & (error <= self.memory)
         believed = np.where(remembers[..., None, None], remembered[..., 1:, :], steady)
         return Outlook(believed, remembers, age, error)
@@ -124,4 +136,5 @@ class Beliefs:
         if self.memory:
             self._remembered = np.where(asked, current, advance(self._remembered))
             self._age = np.where(requests, age, outlook.age)
+        self._known = None
         return believed, source

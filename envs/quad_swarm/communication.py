@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .errors import unknown_name
+from .geometry import length
 from .view import View
 
 Rule = Callable[[View], np.ndarray]
@@ -28,7 +29,7 @@ def full() -> Rule:
 
 def distance(threshold: float) -> Rule:
     """Asks whoever is closer than ``threshold`` (m) (the paper's DBCP)."""
-    return lambda view: np.linalg.norm(view.pos, axis=-1) < threshold
+    return lambda view: length(view.pos) < threshold
 
 
 def cpa(threshold: float, look_ahead: float) -> Rule:

@@ -122,7 +122,7 @@ def make_policy(cell: Cell) -> tuple[Requests, Observation]:
     spec = getattr(model, "env_spec", None) or {}
     arguments = {k: v for k, v in spec.get("kwargs", {}).items() if k in OBSERVATION_ARGUMENTS}
     n = cell.config.n_robots
-    seen = make_observation(cell.config, **arguments)
+    seen = make_observation(cell.config, **arguments, critics=False)
     expected, trained = (n, seen.size), tuple(model.observation_space.shape)
     predictor = model
     if trained != expected:

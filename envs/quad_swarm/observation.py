@@ -13,6 +13,7 @@ import numpy as np
 
 from .beliefs import advance, other_indices
 from .errors import unknown_name
+from .geometry import length
 from .presets import SwarmConfig
 from .swarm import Swarm
 from .view import View
@@ -135,9 +136,9 @@ def _own(view: View) -> np.ndarray:
 def _state(pair: PairView) -> np.ndarray:
     """Positions, velocities and the own goal."""
     view = pair.view
-    distance = np.linalg.norm(view.pos, axis=-1)
+    distance = length(view.pos)
     own_vel, goal = (np.broadcast_to(a[:, :, None], view.pos.shape) for a in (view.own_vel, view.goal))
-    to_goal = goal / np.maximum(np.linalg.norm(goal, axis=-1, keepdims=True), 1.0)
+    to_goal = goal / np.maximum(length(goal)[..., None], 1.0)
     parts = (
         np.stack([distance / _POSITION_SCALE, view.pos[..., 2]], axis=-1),
         pair.closeness(distance)[..., 1:],
@@ -194,8 +195,8 @@ def _critic(pair: PairView) -> np.ndarray:
     surprise = theirs - view.expected
     # The other's view of this robot: the same numbers with the two exchanged
     back = np.array([[row.tolist().index(i) for row in others[others[i]]] for i in range(len(others))])
-    size = np.linalg.norm(surprise, axis=-1)
-    separation = np.linalg.norm(view.plan[:, :, None] - theirs, axis=-1)
+    size = length(surprise)
+    separation = length(view.plan[:, :, None] - theirs)
     parts = (
         np.clip(2 * _flat(pair.turn(surprise[..., stages, :]), 3), -2, 2),
         np.tanh(size[..., stages] / 0.1),
@@ -222,10 +223,11 @@ class PairObservation:
 
     :param config: the world
     :param groups: names of `GROUPS`; "critic" holds what only critics may read
+    :param critics: whether there are any; otherwise their columns are zeros
     :raises ValueError: unknown group
     """
 
-    def __init__(self, config: SwarmConfig, groups: list[str]):
+    def __init__(self, config: SwarmConfig, groups: list[str], critics: bool = True):
         for name in groups:
             if name not in GROUPS:
                 raise unknown_name("observation", name, ["paper", *GROUPS])
@@ -234,6 +236,7 @@ class PairObservation:
         sizes = [GROUPS[name](self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
         self._seen = sum(sizes) - (sizes[-1] if self.groups[-1] == "critic" else 0)
         self.size = 6 + (config.n_robots - 1) * sum(sizes)
+        self._blank = 0 if critics else sum(sizes) - self._seen
 
     def _pair(self, swarm: Swarm) -> PairView:
         return PairView(View(swarm), swarm, self.config)
@@ -247,18 +250,23 @@ class PairObservation:
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
         pair = self._pair(swarm)
-        blocks = np.concatenate([GROUPS[name](pair) for name in self.groups], axis=-1, dtype=np.float32)
+        groups = [GROUPS[name](pair) for name in self.groups if name != "critic" or not self._blank]
+        groups.append(np.zeros((*pair.view.pos.shape[:-1], self._blank)))
+        blocks = np.concatenate(groups, axis=-1, dtype=np.float32)
         return np.concatenate([_own(pair.view), _flat(blocks, 2)], axis=-1, dtype=np.float32)
 
 
-def make_observation(config: SwarmConfig, observation: str = "paper", scale_observation: bool = False) -> Observation:
+def make_observation(
+    config: SwarmConfig, observation: str = "paper", scale_observation: bool = False, critics: bool = True
+) -> Observation:
     """What robots observe.
 
     :param config: the world
     :param observation: "paper", or names of `GROUPS` joined by "+"
     :param scale_observation: of the paper's, see there
+    :param critics: see `PairObservation`
     :raises ValueError: unknown name, or scaling of what is scaled
     """
     if observation == "paper":
         return PaperObservation(config.n_robots, scale_observation)
-    return PairObservation(config, observation.split("+"))
+    return PairObservation(config, observation.split("+"), critics)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from .beliefs import Outlook, advance
+from .geometry import length
 from .swarm import Swarm
 
 
@@ -80,7 +81,7 @@ class View:
     @cached_property
     def plan_separation(self) -> np.ndarray:
         """Distances between the robot's plan and what it expects of the others, (E, n, n - 1, N) (m)."""
-        return np.linalg.norm(self.plan[:, :, None] - self.expected, axis=-1)
+        return length(self.plan[:, :, None] - self.expected)
 
     def approach(self, look_ahead: float) -> tuple[np.ndarray, np.ndarray]:
         """Closest approach if everybody kept the present velocity.
@@ -91,4 +92,4 @@ class View:
         closing = -(self.pos * self.vel).sum(axis=-1)
         speed2 = (self.vel**2).sum(axis=-1)
         time = np.clip(closing / np.maximum(speed2, 1e-12), 0.0, look_ahead)
-        return np.linalg.norm(self.pos + time[..., None] * self.vel, axis=-1), time
+        return length(self.pos + time[..., None] * self.vel), time
