@@ -162,9 +162,10 @@ def _memory(pair: PairView) -> np.ndarray:
     remembers = view.outlook.remembers.astype(float)
     age = np.minimum(view.age / pair.horizon, 1.0)
     drift = np.minimum(view.drift / max(view.memory, 1e-6), 2.0) * (age < 1.0)
-    times = pair.dt * np.arange(1, pair.horizon + 1)
+    stages = _stages(pair.horizon)[1:]
+    times = pair.dt * (np.array(stages) + 1)
     steady = view.pos[..., None, :] + times[:, None] * (view.vel + view.own_vel[:, :, None])[..., None, :]
-    bend = pair.turn((view.expected - steady)[..., _stages(pair.horizon)[1:], :])
+    bend = pair.turn(view.expected[..., stages, :] - steady)
     return np.concatenate([np.stack([remembers, age, np.exp(2 - view.age), drift], axis=-1), _flat(bend, 3)], axis=-1)
 
 
@@ -174,8 +175,8 @@ def _plan(pair: PairView) -> np.ndarray:
     separation = view.plan_separation
     stages = _stages(pair.horizon)
     nearest = separation.argmin(axis=-1) / pair.horizon
-    times = pair.dt * np.arange(1, pair.horizon + 1)
-    bend = (view.plan - times[:, None] * view.own_vel[:, :, None])[:, :, stages[1:]]
+    times = pair.dt * (np.array(stages[1:]) + 1)
+    bend = view.plan[:, :, stages[1:]] - times[:, None] * view.own_vel[:, :, None]
     bend = np.broadcast_to(bend[:, :, None], (*view.pos.shape[:3], *bend.shape[2:]))
     parts = (
         pair.closeness(separation.min(axis=-1)),
