@@ -80,10 +80,17 @@ def best_rules(preset: str) -> dict[str, str]:
 
 
 def tuned(recipe: str, scenario: str) -> list[str]:
-    """The models of a recipe with the threshold that was chosen for this scenario alone, as rules are."""
-    rows = {(row["model"], row["scenario"]): row for row in read_rows(FOLDER / "thresholds.json") if row["safe"]}
-    found = [rows[path, scenario] for path in models(recipe) if (path, scenario) in rows]
-    return [f"{row['model']}@{row['threshold']:g}" for row in found]
+    """The models of a recipe with the threshold that was chosen for this scenario alone, as rules are, where that is
+    not the one they have for all scenarios."""
+    rows = [row for row in read_rows(FOLDER / "thresholds.json") if row["model"] in models(recipe)]
+    for_all: dict[str, float] = {}  # thresholds were tried from the highest on
+    for row in rows:
+        for_all[row["model"]] = min(row["threshold"], for_all.get(row["model"], 1.0))
+    return [
+        f"{row['model']}@{row['threshold']:g}"
+        for row in rows
+        if row["scenario"] == scenario and row["safe"] and row["threshold"] > for_all[row["model"]]
+    ]
 
 
 def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> list[dict[str, Any]]:

@@ -102,14 +102,9 @@ def targets(rows: Rows) -> str:
     for preset in ("paper", "dense"):
         learned = [row for row in rows if row["preset"] == preset and f"/{preset}_seed" in row["policy"]]
         for path in dict.fromkeys(row["policy"].partition("@")[0] for row in learned):
-            for how, marked in (("one threshold", False), ("tuned like rules", True)):
-                mine = {
-                    row["scenario"]: row
-                    for row in learned
-                    if row["policy"].partition("@")[0] == path and ("@" in row["policy"]) == marked
-                }
-                if len(mine) < len(NAMES):
-                    continue
+            one = {row["scenario"]: row for row in learned if row["policy"] == path}
+            own = {row["scenario"]: row for row in learned if row["policy"].startswith(f"{path}@")}
+            for how, mine in (("one for all", one), ("tuned", one | own)):
                 ratios = [f"{mine[name]['request_share'] / share_of_rule(rows, mine[name]):.0%}" for name in NAMES]
                 safe = sum(mine[name]["against_full"]["as_safe"] for name in NAMES)
                 saved = 1 - pooled(list(mine.values()))
