@@ -11,7 +11,7 @@ from quad_swarm.scenarios import ScenarioSampler
 from quad_swarm.swarm import Swarm
 
 CONFIG = make_config("paper")
-EVERYTHING = "state+approach+memory+plan+critic"
+EVERYTHING = "state+approach+memory+plan+told+critic"
 
 
 def flown(steps: int = 8, n_swarms: int = 3) -> Swarm:

@@ -8,6 +8,7 @@ from quad_swarm.planner import PlanStatus
 from quad_swarm.presets import PRESETS, make_config
 from quad_swarm.scenarios import ScenarioSampler
 from quad_swarm.swarm import Swarm
+from quad_swarm.view import View
 
 
 def make_swarm(n_swarms: int, scenario: str = "asymmetric_swap", **overrides) -> Swarm:
@@ -160,6 +161,30 @@ def test_lost_answers_count_as_not_received_and_repeat_with_the_seed():
     swarm = make_swarm(1, radio={"loss": 1.0}, memory=0.0)
     silent = make_swarm(1, memory=0.0)
     assert np.array_equal(fly(swarm, 15), fly(silent, 15, ask=False))
+
+
+def test_a_robot_knows_what_the_others_believe_of_it():
+    swarm, rng = make_swarm(2), np.random.default_rng(0)
+    for _ in range(8):
+        swarm.step(rng.random((2, 4, 3)) < 0.3)
+    told, outlook = View(swarm).told, swarm.beliefs.outlook(swarm.pos, swarm.vel)
+    assert 0 < told.remembers.mean() < 1
+    for i, m in np.ndindex(4, 3):
+        j = swarm.beliefs.others[i, m]
+        mine = swarm.beliefs.others[j].tolist().index(i)
+        for field, of_other in zip(told, outlook, strict=True):
+            assert np.array_equal(field[:, i, m], of_other[:, j, mine])
+
+
+def test_a_robot_takes_its_answers_to_have_arrived():
+    swarm = make_swarm(1, radio={"loss": 1.0})
+    for _ in range(5):
+        swarm.step(all_ask(swarm))
+    view = View(swarm)
+    assert view.told.remembers.all()
+    assert not view.outlook.remembers.any()
+    swarm.reset(0, swarm.pos[0], swarm.goal[0])
+    assert not View(swarm).told.remembers.any()
 
 
 def test_late_answers_are_older_plans():

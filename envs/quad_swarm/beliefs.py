@@ -30,6 +30,12 @@ def other_indices(n_robots: int) -> np.ndarray:
     return np.array([[j for j in range(n_robots) if j != i] for i in range(n_robots)], dtype=np.int64)
 
 
+def back_indices(n_robots: int) -> np.ndarray:
+    """For each robot its own place among the others of each of its others, see `other_indices`: (n, n - 1)."""
+    others = other_indices(n_robots)
+    return np.array([[row.tolist().index(i) for row in others[others[i]]] for i in range(n_robots)], dtype=np.int64)
+
+
 def constant_velocity(pos: np.ndarray, vel: np.ndarray, horizon: int, dt: float) -> np.ndarray:
     """Positions at the next ``horizon`` steps if the velocity stayed: (..., 3), (..., 3) -> (..., N, 3) (m)."""
     times = dt * np.arange(1, horizon + 1)
@@ -71,7 +77,7 @@ class Beliefs:
     def __init__(self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float):
         if not memory >= 0:
             raise ValueError(f"memory={memory}: it is a distance in metres, or 0 to switch it off.")
-        self.others = other_indices(n_robots)
+        self.others, self.back = other_indices(n_robots), back_indices(n_robots)
         self.horizon = horizon
         self.dt = dt
         self.memory = memory

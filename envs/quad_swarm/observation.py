@@ -187,6 +187,21 @@ def _plan(pair: PairView) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
+def _told(pair: PairView) -> np.ndarray:
+    """What the other knows of this robot: whether it still believes a plan that it was told, and how far it is off."""
+    view, stages = pair.view, _stages(pair.horizon)
+    told = view.told
+    off = view.plan[:, :, None, stages] - (told.believed[..., stages, :] - pair.swarm.pos[:, :, None, None])
+    parts = (
+        np.stack(
+            [told.remembers.astype(float), np.minimum(told.age / pair.horizon, 1.0), np.exp(2 - told.age)], axis=-1
+        ),
+        np.tanh(length(off) / 0.1),
+        np.clip(2 * _flat(pair.turn(off[..., 1:, :]), 3), -2, 2),
+    )
+    return np.concatenate(parts, axis=-1)
+
+
 def _critic(pair: PairView) -> np.ndarray:
     """What no robot knows: how wrong the two are about each other, and how close their plans are."""
     view, stages = pair.view, _stages(pair.horizon)
@@ -194,8 +209,7 @@ def _critic(pair: PairView) -> np.ndarray:
     plans = advance(pair.swarm.plans[..., :3])[:, :, 1:]
     theirs = plans[:, others] - pair.swarm.pos[:, :, None, None]
     surprise = theirs - view.expected
-    # The other's view of this robot: the same numbers with the two exchanged
-    back = np.array([[row.tolist().index(i) for row in others[others[i]]] for i in range(len(others))])
+    back = pair.swarm.beliefs.back  # the other's view of this robot: the same numbers with the two exchanged
     size = length(surprise)
     separation = length(view.plan[:, :, None] - theirs)
     parts = (
@@ -215,6 +229,7 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
     "approach": _approach,
     "memory": _memory,
     "plan": _plan,
+    "told": _told,
     "critic": _critic,
 }
 

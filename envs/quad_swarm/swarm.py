@@ -61,7 +61,10 @@ class Swarm:
         self.state = np.zeros((n_swarms, n, 9))
         self.goal = np.zeros((n_swarms, n, 3))
         self.wind = np.zeros((n_swarms, n, 2))
-        self.beliefs = Beliefs(n_swarms, n, horizon, config.planner.dt, config.memory)
+        beliefs = (n_swarms, n, horizon, config.planner.dt, config.memory)
+        self.beliefs = Beliefs(*beliefs)
+        # What they would believe had every answer arrived, which is what those who answered have to assume
+        self.told = Beliefs(*beliefs) if config.radio.loss else self.beliefs
         self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
         # Positions planned in the last steps, the oldest first: what a late answer holds
         self._earlier = [self.plans[..., POSITION].copy() for _ in range(config.radio.delay)]
@@ -114,7 +117,8 @@ class Swarm:
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
-        self.beliefs.forget(np.array([swarm]))
+        for beliefs in {self.beliefs, self.told}:
+            beliefs.forget(np.array([swarm]))
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
         for mine, fresh in zip(self._plans, hover, strict=True):
             mine[swarm * n : (swarm + 1) * n] = fresh
@@ -128,7 +132,8 @@ class Swarm:
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
         self.state, self.goal, self.wind = self.state[swarms], self.goal[swarms], self.wind[swarms]
-        self.beliefs.keep(swarms)
+        for beliefs in {self.beliefs, self.told}:
+            beliefs.keep(swarms)
         self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
         self._earlier = [plans[swarms] for plans in self._earlier]
         self._noise_rngs = [rng for rng, kept in zip(self._noise_rngs, swarms, strict=True) if kept]
@@ -138,7 +143,11 @@ class Swarm:
 
         :param requests: whom each robot asks, (E, n, n - 1) bool, the others of a robot in ascending order
         """
-        believed, source = self.beliefs.update(*self._answers(requests), age=1 + self.config.radio.delay)
+        arriving, plans = self._answers(requests)
+        age = 1 + self.config.radio.delay
+        if self.told is not self.beliefs:
+            self.told.update(requests, self.pos, self.vel, plans, age)
+        believed, source = self.beliefs.update(arriving, self.pos, self.vel, plans, age)
         problems = Problems(
             x=self.state.reshape(-1, 9), goal=self.goal.reshape(-1, 3), others=believed.reshape(-1, *believed.shape[2:])
         )
@@ -153,8 +162,8 @@ class Swarm:
             self.state = self.state + self._disturbances()
         return self._report(before, source, solve_seconds)
 
-    def _answers(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What `Beliefs.update` needs: whose plans arrive where, positions, velocities, and the plans."""
+    def _answers(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whose plans arrive where, (E, n, n - 1) bool, and the plans as of one step ago, (E, n, N + 1, 3) (m)."""
         radio, plans = self.config.radio, self.plans[..., POSITION]
         if radio.loss:
             kept = [rng.random(requests.shape[1:]) >= radio.loss for rng in self._noise_rngs]
@@ -164,7 +173,7 @@ class Swarm:
             plans = self._earlier.pop(0)
             for _ in range(radio.delay):
                 plans = advance(plans)
-        return requests, self.pos, self.vel, plans
+        return requests, plans
 
     def _disturbances(self) -> np.ndarray:
         noise = self.config.noise

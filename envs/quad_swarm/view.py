@@ -68,6 +68,14 @@ class View:
         (m)."""
         return self.outlook.believed - self._swarm.pos[:, :, None, None]
 
+    @cached_property
+    def told(self) -> Outlook:
+        """What each of the others believes of this robot unless it asks, as far as this robot can tell: it knows what
+        it answered, and takes every answer to have arrived."""
+        beliefs = self._swarm.told
+        outlook = beliefs.outlook(self._swarm.pos, self._swarm.vel)
+        return Outlook(*(field[:, beliefs.others, beliefs.back] for field in outlook))
+
     @property
     def age(self) -> np.ndarray:
         """Steps since the newest plan of each of the others was made, N or more without any, (E, n, n - 1)."""
