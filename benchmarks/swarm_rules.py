@@ -1,8 +1,8 @@
 """Tune every family of hand-made rules as hard as a learner: the cheapest of each that is as safe as asking everybody.
 
-``python benchmarks/swarm_rules.py [--quick] [--preset paper dense] [--json F]``, on the validation set. In each
-scenario all rules of a family fly a few episodes, which tell their requests. Then they are tried from the cheapest on,
-in stages of more and more episodes, until one is as safe as full communication in the last stage
+``python benchmarks/swarm_rules.py [--quick] [--preset paper dense] [--family ...] [--json F]``, on the validation set.
+In each scenario all rules of a family fly a few episodes, which tell their requests. Then they are tried from the
+cheapest on, in stages of more and more episodes, until one is as safe as full communication in the last stage
 (`Comparison.as_safe`). One that collides clearly more often in an earlier stage is out. JSON: one row for each
 rule and scenario with the keys of `quad_swarm.evaluation.summarise` over the episodes that it flew, and preset,
 scenario, family, rule, and safe: True or False, or None for those dearer than the one that was found.
@@ -49,6 +49,13 @@ def families() -> dict[str, list[str]]:
         "cpa and stale": [f"{rule}&stale:{k}" for rule in some for k in (3, 4, 5)],
         "cpa and event": [f"{rule}&event:{e:g}" for rule in some[::2] for e in (0.003, 0.01)],
         "cpa and plan": [f"{rule}&plan:{d:g}" for rule in some[::3] for d in (0.8, 1.0)],
+        "plan and stale": [f"plan:{d:g}&stale:{k}" for d in (0.62, 0.65, 0.7, 0.8, 1.0, 1.5) for k in (2, 3, 4, 6)],
+        "plan, or cpa and stale": [
+            f"plan:{d:g}{soon}|cpa:{near}&stale:{k}"
+            for d, soon in itertools.product((0.62, 0.7), ("", "&soon:0.3"))
+            for near in ("0.62:1.5", "0.65:2", "0.8:2", "0.8:3", "1.05:3")
+            for k in (2, 3, 4, 6)
+        ],
         "cpa, soon or stale": [
             f"{rule}&soon:{t:g}|{rule}&stale:{k}" for rule in some for t in (0.15, 0.3) for k in (4, 6)
         ],
@@ -106,13 +113,14 @@ def in_stages(
     return figures, comparison.as_safe or quick
 
 
-def tune(preset: str, scenario: str, quick: bool) -> list[dict[str, Any]]:
-    """The rows of one scenario."""
+def tune(preset: str, scenario: str, names: list[str], quick: bool) -> list[dict[str, Any]]:
+    """The rows of some families in one scenario."""
     stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
     n = make_config(preset).n_robots
     full = fly(["full"], preset, scenario, stages[-1])["full"]
     table = []
-    for family, rules in families().items():
+    for family in names:
+        rules = families()[family]
         flown = fly(rules[::thin], preset, scenario, stages[0])
         safe: dict[str, bool] = {}
         for rule in sorted(flown, key=lambda rule: summarise(flown[rule], n)["request_share"]):
@@ -144,15 +152,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS))
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
+    parser.add_argument("--family", nargs="+", default=list(families()), choices=list(families()))
     parser.add_argument("--quick", action="store_true", help="few episodes and rules, to see that it runs")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
-    work = [(preset, scenario, args.quick) for preset in args.preset for scenario in args.scenario]
+    work = [(preset, scenario, args.family, args.quick) for preset in args.preset for scenario in args.scenario]
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
         for table in pool.map(tune, *zip(*work, strict=True)):
             if args.json:
-                replace_rows(args.json, table, ("preset", "scenario"))
+                replace_rows(args.json, table, ("preset", "scenario", "family"))
 
 
 if __name__ == "__main__":
