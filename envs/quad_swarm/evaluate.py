@@ -77,23 +77,15 @@ def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
     return world
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m quad_swarm.evaluate",
-        description="Fly the same held-out episodes with several policies and compare them.",
-        epilog="Example: python -m quad_swarm.evaluate --policy none full cpa:0.7:1.5 --episodes 200 --jobs 2",
-    )
+def add_policy_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of every command that flies policies in a world."""
     parser.add_argument(
         "--policy",
         nargs="+",
         required=True,
         metavar="POLICY",
-        help="none, full, distance:EPS, cpa:DIST:LOOKAHEAD, random:P, or a model's zip",
+        help="none, full, distance:EPS, cpa:DIST:LOOKAHEAD, random:P, or a model's zip, also MODEL.zip@THRESHOLD",
     )
-    parser.add_argument(
-        "--scenario", nargs="+", default=["all"], metavar="NAME", help=f"all, or some of {', '.join(SCENARIOS)}"
-    )
-    parser.add_argument("--episodes", type=int, default=200, help="episodes of each policy and scenario (default 200)")
     parser.add_argument("--seed", type=int, default=0, help="which set of held-out episodes (default 0)")
     parser.add_argument("--preset", default="paper", help=f"{' or '.join(PRESETS)} (default paper)")
     parser.add_argument("--n-robots", type=int, default=None, help="number of robots (default: the preset's)")
@@ -108,20 +100,35 @@ def _parser() -> argparse.ArgumentParser:
         help="class that loads models (default %(default)s)",
     )
     parser.add_argument("--solver", default="auto", help="planner's solver (default auto)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes; the result does not depend on it (default 1)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a policy and scenario")
-    parser.add_argument(
-        "--plot", type=Path, metavar="DIR", help="draw collisions, requests and flights into this folder"
-    )
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    return parser  # fmt: skip
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
-    args = _parser().parse_args(argv)
+def make_cells(args: argparse.Namespace, scenarios: Sequence[str]) -> list[Cell]:
+    """The policies of a command line in some scenarios.
+
+    :param args: with what `add_policy_arguments` added
+    :raises ValueError: unknown scenario, preset or field, or a world in which the robots do not fit
+    """
+    for name in scenarios:
+        if name not in SCENARIOS:
+            raise unknown_name("scenario", name, ["all", *SCENARIOS])
+    config = make_config(args.preset, **({"n_robots": args.n_robots} | _parse_world(args.world)))
+    for name in scenarios:
+        ScenarioSampler(name, config.n_robots, config.space)  # raises where the robots do not fit
+    return [
+        Cell(policy, name, config, args.max_steps, args.algo, args.solver)
+        for name in scenarios
+        for policy in dict.fromkeys(args.policy)
+    ]
+
+
+def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace) -> int:
+    """Run a command; what the user can mend is told in one line.
+
+    :return: the exit status
+    """
     try:
-        _run(args)
+        command(args)
     except (ValueError, FileNotFoundError, ModuleNotFoundError, BuildError) as error:
         if args.debug:
             raise
@@ -130,24 +137,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(args: argparse.Namespace) -> None:
-    scenarios = list(SCENARIOS) if args.scenario == ["all"] else args.scenario
-    for name in scenarios:
-        if name not in SCENARIOS:
-            raise unknown_name("scenario", name, ["all", *SCENARIOS])
-    world = _parse_world(args.world)
-    config = make_config(args.preset, **({"n_robots": args.n_robots} | world))
-    for name in scenarios:
-        ScenarioSampler(name, config.n_robots, config.space)  # raises where the robots do not fit
-    cells = [
-        Cell(policy, name, config, args.max_steps, args.algo, args.solver)
-        for name in scenarios
-        for policy in dict.fromkeys(args.policy)
-    ]
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m quad_swarm.evaluate",
+        description="Fly the same held-out episodes with several policies and compare them.",
+        epilog="Example: python -m quad_swarm.evaluate --policy none full cpa:0.7:1.5 --episodes 200 --jobs 2",
+    )
+    add_policy_arguments(parser)
+    parser.add_argument(
+        "--scenario", nargs="+", default=["all"], metavar="NAME", help=f"all, or some of {', '.join(SCENARIOS)}"
+    )
+    parser.add_argument("--episodes", type=int, default=200, help="episodes of each policy and scenario (default 200)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes; the result does not depend on it (default 1)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a policy and scenario")
+    parser.add_argument(
+        "--plot", type=Path, metavar="DIR", help="draw collisions, requests and flights into this folder"
+    )
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    return run(_compare, _parser().parse_args(argv))
+
+
+def _compare(args: argparse.Namespace) -> None:
+    cells = make_cells(args, list(SCENARIOS) if args.scenario == ["all"] else args.scenario)
     rows = evaluate(cells, args.episodes, args.seed, args.jobs)
-    solver = Swarm(config, 1, args.solver).planner.solver.name
+    solver = Swarm(cells[0].config, 1, args.solver).planner.solver.name
     common = {"preset": args.preset, "preset_version": PRESET_VERSION, "seed": args.seed, "solver": solver}
-    rows = [row | common | ({"world": world} if world else {}) for row in rows]
+    rows = [row | common | ({"world": _parse_world(args.world)} if args.world else {}) for row in rows]
     print(format_table(rows))
     if args.json:
         write_json(args.json, rows)
