@@ -172,7 +172,9 @@ def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
                 points = sorted((r["request_share"], rate_of(r)) for r in here if r["family"] == family)
                 front = [(s, c) for s, c in points if not any(s2 <= s and c2 < c for s2, c2 in points)]
                 if front:
-                    axes.plot(*zip(*front, strict=True), ".-", color=colour_of(k + 1), linewidth=0.8, label=family)
+                    marker = "o" if k < 7 else "s"  # colours repeat after eight
+                    style = {"marker": marker, "markersize": 4, "linewidth": 0.8, "color": colour_of(k + 1)}
+                    axes.plot(*zip(*front, strict=True), label=family, **style)
             learned = sorted(
                 (r["request_share"], rate_of(r))
                 for r in sweep
