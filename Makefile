@@ -26,9 +26,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 train: install  ## train MADDPG on the swarm, then print the table of policies (STEPS=20000 for a short run)
-	$(BIN)/python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --conf-file $(RECIPE) --n-timesteps $(STEPS) --seed $(SEED) \
+	$(BIN)/sb3-maddpg train --env QuadSwarm-v0 --conf-file $(RECIPE) --n-timesteps $(STEPS) --seed $(SEED) \
 		--log-folder $(LOGS) --tensorboard-log $(LOGS)/tensorboard --progress
-	$(BIN)/python -m sb3_maddpg.zoo evaluate --env QuadSwarm-v0 --policy $(POLICIES) latest:$(LOGS) --scenario all \
+	$(BIN)/sb3-maddpg evaluate --policy $(POLICIES) latest:$(LOGS) --scenario all \
 		--episodes $(EPISODES) --jobs $(JOBS) --json $(LOGS)/table.json --plot $(LOGS)/plots
 
 test: install lint  ## every check: ruff, mypy, pytest

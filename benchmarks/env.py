@@ -24,6 +24,7 @@ import numpy as np
 
 import quad_swarm
 from quad_swarm.task import RequestTask
+from sb3_maddpg.bench import timed
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 CELLS = [("gym", "paper", 1), ("gym", "dense", 1)] + [
@@ -80,19 +81,6 @@ def attach_timers(task: RequestTask) -> dict[str, list[float]]:
         timers[name] = [0.0]
         setattr(owner, method, timed(getattr(owner, method), timers[name]))
     return timers
-
-
-def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
-    """The function, which adds the seconds it takes to a total."""
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        started = time.perf_counter()
-        try:
-            return function(*args, **kwargs)
-        finally:
-            total[0] += time.perf_counter() - started
-
-    return call
 
 
 def main() -> None:

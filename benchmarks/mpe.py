@@ -1,7 +1,7 @@
 """It learns what others learn: the particle worlds of Lowe et al. (2017), by the packaged recipes.
 
 ``python benchmarks/mpe.py [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
-runs ``python -m sb3_maddpg.zoo train`` for each environment, algorithm and seed, with an evaluation of 100 episodes
+runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes
 without noise every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json. Finished runs in
 ``--log-folder`` that were trained by the present recipe are not trained again. Actions are continuous, except where the
 environment is followed by ``:discrete``.
@@ -67,7 +67,7 @@ class Run(NamedTuple):
     @property
     def command(self) -> list[str]:
         """The command line behind ``python``, but for the log folder."""
-        command = ["-m", "sb3_maddpg.zoo", "train", "--algo", self.algo, "--env", MODULES[self.env]]
+        command = ["-m", "sb3_maddpg", "train", "--algo", self.algo, "--env", MODULES[self.env]]
         command += ["--seed", str(self.seed), "-n", str(self.steps), "--eval-freq", str(EVAL_FREQ)]
         command += ["--eval-episodes", str(EVAL_EPISODES), "--log-interval", "-2"]
         return command if self.continuous else [*command, "--env-kwargs", "continuous_actions:False"]

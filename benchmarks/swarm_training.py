@@ -25,9 +25,9 @@ from stable_baselines3.common.vec_env import VecMonitor
 if not __package__:
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-from benchmarks.env import timed
 from quad_swarm.evaluate import write_json
 from sb3_maddpg import MADDPG
+from sb3_maddpg.bench import timed
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 

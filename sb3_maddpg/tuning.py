@@ -1,4 +1,4 @@
-"""What ``python -m sb3_maddpg.zoo train -optimize`` searches: the hyperparameters of MADDPG and MATD3."""
+"""What ``sb3-maddpg train -optimize`` searches: the hyperparameters of MADDPG and MATD3."""
 
 import json
 from typing import Any

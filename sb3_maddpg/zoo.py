@@ -1,11 +1,10 @@
-"""``python -m sb3_maddpg.zoo train|enjoy|record|evaluate``: rl_zoo3 with MADDPG, MATD3, the installed environments."""
+"""``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3 and the installed environments."""
 
-import argparse
 import importlib
 import runpy
 import sys
 from collections.abc import Callable
-from importlib.metadata import EntryPoints, entry_points
+from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,35 +23,11 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, StoreDict, get_latest_run_id, get_saved_hyperparams
 
 from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.cli import PROG, common_options
 from sb3_maddpg.experiment import TeamExperimentManager
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.utils import suggest
-
-USAGE = """\
-Train, watch and compare teams with rl_zoo3; MADDPG, MATD3 and the installed environments are registered.
-
-  train     train a model and evaluate it now and then
-  enjoy     watch a trained model
-  record    record a trained model on video
-  evaluate  compare policies with the environment's own evaluator; `latest:LOGDIR` stands for the newest model there
-
-`<command> --help` lists a command's options, which are those of rl_zoo3. What differs: --algo is maddpg unless given
-(or matd3), the packaged recipe is used unless --conf-file is given, --env-kwargs are merged over the recipe's,
---num-threads is 1 unless given, and -i MODEL.zip continues the training where it ended. --env PACKAGE/MODULE is a
-PettingZoo environment; its --env-kwargs are those of its parallel_env, `state:True` for critics that read the global
-state, and `wrappers`."""
-EPILOG = """\
-examples:
-  python -m sb3_maddpg.zoo train --env QuadSwarm-v0 --progress --tensorboard-log logs/tensorboard
-  python -m sb3_maddpg.zoo train --env OwnBit-v0
-  python -m sb3_maddpg.zoo train --algo matd3 --env mpe2/simple_spread_v3
-  python -m sb3_maddpg.zoo train --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:False
-  python -m sb3_maddpg.zoo train -optimize --env OwnBit-v0 --n-trials 50 --storage logs/tune.log --study-name a
-  python -m sb3_maddpg.zoo evaluate --env QuadSwarm-v0 --policy none full latest:logs --scenario all"""
-
-# Mistakes in what the user gave. Their messages say what to do, so one line is enough.
-USER_ERRORS = (ValueError, FileNotFoundError, AssertionError, gymnasium.error.Error)
 
 
 def register() -> None:
@@ -66,18 +41,9 @@ def register() -> None:
         entry_point.load()
 
 
-def _parser(**kwargs: Any) -> argparse.ArgumentParser:
-    """The options that the zoo itself looks at; rl_zoo3 or the evaluator reads the rest."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, **kwargs)
-    parser.add_argument("--algo", default="maddpg")
-    parser.add_argument("--env")
-    parser.add_argument("--gym-packages", nargs="+", default=[])
-    return parser
-
-
 def _call(function: Callable[[], Any], command: str, argv: list[str]) -> None:
     """rl_zoo3's commands read ``sys.argv`` and have no other way in."""
-    saved, sys.argv = sys.argv, [f"python -m sb3_maddpg.zoo {command}", *argv]
+    saved, sys.argv = sys.argv, [f"{PROG} {command}", *argv]
     try:
         function()
     finally:
@@ -98,7 +64,7 @@ def packaged_config(algo: str, env_id: str) -> str | None:
 
 def train(argv: list[str]) -> int:
     """Train as rl_zoo3 does, by the packaged recipe unless another is given."""
-    parser = _parser()
+    parser = common_options()
     parser.add_argument("-conf", "--conf-file")
     known, rest = parser.parse_known_args(argv)
     if known.env is not None and not {"-h", "--help"} & set(rest):
@@ -112,9 +78,9 @@ def train(argv: list[str]) -> int:
     return 0
 
 
-def _replay(command: str, function: Callable[[], Any], argv: list[str]) -> int:
+def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     """Show a trained model in an environment with the arguments it was trained with."""
-    parser = _parser()
+    parser = common_options()
     parser.add_argument("-f", "--folder", default="logs")
     parser.add_argument("--exp-id", type=int, default=0)
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, default={})
@@ -138,57 +104,13 @@ def _replay(command: str, function: Callable[[], Any], argv: list[str]) -> int:
 
 def enjoy(argv: list[str]) -> int:
     """Watch a trained model."""
-    return _replay("enjoy", rl_zoo3.enjoy.enjoy, argv)
+    return _show("enjoy", rl_zoo3.enjoy.enjoy, argv)
 
 
 def record(argv: list[str]) -> int:
     """Record a trained model on video."""
     # A script without a function to call
-    return _replay("record", lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), argv)
-
-
-def evaluate(argv: list[str]) -> int:
-    """Hand over to the evaluator that a package offers for its environment."""
-    evaluators = entry_points(group="sb3_maddpg.evaluators")
-    parser = _parser(prog="python -m sb3_maddpg.zoo evaluate")
-    known, rest = parser.parse_known_args(argv)
-    if known.env is None:
-        parser.error(f"--env is needed, one of: {', '.join(sorted(evaluators.names))}; further options are its own")
-    for package in known.gym_packages:
-        importlib.import_module(package)
-    main = _evaluator(evaluators, known.env)
-    rest = [latest_model(word, known.algo, known.env) if word.startswith("latest:") else word for word in rest]
-    if known.algo != "maddpg":
-        if known.algo not in ALGOS:
-            raise ValueError(suggest("algorithm", known.algo, ALGOS))
-        algorithm = ALGOS[known.algo]
-        rest += ["--algo", f"{algorithm.__module__}:{algorithm.__qualname__}"]
-    return main(rest)
-
-
-def _evaluator(evaluators: EntryPoints, env_id: str) -> Callable[[list[str]], int]:
-    if env_id not in evaluators.names:
-        raise ValueError(suggest("environment with an evaluator", env_id, evaluators.names))
-    return evaluators[env_id].load()
-
-
-def latest_model(word: str, algo: str, env_id: str) -> str:
-    """
-    :param word: ``latest:LOGDIR``
-    :param algo: name of the algorithm
-    :param env_id: Gymnasium id
-    :return: the final model of the newest run that has one, else its best model so far
-    """
-    folder, name = Path(word.removeprefix("latest:"), algo), EnvironmentName(env_id)
-    runs = [path for path in folder.glob(f"{name}_*") if path.name[len(name) + 1 :].isdigit()]
-    for run in sorted(runs, key=lambda path: int(path.name[len(name) + 1 :]), reverse=True):
-        for model in (run / f"{name}.zip", run / "best_model.zip"):
-            if model.is_file():
-                return str(model)
-    raise FileNotFoundError(
-        f"{word}: no trained model of {algo} for {env_id} in {folder}. Train one with "
-        f"`python -m sb3_maddpg.zoo train --algo {algo} --env {env_id} --log-folder {folder.parent}`."
-    )
+    return _show("record", lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), argv)
 
 
 def _find_env(env_id: str, packages: list[str]) -> None:
@@ -220,39 +142,7 @@ def _has_window(env_id: str, env_kwargs: dict[str, Any]) -> bool:
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
+    "tune": lambda argv: train(["-optimize", *argv]),
     "enjoy": enjoy,
     "record": record,
-    "evaluate": evaluate,
 }
-
-
-def main(argv: list[str] | None = None) -> int:
-    """
-    :param argv: arguments, those of the command line by default
-    :return: exit status, 2 for a mistake in what the user gave
-    """
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_maddpg.zoo",
-        description=USAGE,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    parser.add_argument("command", choices=COMMANDS)
-    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="options of the command")
-    arguments = parser.parse_args(argv)
-    command, rest = arguments.command, arguments.arguments
-    debug = arguments.debug or "--debug" in rest
-    try:
-        register()
-        # rl_zoo3 has no such option, an evaluator may have one
-        return COMMANDS[command](rest if command == "evaluate" else [word for word in rest if word != "--debug"])
-    except USER_ERRORS as error:
-        if debug:
-            raise
-        print(f"error: {error or type(error).__name__} (--debug shows the traceback)", file=sys.stderr)
-        return 2
-
-
-if __name__ == "__main__":
-    sys.exit(main())

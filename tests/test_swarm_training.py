@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 import quad_swarm
 from quad_swarm.evaluate import main as evaluate
 from sb3_maddpg import MADDPG
-from sb3_maddpg.zoo import main as zoo
+from sb3_maddpg.cli import main as zoo
 
 SMALL = {
     "learning_starts": 30,

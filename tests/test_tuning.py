@@ -1,4 +1,4 @@
-"""The search for hyperparameters, ``python -m sb3_maddpg.zoo train -optimize``."""
+"""The search for hyperparameters, ``sb3-maddpg train -optimize``."""
 
 import json
 import subprocess
@@ -16,10 +16,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_maddpg import MADDPG
+from sb3_maddpg.cli import main
 from sb3_maddpg.experiment import arguments_of
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.team_tasks import OwnBit
-from sb3_maddpg.zoo import main, register
+from sb3_maddpg.zoo import register
 from toys import Neighbours, toy
 
 ALGOS = {"maddpg": MADDPG, "matd3": MATD3}
@@ -221,7 +222,7 @@ def test_a_trial_behind_the_others_is_pruned(folder):
 @pytest.mark.parametrize("storage", ["logs/s.log", "sqlite:///s.db"])
 def test_workers_share_a_study(folder, storage):
     Path("recipe.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
-    command = [sys.executable, "-m", "sb3_maddpg.zoo", "train", "--env", "OwnBit-v0", "--conf-file", "recipe.yml"]
+    command = [sys.executable, "-m", "sb3_maddpg", "train", "--env", "OwnBit-v0", "--conf-file", "recipe.yml"]
     command += [*SEARCH, "--n-trials", "2", "--storage", storage, "--study-name", "s", "--seed", "1"]
     workers = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) for _ in range(2)]
     for worker in workers:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.zoo import main
+from sb3_maddpg.cli import main
 
 PACKAGE = """
 import json, sys
@@ -202,7 +202,7 @@ def test_the_packaged_recipes_train_the_swarm(algo, tmp_path, monkeypatch, capsy
 
 
 def test_as_a_command(tmp_path):
-    command = [sys.executable, "-m", "sb3_maddpg.zoo"]
+    command = [sys.executable, "-m", "sb3_maddpg"]
     shown = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
     assert all(word in shown for word in ("train", "enjoy", "record", "evaluate", "latest:LOGDIR"))
     argv = ["train", "--env", "OwnBit-v0", "-n", "600", "--vec-env", "subproc", "--eval-freq", "-1", "--verbose", "0"]

@@ -8,10 +8,11 @@ import pytest
 import yaml
 
 from sb3_maddpg import MADDPG
+from sb3_maddpg.cli import latest_model, main
 from sb3_maddpg.experiment import check_env_kwargs, check_keys
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.parallel import register
-from sb3_maddpg.zoo import latest_model, main, packaged_config
+from sb3_maddpg.zoo import packaged_config
 from sb3_maddpg.zoo import register as register_all
 
 SPREAD = ["--env", "mpe2/simple_spread_v3"]
