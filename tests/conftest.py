@@ -1,5 +1,22 @@
 """One thread per process: the networks are small and the tests run in parallel."""
 
 import os
+import shutil
+
+import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A headless Chromium. Tests that need one are skipped where there is none."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    with sync_api.sync_playwright() as driver:
+        if path is None and not os.path.exists(driver.chromium.executable_path):
+            pytest.skip("no Chromium: install one, or `playwright install chromium`")
+        arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+        chromium = driver.chromium.launch(executable_path=path, args=arguments)
+        yield chromium
+        chromium.close()
