@@ -16,7 +16,6 @@ import multiprocessing
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,34 +39,40 @@ EXCESS = 0.0005
 THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7, 0.65, 0.6, 0.55, 0.5, 0.4, 0.3, 0.2]
 
 
-def tune(path: str, n_robots: list[int | None], scenarios: list[str], quick: bool) -> list[dict[str, Any]]:
-    """The rows of one model."""
-    model = MADDPG.load(path, device="cpu")
-    if model.env_spec is None:
-        raise ValueError(f"{path} does not say in which world it was trained.")
-    preset = model.env_spec["kwargs"]["preset"]
+def tune(paths: list[str], preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
+    """The rows of some models in one scenario."""
+    full = fly(["full"], preset, scenario, (QUICK_STAGES if quick else STAGES)[-1], n)["full"]
+    robots = make_config(preset, n_robots=n).n_robots
     table: list[dict[str, Any]] = []
-    chosen = []
-    for n, scenario in product(n_robots, scenarios):
-        full = fly(["full"], preset, scenario, (QUICK_STAGES if quick else STAGES)[-1], n)["full"]
-        robots = make_config(preset, n_robots=n).n_robots
+    for path in paths:
         for threshold in THRESHOLDS:
-            policy = f"{path}@{threshold:g}"
-            figures, safe = in_stages(policy, preset, scenario, full, quick, n)
+            figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, full, quick, n)
             more = Comparison.of(figures, full[: len(figures)])
             safe &= more.only_first - more.only_second <= EXCESS * more.episodes or quick
             keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
             table.append(keys | {"n_robots": robots} | summarise(figures, robots))
             if safe:
-                chosen.append(threshold)
                 print(f"{path} {scenario} {robots}: {threshold:g}, {table[-1]['request_share']:.2%}", flush=True)
                 break
         else:
             print(f"{path} {scenario} {robots}: no threshold is as safe as full communication", flush=True)
-            chosen.append(THRESHOLDS[-1])
-    model.set_threshold(min(chosen))
-    model.save(path)
     return table
+
+
+def preset_of(path: str) -> str:
+    """The world in which a model was trained."""
+    spec = MADDPG.load(path, device="cpu").env_spec
+    if spec is None:
+        raise ValueError(f"{path} does not say in which world it was trained.")
+    return spec["kwargs"]["preset"]
+
+
+def set_threshold(path: str, table: list[dict[str, Any]]) -> None:
+    """Write the smallest threshold that was needed in any of its cells into a model's file."""
+    last = {(row["scenario"], row["n_robots"]): row["threshold"] for row in table if row["model"] == path}
+    model = MADDPG.load(path, device="cpu")
+    model.set_threshold(min(last.values()))
+    model.save(path)
 
 
 def main() -> None:
@@ -81,11 +86,21 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     paths = args.models or [path for recipe in TUNED for path in models(recipe)]
-    work = [(path, args.n_robots, args.scenario, args.quick) for path in paths]
+    presets = {path: preset_of(path) for path in paths}
+    work = [
+        ([path for path in paths if presets[path] == preset], preset, n, scenario, args.quick)
+        for preset in dict.fromkeys(presets.values())
+        for n in args.n_robots
+        for scenario in args.scenario
+    ]
+    rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
         for table in pool.map(tune, *zip(*work, strict=True)):
-            if args.json:
-                replace_rows(args.json, table, ("model",))
+            rows += table
+    for path in paths:
+        set_threshold(path, rows)
+    if args.json:
+        replace_rows(args.json, rows, ("model",))
 
 
 if __name__ == "__main__":

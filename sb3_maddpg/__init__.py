@@ -4,7 +4,7 @@ from importlib.metadata import version
 
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import TeamReplayBuffer
-from sb3_maddpg.callbacks import CurriculumCallback, MetricsCallback
+from sb3_maddpg.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.parallel import TeamEnv
@@ -18,6 +18,7 @@ __all__ = [
     "MATD3",
     "AgentPolicy",
     "CurriculumCallback",
+    "DashboardCallback",
     "MADDPGPolicy",
     "MetricsCallback",
     "PairPolicy",

@@ -1,10 +1,17 @@
 """Callbacks for MADDPG and for any other Stable-Baselines3 algorithm."""
 
 from collections import deque
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import Figure, HParam, Logger, TensorBoardOutputFormat
+
+from sb3_maddpg.utils import arguments_of
+
+# What a text log cannot show
+TENSORBOARD_ONLY = ("stdout", "log", "json", "csv")
 
 
 def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
@@ -86,3 +93,70 @@ class CurriculumCallback(BaseCallback):
                 print(f"Curriculum: level {self.level} of {self.n_levels - 1} at step {self.num_timesteps}")
         self.logger.record("curriculum/level", self.level)
         return True
+
+
+class DashboardCallback(BaseCallback):
+    """
+    Fills TensorBoard beside the curves: at the start the hyperparameters with the figures that they are judged by, and
+    a layout for its page "Custom scalars"; each time it is called pictures and numbers of the model as it is. Give it
+    to SB3's ``EvalCallback`` as ``callback_after_eval``: it is called after each evaluation. Without TensorBoard it
+    does nothing.
+
+    :param draw: from the model to pictures (Matplotlib) and numbers by their tags; None: no pictures
+    :param layout: title -> chart -> kind and tags, see ``SummaryWriter.add_custom_scalars``
+    """
+
+    def __init__(
+        self,
+        draw: Callable[[BaseAlgorithm], Mapping[str, Any]] | None = None,
+        layout: Mapping[str, Mapping[str, list[Any]]] | None = None,
+    ):
+        super().__init__()
+        self.draw = draw
+        self.layout = layout or LAYOUT
+
+    def _on_training_start(self) -> None:
+        for writer in self._writers():
+            writer.writer.add_custom_scalars(self.layout)
+        tags = {tag for charts in self.layout.values() for _, some in charts.values() for tag in some}
+        judged = sorted(tag for tag in tags if not tag.startswith(("train/", "time/")))
+        params = HParam(hyperparameters(self.model), dict.fromkeys(judged, 0.0))
+        self.logger.record("hparams", params, exclude=TENSORBOARD_ONLY)
+
+    def _on_step(self) -> bool:
+        if self.draw is not None and self._writers():
+            for tag, value in self.draw(self.model).items():
+                picture = hasattr(value, "savefig")
+                self.logger.record(
+                    tag, Figure(value, close=True) if picture else value, exclude=TENSORBOARD_ONLY if picture else None
+                )
+            self.logger.dump(self.num_timesteps)
+        return True
+
+    def _writers(self) -> list[TensorBoardOutputFormat]:
+        return [one for one in self.logger.output_formats if isinstance(one, TensorBoardOutputFormat)]
+
+
+# For environments that say nothing about theirs
+LAYOUT: dict[str, dict[str, list[Any]]] = {
+    "Learning": {
+        "return": ["Multiline", ["rollout/ep_rew_mean", "eval/mean_reward"]],
+        "critics": ["Multiline", ["train/critic_loss"]],
+        "actors": ["Multiline", ["train/actor_loss"]],
+        "scores": ["Multiline", ["train/score_mean", "train/score_std"]],
+        "steps per second": ["Multiline", ["time/fps"]],
+    },
+}
+
+
+def hyperparameters(model: BaseAlgorithm) -> dict[str, bool | str | float]:
+    """
+    :param model: any algorithm
+    :return: the arguments it was made with, as far as they are numbers or words; collections as words
+    """
+    known: dict[str, bool | str | float] = {"algo": type(model).__name__, "policy": type(model.policy).__name__}
+    for name in sorted(arguments_of(type(model)) - {"env", "policy", "verbose", "tensorboard_log"}):
+        value = getattr(model, name, None)
+        if value is not None and not callable(value):
+            known[name] = value if isinstance(value, (bool, int, float, str)) else str(value)
+    return known

@@ -1,8 +1,10 @@
 """rl_zoo3's experiment manager, with its known faults around environment arguments, resuming and tuning mended."""
 
+import functools
 import inspect
 import time
 import warnings
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +21,15 @@ from rl_zoo3.utils import ALGOS, get_callback_list
 from sqlalchemy.exc import DBAPIError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.callbacks import DashboardCallback
 from sb3_maddpg.team import Team
-from sb3_maddpg.utils import describe_env, suggest
+from sb3_maddpg.utils import arguments_of, describe_env, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 # Keys of a recipe that rl_zoo3 uses up itself; every other key is an argument of the algorithm.
@@ -134,6 +138,22 @@ class TeamExperimentManager(ExperimentManager):
         """Make the run's folder; a search has none, each trial's log goes to ``--optimization-log-path``."""
         if not self.optimize_hyperparameters:
             super().create_log_folder()
+
+    def create_callbacks(self) -> None:
+        """rl_zoo3's, and what TensorBoard shows beside the curves."""
+        super().create_callbacks()
+        if not self.tensorboard_log or self.optimize_hyperparameters:
+            return
+        offers = entry_points(group="sb3_maddpg.dashboards")
+        name = self.env_name.gym_id
+        offer = offers[name].load() if name in offers.names else None
+        evaluation = next((one for one in self.callbacks if isinstance(one, EvalCallback)), None)
+        if evaluation is None:  # no pictures either
+            self.callbacks.append(DashboardCallback(layout=offer and offer.LAYOUT))
+            return
+        draw = offer and functools.partial(offer.draw, env_kwargs=self.eval_env_kwargs)
+        evaluation.callback = DashboardCallback(draw, offer and offer.LAYOUT)
+        evaluation.callback.parent = evaluation
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
@@ -314,23 +334,6 @@ def diverged(model: BaseAlgorithm) -> bool:
     :return: whether a network has a weight that is no number
     """
     return any(not weight.isfinite().all() for weight in model.policy.parameters())
-
-
-def arguments_of(cls: type) -> set[str]:
-    """
-    :param cls: a class, which may hand ``**kwargs`` on to its base class
-    :return: names of the arguments of its constructor
-    """
-    names: set[str] = set()
-    for base in cls.__mro__:
-        if "__init__" in vars(base):
-            parameters = inspect.signature(vars(base)["__init__"]).parameters
-            names |= set(parameters)
-            further = {name for name, one in parameters.items() if one.kind is inspect.Parameter.VAR_KEYWORD}
-            names -= further
-            if not further:
-                break
-    return names - {"self"}
 
 
 def _policy(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | None:

@@ -1,6 +1,7 @@
 """Small helpers shared by the algorithm, its policy, its buffer and the zoo."""
 
 import difflib
+import inspect
 import json
 import os
 from collections.abc import Iterable, Iterator
@@ -73,3 +74,20 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def arguments_of(cls: type) -> set[str]:
+    """
+    :param cls: a class, which may hand ``**kwargs`` on to its base class
+    :return: names of the arguments of its constructor
+    """
+    names: set[str] = set()
+    for base in cls.__mro__:
+        if "__init__" in vars(base):
+            parameters = inspect.signature(vars(base)["__init__"]).parameters
+            names |= set(parameters)
+            further = {name for name, one in parameters.items() if one.kind is inspect.Parameter.VAR_KEYWORD}
+            names -= further
+            if not further:
+                break
+    return names - {"self"}

@@ -17,9 +17,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli import main
-from sb3_maddpg.experiment import arguments_of
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.utils import arguments_of
 from sb3_maddpg.zoo import register
 from toys import Neighbours, toy
 

@@ -118,18 +118,26 @@ def make_policy(cell: Cell) -> tuple[Requests, Observation]:
             raise ValueError(f"{error} A model is given by the path of its .zip.") from None
         return (lambda task, rngs: rule(View(task.swarm, rngs))), PaperObservation(cell.config.n_robots)
 
-    model = load_model(cell.policy, cell.algo)
+    return policy_of(load_model(cell.policy, cell.algo), cell.policy, cell.config)
+
+
+def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[Requests, Observation]:
+    """A model as a policy, and the observation that it needs.
+
+    :param name: what messages call it
+    :raises ValueError: it was trained for another number of robots or another space
+    """
     spec = getattr(model, "env_spec", None) or {}
     arguments = {k: v for k, v in spec.get("kwargs", {}).items() if k in OBSERVATION_ARGUMENTS}
-    n = cell.config.n_robots
-    seen = make_observation(cell.config, **arguments, critics=False)
+    n = config.n_robots
+    seen = make_observation(config, **arguments, critics=False)
     expected, trained = (n, seen.size), tuple(model.observation_space.shape)
     predictor = model
     if trained != expected:
         if not hasattr(model, "policy_for") or not hasattr(model.policy, "observation_layout"):
             robots = f"{trained[0]} robots" if len(trained) == 2 else "another environment"
             raise ValueError(
-                f"{cell.policy} was trained for {robots} (observation {trained}); "
+                f"{name} was trained for {robots} (observation {trained}); "
                 f"this world has {n} robots (observation {expected}). "
                 "Choose the preset or --n-robots that it was trained with."
             )
@@ -145,9 +153,17 @@ def make_policy(cell: Cell) -> tuple[Requests, Observation]:
     return request, seen
 
 
-def _begin(cell: Cell, episodes: Sequence[int]) -> tuple[Requests, RequestTask, list[np.random.Generator]]:
-    policy, seen = make_policy(cell)
+def begin(
+    cell: Cell, episodes: Sequence[int], model: Any = None
+) -> tuple[Requests, RequestTask, list[np.random.Generator]]:
+    """A policy, the episodes at their start, and the streams of rules that draw.
+
+    :param cell: policy, scenario and world
+    :param episodes: seeds, see `first_episode`
+    :param model: flies instead of the cell's policy
+    """
     config = cell.config
+    policy, seen = make_policy(cell) if model is None else policy_of(model, cell.policy, config)
     task = RequestTask(
         Swarm(config, len(episodes), cell.solver),
         ScenarioSampler(cell.scenario, config.n_robots, config.space),
@@ -178,25 +194,27 @@ class Flight(NamedTuple):
     beside: np.ndarray
 
 
-def fly(cell: Cell, seed: int, number: int = 0, beside: str = "none") -> Flight:
+def fly(cell: Cell, seed: int, number: int = 0, beside: str = "none", model: Any = None) -> Flight:
     """Fly a held-out episode of a set, step by step.
 
     :param cell: policy, scenario and world
     :param seed: which set
     :param number: which episode of it
     :param beside: a rule that is asked in every step too, but not heeded
+    :param model: flies instead of the cell's policy
     """
-    policy, task, rngs = _begin(cell, [first_episode(seed) + number])
+    policy, task, rngs = begin(cell, [first_episode(seed) + number], model)
     rule = parse_rule(beside)
     state, plans, asked, unheeded = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], [], []
-    over = False
+    over, since = False, 0
     while not over:
         unheeded.append(rule(View(task.swarm, rngs)))
         asked.append(policy(task, rngs))
         outcome = task.step(asked[-1])
         state.append(task.swarm.state[0].copy())
         plans.append(task.swarm.plans[0].copy())
-        over = bool(outcome.terminated[0] | outcome.truncated[0])
+        since += int(task.statistics.arrived[0])
+        over = bool(outcome.terminated[0] | outcome.truncated[0]) or (cell.linger is not None and since > cell.linger)
     requests, others = np.concatenate(asked), np.concatenate(unheeded)
     return Flight(np.array(state), np.array(plans), task.swarm.goal[0], requests, others)
 
@@ -208,7 +226,7 @@ def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
     :param episodes: seeds; ``env.reset(seed=...)`` of `QuadSwarm-v0` draws the same episodes
     :return: for each episode its figures, see `EpisodeStatistics`
     """
-    policy, task, rngs = _begin(cell, episodes)
+    policy, task, rngs = begin(cell, episodes)
     index, since = np.arange(len(episodes)), np.zeros(len(episodes), dtype=int)
     rows: dict[int, dict[str, float]] = {}
     while index.size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -89,8 +90,14 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
 
 def draw_flights(cells: Sequence[Cell], flights: Sequence[Flight]) -> Figure:
     """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2)."""
-    figure, panels = plt.subplots(1, len(cells), figsize=(3.4 * len(cells), 3.8), layout="constrained", squeeze=False)
-    for axes, cell, flight in zip(panels[0], cells, flights, strict=True):
+    columns = min(len(cells), 2)
+    size = (3.6 * columns, 3.6 * math.ceil(len(cells) / columns) + 0.3)
+    figure, panels = plt.subplots(
+        math.ceil(len(cells) / columns), columns, figsize=size, layout="constrained", squeeze=False
+    )
+    for axes in panels.flat[len(cells) :]:
+        axes.set_visible(False)
+    for axes, cell, flight in zip(panels.flat, cells, flights, strict=False):
         draw_flight(axes, flight)
         axes.set_title(cell.scenario.replace("_", " "), fontsize=10)
     figure.suptitle(f"{_label(cells[-1].policy)}: yellow where a robot asks, blue where it does not", fontsize=9)
