@@ -12,7 +12,7 @@ BENCHMARKS ?= planner env training scaling estimators
 POLICIES ?= none full distance:4 cpa:0.65:1.5
 PEERS := agilerl benchmarl xuance
 
-.PHONY: help install train test lint bench bench-peers results results-quick clean
+.PHONY: help install train test lint docs bench bench-peers results results-quick clean
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
@@ -22,7 +22,7 @@ install: $(VENV)/.installed  ## make .venv with the pinned dependencies
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[zoo,plot,render,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[zoo,plot,render,docs,dev]"
 	@touch $@
 
 train: install  ## train MADDPG on the swarm, then print the table of policies (STEPS=20000 for a short run)
@@ -31,13 +31,16 @@ train: install  ## train MADDPG on the swarm, then print the table of policies (
 	$(BIN)/sb3-maddpg evaluate --policy $(POLICIES) latest:$(LOGS) --scenario all \
 		--episodes $(EPISODES) --jobs $(JOBS) --json $(LOGS)/table.json --plot $(LOGS)/plots
 
-test: install lint  ## every check: ruff, mypy, pytest
+test: install lint docs  ## every check: ruff, mypy, the site, pytest
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 lint: install  ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: install  ## the documentation site, in docs/_build; a warning is an error
+	$(BIN)/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going --builder html docs docs/_build
 
 bench: install  ## speed of planner, environment and learner, and the estimators, as tables and as JSON
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done

@@ -65,7 +65,11 @@ def test_with_the_api_alone(algorithm, tmp_path):
         drawn.append(model.num_timesteps)
         return {"team/picture": Figure(), "team/number": 3.0}
 
-    small = {"batch_size": 16, "n_steps": 16} if algorithm is PPO else {"learning_starts": 10, "batch_size": 8, "train_freq": 8}
+    small = (
+        {"batch_size": 16, "n_steps": 16}
+        if algorithm is PPO
+        else {"learning_starts": 10, "batch_size": 8, "train_freq": 8}
+    )
     model = algorithm("MlpPolicy", OwnBit(), tensorboard_log=str(tmp_path), seed=0, **small)
     callback = DashboardCallback(draw)
     model.learn(64, callback=EvalCallback(OwnBit(), callback_after_eval=callback, eval_freq=32, n_eval_episodes=1))

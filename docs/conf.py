@@ -1,0 +1,40 @@
+"""The documentation site: ``make docs``."""
+
+from importlib.metadata import version as version_of
+
+project = "sb3-maddpg"
+author = "the sb3-maddpg authors"
+version = release = version_of("sb3-maddpg")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.viewcode", "sphinx_copybutton"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "sb3-maddpg"
+html_static_path: list[str] = []
+
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 4
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+# Their signatures and docstrings are their own projects'.
+autodoc_inherit_docstrings = False
+suppress_warnings = ["myst.strikethrough"]
+
+
+def _headings(app, what, name, obj, options, lines: list[str]) -> None:
+    """Gymnasium's environments have Markdown headings in their docstrings."""
+    lines[:] = [part for line in lines for part in (("", f"**{line[3:]}**", "") if line.startswith("## ") else (line,))]
+
+
+def _links(app, docname: str, source: list[str]) -> None:
+    """Files that lie above this folder have a page here."""
+    for name in ("CONTRIBUTING", "CHANGELOG"):
+        source[0] = source[0].replace(f"](../{name}.md", f"]({name.lower()}.md")
+
+
+def setup(app) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _headings)
+    app.connect("source-read", _links)
