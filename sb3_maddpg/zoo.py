@@ -1,6 +1,7 @@
 """``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3 and the installed environments."""
 
 import importlib
+import os
 import runpy
 import sys
 from collections.abc import Callable
@@ -95,9 +96,11 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
         rest += ["--env", known.env]
         # rl_zoo3 reads these values as Python; its own merging forgets some of them
         rest += ["--env-kwargs", *(f"{key}:{value!r}" for key, value in env_kwargs.items())] if env_kwargs else []
-        if command == "enjoy" and "--no-render" not in rest and not _has_window(known.env, env_kwargs):
-            print(f"{known.env} has no window to show: only the rewards are printed. `record` makes a video.")
-            rest.append("--no-render")
+        if command == "enjoy" and "--no-render" not in rest:
+            reason = "there is no display" if _is_headless() else f"{known.env} has no window to show"
+            if _is_headless() or not _has_window(known.env, env_kwargs):
+                print(f"Only the rewards are printed: {reason}. `record` makes a video.")
+                rest.append("--no-render")
     _call(function, command, ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest])
     return 0
 
@@ -127,6 +130,12 @@ def _find_env(env_id: str, packages: list[str]) -> None:
             "parallel_env, as PettingZoo's have. Is its package installed?"
         )
     raise ValueError(suggest("environment", env_id, known))
+
+
+def _is_headless() -> bool:
+    """Whether windows would be drawn where nobody sees them. SDL_VIDEODRIVER is for those who want just that."""
+    known = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    return sys.platform.startswith("linux") and not any(os.environ.get(name) for name in known)
 
 
 def _has_window(env_id: str, env_kwargs: dict[str, Any]) -> bool:

@@ -1,12 +1,15 @@
 """Both faces of the swarm: upstream's checkers, exact repetition, and bad input."""
 
 import pickle
+import time
 import warnings
 
 import gymnasium
 import numpy as np
+import pygame
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from gymnasium.wrappers import RecordVideo
 from pettingzoo.test import parallel_api_test
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
@@ -234,6 +237,34 @@ def test_pictures_show_the_swarm():
     assert (before != after).any(axis=-1).mean() > 0.005
     with pytest.raises(ValueError, match="render_mode='rgb_array'"):
         QuadSwarmEnv().render()
+
+
+def test_a_window_shows_every_step(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "none such")
+    with pytest.raises(gymnasium.error.Error, match="rgb_array"):
+        gymnasium.make("QuadSwarm-v0", render_mode="human").reset(seed=0)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gymnasium.make("QuadSwarm-v0", render_mode="human")
+    env.reset(seed=0)
+    first = pygame.surfarray.array3d(pygame.display.get_surface())
+    started = time.perf_counter()
+    for _ in range(5):
+        env.step(np.ones(12, dtype=np.int8))
+    assert time.perf_counter() - started > 0.3, "ten steps a second"
+    assert (pygame.surfarray.array3d(pygame.display.get_surface()) != first).any()
+    assert env.render() is None
+    env.close()
+    assert pygame.display.get_surface() is None
+
+
+def test_videos_are_recorded(tmp_path):
+    env = RecordVideo(gymnasium.make("QuadSwarm-v0", render_mode="rgb_array", max_steps=5), str(tmp_path))
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(np.zeros(12, dtype=np.int8))
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    assert video.stat().st_size > 1000
 
 
 def test_survives_pickling_in_the_middle_of_an_episode():

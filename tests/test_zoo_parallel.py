@@ -1,5 +1,6 @@
 """The command line with PettingZoo modules as environments."""
 
+import sys
 from pathlib import Path
 
 import gymnasium
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+import quad_swarm
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli import latest_model, main
 from sb3_maddpg.experiment import check_env_kwargs, check_keys
@@ -59,7 +61,8 @@ def test_a_pettingzoo_module_is_trained_watched_and_recorded(in_logs, capsys):
     assert video.stat().st_size > 500
 
 
-def test_a_pettingzoo_environment_without_a_window_is_watched_without(in_logs, capsys):
+def test_a_pettingzoo_environment_without_a_window_is_watched_without(in_logs, monkeypatch, capsys):
+    monkeypatch.setitem(quad_swarm.QuadSwarmParallelEnv.metadata, "render_modes", ["rgb_array"])
     swarm = ["--env", "quad_swarm/parallel_env", "--env-kwargs", "max_steps:5"]
     recipe = write({"n_timesteps": 10, "policy": "MlpPolicy"}, swarm[1])
     assert main(["train", *swarm, "--conf-file", recipe, "--eval-freq", "-1", "--verbose", "0"]) == 0
@@ -67,6 +70,11 @@ def test_a_pettingzoo_environment_without_a_window_is_watched_without(in_logs, c
     out = capsys.readouterr().out
     assert "has no window" in out
     assert "Mean episode length: 5.00" in out
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    if sys.platform == "linux":
+        assert main(["enjoy", *swarm[:2], "-n", "10"]) == 0
+        assert "there is no display" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("algo", ["maddpg", "matd3"])

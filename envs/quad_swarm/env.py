@@ -63,14 +63,14 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     :param radio: values of `Radio` to replace
     :param space: values of `ScenarioSpace` to replace
     :param solver: "auto" or a name of `planner.SOLVERS`
-    :param render_mode: None or "rgb_array"
+    :param render_mode: None, "rgb_array", or "human" for a window that shows every step in real time
     :raises ValueError: a wrong value; the message names it and the remedy
 
     ## Version History
     * v0: initial release, presets of version 1
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
     reset_options = ("starts", "goals")
 
     def __init__(
@@ -159,6 +159,8 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         self._requests = np.zeros_like(self._requests)
         if self._renderer is not None:
             self._renderer.reset()
+        if self.render_mode == "human":
+            self.render()
         return self.task.observe()[0], {"scenario": self.task.scenario[0]}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -174,10 +176,16 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
             final = info_of(self.task.final_info(), 0)
             info["is_success"] = final["is_success"]
             info["metrics"] |= final["metrics"]
+        if self.render_mode == "human":
+            self.render()
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
 
     def render(self) -> Any:
-        """The present step as an image, (480, 640, 3) uint8."""
+        """The present step as an image, (480, 640, 3) uint8; in the mode "human" it is shown in a window instead.
+
+        :raises ValueError: the environment was made without a mode
+        :raises gymnasium.error.Error: no window can be opened
+        """
         if self.render_mode is None:
             raise ValueError("No render_mode: make the environment with render_mode='rgb_array'.")
         if self._renderer is None:
@@ -192,10 +200,16 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         ]
         if statistics.collided[0]:
             lines.append("COLLISION")
-        return self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, lines)
+        picture = self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, lines)
+        if self.render_mode == "human":
+            self._renderer.show(self.metadata["render_fps"])
+            return None
+        return picture
 
     def close(self) -> None:
-        """Free the renderer."""
+        """Close the window and free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
         self._renderer = None
 
 

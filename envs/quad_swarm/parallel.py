@@ -17,11 +17,11 @@ class QuadSwarmParallelEnv(ParallelEnv):
     Agents are called "robot_0", "robot_1", ...; each observes its row, acts with `MultiBinary(n - 1)` and gets the
     team's reward.
 
-    :param render_mode: None or "rgb_array"
+    :param render_mode: None, "rgb_array" or "human"
     :param kwargs: arguments of `QuadSwarmEnv`
     """
 
-    metadata = {"name": "quad_swarm_v0", "render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"name": "quad_swarm_v0", "render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(self, render_mode: str | None = None, **kwargs: Any):
         self.team = QuadSwarmEnv(render_mode=render_mode, **kwargs)

@@ -1,9 +1,10 @@
-"""Pictures of the swarm, drawn off-screen with pygame: robots, goals, trails, plans and who asks whom."""
+"""Pictures of the swarm, drawn with pygame, off-screen or in a window: robots, goals, trails, plans, who asks whom."""
 
 from __future__ import annotations
 
 from collections import deque
 
+import gymnasium
 import numpy as np
 import pygame
 
@@ -32,6 +33,8 @@ class Renderer:
         self._others = other_indices(config.n_robots)
         self._trail: deque[np.ndarray] = deque(maxlen=_TRAIL_STEPS)
         self._camera: _Camera | None = None
+        self._window: pygame.Surface | None = None
+        self._clock = pygame.time.Clock()
 
     def reset(self) -> None:
         """A new episode: forget the trails and look anew."""
@@ -68,6 +71,24 @@ class Renderer:
         for row, line in enumerate(lines):
             self._surface.blit(self._font.render(line, True, _INK), (10, 8 + 18 * row))
         return np.ascontiguousarray(pygame.surfarray.array3d(self._surface).swapaxes(0, 1))
+
+    def show(self, fps: float) -> None:
+        """Show what was drawn last in a window, not faster than ``fps`` pictures a second.
+
+        :raises gymnasium.error.Error: there is no window to be had
+        """
+        if self._window is None:
+            self._window = _open_window(self.size)
+        pygame.event.pump()
+        self._window.blit(self._surface, (0, 0))
+        pygame.display.flip()
+        self._clock.tick(fps)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            pygame.display.quit()
+            self._window = None
 
     def _draw_floor(self) -> None:
         low, high = np.array(self.config.planner.workspace_low), np.array(self.config.planner.workspace_high)
@@ -130,6 +151,19 @@ class Renderer:
         angle = np.linspace(0, 2 * np.pi, 25)
         circle = centre + radius * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         self._polyline(circle, colour, 2)
+
+
+def _open_window(size: tuple[int, int]) -> pygame.Surface:
+    try:
+        pygame.display.init()
+        window = pygame.display.set_mode(size)
+    except pygame.error as error:
+        raise gymnasium.error.Error(
+            f"render_mode='human' cannot open a window ({error}). render_mode='rgb_array' needs no display; on the "
+            "command line take `enjoy --no-render`, `record` for a video or `replay` for a page."
+        ) from error
+    pygame.display.set_caption("QuadSwarm")
+    return window
 
 
 class _Camera:
