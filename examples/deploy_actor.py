@@ -1,0 +1,32 @@
+"""One agent's actor by itself: ``python examples/deploy_actor.py [--quick]``.
+
+On a robot neither the critics nor the other actors are needed, nor this package: TorchScript runs in Python and in C++.
+"""
+
+import argparse
+
+import numpy as np
+import torch
+from mpe2 import simple_speaker_listener_v4
+
+from sb3_maddpg import MADDPG
+
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("--quick", action="store_true", help="a few steps, to see that it runs")
+quick = parser.parse_args().quick
+
+env = simple_speaker_listener_v4.parallel_env(continuous_actions=True)
+model = MADDPG("MlpPolicy", env, gamma=0.95, learning_starts=200 if quick else 5000, seed=0)
+model.learn(500 if quick else 100_000)
+
+listener = model.agent_policy("listener_0")
+listener.export("listener.pt")
+
+# From here on as on the robot: PyTorch alone
+actor = torch.jit.load("listener.pt")
+observations, _ = env.reset(seed=1)
+seen = observations["listener_0"]
+action = actor(torch.as_tensor(seen)[None])[0].numpy()
+print("with the package:", listener.predict(seen))
+print("without:         ", action)
+assert np.allclose(action, listener.predict(seen), atol=1e-5)

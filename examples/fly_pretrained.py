@@ -1,0 +1,30 @@
+"""Fly a model that comes with the package, and draw it: ``python examples/fly_pretrained.py [--quick]``."""
+
+import argparse
+
+import gymnasium
+from PIL import Image
+
+from sb3_maddpg import pretrained
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--quick", action="store_true", help="a few steps, to see that it runs")
+quick = parser.parse_args().quick
+
+model = pretrained("quad-swarm-paper")
+kwargs = model.env_spec["kwargs"] | {"scenario": "symmetric_swap"}  # the world in which it was trained
+for n_robots in (4, 6):
+    env = gymnasium.make("quad_swarm:QuadSwarm-v0", render_mode="rgb_array", **kwargs | {"n_robots": n_robots})
+    # One network for all pairs of robots fits a team of any size
+    model = pretrained("quad-swarm-paper", env=env)
+    observation, _ = env.reset(seed=5)
+    pictures, requests, over = [], 0, False
+    while not over:
+        bits, _ = model.predict(observation, deterministic=True)
+        observation, _, terminated, truncated, info = env.step(bits)
+        requests += info["n_requests"]
+        pictures.append(Image.fromarray(env.render()))
+        over = terminated or truncated or (quick and len(pictures) == 10)
+    everybody = n_robots * (n_robots - 1) * len(pictures)
+    print(f"{n_robots} robots: {requests} requests of {everybody} possible, collision: {info['collision']}")
+    pictures[0].save(f"swarm_{n_robots}.gif", save_all=True, append_images=pictures[1:], duration=100, loop=0)

@@ -1,0 +1,47 @@
+"""A scenario and a rule of your own, in wind and with lost plans: ``python examples/own_world.py [--quick]``."""
+
+import argparse
+
+import numpy as np
+
+from quad_swarm.communication import RULES
+from quad_swarm.evaluate import format_table
+from quad_swarm.evaluation import Cell, evaluate
+from quad_swarm.presets import make_config
+from quad_swarm.scenarios import SCENARIOS
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--quick", action="store_true", help="a few episodes, to see that it runs")
+quick = parser.parse_args().quick
+
+
+def gate(n_robots, space, rng):
+    """All robots want to pass between the same two points, half of them from either side."""
+    side = np.where(np.arange(n_robots) % 2, 1.0, -1.0)
+    row = (np.arange(n_robots) // 2 - (n_robots // 2 - 1) / 2) * 1.2
+    starts = np.column_stack([3.0 * side, row, np.full(n_robots, 1.4)])
+    goals = np.column_stack([-3.0 * side, -row, np.full(n_robots, 1.4)])  # their ways cross at the origin
+    return tuple(points + rng.uniform(-0.15, 0.15, points.shape) for points in (starts, goals))
+
+
+def crowded(radius, count):
+    """Asks everybody closer than ``radius`` (m), but only where at least ``count`` are."""
+
+    def rule(view):
+        near = np.linalg.norm(view.pos, axis=-1) < radius
+        return near & (near.sum(axis=-1, keepdims=True) >= count)
+
+    return rule
+
+
+SCENARIOS["gate"] = gate
+RULES["crowded"] = (crowded, ("RADIUS", "COUNT"))
+
+worlds = {
+    "still air": make_config("paper", n_robots=6),
+    "wind, a third of the plans lost": make_config("paper", n_robots=6, noise={"wind": 1.0}, radio={"loss": 0.33}),
+}
+for name, config in worlds.items():
+    policies = ("none", "full", "cpa:0.7:1.5", "crowded:2.5:2")
+    cells = [Cell(policy, "gate", config, 100, "sb3_maddpg:MADDPG", "auto") for policy in policies]
+    print(f"{name}:\n{format_table(evaluate(cells, episodes=5 if quick else 200))}\n")
