@@ -70,7 +70,8 @@ class Renderer:
         self._draw_robots(state)
         for row, line in enumerate(lines):
             self._surface.blit(self._font.render(line, True, _INK), (10, 8 + 18 * row))
-        return np.ascontiguousarray(pygame.surfarray.array3d(self._surface).swapaxes(0, 1))
+        pixels = np.frombuffer(pygame.image.tobytes(self._surface, "RGB"), np.uint8)
+        return pixels.reshape(self.size[1], self.size[0], 3).copy()
 
     def show(self, fps: float) -> None:
         """Show what was drawn last in a window, not faster than ``fps`` pictures a second.
