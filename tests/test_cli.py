@@ -47,7 +47,7 @@ def test_a_shipped_model_is_evaluated_and_replayed_by_its_name(capsys):
     (row,) = map(json.loads, Path("table.json").read_text().splitlines())
     assert row["policy"].endswith("quad-swarm-paper/model.zip@0.5")
     assert main(["replay", *flown, "--out", "page.html"]) == 0
-    assert "model.zip@0.5" in Path("page.html").read_text()
+    assert "quad-swarm-paper@0.5" in Path("page.html").read_text()
     assert main(["replay", "--env", "CartPole-v1", *flown]) == 2
     assert "CartPole-v1" in capsys.readouterr().err
 

@@ -89,12 +89,8 @@ def test_writes_table_json_and_figures(tmp_path, capsys):
         assert row["requests_per_step"] == 12 * row["request_share"]
         assert row["arrived"] <= row["episodes"] == 2
     assert list(target.parent.iterdir()) == [target]
-    assert {path.name for path in (tmp_path / "plots").iterdir()} == {
-        "collisions.png",
-        "requests.png",
-        "flights.png",
-        "swarm.gif",
-    }
+    figures = [f"{name}.{kind}" for name in ("collisions", "requests", "front", "flights") for kind in ("png", "pdf")]
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {*figures, "swarm.gif"}
 
 
 def test_world_can_be_changed(capsys):

@@ -67,6 +67,15 @@ def is_model(policy: str) -> bool:
     return policy.partition("@")[0].endswith(".zip") or os.sep in policy
 
 
+def short_name(policy: str) -> str:
+    """A rule as it is written, a model by its file's name, or its folder's where many files are called model.zip."""
+    if not is_model(policy):
+        return policy
+    path, at, threshold = policy.partition("@")
+    name = Path(path).name
+    return (Path(path).parent.name or name if name == "model.zip" else name) + at + threshold
+
+
 @functools.lru_cache(maxsize=4)
 def load_model(policy: str, algo: str) -> Any:
     """A trained model.

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from .colours import OKABE_ITO, colour_of
-from .evaluation import Cell, Flight, fly, is_model
+from .evaluation import Cell, Flight, fly, short_name
 from .render import Renderer
 
 # Of a path, where a robot asks and where it does not: yellow and blue, as in the paper
@@ -25,7 +25,7 @@ ASKING, SILENT = OKABE_ITO[6], OKABE_ITO[0]
 
 
 def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int, folder: Path) -> list[Path]:
-    """Draw every figure as PNG into ``folder``, and a flight as an animation; returns their paths.
+    """Draw every figure as PNG and as PDF into ``folder``, and a flight as an animation; returns their paths.
 
     :param rows: what `evaluate` returned
     :param cells: what it was given; the last policy's flights are drawn
@@ -37,12 +37,14 @@ def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int
     figures = {
         "collisions": draw_collisions(rows),
         "requests": draw_requests(rows),
+        "front": draw_front(rows),
         "flights": draw_flights(last, flights),
     }
     paths = []
     for name, figure in figures.items():
-        paths.append(folder / f"{name}.png")
-        figure.savefig(paths[-1], dpi=130)
+        for kind in ("png", "pdf"):
+            paths.append(folder / f"{name}.{kind}")
+            figure.savefig(paths[-1], dpi=130)
         plt.close(figure)
     paths.append(folder / "swarm.gif")
     animate(last[-1], flights[-1], paths[-1])
@@ -65,9 +67,36 @@ def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _label(policy: str) -> str:
-    """A rule as it is written, a model by its file's name."""
-    return Path(policy).name if is_model(policy) else policy
+def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Requests against collisions, a panel for each scenario. A line joins the policies that none is better than in
+    both (the Pareto front); bars are 95 % Wilson intervals."""
+    policies = list(dict.fromkeys(row["policy"] for row in rows))
+    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
+    size = (3.4 * len(scenarios), 3.6)
+    figure, panels = plt.subplots(1, len(scenarios), figsize=size, layout="constrained", sharey="row", squeeze=False)
+    for axes, name in zip(panels[0], scenarios, strict=True):
+        mine = [row for row in rows if row["scenario"] == name]
+        points = {row["policy"]: (row["request_share"], row["collisions"] / row["episodes"]) for row in mine}
+        front = sorted(p for p in points.values() if not any(_dominates(q, p) for q in points.values()))
+        axes.plot(*zip(*front, strict=True), color="#999999", linewidth=1, zorder=1)
+        for row in mine:
+            x, y = points[row["policy"]]
+            k = policies.index(row["policy"])
+            bar = [[y - row["collision_low"]], [row["collision_high"] - y]]
+            style = {"fmt": "os^Dv"[k // 8 % 5], "color": colour_of(k), "capsize": 2}
+            axes.errorbar([x], [y], np.maximum(bar, 0), label=short_name(row["policy"]), **style)
+        axes.set_title(name.replace("_", " "), fontsize=10)
+        axes.set_xlabel("requests made, of all possible")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(matplotlib.ticker.PercentFormatter(1.0))
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0][0].set_ylabel("episodes with a collision")
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    return figure
+
+
+def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return one != other and one[0] <= other[0] and one[1] <= other[1]
 
 
 def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: Any) -> None:
@@ -78,7 +107,7 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
         mine = {row["scenario"]: row for row in rows if row["policy"] == policy}
         x = np.arange(len(scenarios)) + (k - (len(policies) - 1) / 2) * width
         heights = np.array([height(mine[name]) for name in scenarios])
-        axes.bar(x, heights, 0.9 * width, color=colour_of(k), label=_label(policy))
+        axes.bar(x, heights, 0.9 * width, color=colour_of(k), label=short_name(policy))
         if interval is not None:
             bounds = np.array([interval(mine[name]) for name in scenarios]).T
             axes.errorbar(x, heights, np.abs(bounds - heights), fmt="none", ecolor="#333333", capsize=2, linewidth=1)
@@ -100,7 +129,7 @@ def draw_flights(cells: Sequence[Cell], flights: Sequence[Flight]) -> Figure:
     for axes, cell, flight in zip(panels.flat, cells, flights, strict=False):
         draw_flight(axes, flight)
         axes.set_title(cell.scenario.replace("_", " "), fontsize=10)
-    figure.suptitle(f"{_label(cells[-1].policy)}: yellow where a robot asks, blue where it does not", fontsize=9)
+    figure.suptitle(f"{short_name(cells[-1].policy)}: yellow where a robot asks, blue where it does not", fontsize=9)
     return figure
 
 
@@ -111,7 +140,7 @@ def animate(cell: Cell, flight: Flight, path: Path) -> None:
     steps = min(int(at_goal.argmax()) + 10 if at_goal.any() else len(at_goal), len(at_goal))
     frames = []
     for k in range(steps):
-        lines = [f"{_label(cell.policy)}, {cell.scenario}", f"step {k + 1}   requests {flight.requests[k].sum()}"]
+        lines = [f"{short_name(cell.policy)}, {cell.scenario}", f"step {k + 1}   requests {flight.requests[k].sum()}"]
         picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
         frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
     duration = round(1000 * cell.config.planner.dt)

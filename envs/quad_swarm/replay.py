@@ -19,7 +19,7 @@ import numpy as np
 from .beliefs import other_indices
 from .colours import OKABE_ITO
 from .evaluate import add_policy_arguments, make_cells, run
-from .evaluation import Cell, Flight, fly, is_model
+from .evaluation import Cell, Flight, fly, short_name
 from .geometry import length
 from .quadrotor import POSITION
 from .scenarios import SCENARIOS
@@ -68,7 +68,7 @@ def _describe(cell: Cell, flight: Flight) -> dict[str, Any]:
     i, j = np.triu_indices(n, k=1)
     separation = length(pos[:, i] - pos[:, j]).min(axis=-1)
     return {
-        "policy": Path(cell.policy).name if is_model(cell.policy) else cell.policy,
+        "policy": short_name(cell.policy),
         "positions": pos.round(_DIGITS).tolist(),
         "plans": plans.round(_DIGITS).tolist(),
         "goals": flight.goal.round(_DIGITS).tolist(),
