@@ -1,7 +1,8 @@
 """Fly everything that docs/results.md says again, from the models and rules in benchmarks/results/swarm.
 
 ``python benchmarks/swarm_results.py [--quick] [--out FOLDER]`` flies the test set, which neither training nor tuning
-has seen, and writes test.json, sweep.json, robustness.json, teams.json and asking.json; parts can be chosen by name.
+has seen, and writes test.json, sweep.json, robustness.json, teams.json and asking.json; parts can be chosen by name,
+also presets and scenarios, and the other rows stay.
 ``--quick`` flies few episodes and checks only that everything runs. `docs/results.py` makes the page of them.
 """
 
@@ -20,15 +21,15 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from tqdm import tqdm
 
 # So that scripts find each other by the names mypy knows them by
 ROOT = Path(__file__).resolve().parent.parent
 if not __package__:
     sys.path[0] = str(ROOT)
 
-from benchmarks.swarm_rules import TEST, cell, read_rows  # noqa: E402
+from benchmarks.swarm_rules import TEST, cell, read_rows, replace_rows  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
-from quad_swarm.evaluate import write_json  # noqa: E402
 from quad_swarm.evaluation import Comparison, fly, fly_all, summarise  # noqa: E402
 from quad_swarm.presets import SwarmConfig, make_config  # noqa: E402
 from quad_swarm.scenarios import SCENARIOS  # noqa: E402
@@ -41,6 +42,8 @@ QUICK = 20
 DBCP = "distance:4"
 # Those with trained models
 PRESETS_TESTED = tuple(preset for preset in ("paper", "dense") if any(FOLDER.glob(f"{preset}_seed*.zip")))
+# What tells the cells of a part from each other; a cell that is flown again replaces its rows
+CELL = ("preset", "scenario", "condition", "n_robots")
 TEAMS = (4, 6, 8, 12, 16)
 # Sixteen robots do not fit on the circle of eight.
 WIDER = {"circle_radius": (3.0, 3.5)}
@@ -189,17 +192,17 @@ def teams(episodes: int) -> list[Any]:
 def asking(episodes: int) -> list[Any]:
     """Jobs of the look at whom policies ask: pairs and steps counted by what the robots saw."""
     return [
-        (preset, policy, name, episodes)
+        ({"preset": preset}, policy, name, episodes)
         for preset in PRESETS_TESTED
         for name in NAMES
         for policy in (best_rules(preset)[name], *models(preset)[:1])
     ]
 
 
-def ask(job: tuple[str, str, str, int]) -> list[dict[str, Any]]:
+def ask(job: tuple[dict[str, Any], str, str, int]) -> list[dict[str, Any]]:
     """For some quantities how often a policy asks at each of their values."""
-    preset, policy, scenario, episodes = job
-    config = make_config(preset)
+    keys, policy, scenario, episodes = job
+    config = make_config(keys["preset"])
     others = other_indices(config.n_robots)
     seen: dict[str, list[np.ndarray]] = {}
     asked = []
@@ -229,7 +232,7 @@ def ask(job: tuple[str, str, str, int]) -> list[dict[str, Any]]:
         edges = np.arange(-0.5, config.n_robots) if "others" in name else np.linspace(0, 4 if "(s)" in name else 5, 21)
         for low, high in pairwise(edges):
             inside = (values >= low) & (values < high)
-            row = {"preset": preset, "policy": policy, "scenario": scenario, "quantity": name}
+            row = keys | {"policy": policy, "scenario": scenario, "quantity": name}
             rows.append(row | {"low": low, "high": high, "n": int(inside.sum()), "asked": int(requests[inside].sum())})
     return rows
 
@@ -247,6 +250,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
+    parser.add_argument("--preset", nargs="+", default=PRESETS_TESTED, choices=PRESETS_TESTED)
+    parser.add_argument("--scenario", nargs="+", default=NAMES, choices=NAMES)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each cell")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=absolute_path, default=FOLDER, help="folder of the JSON files (%(default)s)")
@@ -255,11 +260,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
         for part in args.parts or PARTS:
             make_jobs, run = PARTS[part]
-            rows: list[dict[str, Any]] = []
-            for table in pool.map(run, make_jobs(QUICK if args.quick else EPISODES[part])):
-                rows += table
-                write_json(args.out / f"{part}.json", rows)
-            print(f"wrote {args.out / part}.json, {len(rows)} rows", flush=True)
+            path = args.out / f"{part}.json"
+            jobs = [
+                job
+                for job in make_jobs(QUICK if args.quick else EPISODES[part])
+                if job[0]["preset"] in args.preset and job[2] in args.scenario
+            ]
+            for table in tqdm(pool.map(run, jobs), part, len(jobs), unit="cell", disable=not sys.stderr.isatty()):
+                keys = ("preset", "scenario", "policy", "quantity") if part == "asking" else CELL
+                replace_rows(path, table, tuple(key for key in keys if key in table[0]))
+            print(f"wrote {path}, {len(read_rows(path))} rows", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """``sb3-maddpg bench``: how fast a recipe trains on this machine, and where the time goes."""
 
 import json
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -86,6 +87,7 @@ def main(argv: list[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         options = ["--algo", known.algo, "--n-timesteps", str(known.n_timesteps), "--log-folder", folder]
         options += ["--env", known.env] if known.env else []
+        options += ["--progress"] if sys.stderr.isatty() else []
         zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given])
     result = BenchManager.result
     print(f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="")
