@@ -1,14 +1,15 @@
 """Fly everything that docs/results.md says again, from the models and rules in benchmarks/results/swarm.
 
 ``python benchmarks/swarm_results.py [--quick] [--out FOLDER]`` flies the test set, which neither training nor tuning
-has seen, and writes test.json, sweep.json, robustness.json, teams.json and asking.json; parts can be chosen by name,
-also presets and scenarios, and the other rows stay.
+has seen, and writes test.json, sweep.json, robustness.json, teams.json, asking.json and interventions.json; parts can
+be chosen by name, also presets and scenarios, and the other rows stay.
 ``--quick`` flies few episodes and checks only that everything runs. `docs/results.py` makes the page of them.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import multiprocessing
 import os
 import sys
@@ -30,14 +31,16 @@ if not __package__:
 
 from benchmarks.swarm_rules import TEST, cell, read_rows, replace_rows  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
-from quad_swarm.evaluation import Comparison, fly, fly_all, summarise  # noqa: E402
+from quad_swarm.evaluation import Cell, Comparison, begin, first_episode, fly, fly_all, summarise  # noqa: E402
 from quad_swarm.presets import SwarmConfig, make_config  # noqa: E402
 from quad_swarm.scenarios import SCENARIOS  # noqa: E402
 
 FOLDER = ROOT / "benchmarks" / "results" / "swarm"
 NAMES = list(SCENARIOS)
-EPISODES = {"test": 4000, "sweep": 1000, "robustness": 1000, "teams": 4000, "asking": 200}
+EPISODES = {"test": 4000, "sweep": 1000, "robustness": 1000, "teams": 4000, "asking": 200, "interventions": 4000}
 QUICK = 20
+# A threshold with which there are collisions to look at
+RECKLESS = 0.6
 # The rule that the paper compares with
 DBCP = "distance:4"
 # Those with trained models
@@ -59,6 +62,9 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "plans 3 steps late": {"radio": {"delay": 3}},
     "faster robots": {"planner": {"max_tilt": 0.44}},
 }
+
+
+Intervention = Callable[[np.ndarray, int, int], np.ndarray]
 
 
 def absolute_path(text: str) -> Path:
@@ -237,12 +243,87 @@ def ask(job: tuple[dict[str, Any], str, str, int]) -> list[dict[str, Any]]:
     return rows
 
 
+def interventions(episodes: int) -> list[Any]:
+    """Jobs of what would have helped: first seeds with a threshold that is too high."""
+    return [
+        ({"preset": preset}, f"{path}@{RECKLESS}", "symmetric_swap", episodes)
+        for preset in PRESETS_TESTED
+        for path in models(preset)[:1]
+    ]
+
+
+def intervene(job: tuple[dict[str, Any], str, str, int]) -> list[dict[str, Any]]:
+    """Fly again what ended in a collision, and let more be asked in the last steps before it."""
+    keys, policy, scenario, episodes = job
+    one = cell(policy, scenario, make_config(keys["preset"]))
+    rows = fly_all([one], episodes, TEST)[one]
+    crashes = [(number, *replay(one, number)[1:]) for number, row in enumerate(rows) if row["collided"]]
+    table = []
+    for (who, more), steps in itertools.product(INTERVENTIONS.items(), (1, 2, 3, 4, 6, 8, 12)):
+        again = [replay(one, number, more, pair, range(end - steps, end)) for number, end, pair in crashes]
+        keys_of_row = {"scenario": scenario, "policy": policy, "who": who, "last_steps": steps}
+        table.append(keys | keys_of_row | {"n": len(again), "avoided": sum(not collided for collided, *_ in again)})
+    return table
+
+
+def replay(
+    one: Cell, number: int, more: Intervention | None = None, pair: tuple[int, int] = (0, 0), when: range = range(0)
+) -> tuple[bool, int, tuple[int, int]]:
+    """Fly an episode, in some steps with more requests.
+
+    :param more: from who asks whom, (n, n) bool, and the pair to who is to ask whom
+    :return: whether it ended in a collision, after how many steps, and between which two
+    """
+    policy, task, rngs = begin(one, [first_episode(TEST) + number])
+    n = one.config.n_robots
+    rows, others = np.arange(n)[:, None], other_indices(n)
+    for step in range(one.max_steps):
+        requests = policy(task, rngs)
+        if step in when and more is not None:
+            asked = np.zeros((n, n), dtype=bool)
+            asked[rows, others] = requests[0]
+            requests = more(asked, *pair)[rows, others][None]
+        if task.step(requests).terminated[0]:
+            break
+    pos = task.swarm.pos[0]
+    apart = np.linalg.norm(pos[:, None] - pos, axis=-1) + np.diag(np.full(n, np.inf))
+    i, j = np.unravel_index(apart.argmin(), apart.shape)
+    return bool(task.statistics.collided[0]), step + 1, (int(i), int(j))
+
+
+def each_other(asked: np.ndarray, i: int, j: int) -> np.ndarray:
+    """The two that are about to collide ask each other."""
+    asked[[i, j], [j, i]] = True
+    return asked
+
+
+def everybody(asked: np.ndarray, i: int, j: int) -> np.ndarray:
+    """The two ask everybody."""
+    asked[[i, j]] = True
+    return asked
+
+
+def both(asked: np.ndarray, i: int, j: int) -> np.ndarray:
+    """All others ask the two."""
+    third = np.setdiff1d(np.arange(len(asked)), (i, j))
+    asked[third[:, None], [i, j]] = True
+    return asked
+
+
+INTERVENTIONS: dict[str, Intervention] = {
+    "the two ask each other": each_other,
+    "the two ask everybody": everybody,
+    "all others ask the two": both,
+    "everybody asks everybody": lambda asked, i, j: np.ones_like(asked),
+}
+
 PARTS: dict[str, tuple[Callable[[int], list[Any]], Callable[[Any], list[dict[str, Any]]]]] = {
     "test": (test, compare),
     "sweep": (sweep, compare),
     "robustness": (robustness, compare),
     "teams": (teams, compare),
     "asking": (asking, ask),
+    "interventions": (interventions, intervene),
 }
 
 

@@ -245,6 +245,17 @@ def told(flight: Flight) -> str:
     return table(["step", "closest two (m)", "asks", "the rule would ask"], lines)
 
 
+def interventions_table(rows: Rows) -> str:
+    """What would have avoided the collisions of a policy that asks too little."""
+    steps = list(dict.fromkeys(row["last_steps"] for row in rows))
+    lines = []
+    for preset, who in dict.fromkeys((row["preset"], row["who"]) for row in rows):
+        mine = {row["last_steps"]: row for row in rows if (row["preset"], row["who"]) == (preset, who)}
+        shares = [f"{mine[k]['avoided'] / max(mine[k]['n'], 1):.0%}" for k in steps]
+        lines.append([f"{preset}, {mine[steps[0]]['n']} collisions", who, *shares])
+    return table(["world", "from so many steps before the collision on", *(str(k) for k in steps)], lines)
+
+
 def rate_of(row: dict[str, Any]) -> float:
     """Share of the episodes with a collision."""
     return row["collisions"] / row["episodes"]
@@ -287,8 +298,10 @@ def main() -> None:
     parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
     os.chdir(ROOT)
-    names = ("rules", "test", "sweep", "robustness", "teams", "asking")
-    rules, test, sweep, robustness, teams, asking = (read_rows(args.data / f"{name}.json") for name in names)
+    names = ("rules", "test", "sweep", "robustness", "teams", "asking", "interventions")
+    rules, test, sweep, robustness, teams, asking, interventions = (
+        read_rows(args.data / f"{name}.json") for name in names
+    )
     blocks = {
         "targets": targets(test),
         "paper": main_table(test, "paper"),
@@ -300,6 +313,7 @@ def main() -> None:
         "sweep dense": wide_table([r for r in sweep if is_model(r["policy"])], "policy", "dense"),
         "robustness paper": wide_table(robustness, "condition", "paper"),
         "robustness dense": wide_table(robustness, "condition", "dense"),
+        "interventions": interventions_table(interventions),
         "teams": wide_table(teams, "n_robots", "dense"),
     }
     flown = {

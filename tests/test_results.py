@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -12,7 +13,7 @@ sys.path.append(str(ROOT))
 from benchmarks import swarm_results, swarm_rules  # noqa: E402
 from docs import results as page  # noqa: E402
 from quad_swarm.communication import parse_rule  # noqa: E402
-from quad_swarm.evaluation import Comparison  # noqa: E402
+from quad_swarm.evaluation import Comparison, fly_all  # noqa: E402
 from quad_swarm.presets import make_config  # noqa: E402
 
 
@@ -81,3 +82,19 @@ def test_rows_of_other_keys_stay(tmp_path):
     swarm_rules.replace_rows(path, [{"a": 1, "b": 1}, {"a": 1, "b": 2}, {"a": 2, "b": 3}], ("a",))
     swarm_rules.replace_rows(path, [{"a": 1, "b": 4}], ("a",))
     assert swarm_rules.read_rows(path) == [{"a": 2, "b": 3}, {"a": 1, "b": 4}]
+
+
+def test_interventions_change_the_steps_that_they_should():
+    one = swarm_rules.cell("none", "symmetric_swap", make_config("paper"))
+    rows = fly_all([one], 8, swarm_rules.TEST)[one]
+    number = next(k for k, row in enumerate(rows) if row["collided"])
+    collided, end, pair = swarm_results.replay(one, number)
+    assert (collided, end) == (True, rows[number]["steps"])
+    everybody = swarm_results.INTERVENTIONS["everybody asks everybody"]
+    assert swarm_results.replay(one, number, everybody, pair, range(end, 100)) == (collided, end, pair)
+    assert not swarm_results.replay(one, number, everybody, pair, range(100))[0]
+    asked = np.zeros((4, 4), dtype=bool)
+    each_other = swarm_results.INTERVENTIONS["the two ask each other"](asked.copy(), 1, 3)
+    assert {tuple(map(int, place)) for place in np.argwhere(each_other)} == {(1, 3), (3, 1)}
+    third = swarm_results.INTERVENTIONS["all others ask the two"](asked.copy(), 1, 3)
+    assert {tuple(map(int, place)) for place in np.argwhere(third)} == {(0, 1), (0, 3), (2, 1), (2, 3)}
