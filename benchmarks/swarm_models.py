@@ -36,7 +36,8 @@ from sb3_maddpg import MADDPG
 TUNED = ("paper", "dense", "any", "ablation*")
 # More collisions than full communication that a threshold may have, as a share of the episodes
 EXCESS = 0.0005
-THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7, 0.65, 0.6, 0.55, 0.5, 0.4, 0.3, 0.2]
+THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7, 0.65, 0.6, 0.55, 0.5, 0.4]
+THRESHOLDS += [0.35, 0.3, 0.25, 0.2, 0.15, 0.1]
 
 
 def tune(paths: list[str], preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
