@@ -310,6 +310,18 @@ def test_near_misses_may_look_ahead_along_the_plans():
     assert costs[1] < costs[0]
 
 
+def test_near_misses_far_ahead_may_count_from_less_distance():
+    weights = {"near_miss": 1.0, "near_miss_distance": 0.6, "near_miss_width": 0.3, "near_miss_ahead": 8}
+    # Both would stop at the same place: the miss is in the last steps that are looked at
+    ends = np.array([[-0.5, 0, 1], [0.5, 0.02, 1]])
+    costs = {}
+    for narrowing in (0.0, 0.1, 0.7):
+        env = QuadSwarmEnv(n_robots=2, reward={**weights, "near_miss_narrowing": narrowing})
+        env.reset(options={"starts": ends, "goals": np.zeros_like(ends) + [0, 0, 1]})
+        costs[narrowing] = -env.step(np.array([0, 0]))[-1]["reward_terms"]["near_miss"]
+    assert costs[0.0] > costs[0.1] > costs[0.7] == 0
+
+
 def test_episodes_may_end_at_arrival():
     env = QuadSwarmEnv(n_robots=2, end_at_arrival=True)
     line = np.array([[-1.0, 0, 1], [1, 0, 1]])

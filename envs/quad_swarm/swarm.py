@@ -96,12 +96,12 @@ class Swarm:
         return self._plans.x.reshape(*self.state.shape[:2], *self._plans.x.shape[1:])
 
     def planned_separation(self, steps: int) -> np.ndarray:
-        """How close each robot comes to each of the others by their plans in the ``steps`` after the present one,
-        (E, n, n - 1) (m)."""
+        """How far each robot is from each of the others by their plans in each of the ``steps`` after the present
+        one, (E, n, n - 1, steps) (m)."""
         i, j = self._pairs
         plans = self.plans[..., 2 : 2 + steps, POSITION]
         between = plans[:, i] - plans[:, j]
-        return np.sqrt(_dot(between, between)).min(axis=-1)[:, self._pair_of]
+        return np.sqrt(_dot(between, between))[:, self._pair_of]
 
     def reset(self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
         """Put one swarm's robots at rest at ``starts`` and give them ``goals``, both (n, 3), world frame (m).

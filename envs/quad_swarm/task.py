@@ -27,6 +27,8 @@ class RewardConfig:
     :param near_miss_distance: see there (m)
     :param near_miss_width: see there (m)
     :param near_miss_ahead: count also how close the two come by their plans within so many further steps
+    :param near_miss_narrowing: by how much ``near_miss_distance`` is less for the last of those steps, in proportion
+        for those before: plans that are far ahead still change (m)
     """
 
     goal: float = 1.3
@@ -36,6 +38,7 @@ class RewardConfig:
     near_miss_distance: float = 0.6
     near_miss_width: float = 0.01
     near_miss_ahead: int = 0
+    near_miss_narrowing: float = 0.0
 
 
 class Outcome(NamedTuple):
@@ -153,11 +156,7 @@ class RequestTask:
         }
         near_misses = np.zeros_like(report.separation)
         if self.reward.near_miss:
-            closest = report.separation
-            if self.reward.near_miss_ahead:
-                closest = np.minimum(closest, self.swarm.planned_separation(self.reward.near_miss_ahead))
-            shortfall = (self.reward.near_miss_distance - closest) / self.reward.near_miss_width
-            near_misses = self.reward.near_miss * np.clip(shortfall, 0.0, 1.0)
+            near_misses = self.reward.near_miss * self._near_misses(report.separation)
             terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
         terminated = collided | self.statistics.arrived if self.end_at_arrival else collided
         share = terms["goal"] / max(requests.shape[2], 1)
@@ -172,6 +171,16 @@ class RequestTask:
             n_requests=n_requests,
             report=report,
         )
+
+    def _near_misses(self, separation: np.ndarray) -> np.ndarray:
+        """How near each miss is, 0 to 1, (E, n, n - 1)."""
+        reward, ahead = self.reward, self.reward.near_miss_ahead
+        shortfall = reward.near_miss_distance - separation
+        if ahead:
+            limits = reward.near_miss_distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
+            planned = (limits - self.swarm.planned_separation(ahead)).max(axis=-1)
+            shortfall = np.maximum(shortfall, planned)
+        return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0)
 
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """The last step for `info`: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
