@@ -26,7 +26,7 @@ if not __package__:
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
 from benchmarks.swarm_results import models
-from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, in_stages, replace_rows
+from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, in_stages, progress, replace_rows
 from quad_swarm.evaluation import Comparison, summarise
 from quad_swarm.presets import make_config
 from quad_swarm.scenarios import SCENARIOS
@@ -96,7 +96,7 @@ def main() -> None:
     ]
     rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
-        for table in pool.map(tune, *zip(*work, strict=True)):
+        for table in progress(pool.map(tune, *zip(*work, strict=True)), "thresholds", len(work)):
             rows += table
     for path in paths:
         set_threshold(path, rows)

@@ -22,14 +22,13 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from tqdm import tqdm
 
 # So that scripts find each other by the names mypy knows them by
 ROOT = Path(__file__).resolve().parent.parent
 if not __package__:
     sys.path[0] = str(ROOT)
 
-from benchmarks.swarm_rules import TEST, cell, read_rows, replace_rows  # noqa: E402
+from benchmarks.swarm_rules import TEST, cell, progress, read_rows, replace_rows  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.evaluation import Cell, Comparison, begin, first_episode, fly, fly_all, summarise  # noqa: E402
 from quad_swarm.presets import SwarmConfig, make_config  # noqa: E402
@@ -347,7 +346,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 for job in make_jobs(QUICK if args.quick else EPISODES[part])
                 if job[0]["preset"] in args.preset and job[2] in args.scenario
             ]
-            for table in tqdm(pool.map(run, jobs), part, len(jobs), unit="cell", disable=not sys.stderr.isatty()):
+            for table in progress(pool.map(run, jobs), part, len(jobs)):
                 keys = ("preset", "scenario", "policy", "quantity") if part == "asking" else CELL
                 replace_rows(path, table, tuple(key for key in keys if key in table[0]))
             print(f"wrote {path}, {len(read_rows(path))} rows", flush=True)

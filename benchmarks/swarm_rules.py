@@ -15,16 +15,22 @@ import itertools
 import json
 import multiprocessing
 import os
+import sys
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from tqdm import tqdm
 
 from quad_swarm.evaluate import write_json
 from quad_swarm.evaluation import Cell, Comparison, fly_all, summarise
 from quad_swarm.presets import PRESETS, SwarmConfig, make_config
 from quad_swarm.scenarios import SCENARIOS
+
+Item = TypeVar("Item")
 
 # Sets of held-out episodes, see `first_episode`: rules and thresholds are tuned on one and reported on the other.
 VALIDATION, TEST = 1, 2
@@ -135,6 +141,11 @@ def tune(preset: str, scenario: str, names: list[str], quick: bool) -> list[dict
     return table
 
 
+def progress(items: Iterable[Item], what: str, total: int) -> Iterable[Item]:
+    """Show in a terminal how many of the items are done."""
+    return tqdm(items, what, total, unit="cell", disable=not sys.stderr.isatty(), leave=False)
+
+
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """What a script wrote; nothing if it has not run."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
@@ -159,7 +170,7 @@ def main() -> None:
     args = parser.parse_args()
     work = [(preset, scenario, args.family, args.quick) for preset in args.preset for scenario in args.scenario]
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
-        for table in pool.map(tune, *zip(*work, strict=True)):
+        for table in progress(pool.map(tune, *zip(*work, strict=True)), "rules", len(work)):
             if args.json:
                 replace_rows(args.json, table, ("preset", "scenario", "family"))
 

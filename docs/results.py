@@ -25,7 +25,7 @@ if not __package__:
     sys.path[0] = str(ROOT)
 
 from benchmarks.swarm_results import absolute_path, best_rules, models  # noqa: E402
-from benchmarks.swarm_rules import TEST, cell, read_rows  # noqa: E402
+from benchmarks.swarm_rules import TEST, cell, progress, read_rows  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.colours import colour_of  # noqa: E402
 from quad_swarm.evaluation import Flight, fly, is_model  # noqa: E402
@@ -206,7 +206,8 @@ def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
 def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
     """The first test episode of each scenario as a model flies it, and whom a rule would have asked on its way."""
     config = make_config(preset)
-    return {name: fly(cell(model, name, config), TEST, beside=rule) for name in NAMES}
+    names = progress(NAMES, f"flights, {preset}", len(NAMES))
+    return {name: fly(cell(model, name, config), TEST, beside=rule) for name in names}
 
 
 def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:

@@ -317,7 +317,7 @@ def test_near_misses_far_ahead_may_count_from_less_distance():
     costs = {}
     for narrowing in (0.0, 0.1, 0.7):
         env = QuadSwarmEnv(n_robots=2, reward={**weights, "near_miss_narrowing": narrowing})
-        env.reset(options={"starts": ends, "goals": np.zeros_like(ends) + [0, 0, 1]})
+        env.reset(options={"starts": ends, "goals": np.tile([0.0, 0, 1], (2, 1))})
         costs[narrowing] = -env.step(np.array([0, 0]))[-1]["reward_terms"]["near_miss"]
     assert costs[0.0] > costs[0.1] > costs[0.7] == 0
 
