@@ -1,5 +1,6 @@
 """The evaluation: its figures against an episode flown by hand, its independence of processes, its messages."""
 
+import importlib
 import json
 import math
 
@@ -7,9 +8,11 @@ import gymnasium
 import numpy as np
 import pytest
 
+from quad_swarm.communication import RULES
 from quad_swarm.evaluate import main
 from quad_swarm.evaluation import Cell, evaluate, first_episode, fly, run_episodes, wilson_interval
 from quad_swarm.presets import make_config
+from quad_swarm.scenarios import SCENARIOS
 
 KEYS = {
     "policy", "scenario", "preset", "episodes", "collisions", "collision_low", "collision_high",
@@ -55,6 +58,31 @@ def test_result_does_not_depend_on_the_number_of_processes():
         assert a.pop("solve_us") > 0
         assert b.pop("solve_us") > 0
         assert a == b
+
+
+def test_other_processes_know_what_a_module_of_the_user_added(tmp_path, monkeypatch):
+    module = """
+import numpy as np
+from quad_swarm.communication import RULES
+from quad_swarm.scenarios import SCENARIOS, random
+
+def alone(n_robots, space, rng):
+    starts, _ = random(n_robots, space, rng)
+    return starts, starts + [0.2, 0, 0]
+
+def nobody():
+    return lambda view: np.zeros(view.age.shape, dtype=bool)
+
+SCENARIOS["alone"], RULES["nobody"] = alone, (nobody, ())
+"""
+    (tmp_path / "my_swarm.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(SCENARIOS, "alone", None)  # so that both are taken out again
+    monkeypatch.setitem(RULES, "nobody", None)
+    importlib.import_module("my_swarm")
+    mine = Cell("nobody", "alone", make_config("paper"), 100, "sb3_maddpg:MADDPG", "auto")
+    (row,) = evaluate([mine], episodes=4, jobs=2)
+    assert (row["requests"], row["arrived"]) == (0, 4)
 
 
 def test_other_seeds_are_other_episodes():

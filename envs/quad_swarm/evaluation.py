@@ -22,10 +22,10 @@ import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
-from .communication import parse_rule
+from .communication import RULES, parse_rule
 from .observation import Observation, PaperObservation, make_observation
 from .presets import SwarmConfig
-from .scenarios import ScenarioSampler
+from .scenarios import SCENARIOS, ScenarioSampler
 from .swarm import Swarm
 from .task import RequestTask, RewardConfig
 from .view import View
@@ -375,6 +375,11 @@ def fly_all(
     return flown
 
 
+def _import_all(modules: Sequence[str]) -> None:
+    for module in modules:
+        importlib.import_module(module)
+
+
 def _run_all(work: Sequence[tuple[Cell, range]], jobs: int) -> Iterable[list[dict[str, float]]]:
     progress = functools.partial(
         tqdm, total=len(work), unit="chunk", desc="evaluate", disable=not sys.stderr.isatty(), leave=False
@@ -385,5 +390,9 @@ def _run_all(work: Sequence[tuple[Cell, range]], jobs: int) -> Iterable[list[dic
     # Spawned, not forked: the numerical libraries behind a model hold threads. One thread each, or they fight for the
     # cores.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    # They know what a user added to the scenarios and rules once the modules are imported there too.
+    added = {function.__module__ for function in (*SCENARIOS.values(), *(make for make, _ in RULES.values()))}
+    with ProcessPoolExecutor(
+        jobs, multiprocessing.get_context("spawn"), _import_all, (sorted(added - {"__main__"}),)
+    ) as pool:
         yield from progress(pool.map(run_episodes, *zip(*work, strict=True)))
