@@ -24,7 +24,17 @@ def assert_same(a: dict, b: dict) -> None:
             assert np.array_equal(a[name], b[name]), name
 
 
-@pytest.mark.parametrize("kwargs", [{"max_steps": 12}, {"max_steps": 9, "n_robots": 3, "noise": {"vel": 0.05}}])
+EVERYTHING = {"preset": "dense", "observation": "state+approach+memory+plan+told+critic", "radio": {"loss": 0.3}}
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"max_steps": 12},
+        {"max_steps": 9, "n_robots": 3, "noise": {"vel": 0.05}},
+        {"max_steps": 7, "n_robots": 3, **EVERYTHING},
+    ],
+)
 def test_flies_what_single_environments_fly(kwargs):
     n_envs, steps = 3, 40
     together = gymnasium.make_vec("QuadSwarm-v0", num_envs=n_envs, scenario="symmetric_swap", **kwargs)

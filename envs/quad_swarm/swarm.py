@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -137,6 +138,14 @@ class Swarm:
         self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
         self._earlier = [plans[swarms] for plans in self._earlier]
         self._noise_rngs = [rng for rng, kept in zip(self._noise_rngs, swarms, strict=True) if kept]
+
+    def part(self, swarms: np.ndarray) -> Swarm:
+        """Some of the swarms (mask) to look at: a copy, but for the planner and the generators."""
+        part = copy(self)
+        part.beliefs = copy(self.beliefs)
+        part.told = part.beliefs if self.told is self.beliefs else copy(self.told)
+        part.keep(swarms)
+        return part
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let every robot ask, plan and fly for one step.

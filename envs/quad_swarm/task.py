@@ -138,9 +138,9 @@ class RequestTask:
         self.statistics.keep(swarms)
         self.scenario = [name for name, kept in zip(self.scenario, swarms, strict=True) if kept]
 
-    def observe(self) -> np.ndarray:
-        """What every robot observes, (E, n, observation_size) float32."""
-        return self.observation(self.swarm)
+    def observe(self, swarms: np.ndarray | None = None) -> np.ndarray:
+        """What every robot observes, (E, n, observation_size) float32; of some swarms only if there is a mask."""
+        return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))
 
     def step(self, requests: np.ndarray) -> Outcome:
         """One step of every swarm; ``requests`` as in `Swarm.step`."""

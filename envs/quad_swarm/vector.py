@@ -95,7 +95,8 @@ class QuadSwarmVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             infos |= _masked({"final_obs": observations, "final_info": final}, done)
             for k in np.flatnonzero(done):
                 self.task.reset(int(k), self._rngs[k])
-            observations = self.task.observe()
+            observations = observations.copy()
+            observations[done] = self.task.observe(done)
         return observations, outcome.reward, outcome.terminated, outcome.truncated, infos
 
     def _with_masks(self, info: Mapping[str, Any]) -> dict[str, Any]:
