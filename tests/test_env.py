@@ -195,6 +195,7 @@ def test_refuses_senseless_actions(action, message):
         ({"solver": "ipop"}, "Unknown solver 'ipop'"),
         ({"reward": {"gaol": 1}}, "Did you mean 'goal'"),
         ({"max_steps": 0}, "max_steps=0"),
+        ({"hard_starts": 1.0}, "hard_starts=1.0"),
         ({"memory": -1.0}, "memory=-1"),
         ({"render_mode": "ansi"}, "render_mode"),
     ],
