@@ -195,7 +195,6 @@ def test_refuses_senseless_actions(action, message):
         ({"solver": "ipop"}, "Unknown solver 'ipop'"),
         ({"reward": {"gaol": 1}}, "Did you mean 'goal'"),
         ({"max_steps": 0}, "max_steps=0"),
-        ({"hard_starts": 1.0}, "hard_starts=1.0"),
         ({"memory": -1.0}, "memory=-1"),
         ({"render_mode": "ansi"}, "render_mode"),
     ],
@@ -321,30 +320,6 @@ def test_near_misses_far_ahead_may_count_from_less_distance():
         env.reset(options={"starts": ends, "goals": np.tile([0.0, 0, 1], (2, 1))})
         costs[narrowing] = -env.step(np.array([0, 0]))[-1]["reward_terms"]["near_miss"]
     assert costs[0.0] > costs[0.1] > costs[0.7] == 0
-
-
-@pytest.mark.parametrize("radio", [{}, {"loss": 0.2, "delay": 1}])
-def test_episodes_may_begin_a_few_steps_before_an_earlier_collision(radio):
-    n_envs, n = 4, 3
-    kwargs = {"scenario": "symmetric_swap", "n_robots": n, "radio": radio, "observation": "memory+plan+told"}
-    envs = gymnasium.make_vec("QuadSwarm-v0", n_envs, hard_starts=0.5, **kwargs)
-    envs.reset(seed=0)
-    swarm = envs.unwrapped.task.swarm
-    rng = np.random.default_rng(0)
-    flown, resumed = [[] for _ in range(n_envs)], 0
-    for _ in range(150):
-        for k in range(n_envs):
-            flown[k].append((swarm.state[k].copy(), swarm.plans[k].copy(), envs.unwrapped.task.observe()[k]))
-        requests = rng.random((n_envs, n * (n - 1))) < 0.1
-        observations, _, terminated, truncated, _ = envs.step(requests.astype(np.int8))
-        for k in np.flatnonzero(terminated | truncated):
-            if swarm.state[k, :, 3:6].any():  # a drawn episode begins at rest
-                resumed += 1
-                before = [seen for past in flown for seen in past if np.array_equal(seen[0], swarm.state[k])]
-                assert len(before) >= 1, "somebody was here"
-                assert any(np.array_equal(seen[1], swarm.plans[k]) for seen in before)
-                assert any(np.array_equal(seen[2], observations[k]) for seen in before)
-    assert resumed >= 5
 
 
 def test_episodes_may_end_at_arrival():

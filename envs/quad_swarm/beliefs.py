@@ -93,11 +93,6 @@ class Beliefs:
         self._age[swarms] = self.horizon
         self._known = None
 
-    def recall(self, swarm: int, past: Beliefs) -> None:
-        """Put what the only swarm of ``past`` knew into one swarm."""
-        self._remembered[swarm], self._age[swarm] = past._remembered[0], past._age[0]
-        self._known = None
-
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (indices or mask)."""
         self._remembered, self._age = self._remembered[swarms], self._age[swarms]

@@ -55,7 +55,6 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     :param scale_observation: of the paper's: divide distances by 4 m and velocities by 4 m/s
     :param continuous_collisions: end episodes at collisions between steps too
     :param end_at_arrival: end episodes as soon as all robots are at their goals
-    :param hard_starts: share of the episodes that begin a few steps before an earlier collision, for training
     :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the
         preset's
     :param reward: values of `RewardConfig` to replace
@@ -84,7 +83,6 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         scale_observation: bool = False,
         continuous_collisions: bool = False,
         end_at_arrival: bool = False,
-        hard_starts: float = 0.0,
         memory: float | None = None,
         reward: Mapping[str, float] | None = None,
         planner: Mapping[str, Any] | None = None,
@@ -104,7 +102,6 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
             scale_observation=scale_observation,
             continuous_collisions=continuous_collisions,
             end_at_arrival=end_at_arrival,
-            hard_starts=hard_starts,
             memory=memory,
             reward=reward,
             planner=planner,

@@ -139,30 +139,13 @@ class Swarm:
         self._earlier = [plans[swarms] for plans in self._earlier]
         self._noise_rngs = [rng for rng, kept in zip(self._noise_rngs, swarms, strict=True) if kept]
 
-    def glance(self) -> Swarm:
-        """The swarms as they are now, at no cost: with the same arrays, in which only `reset` and `resume` write."""
-        glance = copy(self)
-        glance.beliefs = copy(self.beliefs)
-        glance.told = glance.beliefs if self.told is self.beliefs else copy(self.told)
-        glance._earlier = list(self._earlier)
-        return glance
-
     def part(self, swarms: np.ndarray) -> Swarm:
-        """Some of the swarms (mask): a copy, but for the planner and the generators."""
-        part = self.glance()
+        """Some of the swarms (mask) to look at: a copy, but for the planner and the generators."""
+        part = copy(self)
+        part.beliefs = copy(self.beliefs)
+        part.told = part.beliefs if self.told is self.beliefs else copy(self.told)
         part.keep(swarms)
         return part
-
-    def resume(self, swarm: int, past: Swarm) -> None:
-        """Let one swarm go on from where the only one of ``past`` was. Disturbances go on as they are."""
-        n = self.config.n_robots
-        self.state[swarm], self.goal[swarm] = past.state[0], past.goal[0]
-        for beliefs, known in {self.beliefs: past.beliefs, self.told: past.told}.items():
-            beliefs.recall(swarm, known)
-        for mine, other in zip(self._plans, past._plans, strict=True):
-            mine[swarm * n : (swarm + 1) * n] = other
-        for plans, earlier in zip(self._earlier, past._earlier, strict=True):
-            plans[swarm] = earlier[0]
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let every robot ask, plan and fly for one step.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,10 +13,6 @@ from .presets import make_config, replace_fields
 from .scenarios import ScenarioSampler
 from .statistics import EpisodeStatistics
 from .swarm import StepReport, Swarm
-
-# How many steps before a collision episodes with a hard start begin: in the last three hardly anything helps
-HARD_STEPS = (4, 12)
-_MOST_HARD = 1000
 
 
 @dataclass(frozen=True)
@@ -81,8 +76,6 @@ class RequestTask:
     :param observation: what robots observe, the paper's without scaling if None
     :param continuous_collisions: end episodes at collisions between steps too; the paper looks at the steps alone
     :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
-    :param hard_starts: share of the episodes that begin a few steps before an earlier collision, `HARD_STEPS`; for
-        training: collisions become so rare that hardly anything is learned about the last of them
     """
 
     def __init__(
@@ -94,23 +87,15 @@ class RequestTask:
         observation: Observation | None = None,
         continuous_collisions: bool = False,
         end_at_arrival: bool = False,
-        hard_starts: float = 0.0,
     ):
         if max_steps < 1:
             raise ValueError(f"max_steps={max_steps}: an episode needs at least one step.")
-        if not 0 <= hard_starts < 1:
-            raise ValueError(f"hard_starts={hard_starts}: a share of the episodes, at least 0 and less than 1.")
         self.swarm = swarm
         self.sampler = sampler
         self.reward = reward
         self.max_steps = max_steps
         self.continuous_collisions = continuous_collisions
         self.end_at_arrival = end_at_arrival
-        self.hard_starts = hard_starts
-        # The last steps of all swarms, and where episodes may begin: scenario and a single swarm
-        self._lately: deque[Swarm] = deque(maxlen=HARD_STEPS[1])
-        self._n_hard = 0
-        self._hard: deque[tuple[str, Swarm]] = deque(maxlen=_MOST_HARD)
         n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, n)
@@ -138,12 +123,7 @@ class RequestTask:
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
         """Draw a new episode for one swarm; every random number of the episode comes from ``rng``."""
-        if self.hard_starts and self._hard and rng.random() < self.hard_starts:
-            name, past = self._hard[int(rng.integers(len(self._hard)))]
-            self.place(swarm, name, past.pos[0], past.goal[0], rng)
-            self.swarm.resume(swarm, past)
-        else:
-            self.place(swarm, *self.sampler.sample(rng), rng)
+        self.place(swarm, *self.sampler.sample(rng), rng)
 
     def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, rng: np.random.Generator) -> None:
         """Begin a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
@@ -164,15 +144,11 @@ class RequestTask:
 
     def step(self, requests: np.ndarray) -> Outcome:
         """One step of every swarm; ``requests`` as in `Swarm.step`."""
-        if self.hard_starts:
-            self._lately.append(self.swarm.glance())
         report = self.swarm.step(requests)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
         n_requests = requests.sum(axis=(1, 2))
         self.statistics.add(report, n_requests, collided)
-        if self.hard_starts:
-            self._remember(collided)
         terms = {
             "goal": self.reward.goal * report.at_goal.all(axis=1),
             "collision": -self.reward.collision * collided,
@@ -195,15 +171,6 @@ class RequestTask:
             n_requests=n_requests,
             report=report,
         )
-
-    def _remember(self, collided: np.ndarray) -> None:
-        """Keep where these swarms (mask) were a few steps ago, each number of steps as often as the next."""
-        for swarm in np.flatnonzero(collided):
-            self._n_hard += 1
-            back = HARD_STEPS[0] + self._n_hard % (HARD_STEPS[1] - HARD_STEPS[0] + 1)
-            if back <= self.statistics.steps[swarm]:
-                past = self._lately[-back].part(np.arange(len(collided)) == swarm)
-                self._hard.append((self.scenario[swarm], past))
 
     def _near_misses(self, separation: np.ndarray) -> np.ndarray:
         """How near each miss is, 0 to 1, (E, n, n - 1)."""
@@ -248,7 +215,6 @@ def make_task(
     scale_observation: bool = False,
     continuous_collisions: bool = False,
     end_at_arrival: bool = False,
-    hard_starts: float = 0.0,
     memory: float | None = None,
     reward: Mapping[str, float] | None = None,
     planner: Mapping[str, Any] | None = None,
@@ -269,4 +235,4 @@ def make_task(
     weights = replace_fields(RewardConfig(), reward or {}, "reward")
     swarm = Swarm(config, n_swarms, solver)
     seen = make_observation(config, observation, scale_observation)
-    return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival, hard_starts)
+    return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival)
