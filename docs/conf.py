@@ -7,7 +7,7 @@ author = "The sb3-maddpg developers"
 project_copyright = f"2026 {author}"
 version = release = version_of("sb3-maddpg")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.viewcode", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx-mathjax-offline", "sphinx.ext.viewcode", "sphinx_copybutton"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "sb3-maddpg"
