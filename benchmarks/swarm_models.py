@@ -6,13 +6,14 @@ the highest on, in stages of more and more episodes, until the model is as safe 
 (`Comparison.as_safe`) and, in three times as many episodes, has hardly more collisions (`EXCESS`): who takes the first
 threshold that passes takes one that was lucky in these episodes. The smallest of them, with which it is safe
 everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with the keys of
-`quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe; rows of
-other models stay.
+`quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe; those of
+other cells stay, and count for the model's threshold.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import multiprocessing
 import os
 import sys
@@ -27,7 +28,7 @@ if not __package__:
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
 from benchmarks.swarm_results import models
-from benchmarks.swarm_rules import QUICK_STAGES, fly, in_stages, progress, replace_rows
+from benchmarks.swarm_rules import QUICK_STAGES, fly, in_stages, progress, read_rows, replace_rows
 from quad_swarm.evaluation import Comparison, summarise
 from quad_swarm.presets import make_config
 from quad_swarm.scenarios import SCENARIOS
@@ -42,27 +43,31 @@ THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7
 THRESHOLDS += [0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1]
 
 
-def tune(paths: list[str], preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
-    """The rows of some models in one scenario."""
-    full = fly(["full"], preset, scenario, QUICK_STAGES[-1] if quick else EPISODES, n)["full"]
+@functools.cache
+def full(preset: str, scenario: str, n: int | None, episodes: int) -> list[dict[str, float]]:
+    """Figures of full communication."""
+    return fly(["full"], preset, scenario, episodes, n)["full"]
+
+
+def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
+    """The rows of a model in one scenario."""
+    rival = full(preset, scenario, n, QUICK_STAGES[-1] if quick else EPISODES)
     robots = make_config(preset, n_robots=n).n_robots
     table: list[dict[str, Any]] = []
-    for path in paths:
-        for threshold in THRESHOLDS:
-            figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, full, quick, n)
-            if safe and not quick:
-                figures, safe = in_stages(
-                    f"{path}@{threshold:g}", preset, scenario, full, quick, n, figures, stages=(EPISODES,)
-                )
-                more = Comparison.of(figures, full)
-                safe &= more.only_first - more.only_second <= EXCESS * EPISODES
-            keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
-            table.append(keys | {"n_robots": robots} | summarise(figures, robots))
-            if safe:
-                print(f"{path} {scenario} {robots}: {threshold:g}, {table[-1]['request_share']:.2%}", flush=True)
-                break
-        else:
-            print(f"{path} {scenario} {robots}: no threshold is as safe as full communication", flush=True)
+    for threshold in THRESHOLDS:
+        policy = f"{path}@{threshold:g}"
+        figures, safe = in_stages(policy, preset, scenario, rival, quick, n)
+        if safe and not quick:
+            figures, safe = in_stages(policy, preset, scenario, rival, quick, n, figures, stages=(EPISODES,))
+            more = Comparison.of(figures, rival)
+            safe &= more.only_first - more.only_second <= EXCESS * EPISODES
+        keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
+        table.append(keys | {"n_robots": robots} | summarise(figures, robots))
+        if safe:
+            print(f"{path} {scenario} {robots}: {threshold:g}, {table[-1]['request_share']:.2%}", flush=True)
+            break
+    else:
+        print(f"{path} {scenario} {robots}: no threshold is as safe as full communication", flush=True)
     return table
 
 
@@ -95,19 +100,19 @@ def main() -> None:
     paths = args.models or [path for recipe in TUNED for path in models(recipe)]
     presets = {path: preset_of(path) for path in paths}
     work = [
-        ([path for path in paths if presets[path] == preset], preset, n, scenario, args.quick)
-        for preset in dict.fromkeys(presets.values())
+        (path, presets[path], n, scenario, args.quick)
         for n in args.n_robots
         for scenario in args.scenario
+        for path in paths
     ]
     rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
         for table in progress(pool.map(tune, *zip(*work, strict=True)), "thresholds", len(work)):
             rows += table
+            if args.json:
+                replace_rows(args.json, table, ("model", "scenario", "n_robots"))
     for path in paths:
-        set_threshold(path, rows)
-    if args.json:
-        replace_rows(args.json, rows, ("model",))
+        set_threshold(path, read_rows(args.json) if args.json else rows)
 
 
 if __name__ == "__main__":
