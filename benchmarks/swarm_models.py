@@ -49,6 +49,11 @@ def full(preset: str, scenario: str, n: int | None, episodes: int) -> list[dict[
     return fly(["full"], preset, scenario, episodes, n)["full"]
 
 
+def has_reserve(comparison: Comparison) -> bool:
+    """Whether a threshold is not only as safe as full communication, but not at the edge of it."""
+    return comparison.only_first - comparison.only_second <= EXCESS * comparison.episodes
+
+
 def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
     """The rows of a model in one scenario."""
     rival = full(preset, scenario, n, QUICK_STAGES[-1] if quick else EPISODES)
@@ -59,8 +64,7 @@ def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> l
         figures, safe = in_stages(policy, preset, scenario, rival, quick, n)
         if safe and not quick:
             figures, safe = in_stages(policy, preset, scenario, rival, quick, n, figures, stages=(EPISODES,))
-            more = Comparison.of(figures, rival)
-            safe &= more.only_first - more.only_second <= EXCESS * EPISODES
+            safe &= has_reserve(Comparison.of(figures, rival))
         keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
         table.append(keys | {"n_robots": robots} | summarise(figures, robots))
         if safe:

@@ -102,17 +102,17 @@ def in_stages(
     quick: bool,
     n_robots: int | None = None,
     flown: list[dict[str, float]] | None = None,
-    stages: Sequence[int] = STAGES,
+    stages: Sequence[int] | None = None,
 ) -> tuple[list[dict[str, float]], bool]:
     """Fly a policy in more and more episodes, as long as there is hope.
 
     :param full: figures of full communication in the same episodes
     :param flown: the policy's figures in the first of them
-    :param stages: numbers of episodes, unless quick
+    :param stages: numbers of episodes, unless quick; ``STAGES`` if None
     :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
     """
     figures = list(flown or [])
-    for episodes in QUICK_STAGES if quick else stages:
+    for episodes in QUICK_STAGES if quick else stages or STAGES:
         if episodes > len(figures):
             figures += fly([policy], preset, scenario, episodes, n_robots, skip=len(figures))[policy]
         comparison = Comparison.of(figures, full[:episodes])

@@ -10,11 +10,13 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT))
 
-from benchmarks import swarm_results, swarm_rules  # noqa: E402
+from benchmarks import swarm_models, swarm_results, swarm_rules  # noqa: E402
 from docs import results as page  # noqa: E402
 from quad_swarm.communication import parse_rule  # noqa: E402
 from quad_swarm.evaluation import Comparison, fly_all  # noqa: E402
 from quad_swarm.presets import make_config  # noqa: E402
+from sb3_maddpg import MADDPG  # noqa: E402
+from sb3_maddpg.shipped import pretrained_folder  # noqa: E402
 
 
 def test_every_rule_of_every_family_can_be_read():
@@ -98,3 +100,28 @@ def test_interventions_change_the_steps_that_they_should():
     assert {tuple(map(int, place)) for place in np.argwhere(each_other)} == {(1, 3), (3, 1)}
     third = swarm_results.INTERVENTIONS["all others ask the two"](asked.copy(), 1, 3)
     assert {tuple(map(int, place)) for place in np.argwhere(third)} == {(0, 1), (0, 3), (2, 1), (2, 3)}
+
+
+def test_thresholds_are_kept_cell_by_cell_and_the_smallest_is_written_into_the_model(tmp_path, monkeypatch):
+    path, table = tmp_path / "model.zip", tmp_path / "thresholds.json"
+    path.write_bytes((pretrained_folder("quad-swarm-paper") / "model.zip").read_bytes())
+    other_cell = {"model": str(path), "scenario": "symmetric_swap", "n_robots": 4, "threshold": 0.3, "safe": True}
+    stale = {"model": str(path), "scenario": "random", "n_robots": 4, "threshold": 0.1, "safe": True}
+    table.write_text("".join(json.dumps(row) + "\n" for row in (other_cell, stale)))
+    words = ["swarm_models.py", str(path), "--scenario", "random", "--quick", "--jobs", "1", "--json", str(table)]
+    monkeypatch.setattr(sys, "argv", words)
+    swarm_models.main()
+    rows = swarm_rules.read_rows(table)
+    assert rows[0] == other_cell
+    assert stale not in rows
+    chosen = rows[-1]
+    assert chosen["scenario"] == "random"
+    assert chosen["safe"]
+    assert chosen["threshold"] > 0.3
+    assert MADDPG.load(path, device="cpu").policy.threshold == 0.3
+
+
+def test_a_threshold_needs_a_reserve():
+    assert swarm_models.has_reserve(Comparison(12000, 10, 1))
+    assert not swarm_models.has_reserve(Comparison(12000, 10, 0))
+    assert Comparison(12000, 10, 0).as_safe, "though it would do without"
