@@ -122,6 +122,6 @@ def test_thresholds_are_kept_cell_by_cell_and_the_smallest_is_written_into_the_m
 
 
 def test_a_threshold_needs_a_reserve():
-    assert swarm_models.has_reserve(Comparison(12000, 10, 1))
-    assert not swarm_models.has_reserve(Comparison(12000, 10, 0))
-    assert Comparison(12000, 10, 0).as_safe, "though it would do without"
+    assert swarm_models.has_reserve(Comparison(12000, 17, 1))
+    assert not swarm_models.has_reserve(Comparison(12000, 17, 0))
+    assert Comparison(12000, 25, 0).as_safe, "though it would do without"
