@@ -3,11 +3,10 @@
 ``python benchmarks/swarm_models.py [MODEL.zip ...] [--scenario ...] [--n-robots ...] [--json F]``, on the validation
 set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds are tried from
 the highest on, in stages of more and more episodes, until the model is as safe as full communication
-(`Comparison.as_safe`) and, in three times as many episodes, has hardly more collisions (`EXCESS`): who takes the first
-threshold that passes takes one that was lucky in these episodes. The smallest of them, with which it is safe
-everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with the keys of
-`quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe; those of
-other cells stay, and count for the model's threshold.
+(`Comparison.as_safe`) and not at the edge of it (`EXCESS`): who takes the first threshold that passes takes one that
+was lucky in these episodes. The smallest of them, with which it is safe everywhere, is written into the model's file.
+JSON: one row a model, scenario and threshold with the keys of `quad_swarm.evaluation.summarise` over the episodes that
+it flew, and model, threshold, preset, scenario, safe; those of other cells stay, and count for the model's threshold.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ if not __package__:
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
 from benchmarks.swarm_results import models
-from benchmarks.swarm_rules import QUICK_STAGES, fly, in_stages, progress, read_rows, replace_rows
+from benchmarks.swarm_rules import QUICK_STAGES, STAGES, fly, in_stages, progress, read_rows, replace_rows
 from quad_swarm.evaluation import Comparison, summarise
 from quad_swarm.presets import make_config
 from quad_swarm.scenarios import SCENARIOS
@@ -59,11 +58,9 @@ def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> l
     robots = make_config(preset, n_robots=n).n_robots
     table: list[dict[str, Any]] = []
     for threshold in THRESHOLDS:
-        policy = f"{path}@{threshold:g}"
-        figures, safe = in_stages(policy, preset, scenario, rival, quick, n)
-        if safe and not quick:
-            figures, safe = in_stages(policy, preset, scenario, rival, quick, n, figures, stages=(EPISODES,))
-            safe &= has_reserve(Comparison.of(figures, rival))
+        stages = (*STAGES, EPISODES)
+        figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, rival, quick, n, stages=stages)
+        safe &= quick or has_reserve(Comparison.of(figures, rival[: len(figures)]))
         keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
         table.append(keys | {"n_robots": robots} | summarise(figures, robots))
         if safe:
