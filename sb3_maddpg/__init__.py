@@ -3,7 +3,7 @@
 from importlib.metadata import version
 
 from sb3_maddpg.agent_policy import AgentPolicy
-from sb3_maddpg.buffers import TeamReplayBuffer
+from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
@@ -22,6 +22,7 @@ __all__ = [
     "MADDPGPolicy",
     "MetricsCallback",
     "PairPolicy",
+    "PrioritizedTeamReplayBuffer",
     "TeamEnv",
     "TeamReplayBuffer",
     "pretrained",

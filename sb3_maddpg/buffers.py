@@ -1,4 +1,4 @@
-"""Replay buffer of a team."""
+"""Replay buffers of a team."""
 
 import math
 from collections.abc import Sequence
@@ -28,6 +28,8 @@ class TeamReplayBufferSamples(NamedTuple):
     :param active: (batch, n_agents), 1 where the agent acted; ``None`` if every agent always has
     :param next_active: (batch, n_agents), 1 where the agent is still there at the end of the window; ``None`` as above
     :param pair_rewards: (batch, n_agents, n_pairs), discounted sums, ``None`` if they are not kept
+    :param indices: (batch,), where the samples lie, for ``update_priorities``; ``None`` without priorities
+    :param weights: (batch,), what the losses of the samples count, at most 1; ``None`` without priorities
     """
 
     observations: th.Tensor
@@ -39,6 +41,8 @@ class TeamReplayBufferSamples(NamedTuple):
     active: th.Tensor | None = None
     next_active: th.Tensor | None = None
     pair_rewards: th.Tensor | None = None
+    indices: np.ndarray | None = None
+    weights: th.Tensor | None = None
 
 
 class TeamReplayBuffer(ReplayBuffer):
@@ -297,12 +301,15 @@ class TeamReplayBuffer(ReplayBuffer):
                 next_obs = self.observations[(batch_inds + 1) % self.buffer_size, env_inds]
             else:
                 next_obs = batch["next_observations"]
+        rest: dict[str, Any] = {
+            name: self.to_torch(value) if isinstance(value, np.ndarray) else value for name, value in data.items()
+        }
         return TeamReplayBufferSamples(
             observations=self.to_torch(self._normalize_obs(batch["observations"], env)),  # type: ignore[arg-type]
             actions=self.to_torch(batch["actions"]),
             next_observations=self.to_torch(self._normalize_obs(next_obs, env)),  # type: ignore[arg-type]
             active=None if self.all_active else self.to_torch(self._columns(batch["numbers"])["agent_active"]),
-            **{name: self.to_torch(value) if isinstance(value, np.ndarray) else value for name, value in data.items()},
+            **rest,
         )
 
     def _read(self, name: str, index: np.ndarray) -> np.ndarray:
@@ -377,6 +384,107 @@ class TeamReplayBuffer(ReplayBuffer):
             "next_active": None if self.all_active else (active & ~terminated)[at_end].astype(np.float32),
             "pair_rewards": pair_total if self.n_pairs else None,
         }
+
+
+class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
+    """
+    A team's replay buffer that replays what the critic was wrong about more often: proportional prioritised experience
+    replay (Schaul et al. 2016, Algorithm 1). A transition is drawn in proportion to its priority to the power of
+    ``alpha``, and its losses count ``(size * probability) ** -beta``, divided by the largest such weight in the batch.
+    Its priority is its error when it was last replayed, plus ``epsilon``; new ones get the largest there has been.
+    Batches are drawn from as many equal shares of the priorities as they have samples.
+
+    :param alpha: how much priorities count, 0 for uniform replay
+    :param beta: how much of the bias of such replay the weights take away, 1 for all of it
+    :param epsilon: added to errors, so that nothing is never replayed again
+    :param args: see ``TeamReplayBuffer``
+    :param kwargs: see ``TeamReplayBuffer``
+    """
+
+    def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.5, epsilon: float = 0.01, **kwargs: Any):
+        if not (0 <= alpha <= 1 and 0 <= beta <= 1):
+            raise ValueError(f"alpha={alpha} and beta={beta} must be between 0 and 1.")
+        if not epsilon > 0:
+            raise ValueError(f"epsilon={epsilon} must be positive: what had no error would never be replayed again.")
+        super().__init__(*args, **kwargs)
+        self.alpha = alpha
+        self.beta = beta
+        self.epsilon = epsilon
+        self.reset()
+
+    def reset(self) -> None:
+        super().reset()
+        self.priorities = SumTree(self.buffer_size * self.n_envs)
+        self.largest_priority = 1.0
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        row = self.pos
+        super().add(*args, **kwargs)
+        self.priorities.set(row * self.n_envs + np.arange(self.n_envs), self.largest_priority)
+        if self.optimize_memory_usage and self.full:
+            # Its observation was overwritten by the next one of its predecessor
+            self.priorities.set(self.pos * self.n_envs + np.arange(self.n_envs), 0.0)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> TeamReplayBufferSamples:  # type: ignore[override]
+        """
+        :param batch_size: number of transitions
+        :param env: to normalise observations and rewards
+        """
+        shares = (np.arange(batch_size) + np.random.random(batch_size)) / batch_size  # noqa: NPY002
+        indices, probabilities = self.priorities.find(shares)
+        samples = self.samples_at(indices // self.n_envs, indices % self.n_envs, env)
+        weights = (probabilities / probabilities.min()) ** -self.beta
+        return samples._replace(indices=indices, weights=self.to_torch(weights.astype(np.float32)))
+
+    def update_priorities(self, indices: np.ndarray, errors: np.ndarray) -> None:
+        """
+        Set priorities by what the critic has been wrong by.
+
+        :param indices: (batch,), of the samples
+        :param errors: (batch,), at least 0
+        """
+        priorities = (errors.astype(np.float64) + self.epsilon) ** self.alpha
+        self.largest_priority = max(self.largest_priority, priorities.max())
+        self.priorities.set(indices, priorities)
+
+
+class SumTree:
+    """
+    Numbers with all sums that finding a share of their total needs, in a time that grows with the logarithm of their
+    number.
+
+    :param size: how many numbers, all 0 at first
+    """
+
+    def __init__(self, size: int):
+        self.depth = max(size - 1, 0).bit_length()
+        self.sums = np.zeros(2 << self.depth)  # the total at 1, below i are 2 i and 2 i + 1, the numbers come last
+
+    def set(self, indices: np.ndarray, values: np.ndarray | float) -> None:
+        """
+        :param indices: (n,), which numbers
+        :param values: (n,), at least 0, or one for all
+        """
+        nodes = indices + (1 << self.depth)
+        self.sums[nodes] = values
+        for _ in range(self.depth):
+            nodes = nodes >> 1
+            self.sums[nodes] = self.sums[2 * nodes] + self.sums[2 * nodes + 1]
+
+    def find(self, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param shares: (n,), of the total, from 0 to below 1
+        :return: (n,), the numbers that contain these points of their running sum, and (n,), what share of it each is
+        """
+        nodes = np.ones(len(shares), np.intp)
+        rest = shares * self.sums[1]
+        for _ in range(self.depth):
+            nodes = 2 * nodes
+            left, right = self.sums[nodes], self.sums[nodes + 1]
+            goes_right = (rest >= left) & (right > 0)  # rounding must not lead to where there is nothing
+            rest -= left * goes_right
+            nodes += goes_right
+        return nodes - (1 << self.depth), self.sums[nodes] / self.sums[1]
 
 
 def _check_arguments(n_steps: int, gamma: float, n_pairs: int, optimize_memory_usage: bool) -> None:

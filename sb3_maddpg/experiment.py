@@ -17,10 +17,11 @@ from optuna.storages.journal import JournalFileBackend
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, get_callback_list
+from rl_zoo3.utils import ALGOS, get_callback_list, get_class_by_name
 from sqlalchemy.exc import DBAPIError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -64,6 +65,7 @@ class TeamExperimentManager(ExperimentManager):
       with ``eval_env_kwargs`` and ``--eval-env-kwargs`` merged over them;
     - unknown keys are refused, with the nearest known one;
     - ``vec_env: gymnasium`` takes the environment's own Gymnasium vector environment, see ``GymnasiumVecEnv``;
+    - ``replay_buffer_class`` can be a dotted path, as ``policy`` can;
     - every model, not only MADDPG's, carries the environment it was trained in as ``env_spec``;
     - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up; with a team of
       another size a ``PairPolicy`` goes on with its networks alone;
@@ -96,6 +98,9 @@ class TeamExperimentManager(ExperimentManager):
         if self.own_vec_env:
             saved["vec_env"] = "gymnasium"
         check_env_kwargs(self.env_name.gym_id, self.eval_env_kwargs)
+        buffer = hyperparams.get("replay_buffer_class")
+        if isinstance(buffer, str) and "." in buffer:  # other names are for rl_zoo3
+            hyperparams["replay_buffer_class"] = _import_buffer(buffer)
         return hyperparams, dict(sorted(saved.items()))
 
     def _read_vec_env(self, hyperparams: dict[str, Any]) -> bool:
@@ -339,6 +344,17 @@ def diverged(model: BaseAlgorithm) -> bool:
 def _policy(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | None:
     """The policy that a recipe names, or None for a dotted path, which rl_zoo3 imports later."""
     return ALGOS[algo].policy_aliases.get(name) if isinstance(name, str) else name
+
+
+def _import_buffer(name: str) -> type[ReplayBuffer]:
+    """The replay buffer that a recipe names by a dotted path."""
+    try:
+        return get_class_by_name(name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Give the dotted path of a class, "
+            "such as sb3_maddpg.PrioritizedTeamReplayBuffer."
+        ) from error
 
 
 def check_keys(algo: str, hyperparams: dict[str, Any]) -> None:

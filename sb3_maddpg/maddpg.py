@@ -25,7 +25,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped
 
 from sb3_maddpg.agent_policy import AgentPolicy
-from sb3_maddpg.buffers import TeamReplayBuffer, TeamReplayBufferSamples
+from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import record_metrics
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.networks import polyak_update
@@ -389,7 +389,11 @@ class MADDPG(OffPolicyAlgorithm):
         # A sum over agents: each gradient is that of the agent's own mean squared error
         values = critic.credited(critic(obs, actions))
         errors = (values - targets).square().sum(dim=0)
-        loss = _mean_over_batch(errors, None if data.active is None else critic.spread(data.active)).sum()
+        active = None if data.active is None else critic.spread(data.active)
+        if isinstance(self.replay_buffer, PrioritizedTeamReplayBuffer) and data.indices is not None:
+            counted = errors.detach() if active is None else errors.detach() * active
+            self.replay_buffer.update_priorities(data.indices, counted.sum(dim=1).sqrt().cpu().numpy())
+        loss = _mean_over_batch(errors, active, data.weights).sum()
         parts_left = critic.parts_per_agent if critic.part_credit else 1
         return loss, by_agent(values[0].detach(), parts_left).mean(dim=0)
 
@@ -416,7 +420,8 @@ class MADDPG(OffPolicyAlgorithm):
         losses = self.policy_regularization * team.regularization(logits) - by_agent(objective, critic.units_per_agent)
         if self.threshold_price is not None:
             losses = losses + _price_up_to(team.squash(logits), self.threshold_price).sum(dim=-1)
-        return _mean_over_batch(losses, data.active).sum(), team.squash(logits.detach())[:, team.discrete_columns]
+        loss = _mean_over_batch(losses, data.active, data.weights).sum()
+        return loss, team.squash(logits.detach())[:, team.discrete_columns]
 
     def _descend(self, network: Actor | Critic, loss: th.Tensor) -> None:
         network.optimizer.zero_grad()
@@ -583,12 +588,15 @@ def _price_up_to(scores: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
     return first * th.expm1(growth * scores) / growth
 
 
-def _mean_over_batch(values: th.Tensor, active: th.Tensor | None) -> th.Tensor:
+def _mean_over_batch(values: th.Tensor, active: th.Tensor | None, weights: th.Tensor | None) -> th.Tensor:
     """
     :param values: (batch, n)
     :param active: which of them count, (batch, n), None for all
+    :param weights: how much the samples count, (batch,), None for 1
     :return: (n,)
     """
+    if weights is not None:
+        values = values * weights.unsqueeze(1)
     return values.mean(dim=0) if active is None else (values * active).sum(dim=0) / active.sum(dim=0).clamp(min=1.0)
 
 

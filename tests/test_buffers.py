@@ -9,9 +9,11 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_maddpg import MADDPG, TeamReplayBuffer
+from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer, TeamReplayBuffer
+from sb3_maddpg.buffers import SumTree
 from sb3_maddpg.team_tasks import OwnBit
 
 N, D, K = 3, 2, 2
@@ -295,3 +297,118 @@ def test_missing_keys_are_filled_in_environment_by_environment():
 def test_what_cannot_be_used_is_refused(kwargs, info, message):
     with pytest.raises(ValueError, match=message):
         add(buffer(**kwargs), 0, **info)
+
+
+def prioritized(size: int = 8, n_envs: int = 1, **kwargs) -> PrioritizedTeamReplayBuffer:
+    space = spaces.MultiBinary(N * K)
+    return PrioritizedTeamReplayBuffer(size, BOX, space, device="cpu", n_envs=n_envs, **kwargs)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=40).filter(any), st.floats(0, 1, exclude_max=True))
+def test_a_sum_tree_finds_the_number_at_a_share_of_the_total(numbers, share):
+    tree = SumTree(len(numbers))
+    tree.set(np.arange(len(numbers)), np.array(numbers))
+    assert tree.sums[1] == pytest.approx(sum(numbers))
+    (found,), (part,) = tree.find(np.array([share]))
+    running = np.cumsum([0.0, *numbers])
+    slack = 1e-9 * running[-1]
+    assert running[found] - slack <= share * running[-1] <= running[found + 1] + slack
+    assert numbers[found] > 0
+    assert part == pytest.approx(numbers[found] / running[-1])
+
+
+def test_what_the_critic_was_wrong_about_is_replayed_in_proportion():
+    memory = prioritized(alpha=0.5, beta=1.0, epsilon=1e-9)
+    for index in range(4):
+        add(memory, index)
+    assert np.bincount(memory.sample(400).indices).tolist() == [100, 100, 100, 100]
+    memory.update_priorities(np.arange(4), np.array([1.0, 4.0, 0.0, 25.0]))
+    sample = memory.sample(8000)
+    assert np.bincount(sample.indices, minlength=4) == pytest.approx([1000, 2000, 0, 5000], abs=2)
+    assert (sample.observations[:, 0, 0].numpy() == sample.indices).all()
+    assert {index: round(float(sample.weights[sample.indices == index][0]), 3) for index in (0, 1, 3)} == {
+        0: 1.0,
+        1: 0.5,
+        3: 0.2,
+    }
+    add(memory, 4)
+    assert np.mean(memory.sample(1300).indices == 4) == pytest.approx(5 / 13, abs=0.01)  # like the largest so far
+
+
+def test_weights_make_a_prioritized_mean_that_of_all():
+    memory = prioritized(size=64, n_envs=1, alpha=0.7, beta=1.0)
+    for index in range(64):
+        add(memory, index % 64, float(index))
+    memory.update_priorities(np.arange(64), np.arange(64.0) % 7)
+    sample = memory.sample(100_000)
+    mean = (sample.weights * sample.rewards[:, 0]).sum() / sample.weights.sum()
+    assert float(mean) == pytest.approx(31.5, abs=0.3)
+
+
+def test_priorities_are_of_the_transition_that_took_the_place_of_another():
+    memory = prioritized(size=8, n_envs=2, alpha=1.0, epsilon=1e-6)
+    obs = np.zeros((2, N, D), np.float32)
+    for step in range(6):
+        if step == 4:
+            memory.update_priorities(np.arange(8), np.zeros(8))
+        memory.add(obs, obs, np.zeros((2, N * K), np.int8), np.full(2, step), np.zeros(2), [{}, {}])
+    assert set(memory.sample(64).rewards[:, 0].tolist()) == {4.0, 5.0}
+
+
+def test_a_row_without_its_observation_is_not_replayed():
+    memory = prioritized(size=4, optimize_memory_usage=True, handle_timeout_termination=False)
+    for index in range(6):
+        add(memory, index)
+    sample = memory.sample(64)
+    assert set(sample.observations[:, 0, 0].tolist()) == {3.0, 4.0, 5.0}
+    memory.reset()
+    add(memory, 7)
+    assert set(memory.sample(8).observations[:, 0, 0].tolist()) == {7.0}
+
+
+def test_priorities_are_saved_with_the_buffer():
+    memory = prioritized()
+    for index in range(3):
+        add(memory, index)
+    memory.update_priorities(np.arange(3), np.array([0.0, 9.0, 3.0]))
+    again = pickle.loads(pickle.dumps(memory))
+    set_random_seed(0)
+    first = memory.sample(32).indices
+    set_random_seed(0)
+    assert again.sample(32).indices.tolist() == first.tolist()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"alpha": -1.0}, r"alpha=-1.0 and beta=0.5 must be between 0 and 1"),
+        ({"beta": 2.0}, r"alpha=0.6 and beta=2.0 must be between 0 and 1"),
+        ({"epsilon": 0.0}, r"epsilon=0.0 must be positive"),
+    ],
+)
+def test_exponents_out_of_range_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        prioritized(**kwargs)
+
+
+def test_training_sets_priorities_to_the_critics_errors():
+    env = OwnBit()
+    model = MADDPG(
+        "MlpPolicy",
+        env,
+        replay_buffer_class=PrioritizedTeamReplayBuffer,
+        replay_buffer_kwargs={"alpha": 1.0, "beta": 0.4},
+        buffer_size=256,
+        learning_starts=64,
+        batch_size=64,
+        train_freq=8,
+        seed=0,
+    )
+    model.learn(512)
+    memory = model.replay_buffer
+    leaves = memory.priorities.sums[1 << memory.priorities.depth :][:256]
+    assert (leaves > 0).all()
+    assert len(np.unique(leaves)) > 100
+    weights = memory.sample(64).weights
+    assert 0 < float(weights.min()) < float(weights.max()) <= 1.0
