@@ -16,7 +16,7 @@ import json
 import multiprocessing
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,7 +36,7 @@ Item = TypeVar("Item")
 VALIDATION, TEST = 1, 2
 # Steps flown on after arrival.
 LINGER = 10
-STAGES, QUICK_STAGES = (30, 100, 250, 500, 1000, 2000, 4000), (10, 20)
+STAGES, QUICK_STAGES = (30, 100, 250, 500, 1000, 2000, 4000, 12000), (10, 20)
 
 DISTANCES = (0.62, 0.65, 0.7, 0.8, 0.9, 1.05, 1.2, 1.5)
 LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
@@ -102,17 +102,15 @@ def in_stages(
     quick: bool,
     n_robots: int | None = None,
     flown: list[dict[str, float]] | None = None,
-    stages: Sequence[int] | None = None,
 ) -> tuple[list[dict[str, float]], bool]:
     """Fly a policy in more and more episodes, as long as there is hope.
 
     :param full: figures of full communication in the same episodes
     :param flown: the policy's figures in the first of them
-    :param stages: numbers of episodes, unless quick; ``STAGES`` if None
     :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
     """
     figures = list(flown or [])
-    for episodes in QUICK_STAGES if quick else stages or STAGES:
+    for episodes in QUICK_STAGES if quick else STAGES:
         if episodes > len(figures):
             figures += fly([policy], preset, scenario, episodes, n_robots, skip=len(figures))[policy]
         comparison = Comparison.of(figures, full[:episodes])

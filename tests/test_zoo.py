@@ -6,10 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 import yaml
 
-from sb3_maddpg import MADDPG
+from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
 from sb3_maddpg.cli import main
 
 PACKAGE = """
@@ -122,9 +123,20 @@ def test_an_interrupted_training_is_saved(arena):
     assert MADDPG.load("logs/maddpg/Arena-v0_1/Arena-v0.zip").num_timesteps == 150
 
 
+def test_a_recipe_names_its_replay_buffer_by_a_dotted_path(arena):
+    name = "sb3_maddpg.PrioritizedTeamReplayBuffer"
+    assert train(recipe={"replay_buffer_class": name, "replay_buffer_kwargs": {"alpha": 0.3}}) == 0
+    run = Path("logs/maddpg/Arena-v0_1")
+    assert yaml.safe_load((run / "Arena-v0" / "config.yml").read_text())["replay_buffer_class"] == name
+    model = MADDPG.load(run / "Arena-v0.zip", env=gymnasium.make("Arena-v0"))
+    assert type(model.replay_buffer) is PrioritizedTeamReplayBuffer
+    assert model.replay_buffer.alpha == 0.3
+
+
 @pytest.mark.parametrize(
     ("recipe", "argv", "message"),
     [
+        ({"replay_buffer_class": "sb3_maddpg.Prior"}, [], "no attribute 'Prior'). Give the dotted path of a class"),
         ({"estimatr": "score"}, [], "Unknown key in the recipe for maddpg 'estimatr': did you mean 'estimator'?"),
         ({}, ["-params", "taau:0.1"], "did you mean 'tau'?"),
         ({"policy_kwargs": {"net_arc": [8]}}, [], "did you mean 'net_arch'?"),
