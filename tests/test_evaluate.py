@@ -3,11 +3,13 @@
 import importlib
 import json
 import math
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 
+import sb3_maddpg
 from quad_swarm.communication import RULES
 from quad_swarm.evaluate import main
 from quad_swarm.evaluation import Cell, evaluate, first_episode, fly, run_episodes, wilson_interval
@@ -119,6 +121,21 @@ def test_writes_table_json_and_figures(tmp_path, capsys):
     assert list(target.parent.iterdir()) == [target]
     figures = [f"{name}.{kind}" for name in ("collisions", "requests", "front", "flights") for kind in ("png", "pdf")]
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {*figures, "swarm.gif"}
+
+
+def test_the_table_names_models_shortly_where_that_tells_them_apart(capsys, tmp_path):
+    path = str(Path(sb3_maddpg.__file__).parent / "models" / "quad-swarm-paper" / "model.zip")
+    flags = ["--scenario", "random", "--episodes", "1"]
+    assert main(["--policy", path, f"{path}@0.7", *flags]) == 0
+    names = [line.split()[1] for line in capsys.readouterr().out.splitlines() if "quad-swarm-paper" in line]
+    assert names == ["quad-swarm-paper", "quad-swarm-paper@0.7"]
+    copies = [tmp_path / folder / "swarm.zip" for folder in ("first", "second")]
+    for copy in copies:
+        copy.parent.mkdir()
+        copy.write_bytes(Path(path).read_bytes())
+    assert main(["--policy", *map(str, copies), *flags]) == 0
+    printed = capsys.readouterr().out
+    assert all(str(copy) in printed for copy in copies)
 
 
 def test_world_can_be_changed(capsys):

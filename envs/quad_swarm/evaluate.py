@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from .errors import unknown_name
-from .evaluation import Cell, evaluate
+from .evaluation import Cell, evaluate, short_name
 from .planner import BuildError
 from .presets import PRESET_VERSION, PRESETS, make_config
 from .scenarios import SCENARIOS, ScenarioSampler
@@ -25,10 +25,13 @@ from .swarm import Swarm
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as a table to print."""
+    """The rows as a table to print; models by their short names where these tell them apart."""
+    names = {row["policy"]: short_name(row["policy"]) for row in rows}
+    if len(set(names.values())) < len(names):
+        names = {policy: policy for policy in names}
     columns: list[tuple[str, Callable[[Mapping[str, Any]], str]]] = [
         ("scenario", lambda r: r["scenario"]),
-        ("policy", lambda r: r["policy"] if len(r["policy"]) <= 40 else "..." + r["policy"][-37:]),
+        ("policy", lambda r: names[r["policy"]]),
         ("collisions", lambda r: f"{r['collisions']}/{r['episodes']}"),
         ("rate", lambda r: f"{r['collisions'] / r['episodes']:.1%}"),
         ("95 % interval", lambda r: f"{r['collision_low']:.1%} - {r['collision_high']:.1%}"),
