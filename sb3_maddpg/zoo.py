@@ -1,5 +1,7 @@
 """``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3 and the installed environments."""
 
+import ast
+import builtins
 import importlib
 import os
 import runpy
@@ -17,6 +19,7 @@ from gymnasium.envs.registration import load_env_creator
 try:
     import rl_zoo3.enjoy
     import rl_zoo3.train
+    import rl_zoo3.utils
 except ImportError as error:
     raise ImportError(f"{error}. The zoo needs its own packages: pip install 'sb3-maddpg[zoo]'.") from error
 from huggingface_sb3 import EnvironmentName
@@ -37,9 +40,37 @@ def register() -> None:
     HYPERPARAMS_SAMPLER.update({"maddpg": sample_maddpg_params, "matd3": sample_matd3_params})
     HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3"), convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
+    rl_zoo3.train.StoreDict = WordsAndPython  # type: ignore[misc]
     importlib.import_module("sb3_maddpg.team_tasks")
     for entry_point in entry_points(group="sb3_maddpg.environments"):
         entry_point.load()
+
+
+class WordsAndPython(StoreDict):
+    """
+    rl_zoo3's ``key:value``, where values are Python, and beside it plain words: ``preset:dense`` as well as
+    ``preset:"'dense'"``.
+    """
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        try:
+            super().__call__(parser, namespace, [_quoted(word) for word in values], option_string)
+        except Exception as error:
+            raise ValueError(f"{option_string} {' '.join(values)}: {error}. Write key:value.") from error
+
+
+def _quoted(word: str) -> str:
+    """:return: ``key:value`` with a value that Python can read"""
+    key, colon, value = word.partition(":")
+    if not colon or not value:
+        raise ValueError(f"'{word}' has no value")
+    try:
+        tree = ast.parse(value, mode="eval")
+    except SyntaxError:
+        return f"{key}:{value!r}"
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    known = names <= vars(builtins).keys() | vars(rl_zoo3.utils).keys()
+    return word if known and not isinstance(tree.body, ast.Name) else f"{key}:{value!r}"
 
 
 def _call(function: Callable[[], Any], command: str, argv: list[str]) -> None:
@@ -84,7 +115,7 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     parser = common_options()
     parser.add_argument("-f", "--folder", default="logs")
     parser.add_argument("--exp-id", type=int, default=0)
-    parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, default={})
+    parser.add_argument("--env-kwargs", nargs="+", action=WordsAndPython, default={})
     known, rest = parser.parse_known_args(argv)
     if known.env is not None and not {"-h", "--help"} & set(rest):
         _find_env(known.env, known.gym_packages)

@@ -1,5 +1,6 @@
 """The command line, with a package of its own that brings an environment, a callback and an evaluator."""
 
+import argparse
 import importlib
 import json
 import subprocess
@@ -12,6 +13,7 @@ import yaml
 
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
 from sb3_maddpg.cli import main
+from sb3_maddpg.zoo import WordsAndPython
 
 PACKAGE = """
 import json, sys
@@ -100,6 +102,33 @@ def test_arguments_of_the_environment_reach_training_and_evaluation(arena, tmp_p
     }
     assert MADDPG.load(run / "Arena-v0.zip").env_spec == {"id": "Arena-v0", "kwargs": {"flavour": "sweet", "spice": 7}}
     assert "logs/maddpg/Arena-v0_1/Arena-v0.zip" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["preset:dense", "n_robots:8"], {"preset": "dense", "n_robots": 8}),
+        (["preset:'dense'", "flag:False", "none:None"], {"preset": "dense", "flag": False, "none": None}),
+        (["observation:state+memory", "rate:lin_0.01"], {"observation": "state+memory", "rate": "lin_0.01"}),
+        (
+            ["scenario:{'random': 1}", "policy_kwargs:dict(net_arch=[8])"],
+            {"scenario": {"random": 1}, "policy_kwargs": {"net_arch": [8]}},
+        ),
+        (["scenario:all", "path:a:b"], {"scenario": "all", "path": "a:b"}),
+    ],
+)
+def test_arguments_are_words_or_python(words, meant):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--env-kwargs", nargs="+", action=WordsAndPython)
+    assert parser.parse_args(["--env-kwargs", *words]).env_kwargs == meant
+
+
+@pytest.mark.parametrize("word", ["preset", "preset:", "n:1/0"])
+def test_an_argument_without_a_value_is_refused(arena, capsys, word):
+    assert train("--env-kwargs", word) == 2
+    error = capsys.readouterr().err
+    assert f"--env-kwargs {word}: " in error
+    assert error.endswith("Write key:value. (--debug shows the traceback)\n")
 
 
 def test_resuming_goes_on_where_training_ended(arena):
