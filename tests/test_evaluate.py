@@ -153,6 +153,7 @@ def test_world_can_be_changed(capsys):
         (["--policy", "none", "--preset", "papper"], "Did you mean 'paper'"),
         (["--policy", "none", "--n-robots", "99"], "do not fit"),
         (["--policy", "none", "--episodes", "0"], "episodes=0"),
+        (["--policy", "none", "--seed", "-1"], "seed=-1: sets of held-out episodes are counted from 0"),
         (["--policy", "none", "--solver", "fatrob"], "Did you mean 'fatrop'"),
         (["--policy", "none", "--world", "separation"], "write NAME=VALUE"),
         (["--policy", "none", "--world", "planner.seperation=1"], "Did you mean 'separation'"),

@@ -253,7 +253,12 @@ def run_episodes(cell: Cell, episodes: Sequence[int]) -> list[dict[str, float]]:
 
 
 def first_episode(seed: int) -> int:
-    """Seed of the first held-out episode of set ``seed``; the others follow it."""
+    """Seed of the first held-out episode of set ``seed``; the others follow it.
+
+    :raises ValueError: the set is negative, where training's seeds are
+    """
+    if seed < 0:
+        raise ValueError(f"seed={seed}: sets of held-out episodes are counted from 0.")
     return _FIRST_SEED + seed * 10**6
 
 
