@@ -206,12 +206,15 @@ class TeamExperimentManager(ExperimentManager):
         elif isinstance(model, OffPolicyAlgorithm):
             kwargs["log_interval"] = LOG_EPISODES
         try:
-            model.learn(
-                self.n_timesteps,
-                callback=self.callbacks or None,
-                reset_num_timesteps=not self.continue_training,
-                **kwargs,
-            )
+            with warnings.catch_warnings():
+                # Evaluation goes episode by episode, whatever steps the training
+                warnings.filterwarnings("ignore", "Training and eval env are not of the same type")
+                model.learn(
+                    self.n_timesteps,
+                    callback=self.callbacks or None,
+                    reset_num_timesteps=not self.continue_training,
+                    **kwargs,
+                )
         except KeyboardInterrupt:
             print("Interrupted: saving what has been learned so far.")
             for callback in self.callbacks:  # closes the progress bar

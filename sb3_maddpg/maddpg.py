@@ -263,16 +263,29 @@ class MADDPG(OffPolicyAlgorithm):
             raise ValueError(f"{self.policy_class.__name__} is no policy of a team: use MlpPolicy or PairPolicy.")
         if self.estimator not in ESTIMATORS:
             raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
-        if self.max_grad_norm is not None and not self.max_grad_norm > 0:
-            raise ValueError(f"max_grad_norm={self.max_grad_norm} must be positive, or None for no limit.")
-        if self.n_steps < 1 or self.policy_delay < 1:
-            raise ValueError(f"n_steps={self.n_steps} and policy_delay={self.policy_delay} must be at least 1.")
         if self.threshold_price is not None:
             first, last = self.threshold_price
             if not 0 < first < last:
                 raise ValueError(f"threshold_price={self.threshold_price} is a positive price and a higher one.")
             if not isinstance(self.action_space, spaces.MultiBinary):
                 raise ValueError(f"threshold_price is for bits, the action space is {self.action_space}.")
+        if self.replay_buffer_class is not None and not issubclass(self.replay_buffer_class, TeamReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class={self.replay_buffer_class.__name__} knows no agents: derive it from "
+                "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
+                "observations, which a team does not have."
+            )
+        self._check_numbers()
+
+    def _check_numbers(self) -> None:
+        for name in ("tau", "gamma"):
+            value = getattr(self, name)
+            if not isinstance(value, (int, float, np.floating)) or not 0 <= value <= 1:
+                raise ValueError(f"{name}={value!r} must be a number between 0 and 1.")
+        if self.max_grad_norm is not None and not self.max_grad_norm > 0:
+            raise ValueError(f"max_grad_norm={self.max_grad_norm} must be positive, or None for no limit.")
+        if self.n_steps < 1 or self.policy_delay < 1:
+            raise ValueError(f"n_steps={self.n_steps} and policy_delay={self.policy_delay} must be at least 1.")
         noise = np.asarray(self.exploration_noise)
         if noise.shape not in ((), (2,)) or not (noise >= 0).all():
             raise ValueError(
@@ -280,12 +293,6 @@ class MADDPG(OffPolicyAlgorithm):
             )
         if not callable(self.temperature) and not self.temperature > 0:
             raise ValueError(f"temperature={self.temperature} must be positive.")
-        if self.replay_buffer_class is not None and not issubclass(self.replay_buffer_class, TeamReplayBuffer):
-            raise ValueError(
-                f"replay_buffer_class={self.replay_buffer_class.__name__} knows no agents: derive it from "
-                "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
-                "observations, which a team does not have."
-            )
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor

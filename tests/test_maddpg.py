@@ -182,6 +182,8 @@ def test_tasks_are_proper_environments():
         ({"exploration_noise": (0.1, 0.2, 0.3)}, "or two of them"),
         ({"temperature": 0.0}, r"temperature=0\.0 must be positive"),
         ({"n_steps": 0}, "n_steps=0 .* must be at least 1"),
+        ({"tau": "fast"}, "tau='fast' must be a number between 0 and 1"),
+        ({"gamma": 1.5}, "gamma=1.5 must be a number between 0 and 1"),
         ({"policy_delay": 0}, "policy_delay=0 must be at least 1"),
     ],
 )
