@@ -36,7 +36,7 @@ from quad_swarm.scenarios import SCENARIOS  # noqa: E402
 
 FOLDER = ROOT / "benchmarks" / "results" / "swarm"
 NAMES = list(SCENARIOS)
-EPISODES = {"test": 12000, "sweep": 1000, "robustness": 1000, "teams": 4000, "asking": 200, "interventions": 4000}
+EPISODES = {"test": 12000, "sweep": 1000, "robustness": 1000, "teams": 4000, "asking": 200, "interventions": 12000}
 QUICK = 20
 # A threshold with which there are collisions to look at
 RECKLESS = 0.6

@@ -429,7 +429,10 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         """
         :param batch_size: number of transitions
         :param env: to normalise observations and rewards
+        :raises ValueError: there is nothing to sample
         """
+        if not self.size():
+            raise ValueError("The replay buffer is empty: add transitions first, see learning_starts.")
         shares = (np.arange(batch_size) + np.random.random(batch_size)) / batch_size  # noqa: NPY002
         indices, probabilities = self.priorities.find(shares)
         samples = self.samples_at(indices // self.n_envs, indices % self.n_envs, env)

@@ -369,6 +369,8 @@ def test_a_row_without_its_observation_is_not_replayed():
 
 def test_priorities_are_saved_with_the_buffer():
     memory = prioritized()
+    with pytest.raises(ValueError, match="buffer is empty"):
+        memory.sample(1)
     for index in range(3):
         add(memory, index)
     memory.update_priorities(np.arange(3), np.array([0.0, 9.0, 3.0]))
