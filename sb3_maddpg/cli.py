@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import json
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -218,6 +219,8 @@ def main(argv: list[str] | None = None) -> int:
     :param argv: arguments, those of the command line by default
     :return: exit status, 2 for a mistake in what the user gave
     """
+    if not {"", os.getcwd()} & set(sys.path):  # the script does not see what lies here, `python -m` does
+        sys.path.append(os.getcwd())
     arguments = _parser().parse_args(argv)
     command, rest = arguments.command, arguments.arguments
     debug = arguments.debug or "--debug" in rest

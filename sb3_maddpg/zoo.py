@@ -158,7 +158,7 @@ def _find_env(env_id: str, packages: list[str]) -> None:
     if slash and not any(name.startswith(f"{package}/") for name in known):
         raise ValueError(
             f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
-            "parallel_env, as PettingZoo's have. Is its package installed?"
+            "parallel_env, as PettingZoo's have. Is its package installed, or in this folder?"
         )
     raise ValueError(suggest("environment", env_id, known))
 

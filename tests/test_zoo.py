@@ -249,3 +249,12 @@ def test_as_a_command(tmp_path):
     argv = ["train", "--env", "OwnBit-v0", "-n", "600", "--vec-env", "subproc", "--eval-freq", "-1", "--verbose", "0"]
     subprocess.run([*command, *argv, "-params", "n_envs:2"], check=True, cwd=tmp_path)
     assert MADDPG.load(tmp_path / "logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip").num_timesteps == 600
+
+
+def test_the_script_finds_environments_in_the_present_folder(tmp_path):
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "spread.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
+    script = [str(Path(sys.executable).parent / "sb3-maddpg")]
+    argv = ["train", "--env", "pack/spread", "-n", "100", "--eval-freq", "-1", "--verbose", "0"]
+    subprocess.run([*script, *argv], check=True, cwd=tmp_path)
+    assert (tmp_path / "logs" / "maddpg" / "pack-spread_1" / "pack-spread.zip").is_file()
