@@ -37,7 +37,7 @@ from sb3_maddpg import MADDPG
 TUNED = ("paper", "dense", "any", "ablation*")
 # More collisions than full communication that a threshold may have in all episodes: two thirds of what is allowed
 EXCESS = 16
-THRESHOLDS = [0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7]
+THRESHOLDS = [0.99, 0.98, 0.965, 0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7]
 THRESHOLDS += [0.675, 0.65, 0.625, 0.6, 0.575, 0.55, 0.525, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1]
 
 
