@@ -416,14 +416,26 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         super().reset()
         self.priorities = SumTree(self.buffer_size * self.n_envs)
         self.largest_priority = 1.0
+        self.new_rows = 0
 
     def add(self, *args: Any, **kwargs: Any) -> None:
-        row = self.pos
         super().add(*args, **kwargs)
-        self.priorities.set(row * self.n_envs + np.arange(self.n_envs), self.largest_priority)
+        self.new_rows = min(self.new_rows + 1, self.buffer_size)
+
+    def _prioritize_new(self) -> None:
+        """All that were added since the last call at once, which is much faster than one by one."""
+        if not self.new_rows:
+            return
+        rows = (self.pos - 1 - np.arange(self.new_rows)) % self.buffer_size
+        self.priorities.set(self._indices(rows), self.largest_priority)
+        self.new_rows = 0
         if self.optimize_memory_usage and self.full:
             # Its observation was overwritten by the next one of its predecessor
-            self.priorities.set(self.pos * self.n_envs + np.arange(self.n_envs), 0.0)
+            self.priorities.set(self._indices(np.array([self.pos])), 0.0)
+
+    def _indices(self, rows: np.ndarray) -> np.ndarray:
+        """:return: of all transitions in some rows"""
+        return (rows[:, None] * self.n_envs + np.arange(self.n_envs)).ravel()
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> TeamReplayBufferSamples:  # type: ignore[override]
         """
@@ -433,6 +445,7 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         """
         if not self.size():
             raise ValueError("The replay buffer is empty: add transitions first, see learning_starts.")
+        self._prioritize_new()
         shares = (np.arange(batch_size) + np.random.random(batch_size)) / batch_size  # noqa: NPY002
         indices, probabilities = self.priorities.find(shares)
         samples = self.samples_at(indices // self.n_envs, indices % self.n_envs, env)
@@ -446,6 +459,7 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         :param indices: (batch,), of the samples
         :param errors: (batch,), at least 0
         """
+        self._prioritize_new()
         priorities = (errors.astype(np.float64) + self.epsilon) ** self.alpha
         self.largest_priority = max(self.largest_priority, priorities.max())
         self.priorities.set(indices, priorities)

@@ -409,8 +409,8 @@ def test_training_sets_priorities_to_the_critics_errors():
     )
     model.learn(512)
     memory = model.replay_buffer
+    weights = memory.sample(64).weights
     leaves = memory.priorities.sums[1 << memory.priorities.depth :][:256]
     assert (leaves > 0).all()
     assert len(np.unique(leaves)) > 100
-    weights = memory.sample(64).weights
     assert 0 < float(weights.min()) < float(weights.max()) <= 1.0
