@@ -9,7 +9,10 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.relational import PairPolicy
-from sb3_maddpg.utils import suggest
+from sb3_maddpg.utils import arguments_of, suggest
+
+# What a team of another size does not take over from the model
+OF_TEAM = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
 
 
 def shipped_models() -> list[str]:
@@ -24,7 +27,8 @@ def pretrained(name: str, env: GymEnv | None = None, **kwargs) -> MADDPG:
 
     :param name: see ``shipped_models``
     :param env: to fly in or to train on; a team of another size is welcome where the policy is a ``PairPolicy``
-    :param kwargs: further arguments of ``MADDPG.load``; with a team of another size, of ``MADDPG``
+    :param kwargs: further arguments of ``MADDPG.load``; with a team of another size, of ``MADDPG``, over those that the
+        model was trained with
     :raises ValueError: no such model, or an environment that it does not fit
     """
     path = pretrained_folder(name) / "model.zip"
@@ -35,8 +39,9 @@ def pretrained(name: str, env: GymEnv | None = None, **kwargs) -> MADDPG:
     same = (wrapped.observation_space, wrapped.action_space) == (model.observation_space, model.action_space)
     if same or not isinstance(model.policy, PairPolicy):
         return MADDPG.load(path, env=wrapped, **kwargs)
+    trained = {name: getattr(model, name) for name in arguments_of(MADDPG) - OF_TEAM if hasattr(model, name)}
     own = {key: value for key, value in model.policy_kwargs.items() if key not in PairPolicy.env_attributes}
-    resized = MADDPG("PairPolicy", wrapped, policy_kwargs=own, **kwargs)
+    resized = MADDPG("PairPolicy", wrapped, policy_kwargs=own, **{**trained, **kwargs})
     try:
         resized.set_parameters(str(path))
     except RuntimeError as error:

@@ -10,7 +10,7 @@ from sb3_maddpg import pretrained
 from sb3_maddpg.shipped import pretrained_folder, shipped_models
 
 # Model -> world, number of robots, and the largest share of requests in the symmetric swap, 1.3 times what it needs.
-SHIPPED = {"quad-swarm-paper": ("paper", 4, 0.04)}
+SHIPPED = {"quad-swarm-dense": ("dense", 8, 0.122), "quad-swarm-paper": ("paper", 4, 0.04)}
 
 
 def test_every_shipped_model_is_tested():
@@ -41,6 +41,9 @@ def test_acts_in_its_environment_and_in_a_larger_team(name):
         bits, _ = loaded.predict(obs, deterministic=True)
         assert bits.shape == (n_robots * (n_robots - 1),)
         assert loaded.policy.threshold == model.policy.threshold
+        for what in ("batch_size", "buffer_size", "gamma", "n_steps", "replay_buffer_class", "threshold_price"):
+            assert getattr(loaded, what) == getattr(model, what), what
+        assert type(loaded.replay_buffer) is model.replay_buffer_class
         for old, new in zip(model.actor.parameters(), loaded.actor.parameters(), strict=True):
             assert np.array_equal(old.detach(), new.detach())
 
