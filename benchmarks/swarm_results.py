@@ -90,15 +90,15 @@ def best_rules(preset: str) -> dict[str, str]:
 def tuned(recipe: str, scenario: str) -> list[str]:
     """The models of a recipe with the threshold that was chosen for this scenario alone, as rules are, where that is
     not the one they have for all scenarios."""
-    rows = [row for row in read_rows(FOLDER / "thresholds.json") if row["model"] in models(recipe)]
-    for_all: dict[str, float] = {}  # thresholds were tried from the highest on
-    for row in rows:
-        for_all[row["model"]] = min(row["threshold"], for_all.get(row["model"], 1.0))
-    return [
-        f"{row['model']}@{row['threshold']:g}"
-        for row in rows
-        if row["scenario"] == scenario and row["safe"] and row["threshold"] > for_all[row["model"]]
-    ]
+    for_all: dict[str, float] = {}
+    for_this: dict[str, float] = {}
+    paths = models(recipe)
+    for row in read_rows(FOLDER / "thresholds.json"):  # tried from the highest on, for each number of robots
+        if (path := row["model"]) in paths:
+            for_all[path] = min(row["threshold"], for_all.get(path, 1.0))
+            if row["scenario"] == scenario:
+                for_this[path] = min(row["threshold"], for_this.get(path, 1.0))
+    return [f"{path}@{threshold:g}" for path, threshold in for_this.items() if threshold > for_all[path]]
 
 
 def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> list[dict[str, Any]]:
@@ -183,7 +183,7 @@ def teams(episodes: int) -> list[Any]:
     return [
         (
             {"preset": "dense"},
-            ["full", rules[name], *models("any")],
+            ["full", rules[name], *models("any"), *tuned("any", name)],
             name,
             make_config("dense", n_robots=n, space=WIDER if n > 12 else None),
             episodes,

@@ -154,6 +154,26 @@ def wide_table(rows: Rows, first: str, preset: str) -> str:
     return table([first.replace("_", " "), "policy", *(name.replace("_", " ") for name in NAMES)], lines)
 
 
+def teams_table(rows: Rows) -> str:
+    """Every number of robots: collisions and requests, in bold where at most half a point less safe than asking
+    everybody. A learned policy comes with its one threshold, and with those chosen for each scenario."""
+    learned = dict.fromkeys(row["policy"].partition("@")[0] for row in rows if is_model(row["policy"]))
+    lines = []
+    for n in dict.fromkeys(row["n_robots"] for row in rows):
+        lines += [[str(n), kind] for kind in ("`full`", "best rule")]
+        lines += [[str(n), label(path) + how] for path in learned for how in ("", ", tuned")]
+        for name in NAMES:
+            here = {row["policy"]: row for row in rows if (row["n_robots"], row["scenario"]) == (n, name)}
+            cells = [here["full"], here[here["full"]["against_rule"]["rival"]]]
+            for path in learned:
+                tuned = next((policy for policy in here if policy.startswith(f"{path}@")), path)
+                cells += [here[path], here[tuned]]
+            for line, row in zip(lines[-len(cells) :], cells, strict=True):
+                mark = "**" if row["policy"] != "full" and row["against_full"]["high"] < 0.005 else ""
+                line.append(f"{mark}{row['collisions']}/{row['episodes']}, {row['request_share']:.2%}{mark}")
+    return table(["robots", "policy", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
 def kind_of(row: dict[str, Any]) -> str:
     """A policy by its part in a comparison."""
     return label(row["policy"]) if is_model(row["policy"]) or row["policy"] in ("full", "none") else "best rule"
@@ -315,7 +335,7 @@ def main() -> None:
         "robustness paper": wide_table(robustness, "condition", "paper"),
         "robustness dense": wide_table(robustness, "condition", "dense"),
         "interventions": interventions_table(interventions),
-        "teams": wide_table(teams, "n_robots", "dense"),
+        "teams": teams_table(teams),
     }
     flown = {
         preset: flights(models(preset)[0], best_rules(preset)["symmetric_swap"], preset)

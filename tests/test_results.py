@@ -78,6 +78,29 @@ def test_tables_of_flown_episodes(tmp_path):
     assert f"| symmetric swap | `none` | {none['collisions']}/30 [" in text
 
 
+def test_table_of_teams_shows_each_model_with_its_threshold_and_with_the_tuned_one():
+    model = "benchmarks/results/swarm/any_seed0.zip"
+
+    def row(scenario, policy, collisions, share, high):
+        against = {"against_full": {"high": high}, "against_rule": {"rival": "cpa:1:1"}}
+        keys = {"n_robots": 6, "scenario": scenario, "policy": policy}
+        return keys | {"collisions": collisions, "episodes": 4000, "request_share": share} | against
+
+    rows = [
+        row(name, policy, *figures)
+        for name in page.NAMES
+        for policy, figures in {"full": (1, 1, 0), "cpa:1:1": (30, 0.2, 0.009), model: (9, 0.1, 0.004)}.items()
+    ]
+    rows.append(row("random", f"{model}@0.9", 12, 0.01, 0.005))
+    lines = page.teams_table(rows).splitlines()[2:]
+    assert lines[0].startswith("| 6 | `full` | 1/4000, 100.00% |")
+    assert lines[1] == "| 6 | best rule " + "| 30/4000, 20.00% " * 4 + "|"
+    assert lines[2] == "| 6 | any, seed 0 " + "| **9/4000, 10.00%** " * 4 + "|"
+    swaps = "| **9/4000, 10.00%** " * 3
+    assert lines[3] == f"| 6 | any, seed 0, tuned {swaps}| 12/4000, 1.00% |"
+    assert len(lines) == 4
+
+
 def test_rows_of_other_keys_stay(tmp_path):
     path = tmp_path / "rows.json"
     assert swarm_rules.read_rows(path) == []
