@@ -1,9 +1,9 @@
 """How long a training of a swarm's recipe takes, and where the time goes.
 
-``python benchmarks/swarm_training.py [--recipe RECIPE.yml ...] [--steps N] [--json F]`` trains on one core. Planner:
-its batch calls. Learner: updates. Acting: the policy while exploring. Rest: the swarm around its planner, observations,
-infos, the replay buffer and logging. JSON: one row a recipe with recipe, steps, updates, episodes, seconds, and the
-share of each part.
+``python benchmarks/swarm_training.py [--recipe RECIPE.yml ...] [--steps N] [--threads N] [--json F]``. Planner: its
+batch calls, on one core. Learner: updates. Acting: the policy while exploring. Rest: the swarm around its planner,
+observations, infos, the replay buffer and logging. JSON: one row a recipe with recipe, threads, steps, updates,
+episodes, seconds, and the share of each part.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import gymnasium
 import torch as th
 import yaml
+from rl_zoo3.utils import get_class_by_name
 from stable_baselines3.common.vec_env import VecMonitor
 
 if not __package__:
@@ -38,6 +39,8 @@ def measure(recipe: str, steps: int | None) -> dict[str, Any]:
         hyperparams.pop(key, None)
     steps = steps or hyperparams["n_timesteps"]
     del hyperparams["n_timesteps"]
+    if "replay_buffer_class" in hyperparams:
+        hyperparams["replay_buffer_class"] = get_class_by_name(hyperparams["replay_buffer_class"])
     rate = float(str(hyperparams.pop("learning_rate")).removeprefix("lin_"))
     envs = gymnasium.make_vec("QuadSwarm-v0", hyperparams.pop("n_envs"), **hyperparams.pop("env_kwargs"))
     env = VecMonitor(GymnasiumVecEnv(envs))
@@ -52,8 +55,8 @@ def measure(recipe: str, steps: int | None) -> dict[str, Any]:
     seconds = time.perf_counter() - started
     parts = {"planner": planner[0], "learner": learner[0], "acting": acting[0]}
     parts["rest"] = seconds - sum(parts.values())
-    row: dict[str, Any] = {"recipe": recipe, "steps": model.num_timesteps, "updates": model._n_updates}
-    row |= {"episodes": model._episode_num, "seconds": seconds}
+    row: dict[str, Any] = {"recipe": recipe, "threads": th.get_num_threads(), "steps": model.num_timesteps}
+    row |= {"updates": model._n_updates, "episodes": model._episode_num, "seconds": seconds}
     return row | {f"share_{name}": part / seconds for name, part in parts.items()}
 
 
@@ -63,9 +66,10 @@ def main() -> None:
     default = ["zoo_configs/quad_swarm_paper.yml", "zoo_configs/quad_swarm_dense.yml", "zoo_configs/maddpg.yml"]
     parser.add_argument("--recipe", nargs="+", default=default)
     parser.add_argument("--steps", type=int, help="the recipe's unless given")
+    parser.add_argument("--threads", type=int, default=1, help="of PyTorch (%(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
-    th.set_num_threads(1)
+    th.set_num_threads(args.threads)
     rows = []
     for recipe in args.recipe:
         rows.append(measure(recipe, args.steps))

@@ -269,9 +269,12 @@ class MADDPG(OffPolicyAlgorithm):
                 raise ValueError(f"threshold_price={self.threshold_price} is a positive price and a higher one.")
             if not isinstance(self.action_space, spaces.MultiBinary):
                 raise ValueError(f"threshold_price is for bits, the action space is {self.action_space}.")
-        if self.replay_buffer_class is not None and not issubclass(self.replay_buffer_class, TeamReplayBuffer):
+        buffer = self.replay_buffer_class
+        if isinstance(buffer, str):
+            raise ValueError(f"replay_buffer_class={buffer!r} is a name, which only recipes know: give the class.")
+        if buffer is not None and not issubclass(buffer, TeamReplayBuffer):
             raise ValueError(
-                f"replay_buffer_class={self.replay_buffer_class.__name__} knows no agents: derive it from "
+                f"replay_buffer_class={buffer.__name__} knows no agents: derive it from "
                 "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
                 "observations, which a team does not have."
             )

@@ -158,6 +158,8 @@ def test_returns_of_several_steps(algorithm, kind):
 def test_what_a_team_has_not_is_refused(algorithm, kind):
     with pytest.raises(ValueError, match=r"HerReplayBuffer knows no agents: derive it from .*TeamReplayBuffer.*goals"):
         algorithm("MlpPolicy", toy(kind), replay_buffer_class=HerReplayBuffer)
+    with pytest.raises(ValueError, match=r"'TeamReplayBuffer' is a name, .*: give the class"):
+        algorithm("MlpPolicy", toy(kind), replay_buffer_class="TeamReplayBuffer")
     env = toy(kind)
     env.observation_space = spaces.Dict({"observation": env.observation_space})
     with pytest.raises(ValueError, match=r"shape \(n_agents, obs_dim\), not Dict.*Flatten"):

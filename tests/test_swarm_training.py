@@ -1,6 +1,8 @@
 """The two packages together: training on the swarm, from recipes and by hand, and judging what was trained."""
 
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,11 @@ import quad_swarm
 from quad_swarm.evaluate import main as evaluate
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli import main as zoo
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT))
+
+from benchmarks.swarm_training import measure  # noqa: E402
 
 SMALL = {
     "learning_starts": 30,
@@ -131,3 +138,13 @@ def test_not_a_number_is_named(tmp_path):
     observation[2, 5] = np.nan
     with pytest.raises(ValueError, match=r"agent\(s\) robot_2"):
         model.predict(observation)
+
+
+@pytest.mark.parametrize("recipe", sorted((ROOT / "zoo_configs").glob("quad_swarm_*.yml")), ids=lambda path: path.stem)
+def test_where_the_time_of_a_recipe_goes(recipe):
+    row = measure(str(recipe), 128)
+    assert row["steps"] >= 128
+    shares = {key: row[key] for key in row if key.startswith("share_")}
+    assert set(shares) == {"share_planner", "share_learner", "share_acting", "share_rest"}
+    assert shares["share_planner"] > 0
+    assert sum(shares.values()) == pytest.approx(1)
