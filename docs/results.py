@@ -1,7 +1,8 @@
 """Put tables and figures of the swarm's results into docs/results.md: ``python docs/results.py [--data FOLDER]``.
 
 The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
-come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py` and `benchmarks/swarm_results.py`.
+come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py`, `benchmarks/swarm_results.py` and, how long
+trainings take, `benchmarks/swarm_training.py`.
 """
 
 from __future__ import annotations
@@ -174,6 +175,17 @@ def teams_table(rows: Rows) -> str:
     return table(["robots", "policy", *(name.replace("_", " ") for name in NAMES)], lines)
 
 
+def training_table(rows: Rows) -> str:
+    """How long trainings take, and what of."""
+    parts = ("planner", "learner", "acting", "rest")
+    lines = []
+    for row in rows:
+        line = [f"`{row['recipe']}`", f"{row['steps']:,}", f"{row['episodes']:,}", f"{row['updates']:,}"]
+        line += [str(row["threads"]), f"{row['seconds'] / 60:.1f}"]
+        lines.append([*line, *(f"{row[f'share_{part}']:.0%}" for part in parts)])
+    return table(["recipe", "steps", "episodes", "updates", "threads", "minutes", *parts], lines)
+
+
 def kind_of(row: dict[str, Any]) -> str:
     """A policy by its part in a comparison."""
     return label(row["policy"]) if is_model(row["policy"]) or row["policy"] in ("full", "none") else "best rule"
@@ -319,8 +331,8 @@ def main() -> None:
     parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
     os.chdir(ROOT)
-    names = ("rules", "test", "sweep", "robustness", "teams", "asking", "interventions")
-    rules, test, sweep, robustness, teams, asking, interventions = (
+    names = ("rules", "test", "sweep", "robustness", "teams", "asking", "interventions", "training")
+    rules, test, sweep, robustness, teams, asking, interventions, training = (
         read_rows(args.data / f"{name}.json") for name in names
     )
     blocks = {
@@ -336,6 +348,7 @@ def main() -> None:
         "robustness dense": wide_table(robustness, "condition", "dense"),
         "interventions": interventions_table(interventions),
         "teams": teams_table(teams),
+        "training": training_table(training),
     }
     flown = {
         preset: flights(models(preset)[0], best_rules(preset)["symmetric_swap"], preset)
