@@ -83,9 +83,9 @@ def fly(
     return {cell.policy: rows for cell, rows in fly_all(cells, episodes, VALIDATION, skip=skip).items()}
 
 
-def cell(policy: str, scenario: str, config: SwarmConfig) -> Cell:
+def cell(policy: str, scenario: str, config: SwarmConfig, algo: str = "sb3_maddpg:MADDPG") -> Cell:
     """A policy in a scenario as all results here fly it."""
-    return Cell(policy, scenario, config, 100, "sb3_maddpg:MADDPG", "rti", LINGER)
+    return Cell(policy, scenario, config, 100, algo, "rti", LINGER)
 
 
 def hopeless(comparison: Comparison) -> bool:

@@ -1,8 +1,8 @@
 """Put tables and figures of the swarm's results into docs/results.md: ``python docs/results.py [--data FOLDER]``.
 
 The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
-come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py`, `benchmarks/swarm_results.py` and, how long
-trainings take, `benchmarks/swarm_training.py`.
+come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py`, `benchmarks/swarm_results.py`, of PPO from
+`benchmarks/swarm_ppo.py` and, how long trainings take, `benchmarks/swarm_training.py`.
 """
 
 from __future__ import annotations
@@ -175,6 +175,16 @@ def teams_table(rows: Rows) -> str:
     return table(["robots", "policy", *(name.replace("_", " ") for name in NAMES)], lines)
 
 
+def ppo_table(rows: Rows) -> str:
+    """Collisions and requests of PPO by the price of a request and the threshold."""
+    lines = []
+    for price, threshold in dict.fromkeys((row["price"], row["threshold"]) for row in rows):
+        here = {row["scenario"]: row for row in rows if (row["price"], row["threshold"]) == (price, threshold)}
+        cells = [f"{here[k]['collisions']}/{here[k]['episodes']}, {here[k]['request_share']:.1%}" for k in NAMES]
+        lines.append([f"{price:g}", f"{threshold:g}", *cells])
+    return table(["price", "threshold", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
 def training_table(rows: Rows) -> str:
     """How long trainings take, and what of."""
     parts = ("planner", "learner", "acting", "rest")
@@ -331,8 +341,8 @@ def main() -> None:
     parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
     os.chdir(ROOT)
-    names = ("rules", "test", "sweep", "robustness", "teams", "asking", "interventions", "training")
-    rules, test, sweep, robustness, teams, asking, interventions, training = (
+    names = ("rules", "test", "sweep", "robustness", "teams", "asking", "interventions", "ppo", "training")
+    rules, test, sweep, robustness, teams, asking, interventions, ppo, training = (
         read_rows(args.data / f"{name}.json") for name in names
     )
     blocks = {
@@ -348,6 +358,7 @@ def main() -> None:
         "robustness dense": wide_table(robustness, "condition", "dense"),
         "interventions": interventions_table(interventions),
         "teams": teams_table(teams),
+        "ppo": ppo_table(ppo),
         "training": training_table(training),
     }
     flown = {

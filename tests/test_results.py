@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT))
 
-from benchmarks import swarm_models, swarm_results, swarm_rules  # noqa: E402
+from benchmarks import swarm_models, swarm_ppo, swarm_results, swarm_rules  # noqa: E402
 from docs import results as page  # noqa: E402
 from quad_swarm.communication import parse_rule  # noqa: E402
 from quad_swarm.evaluation import Comparison, fly_all  # noqa: E402
@@ -148,3 +148,16 @@ def test_a_threshold_needs_a_reserve():
     assert swarm_models.has_reserve(Comparison(12000, 17, 1))
     assert not swarm_models.has_reserve(Comparison(12000, 17, 0))
     assert Comparison(12000, 25, 0).as_safe, "though it would do without"
+
+
+def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
+    table = tmp_path / "ppo.json"
+    words = ["swarm_ppo.py", "--price", "0.05", "--steps", "2048", "--episodes", "3", "--models", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*words, "--json", str(table)])
+    swarm_ppo.main()
+    rows = swarm_rules.read_rows(table)
+    assert len(rows) == 4 * len(swarm_ppo.THRESHOLDS)
+    shares = [row["request_share"] for row in rows if row["scenario"] == "random"]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > shares[-1]
+    assert page.ppo_table(rows).count("/3, ") == len(rows)
