@@ -327,7 +327,7 @@ def draw_asking(rows: Rows, path: Path) -> None:
                     axes.plot(*zip(*points, strict=True), ".-", color=colour, label=name)
             axes.set_xlabel(quantity)
             axes.spines[["top", "right"]].set_visible(False)
-        line[0].set_ylabel(f"{preset}: asked, of all pairs and steps")
+        line[0].set_ylabel(f"{preset}: share asked")
         line[0].legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=90)
     plt.close(figure)
