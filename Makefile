@@ -9,6 +9,8 @@ LOGS ?= logs
 EPISODES ?= 500
 JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
 BENCHMARKS ?= planner env training scaling estimators
+TEAMS ?= 4 6 8 12 16
+TEAM_FAMILIES ?= "cpa" "cpa and stale" "cpa and event" "plan and stale" "plan, or cpa and stale" "two cpa"
 POLICIES ?= none full distance:4 cpa:0.65:1.5
 PEERS := agilerl benchmarl xuance
 
@@ -47,7 +49,11 @@ bench: install  ## speed of planner, environment and learner, and the estimators
 
 results: install  ## fly everything that docs/results.md says again: tuned rules and thresholds, test set, tables and figures (hours)
 	$(BIN)/python benchmarks/swarm_rules.py --jobs $(JOBS) --json benchmarks/results/swarm/rules.json
+	$(BIN)/python benchmarks/swarm_rules.py --preset dense --n-robots $(TEAMS) --family $(TEAM_FAMILIES) --jobs $(JOBS) \
+		--json benchmarks/results/swarm/team_rules.json
 	$(BIN)/python benchmarks/swarm_models.py --jobs $(JOBS) --json benchmarks/results/swarm/thresholds.json
+	$(BIN)/python benchmarks/swarm_models.py benchmarks/results/swarm/any_seed*.zip --n-robots $(TEAMS) --jobs $(JOBS) \
+		--json benchmarks/results/swarm/thresholds.json
 	$(BIN)/python benchmarks/swarm_results.py --jobs $(JOBS)
 	$(BIN)/python benchmarks/swarm_ppo.py --models $(LOGS) --json benchmarks/results/swarm/ppo.json
 	$(BIN)/python docs/results.py

@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 if not __package__:
     sys.path[0] = str(ROOT)
 
-from benchmarks.swarm_rules import TEST, cell, progress, read_rows, replace_rows  # noqa: E402
+from benchmarks.swarm_rules import TEST, cell, progress, read_rows, replace_rows, world  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.evaluation import Cell, Comparison, begin, first_episode, fly, fly_all, summarise  # noqa: E402
 from quad_swarm.presets import SwarmConfig, make_config  # noqa: E402
@@ -47,8 +47,6 @@ PRESETS_TESTED = tuple(preset for preset in ("paper", "dense") if any(FOLDER.glo
 # What tells the cells of a part from each other; a cell that is flown again replaces its rows
 CELL = ("preset", "scenario", "condition", "n_robots")
 TEAMS = (4, 6, 8, 12, 16)
-# Sixteen robots do not fit on the circle of eight.
-WIDER = {"circle_radius": (3.0, 3.5)}
 CONDITIONS: dict[str, dict[str, Any]] = {
     "as trained": {},
     "state noise": {"noise": {"pos": 0.004, "vel": 0.02, "attitude": 0.006}},
@@ -76,29 +74,34 @@ def models(recipe: str) -> list[str]:
     return [str(path.relative_to(ROOT)) for path in sorted(FOLDER.glob(f"{recipe}_seed*.zip"))]
 
 
-def best_rules(preset: str) -> dict[str, str]:
-    """For each scenario the rule with the fewest requests that was as safe as full communication in validation."""
+def best_rules(preset: str, n_robots: int | None = None) -> dict[str, str]:
+    """For each scenario the rule with the fewest requests that was as safe as full communication in validation, in a
+    preset or in a team of another size."""
     best: dict[str, dict[str, Any]] = {}
-    for row in read_rows(FOLDER / "rules.json"):
-        if row["preset"] == preset and row["safe"]:
+    for row in read_rows(FOLDER / ("rules.json" if n_robots is None else "team_rules.json")):
+        if row["preset"] == preset and row.get("n_robots") == n_robots and row["safe"]:
             known = best.setdefault(row["scenario"], row)
             if row["request_share"] < known["request_share"]:
                 best[row["scenario"]] = row
     return {scenario: best[scenario]["rule"] if scenario in best else "full" for scenario in NAMES}
 
 
-def tuned(recipe: str, scenario: str) -> list[str]:
+def tuned(recipe: str, scenario: str, n_robots: int | None = None) -> list[str]:
     """The models of a recipe with the threshold that was chosen for this scenario alone, as rules are, where that is
-    not the one they have for all scenarios."""
+    not the one they have for all scenarios; with ``n_robots`` all of them, with that of this number of robots."""
     for_all: dict[str, float] = {}
     for_this: dict[str, float] = {}
     paths = models(recipe)
-    for row in read_rows(FOLDER / "thresholds.json"):  # tried from the highest on, for each number of robots
+    for row in read_rows(FOLDER / "thresholds.json"):  # tried from the highest on
         if (path := row["model"]) in paths:
             for_all[path] = min(row["threshold"], for_all.get(path, 1.0))
-            if row["scenario"] == scenario:
-                for_this[path] = min(row["threshold"], for_this.get(path, 1.0))
-    return [f"{path}@{threshold:g}" for path, threshold in for_this.items() if threshold > for_all[path]]
+            if row["scenario"] == scenario and n_robots in (None, row["n_robots"]):
+                for_this[path] = row["threshold"]
+    return [
+        f"{path}@{threshold:g}"
+        for path, threshold in for_this.items()
+        if n_robots is not None or threshold > for_all[path]
+    ]
 
 
 def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> list[dict[str, Any]]:
@@ -178,15 +181,15 @@ def robustness(episodes: int) -> list[Any]:
 
 
 def teams(episodes: int) -> list[Any]:
-    """Jobs of other sizes of the team; the rules are those of eight robots."""
-    rules = best_rules("dense")
+    """Jobs of other sizes of the team: all models with the thresholds tuned for it, the first with that for all."""
     return [
         (
             {"preset": "dense"},
-            ["full", rules[name], *models("any"), *tuned("any", name)],
+            ["full", best_rules("dense", n)[name], *models("any")[:1], *tuned("any", name, n)],
             name,
-            make_config("dense", n_robots=n, space=WIDER if n > 12 else None),
-            episodes,
+            world("dense", n),
+            # Where full communication collides often too, more episodes are needed to tell a difference
+            episodes * 3 if (n, name) == (16, "symmetric_swap") else episodes,
         )
         for n in TEAMS
         for name in NAMES

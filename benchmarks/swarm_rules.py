@@ -1,11 +1,11 @@
 """Tune every family of hand-made rules as hard as a learner: the cheapest of each that is as safe as asking everybody.
 
-``python benchmarks/swarm_rules.py [--quick] [--preset paper dense] [--family ...] [--json F]``, on the validation set.
-In each scenario all rules of a family fly a few episodes, which tell their requests. Then they are tried from the
-cheapest on, in stages of more and more episodes, until one is as safe as full communication in the last stage
-(`Comparison.as_safe`). One that collides clearly more often in an earlier stage is out. JSON: one row for each
-rule and scenario with the keys of `quad_swarm.evaluation.summarise` over the episodes that it flew, and preset,
-scenario, family, rule, and safe: True or False, or None for those dearer than the one that was found.
+``python benchmarks/swarm_rules.py [--quick] [--preset ...] [--n-robots ...] [--family ...] [--json F]``, on the
+validation set. In each scenario all rules of a family fly a few episodes, which tell their requests. Then they are
+tried from the cheapest on, in stages of more and more episodes, until one is as safe as full communication
+(`Standard`). One that collides clearly more often in an earlier stage is out. JSON: one row for each rule and scenario
+with the keys of `quad_swarm.evaluation.summarise` over the episodes that it flew, and preset, scenario, family, rule,
+with ``--n-robots`` also n_robots, and safe: True or False, or None for those dearer than the one that was found.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -37,6 +37,22 @@ VALIDATION, TEST = 1, 2
 # Steps flown on after arrival.
 LINGER = 10
 STAGES, QUICK_STAGES = (30, 100, 250, 500, 1000, 2000, 4000, 12000), (10, 20)
+# More than twelve robots do not fit on the circle of eight.
+WIDER = {"circle_radius": (3.0, 3.5)}
+
+
+class Standard(NamedTuple):
+    """What is as safe as full communication when rules and thresholds are tuned.
+
+    :param margin: upper bound of the 95 % interval of the paired difference of the collision rates
+    :param enough: episodes from which on that is believed
+    """
+
+    margin: float
+    enough: int
+
+
+OF_PRESET, OF_TEAM = Standard(0.003, 12000), Standard(0.005, 2000)
 
 DISTANCES = (0.62, 0.65, 0.7, 0.8, 0.9, 1.05, 1.2, 1.5)
 LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
@@ -78,9 +94,14 @@ def fly(
     policies: list[str], preset: str, scenario: str, episodes: int, n_robots: int | None = None, skip: int = 0
 ) -> dict[str, list[dict[str, float]]]:
     """:return: for each policy the figures of its validation episodes, without the first ``skip``"""
-    config = make_config(preset, n_robots=n_robots)
+    config = world(preset, n_robots)
     cells = [cell(policy, scenario, config) for policy in policies]
     return {cell.policy: rows for cell, rows in fly_all(cells, episodes, VALIDATION, skip=skip).items()}
+
+
+def world(preset: str, n_robots: int | None = None) -> SwarmConfig:
+    """A preset, or a team of another size in it."""
+    return make_config(preset, n_robots=n_robots, space=WIDER if n_robots is not None and n_robots > 12 else None)
 
 
 def cell(policy: str, scenario: str, config: SwarmConfig, algo: str = "sb3_maddpg:MADDPG") -> Cell:
@@ -88,10 +109,10 @@ def cell(policy: str, scenario: str, config: SwarmConfig, algo: str = "sb3_maddp
     return Cell(policy, scenario, config, 100, algo, "rti", LINGER)
 
 
-def hopeless(comparison: Comparison) -> bool:
+def hopeless(comparison: Comparison, margin: float = OF_PRESET.margin) -> bool:
     """Whether a policy will hardly turn out as safe as full communication with more episodes."""
     excess = comparison.only_first - comparison.only_second
-    return excess >= 4 and excess / comparison.episodes > 0.003
+    return excess >= 4 and excess / comparison.episodes > margin
 
 
 def in_stages(
@@ -103,41 +124,46 @@ def in_stages(
     n_robots: int | None = None,
     flown: list[dict[str, float]] | None = None,
 ) -> tuple[list[dict[str, float]], bool]:
-    """Fly a policy in more and more episodes, as long as there is hope.
+    """Fly a policy in more and more episodes, as long as there is hope and it is not yet as safe as it has to be.
 
-    :param full: figures of full communication in the same episodes
+    :param full: figures of full communication in the same episodes; those that are missing are flown and appended
     :param flown: the policy's figures in the first of them
     :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
     """
     figures = list(flown or [])
+    margin, enough = OF_PRESET if n_robots is None else OF_TEAM
     for episodes in QUICK_STAGES if quick else STAGES:
-        if episodes > len(figures):
-            figures += fly([policy], preset, scenario, episodes, n_robots, skip=len(figures))[policy]
+        for name, known in ((policy, figures), ("full", full)):
+            if episodes > len(known):
+                known += fly([name], preset, scenario, episodes, n_robots, skip=len(known))[name]
         comparison = Comparison.of(figures, full[:episodes])
-        if hopeless(comparison):
+        if hopeless(comparison, margin):
             return figures, False
-    return figures, comparison.as_safe or quick
+        if episodes >= enough and comparison.interval[1] < margin:
+            return figures, True
+    return figures, quick
 
 
-def tune(preset: str, scenario: str, names: list[str], quick: bool) -> list[dict[str, Any]]:
+def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], quick: bool) -> list[dict[str, Any]]:
     """The rows of some families in one scenario."""
     stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
-    n = make_config(preset).n_robots
-    full = fly(["full"], preset, scenario, stages[-1])["full"]
+    n = world(preset, n_robots).n_robots
+    full: list[dict[str, float]] = []
     table = []
     for family in names:
         rules = families()[family]
-        flown = fly(rules[::thin], preset, scenario, stages[0])
+        flown = fly(rules[::thin], preset, scenario, stages[0], n_robots)
         safe: dict[str, bool] = {}
         for rule in sorted(flown, key=lambda rule: summarise(flown[rule], n)["request_share"]):
-            flown[rule], safe[rule] = in_stages(rule, preset, scenario, full, quick, flown=flown[rule])
+            flown[rule], safe[rule] = in_stages(rule, preset, scenario, full, quick, n_robots, flown[rule])
             if safe[rule]:
                 break
-        keys = {"preset": preset, "scenario": scenario, "family": family}
+        keys: dict[str, Any] = {"preset": preset, "scenario": scenario, "family": family}
+        keys |= {} if n_robots is None else {"n_robots": n_robots}
         table += [keys | {"rule": rule, "safe": safe.get(rule)} | summarise(flown[rule], n) for rule in flown]
         best = [rule for rule in safe if safe[rule]]
         share = f"{summarise(flown[best[0]], n)['request_share']:.2%}" if best else "-"
-        print(f"{preset:6} {scenario:16} {family:20} {best[0] if best else 'none':45} {share:>8}", flush=True)
+        print(f"{preset:6} {n:2} {scenario:16} {family:24} {best[0] if best else 'none':45} {share:>8}", flush=True)
     return table
 
 
@@ -163,16 +189,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS))
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
+    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
     parser.add_argument("--family", nargs="+", default=list(families()), choices=list(families()))
     parser.add_argument("--quick", action="store_true", help="few episodes and rules, to see that it runs")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
-    work = [(preset, scenario, args.family, args.quick) for preset in args.preset for scenario in args.scenario]
+    work = [
+        (preset, n, scenario, args.family, args.quick)
+        for preset in args.preset
+        for n in args.n_robots
+        for scenario in args.scenario
+    ]
+    keys = ("preset", "scenario", "family", "n_robots")
     with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
         for table in progress(pool.map(tune, *zip(*work, strict=True)), "rules", len(work)):
             if args.json:
-                replace_rows(args.json, table, ("preset", "scenario", "family"))
+                replace_rows(args.json, table, keys if "n_robots" in table[0] else keys[:-1])
 
 
 if __name__ == "__main__":

@@ -61,6 +61,44 @@ def test_stages_fly_every_episode_once_and_stop_where_there_is_no_hope(monkeypat
     assert (len(figures), safe) == (10, False)
 
 
+def test_teams_of_another_size_need_fewer_episodes_and_fly_full_communication_only_as_far(monkeypatch):
+    monkeypatch.setattr(swarm_rules, "STAGES", (5, 10, 20))
+    monkeypatch.setattr(swarm_rules, "OF_TEAM", swarm_rules.Standard(0.3, 10))
+    rival: list[dict[str, float]] = []
+    figures, safe = swarm_rules.in_stages("distance:4", "dense", "random", rival, False, 5)
+    assert (len(figures), len(rival), safe) == (10, 10, True)
+    figures, safe = swarm_rules.in_stages("distance:4", "dense", "random", rival, False)
+    assert (len(figures), len(rival), safe) == (20, 20, False), "a preset's own team has a standard of its own"
+
+
+def test_rules_are_tuned_for_each_size_of_the_team(tmp_path, monkeypatch):
+    table = tmp_path / "team_rules.json"
+    words = ["swarm_rules.py", "--preset", "dense", "--scenario", "random", "--family", "random", "--quick"]
+    monkeypatch.setattr(sys, "argv", [*words, "--n-robots", "3", "4", "--jobs", "1", "--json", str(table)])
+    swarm_rules.main()
+    rows = swarm_rules.read_rows(table)
+    assert [row["n_robots"] for row in rows] == [3, 4]
+    assert rows[1]["possible_requests"] > rows[0]["possible_requests"]
+    monkeypatch.setattr(swarm_results, "FOLDER", tmp_path)
+    assert swarm_results.best_rules("dense", 3)["random"] == rows[0]["rule"]
+    assert swarm_results.best_rules("dense", 3)["random_swap"] == "full", "not tuned"
+    assert swarm_results.best_rules("dense", 5)["random"] == "full"
+
+
+def test_thresholds_of_a_model_for_all_sizes_are_those_of_the_size_that_flies(tmp_path, monkeypatch):
+    monkeypatch.setattr(swarm_results, "models", lambda recipe: ["any_seed0.zip"])
+    monkeypatch.setattr(swarm_results, "FOLDER", tmp_path)
+    cells = [(4, "random", 0.9), (4, "random", 0.8), (8, "random", 0.7), (8, "symmetric_swap", 0.5)]
+    rows = [
+        dict(zip(("n_robots", "scenario", "threshold"), c, strict=True)) | {"model": "any_seed0.zip"} for c in cells
+    ]
+    (tmp_path / "thresholds.json").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert swarm_results.tuned("any", "random", 4) == ["any_seed0.zip@0.8"], "the last that was tried"
+    assert swarm_results.tuned("any", "random", 8) == ["any_seed0.zip@0.7"]
+    assert swarm_results.tuned("any", "symmetric_swap", 8) == ["any_seed0.zip@0.5"]
+    assert swarm_results.tuned("any", "symmetric_swap") == [], "it is the threshold for all"
+
+
 def test_tables_of_flown_episodes(tmp_path):
     rows = swarm_results.compare(
         ({"preset": "paper"}, ["full", "cpa:0.65:1.5", "none"], "symmetric_swap", make_config("paper"), 30)
@@ -145,8 +183,9 @@ def test_thresholds_are_kept_cell_by_cell_and_the_smallest_is_written_into_the_m
 
 
 def test_a_threshold_needs_a_reserve():
-    assert swarm_models.has_reserve(Comparison(12000, 17, 1))
-    assert not swarm_models.has_reserve(Comparison(12000, 17, 0))
+    margin = swarm_rules.OF_PRESET.margin
+    assert swarm_models.has_reserve(Comparison(12000, 17, 1), margin)
+    assert not swarm_models.has_reserve(Comparison(12000, 17, 0), margin)
     assert Comparison(12000, 25, 0).as_safe, "though it would do without"
 
 
