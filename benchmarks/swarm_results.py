@@ -1,8 +1,8 @@
 """Fly everything that docs/results.md says again, from the models and rules in benchmarks/results/swarm.
 
 ``python benchmarks/swarm_results.py [--quick] [--out FOLDER]`` flies the test set, which neither training nor tuning
-has seen, and writes test.json, sweep.json, robustness.json, teams.json, asking.json and interventions.json; parts can
-be chosen by name, also presets and scenarios, and the other rows stay.
+has seen, and writes test.json, sweep.json, robustness.json, unseen.json, teams.json, asking.json and
+interventions.json; parts can be chosen by name, also presets and scenarios, and the other rows stay.
 ``--quick`` flies few episodes and checks only that everything runs. `docs/results.py` makes the page of them.
 """
 
@@ -32,11 +32,12 @@ from benchmarks.swarm_rules import TEST, cell, progress, read_rows, replace_rows
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.evaluation import Cell, Comparison, begin, first_episode, fly, fly_all, summarise  # noqa: E402
 from quad_swarm.presets import SwarmConfig, make_config  # noqa: E402
-from quad_swarm.scenarios import SCENARIOS  # noqa: E402
+from quad_swarm.scenarios import SCENARIOS, Scenario, ScenarioSpace  # noqa: E402
 
 FOLDER = ROOT / "benchmarks" / "results" / "swarm"
 NAMES = list(SCENARIOS)
-EPISODES = {"test": 12000, "sweep": 1000, "robustness": 1000, "teams": 4000, "asking": 200, "interventions": 12000}
+EPISODES = {"test": 12000, "sweep": 1000, "robustness": 1000, "unseen": 4000, "teams": 4000}
+EPISODES |= {"asking": 200, "interventions": 12000}
 QUICK = 20
 # A threshold with which there are collisions to look at
 RECKLESS = 0.6
@@ -180,6 +181,70 @@ def robustness(episodes: int) -> list[Any]:
     ]
 
 
+def half_swap(n_robots: int, space: ScenarioSpace, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A mixture within one episode: half of the robots as in `symmetric_swap`, the others on ways of their own."""
+    half = n_robots // 2
+    while True:
+        swapping, own = (
+            SCENARIOS[name](n, space, rng) for name, n in (("symmetric_swap", half), ("random", n_robots - half))
+        )
+        starts, goals = (np.concatenate(both) for both in zip(swapping, own, strict=True))
+        if min(apart(starts), apart(goals)) >= space.spacing:
+            return starts, goals
+
+
+def two_streams(n_robots: int, space: ScenarioSpace, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Two rows of robots cross at a right angle, abreast and at one height, starts and goals slightly moved."""
+    half, along = n_robots // 2, space.sector_radius[1]
+    abreast = [
+        (k - (m - 1) / 2) * (space.spacing + 2 * space.circle_jitter) for m in (half, n_robots - half) for k in range(m)
+    ]
+    starts = np.column_stack([np.full(n_robots, -along), abreast, np.full(n_robots, rng.uniform(*space.heights))])
+    goals = starts * (-1, 1, 1)
+    for points in (starts, goals):
+        points[half:, :2] = points[half:, 1::-1]
+        points += rng.uniform(-space.circle_jitter, space.circle_jitter, size=points.shape)
+    return starts, goals
+
+
+def apart(points: np.ndarray) -> float:
+    """Distance of the closest two of some points (m)."""
+    return float((np.linalg.norm(points[:, None] - points, axis=-1) + np.diag(np.full(len(points), np.inf))).min())
+
+
+UNSEEN: dict[str, Scenario] = {"half_swap": half_swap, "two_streams": two_streams}
+
+
+def unseen(episodes: int) -> list[Any]:
+    """Jobs of scenarios that nothing was trained or tuned in: the rules of both swaps, and the first seeds."""
+    return [
+        (
+            {"preset": preset},
+            [
+                "full",
+                *(best_rules(preset)[swap] for swap in ("symmetric_swap", "asymmetric_swap")),
+                "none",
+                *models(preset)[:1],
+            ],
+            name,
+            make_config(preset),
+            episodes,
+        )
+        for preset in PRESETS_TESTED
+        for name in UNSEEN
+    ]
+
+
+def compare_unseen(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> list[dict[str, Any]]:
+    """`compare` in a scenario of `UNSEEN`."""
+    SCENARIOS.update(UNSEEN)
+    try:
+        return compare(job)
+    finally:
+        for name in UNSEEN:
+            del SCENARIOS[name]
+
+
 def teams(episodes: int) -> list[Any]:
     """Jobs of other sizes of the team: all models with the thresholds tuned for it, the first with that for all."""
     return [
@@ -288,8 +353,8 @@ def replay(
         if task.step(requests).terminated[0]:
             break
     pos = task.swarm.pos[0]
-    apart = np.linalg.norm(pos[:, None] - pos, axis=-1) + np.diag(np.full(n, np.inf))
-    i, j = np.unravel_index(apart.argmin(), apart.shape)
+    distance = np.linalg.norm(pos[:, None] - pos, axis=-1) + np.diag(np.full(n, np.inf))
+    i, j = np.unravel_index(distance.argmin(), distance.shape)
     return bool(task.statistics.collided[0]), step + 1, (int(i), int(j))
 
 
@@ -323,6 +388,7 @@ PARTS: dict[str, tuple[Callable[[int], list[Any]], Callable[[Any], list[dict[str
     "test": (test, compare),
     "sweep": (sweep, compare),
     "robustness": (robustness, compare),
+    "unseen": (unseen, compare_unseen),
     "teams": (teams, compare),
     "asking": (asking, ask),
     "interventions": (interventions, intervene),
@@ -347,7 +413,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             jobs = [
                 job
                 for job in make_jobs(QUICK if args.quick else EPISODES[part])
-                if job[0]["preset"] in args.preset and job[2] in args.scenario
+                if job[0]["preset"] in args.preset and job[2] in (*args.scenario, *UNSEEN)
             ]
             for table in progress(pool.map(run, jobs), part, len(jobs)):
                 keys = ("preset", "scenario", "policy", "quantity") if part == "asking" else CELL

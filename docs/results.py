@@ -26,7 +26,7 @@ if not __package__:
     sys.path[0] = str(ROOT)
 
 from benchmarks.swarm_results import absolute_path, best_rules, models  # noqa: E402
-from benchmarks.swarm_rules import TEST, cell, progress, read_rows  # noqa: E402
+from benchmarks.swarm_rules import OF_TEAM, TEST, cell, progress, read_rows  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.colours import colour_of  # noqa: E402
 from quad_swarm.evaluation import Flight, fly, is_model  # noqa: E402
@@ -157,22 +157,35 @@ def wide_table(rows: Rows, first: str, preset: str) -> str:
 
 def teams_table(rows: Rows) -> str:
     """Every number of robots: collisions and requests, in bold where at most half a point less safe than asking
-    everybody. A learned policy comes with its one threshold, and with those chosen for each scenario."""
-    learned = dict.fromkeys(row["policy"].partition("@")[0] for row in rows if is_model(row["policy"]))
+    everybody, and the share of the best rule's requests. Models with their thresholds for each cell, and the first with
+    the one for all."""
     lines = []
     for n in dict.fromkeys(row["n_robots"] for row in rows):
-        lines += [[str(n), kind] for kind in ("`full`", "best rule")]
-        lines += [[str(n), label(path) + how] for path in learned for how in ("", ", tuned")]
+        cells: dict[str, list[str]] = {}
         for name in NAMES:
             here = {row["policy"]: row for row in rows if (row["n_robots"], row["scenario"]) == (n, name)}
-            cells = [here["full"], here[here["full"]["against_rule"]["rival"]]]
-            for path in learned:
-                tuned = next((policy for policy in here if policy.startswith(f"{path}@")), path)
-                cells += [here[path], here[tuned]]
-            for line, row in zip(lines[-len(cells) :], cells, strict=True):
-                mark = "**" if row["policy"] != "full" and row["against_full"]["high"] < 0.005 else ""
-                line.append(f"{mark}{row['collisions']}/{row['episodes']}, {row['request_share']:.2%}{mark}")
+            rule = here["full"]["against_rule"]["rival"]
+            for policy, row in here.items():
+                path, _, threshold = policy.partition("@")
+                kind = f"{label(path)}, {'tuned' if threshold else 'one for all'}" if is_model(policy) else "best rule"
+                mark = "**" if policy != "full" and row["against_full"]["high"] < OF_TEAM.margin else ""
+                text = f"{mark}{row['collisions']}/{row['episodes']}, {row['request_share']:.2%}{mark}"
+                if is_model(policy):
+                    text += f" ({row['request_share'] / max(here[rule]['request_share'], 1e-9):.0%})"
+                cells.setdefault("`full`" if policy == "full" else kind, []).append(text)
+                if policy == rule == "full":  # no rule is safe, or none was tuned
+                    cells.setdefault("best rule", []).append("none is safe")
+        lines += [[str(n), kind, *texts] for kind, texts in cells.items()]
     return table(["robots", "policy", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def unseen_table(rows: Rows) -> str:
+    """Policies in scenarios that nothing was trained or tuned in."""
+    lines = []
+    for row in rows:
+        line = [row["preset"], row["scenario"].replace("_", " "), label(row["policy"]), rate(row), versus(row, "full")]
+        lines.append([*line, f"{row['request_share']:.2%}"])
+    return table(["preset", "scenario", "policy", "collisions, 95 %", "against full (points)", "requests"], lines)
 
 
 def ppo_table(rows: Rows) -> str:
@@ -341,8 +354,8 @@ def main() -> None:
     parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
     os.chdir(ROOT)
-    names = ("rules", "test", "sweep", "robustness", "teams", "asking", "interventions", "ppo", "training")
-    rules, test, sweep, robustness, teams, asking, interventions, ppo, training = (
+    names = ("rules", "test", "sweep", "robustness", "unseen", "teams", "asking", "interventions", "ppo", "training")
+    rules, test, sweep, robustness, unseen, teams, asking, interventions, ppo, training = (
         read_rows(args.data / f"{name}.json") for name in names
     )
     blocks = {
@@ -357,6 +370,7 @@ def main() -> None:
         "robustness paper": wide_table(robustness, "condition", "paper"),
         "robustness dense": wide_table(robustness, "condition", "dense"),
         "interventions": interventions_table(interventions),
+        "unseen": unseen_table(unseen),
         "teams": teams_table(teams),
         "ppo": ppo_table(ppo),
         "training": training_table(training),

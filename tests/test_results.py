@@ -15,6 +15,7 @@ from docs import results as page  # noqa: E402
 from quad_swarm.communication import parse_rule  # noqa: E402
 from quad_swarm.evaluation import Comparison, fly_all  # noqa: E402
 from quad_swarm.presets import make_config  # noqa: E402
+from quad_swarm.scenarios import SCENARIOS  # noqa: E402
 from sb3_maddpg import MADDPG  # noqa: E402
 from sb3_maddpg.shipped import pretrained_folder  # noqa: E402
 
@@ -116,27 +117,48 @@ def test_tables_of_flown_episodes(tmp_path):
     assert f"| symmetric swap | `none` | {none['collisions']}/30 [" in text
 
 
-def test_table_of_teams_shows_each_model_with_its_threshold_and_with_the_tuned_one():
+def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
     model = "benchmarks/results/swarm/any_seed0.zip"
 
-    def row(scenario, policy, collisions, share, high):
-        against = {"against_full": {"high": high}, "against_rule": {"rival": "cpa:1:1"}}
+    def row(scenario, policy, collisions, share, high, rule="cpa:1:1"):
+        against = {"against_full": {"high": high}, "against_rule": {"rival": rule}}
         keys = {"n_robots": 6, "scenario": scenario, "policy": policy}
         return keys | {"collisions": collisions, "episodes": 4000, "request_share": share} | against
 
-    rows = [
-        row(name, policy, *figures)
-        for name in page.NAMES
-        for policy, figures in {"full": (1, 1, 0), "cpa:1:1": (30, 0.2, 0.009), model: (9, 0.1, 0.004)}.items()
-    ]
-    rows.append(row("random", f"{model}@0.9", 12, 0.01, 0.005))
+    policies = {
+        "full": (1, 1, 0),
+        "cpa:1:1": (30, 0.2, 0.009),
+        model: (9, 0.1, 0.004),
+        f"{model}@0.9": (12, 0.05, 0.006),
+    }
+    rows = [row(name, policy, *figures) for name in page.NAMES[:-1] for policy, figures in policies.items()]
+    rows += [row(page.NAMES[-1], k, *v, rule="full") for k, v in policies.items() if k != "cpa:1:1"]
     lines = page.teams_table(rows).splitlines()[2:]
-    assert lines[0].startswith("| 6 | `full` | 1/4000, 100.00% |")
-    assert lines[1] == "| 6 | best rule " + "| 30/4000, 20.00% " * 4 + "|"
-    assert lines[2] == "| 6 | any, seed 0 " + "| **9/4000, 10.00%** " * 4 + "|"
-    swaps = "| **9/4000, 10.00%** " * 3
-    assert lines[3] == f"| 6 | any, seed 0, tuned {swaps}| 12/4000, 1.00% |"
+    assert lines[0] == "| 6 | `full` " + "| 1/4000, 100.00% " * 4 + "|"
+    assert lines[1] == "| 6 | best rule " + "| 30/4000, 20.00% " * 3 + "| none is safe |"
+    assert (
+        lines[2]
+        == "| 6 | any, seed 0, one for all " + "| **9/4000, 10.00%** (50%) " * 3 + "| **9/4000, 10.00%** (10%) |"
+    )
+    assert lines[3] == "| 6 | any, seed 0, tuned " + "| 12/4000, 5.00% (25%) " * 3 + "| 12/4000, 5.00% (5%) |"
     assert len(lines) == 4
+
+
+@pytest.mark.parametrize("name", swarm_results.UNSEEN)
+@pytest.mark.parametrize("preset", ["paper", "dense"])
+def test_unseen_scenarios_are_other_ones_and_gone_after_the_flight(name, preset):
+    config = make_config(preset)
+    for seed in range(20):
+        starts, goals = swarm_results.UNSEEN[name](config.n_robots, config.space, np.random.default_rng(seed))
+        assert starts.shape == goals.shape == (config.n_robots, 3)
+        for points in (starts, goals):
+            assert swarm_results.apart(points) >= config.space.spacing - 1e-9
+    known = dict(SCENARIOS)
+    rows = swarm_results.compare_unseen(({"preset": preset}, ["full", "none"], name, config, 60))
+    assert known == SCENARIOS
+    assert [row["scenario"] for row in rows] == [name] * 2
+    assert rows[1]["collisions"] > rows[0]["collisions"], "robots meet there"
+    assert page.unseen_table(rows).count(f"| {name.replace('_', ' ')} |") == 2
 
 
 def test_rows_of_other_keys_stay(tmp_path):
