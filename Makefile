@@ -56,12 +56,15 @@ results: install  ## fly everything that docs/results.md says again: tuned rules
 		--json benchmarks/results/swarm/thresholds.json
 	$(BIN)/python benchmarks/swarm_results.py --jobs $(JOBS)
 	$(BIN)/python benchmarks/swarm_ppo.py --models $(LOGS) --json benchmarks/results/swarm/ppo.json
+	$(BIN)/python benchmarks/swarm_counterfactual.py --models $(LOGS) --json benchmarks/results/swarm/counterfactual.json
 	$(BIN)/python docs/results.py
 
 results-quick: install  ## the same with few episodes and rules, into $(LOGS)/results
 	$(BIN)/python benchmarks/swarm_rules.py --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json
 	$(BIN)/python benchmarks/swarm_results.py --quick --jobs $(JOBS) --out $(LOGS)/results
 	$(BIN)/python benchmarks/swarm_ppo.py --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json
+	$(BIN)/python benchmarks/swarm_counterfactual.py --forks 10 --episodes 20 --models $(LOGS)/results \
+		--json $(LOGS)/results/counterfactual.json
 	$(BIN)/python docs/results.py --data $(LOGS)/results --page $(LOGS)/results/results.md --images $(LOGS)/results
 
 bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against other libraries, each in its own environment

@@ -45,7 +45,7 @@ class Standard(NamedTuple):
     """What is as safe as full communication when rules and thresholds are tuned.
 
     :param margin: upper bound of the 95 % interval of the paired difference of the collision rates
-    :param enough: episodes from which on that is believed
+    :param enough: episodes from which on that is decided, as soon as the interval's half is shorter than the margin
     """
 
     margin: float
@@ -124,7 +124,7 @@ def in_stages(
     n_robots: int | None = None,
     flown: list[dict[str, float]] | None = None,
 ) -> tuple[list[dict[str, float]], bool]:
-    """Fly a policy in more and more episodes, as long as there is hope and it is not yet as safe as it has to be.
+    """Fly a policy in more and more episodes, as long as there is hope and it is not yet decided (`Standard`).
 
     :param full: figures of full communication in the same episodes; those that are missing are flown and appended
     :param flown: the policy's figures in the first of them
@@ -139,8 +139,9 @@ def in_stages(
         comparison = Comparison.of(figures, full[:episodes])
         if hopeless(comparison, margin):
             return figures, False
-        if episodes >= enough and comparison.interval[1] < margin:
-            return figures, True
+        low, high = comparison.interval
+        if episodes >= enough and (high - low) / 2 < margin:
+            return figures, high < margin
     return figures, quick
 
 

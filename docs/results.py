@@ -1,8 +1,9 @@
 """Put tables and figures of the swarm's results into docs/results.md: ``python docs/results.py [--data FOLDER]``.
 
 The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
-come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py`, `benchmarks/swarm_results.py`, of PPO from
-`benchmarks/swarm_ppo.py` and, how long trainings take, `benchmarks/swarm_training.py`.
+come from `benchmarks/swarm_rules.py`, `benchmarks/swarm_models.py`, `benchmarks/swarm_results.py`, of other learners
+from `benchmarks/swarm_ppo.py` and `benchmarks/swarm_counterfactual.py`, and how long trainings take from
+`benchmarks/swarm_training.py`.
 """
 
 from __future__ import annotations
@@ -188,14 +189,14 @@ def unseen_table(rows: Rows) -> str:
     return table(["preset", "scenario", "policy", "collisions, 95 %", "against full (points)", "requests"], lines)
 
 
-def ppo_table(rows: Rows) -> str:
-    """Collisions and requests of PPO by the price of a request and the threshold."""
+def reference_table(rows: Rows, *names: str) -> str:
+    """Collisions and requests of another learner by what it was flown with."""
     lines = []
-    for price, threshold in dict.fromkeys((row["price"], row["threshold"]) for row in rows):
-        here = {row["scenario"]: row for row in rows if (row["price"], row["threshold"]) == (price, threshold)}
+    for values in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
+        here = {row["scenario"]: row for row in rows if tuple(row[name] for name in names) == values}
         cells = [f"{here[k]['collisions']}/{here[k]['episodes']}, {here[k]['request_share']:.1%}" for k in NAMES]
-        lines.append([f"{price:g}", f"{threshold:g}", *cells])
-    return table(["price", "threshold", *(name.replace("_", " ") for name in NAMES)], lines)
+        lines.append([*(f"{value:g}" for value in values), *cells])
+    return table([*names, *(name.replace("_", " ") for name in NAMES)], lines)
 
 
 def training_table(rows: Rows) -> str:
@@ -354,9 +355,9 @@ def main() -> None:
     parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
     os.chdir(ROOT)
-    names = ("rules", "test", "sweep", "robustness", "unseen", "teams", "asking", "interventions", "ppo", "training")
-    rules, test, sweep, robustness, unseen, teams, asking, interventions, ppo, training = (
-        read_rows(args.data / f"{name}.json") for name in names
+    names = ("rules", "test", "sweep", "robustness", "unseen", "teams", "asking", "interventions", "ppo")
+    rules, test, sweep, robustness, unseen, teams, asking, interventions, ppo, counterfactual, training = (
+        read_rows(args.data / f"{name}.json") for name in (*names, "counterfactual", "training")
     )
     blocks = {
         "targets": targets(test),
@@ -372,7 +373,8 @@ def main() -> None:
         "interventions": interventions_table(interventions),
         "unseen": unseen_table(unseen),
         "teams": teams_table(teams),
-        "ppo": ppo_table(ppo),
+        "ppo": reference_table(ppo, "price", "threshold"),
+        "counterfactual": reference_table(counterfactual, "price"),
         "training": training_table(training),
     }
     flown = {

@@ -4,13 +4,14 @@ import json
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT))
 
-from benchmarks import swarm_models, swarm_ppo, swarm_results, swarm_rules  # noqa: E402
+from benchmarks import swarm_counterfactual, swarm_models, swarm_ppo, swarm_results, swarm_rules  # noqa: E402
 from docs import results as page  # noqa: E402
 from quad_swarm.communication import parse_rule  # noqa: E402
 from quad_swarm.evaluation import Comparison, fly_all  # noqa: E402
@@ -221,4 +222,43 @@ def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
     shares = [row["request_share"] for row in rows if row["scenario"] == "random"]
     assert shares == sorted(shares, reverse=True)
     assert shares[0] > shares[-1]
-    assert page.ppo_table(rows).count("/3, ") == len(rows)
+    assert page.reference_table(rows, "price", "threshold").count("/3, ") == len(rows)
+
+
+def test_forks_differ_by_the_request_that_is_turned_round_and_by_nothing_else(monkeypatch):
+    env = gymnasium.make("QuadSwarm-v0", **swarm_ppo.env_kwargs(0.0))
+    model = MADDPG("PairPolicy", env, policy_kwargs={"pair_credit": True}, buffer_size=100, seed=0, device="cpu")
+    monkeypatch.setattr(swarm_counterfactual, "SWARMS", 4)
+    source = swarm_counterfactual.Forks(model, 0)
+    monkeypatch.setattr(swarm_counterfactual, "HELD", 0)
+    labels = source.fork()
+    assert labels.obs.shape[0] == labels.gain.shape[0] == 4 * 4
+    assert not labels.gain.any(), "nothing was turned round"
+    pos = source.task.swarm.pos.copy().reshape(13, 4, 4, 3)
+    assert (pos == pos[:1]).all(), "forks leave the swarms where they are"
+    monkeypatch.setattr(swarm_counterfactual, "HELD", 3)
+    gains = np.concatenate([source.fork().gain for _ in range(6)])
+    assert 0 < (gains != 0).mean() < 1
+
+
+def test_a_regression_on_forks_is_trained_and_flown(tmp_path, monkeypatch):
+    table = tmp_path / "counterfactual.json"
+    words = [
+        "swarm_counterfactual.py",
+        "--forks",
+        "2",
+        "--episodes",
+        "3",
+        "--models",
+        str(tmp_path),
+        "--json",
+        str(table),
+    ]
+    monkeypatch.setattr(sys, "argv", words)
+    swarm_counterfactual.main()
+    rows = swarm_rules.read_rows(table)
+    assert len(rows) == 4 * len(swarm_counterfactual.PRICES)
+    shares = [row["request_share"] for row in rows if row["scenario"] == "symmetric_swap"]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > shares[-1]
+    assert page.reference_table(rows, "price").count("/3, ") == len(rows)
