@@ -4,9 +4,10 @@
 set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds are tried from
 the highest on, in stages of more and more episodes, until the model is as safe as full communication
 (`swarm_rules.Standard`) and not at the edge of it (`RESERVE`): who takes the first threshold that passes takes one that
-was lucky in these episodes. The smallest of them, with which it is safe everywhere, is written into the model's file.
-JSON: one row a model, scenario and threshold with the keys of `quad_swarm.evaluation.summarise` over the episodes that
-it flew, and model, threshold, preset, scenario, safe; those of other cells stay, and count for the model's threshold.
+was lucky in these episodes. With ``--n-robots`` every second threshold is tried. The smallest of them, with which it is
+safe everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with the keys of
+`quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe; those of
+other cells stay, and count for the model's threshold.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> l
     robots = world(preset, n).n_robots
     margin = (OF_PRESET if n is None else OF_TEAM).margin
     table: list[dict[str, Any]] = []
-    for threshold in THRESHOLDS:
+    for threshold in THRESHOLDS if n is None else THRESHOLDS[::2]:
         figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, rival, quick, n)
         safe &= quick or has_reserve(Comparison.of(figures, rival[: len(figures)]), margin)
         keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
