@@ -10,7 +10,7 @@ EPISODES ?= 500
 JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
 BENCHMARKS ?= planner env training scaling estimators
 TEAMS ?= 4 6 8 12 16
-TEAM_FAMILIES ?= "cpa" "cpa and stale" "cpa and event" "plan and stale" "plan, or cpa and stale" "two cpa"
+TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan and stale" "plan, or cpa and stale" "two cpa"
 POLICIES ?= none full distance:4 cpa:0.65:1.5
 PEERS := agilerl benchmarl xuance
 
