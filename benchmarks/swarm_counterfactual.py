@@ -30,10 +30,9 @@ ROOT = Path(__file__).resolve().parent.parent
 if not __package__:
     sys.path[0] = str(ROOT)
 
-from benchmarks.swarm_ppo import env_kwargs  # noqa: E402
-from benchmarks.swarm_rules import VALIDATION, cell  # noqa: E402
+from benchmarks.swarm_ppo import env_kwargs, validate  # noqa: E402
+from benchmarks.swarm_rules import cell  # noqa: E402
 from quad_swarm.evaluate import write_json  # noqa: E402
-from quad_swarm.evaluation import fly_all, summarise  # noqa: E402
 from quad_swarm.presets import make_config  # noqa: E402
 from quad_swarm.scenarios import SCENARIOS  # noqa: E402
 from quad_swarm.task import RequestTask, make_task  # noqa: E402
@@ -167,15 +166,11 @@ def main() -> None:
     keys |= {"labels": args.forks * SWARMS * (source.copies - 1), "seconds": time.perf_counter() - started}
     path = args.models / f"counterfactual_seed{args.seed}.zip"
     model.save(path)
-    config, rows = make_config("paper"), []
+    config = make_config("paper")
+    rows: list[dict[str, Any]] = []
     for name in SCENARIOS:
         cells = {price: cell(f"{path}@{1 / (1 + np.exp(-SCALE * price)):.6f}", name, config) for price in PRICES}
-        flown = fly_all(list(cells.values()), args.episodes, VALIDATION)
-        for price, one in cells.items():
-            row = keys | {"scenario": name, "price": price} | summarise(flown[one], config.n_robots)
-            rows.append(row)
-            figures = f"{row['collisions']}/{row['episodes']} at {row['request_share']:.1%}"
-            print(f"{name}, price {price}: {figures}", flush=True)
+        rows += validate(cells, "price", args.episodes, keys)
     if args.json:
         write_json(args.json, rows)
 

@@ -34,7 +34,7 @@ if not __package__:
 
 from benchmarks.swarm_rules import VALIDATION, cell  # noqa: E402
 from quad_swarm.evaluate import write_json  # noqa: E402
-from quad_swarm.evaluation import fly_all, summarise  # noqa: E402
+from quad_swarm.evaluation import Cell, fly_all, summarise  # noqa: E402
 from quad_swarm.presets import make_config  # noqa: E402
 from quad_swarm.scenarios import SCENARIOS  # noqa: E402
 from sb3_maddpg.vec_env import GymnasiumVecEnv  # noqa: E402
@@ -131,6 +131,24 @@ def train(price: float, steps: int, seed: int) -> PPO:
     return model.learn(steps * env.n)
 
 
+def validate(cells: dict[float, Cell], what: str, episodes: int, keys: dict[str, Any]) -> list[dict[str, Any]]:
+    """Fly a scenario of the validation set with several values of something.
+
+    :param cells: what flies with each value
+    :param what: name of the values
+    :param keys: of every row
+    :return: a row for each value
+    """
+    flown = fly_all(list(cells.values()), episodes, VALIDATION)
+    rows = []
+    for value, one in cells.items():
+        row = {"scenario": one.scenario, what: value} | summarise(flown[one], one.config.n_robots)
+        rows.append(keys | row)
+        figures = f"{row['collisions']}/{row['episodes']} at {row['request_share']:.1%}"
+        print(f"{one.scenario}, {what} {value:g}: {figures}", flush=True)
+    return rows
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -142,7 +160,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     args.models.mkdir(parents=True, exist_ok=True)
-    config, rows = make_config("paper"), []
+    config = make_config("paper")
+    rows: list[dict[str, Any]] = []
     for price in args.price:
         started = time.perf_counter()
         model = train(price, args.steps, args.seed)
@@ -151,12 +170,7 @@ def main() -> None:
         model.save(path)
         for name in SCENARIOS:
             cells = {d: cell(f"{path}@{d}", name, config, algo="benchmarks.swarm_ppo:SharedPPO") for d in THRESHOLDS}
-            flown = fly_all(list(cells.values()), args.episodes, VALIDATION)
-            for threshold, one in cells.items():
-                row = {"scenario": name, "threshold": threshold} | summarise(flown[one], config.n_robots)
-                rows.append(keys | row)
-                figures = f"{row['collisions']}/{row['episodes']} at {row['request_share']:.1%}"
-                print(f"price {price:g}, {name}, threshold {threshold}: {figures}", flush=True)
+            rows += validate(cells, "threshold", args.episodes, keys)
         if args.json:
             write_json(args.json, rows)
 

@@ -9,7 +9,7 @@ from quad_swarm.presets import make_config
 from sb3_maddpg import pretrained
 from sb3_maddpg.shipped import pretrained_folder, shipped_models
 
-# Model -> world, and for numbers of robots the largest share of requests in the symmetric swap, 1.3 times what it needs.
+# Model -> world, and for numbers of robots the largest share of requests in the symmetric swap: 1.3 times its own.
 SHIPPED = {
     "quad-swarm-any": ("dense", {8: 0.17, 12: 0.18}),
     "quad-swarm-dense": ("dense", {8: 0.122}),
