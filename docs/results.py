@@ -32,7 +32,7 @@ from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.colours import colour_of  # noqa: E402
 from quad_swarm.evaluation import Flight, fly, is_model  # noqa: E402
 from quad_swarm.plots import draw_flight  # noqa: E402
-from quad_swarm.presets import make_config  # noqa: E402
+from quad_swarm.presets import PRESETS, make_config  # noqa: E402
 from quad_swarm.scenarios import SCENARIOS  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results" / "swarm"
@@ -217,7 +217,7 @@ def kind_of(row: dict[str, Any]) -> str:
 
 def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
     """Requests against collisions: rule families, the learned policy at all thresholds, and the tested policies."""
-    presets = list(dict.fromkeys(row["preset"] for row in rules))
+    presets = [preset for preset in PRESETS if any(row["preset"] == preset for row in rules)]
     size = (15, 3.5 * len(presets))
     figure, panels = plt.subplots(len(presets), 4, figsize=size, layout="constrained", sharey="row", squeeze=False)
     families = list(dict.fromkeys(row["family"] for row in rules))
