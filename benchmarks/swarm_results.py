@@ -249,7 +249,7 @@ def teams(episodes: int) -> list[Any]:
     """Jobs of other sizes of the team: all models with the thresholds tuned for it, the first with that for all."""
     return [
         (
-            {"preset": "dense"},
+            {"preset": "dense", "n_robots": n},
             ["full", best_rules("dense", n)[name], *models("any")[:1], *tuned("any", name, n)],
             name,
             world("dense", n),

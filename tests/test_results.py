@@ -145,6 +145,16 @@ def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
     assert len(lines) == 4
 
 
+def test_flights_of_teams_fill_their_table():
+    jobs = [job for job in swarm_results.teams(4) if job[3].n_robots < 8]
+    rows = [row for job in jobs for row in swarm_results.compare(job)]
+    assert {(row["n_robots"], row["scenario"]) for row in rows} == {(n, name) for n in (4, 6) for name in page.NAMES}
+    lines = page.teams_table(rows).splitlines()[2:]
+    assert [line.split(" | ")[0] for line in lines] == sorted(line.split(" | ")[0] for line in lines)
+    assert {line.split("|")[1].strip() for line in lines} == {"4", "6"}
+    assert all(line.count("|") == 7 for line in lines)
+
+
 @pytest.mark.parametrize("name", swarm_results.UNSEEN)
 @pytest.mark.parametrize("preset", ["paper", "dense"])
 def test_unseen_scenarios_are_other_ones_and_gone_after_the_flight(name, preset):
