@@ -162,7 +162,7 @@ def teams_table(rows: Rows) -> str:
     the one for all."""
     lines = []
     for n in dict.fromkeys(row["n_robots"] for row in rows):
-        cells: dict[str, list[str]] = {}
+        cells: dict[str, dict[str, str]] = {}
         for name in NAMES:
             here = {row["policy"]: row for row in rows if (row["n_robots"], row["scenario"]) == (n, name)}
             rule = here["full"]["against_rule"]["rival"]
@@ -173,10 +173,10 @@ def teams_table(rows: Rows) -> str:
                 text = f"{mark}{row['collisions']}/{row['episodes']}, {row['request_share']:.2%}{mark}"
                 if is_model(policy):
                     text += f" ({row['request_share'] / max(here[rule]['request_share'], 1e-9):.0%})"
-                cells.setdefault("`full`" if policy == "full" else kind, []).append(text)
+                cells.setdefault("`full`" if policy == "full" else kind, {})[name] = text
                 if policy == rule == "full":  # no rule is safe, or none was tuned
-                    cells.setdefault("best rule", []).append("none is safe")
-        lines += [[str(n), kind, *texts] for kind, texts in cells.items()]
+                    cells.setdefault("best rule", {})[name] = "none is safe"
+        lines += [[str(n), kind, *(by_name.get(name, "-") for name in NAMES)] for kind, by_name in cells.items()]
     return table(["robots", "policy", *(name.replace("_", " ") for name in NAMES)], lines)
 
 

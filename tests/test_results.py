@@ -143,6 +143,8 @@ def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
     )
     assert lines[3] == "| 6 | any, seed 0, tuned " + "| 12/4000, 5.00% (25%) " * 3 + "| 12/4000, 5.00% (5%) |"
     assert len(lines) == 4
+    rows.append(row(page.NAMES[1], model.replace("0", "1") + "@0.5", 0, 0.02, 0.006))
+    assert page.teams_table(rows).splitlines()[-1] == "| 6 | any, seed 1, tuned | - | 0/4000, 2.00% (10%) | - | - |"
 
 
 def test_flights_of_teams_fill_their_table():
