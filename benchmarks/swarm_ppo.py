@@ -168,6 +168,7 @@ def main() -> None:
         keys = {"price": price, "steps": args.steps, "seed": args.seed, "seconds": time.perf_counter() - started}
         path = args.models / f"ppo_price{price:g}_seed{args.seed}.zip"
         model.save(path)
+        print(f"price {price:g}", flush=True)
         for name in SCENARIOS:
             cells = {d: cell(f"{path}@{d}", name, config, algo="benchmarks.swarm_ppo:SharedPPO") for d in THRESHOLDS}
             rows += validate(cells, "threshold", args.episodes, keys)
