@@ -2,7 +2,7 @@
 
 ``python benchmarks/swarm_results.py [--quick] [--out FOLDER]`` flies the test set, which neither training nor tuning
 has seen, and writes test.json, sweep.json, robustness.json, unseen.json, teams.json, asking.json and
-interventions.json; parts can be chosen by name, also presets and scenarios, and the other rows stay.
+interventions.json; parts can be chosen by name, also presets, scenarios and teams, and the other rows stay.
 ``--quick`` flies few episodes and checks only that everything runs. `docs/results.py` makes the page of them.
 """
 
@@ -47,7 +47,8 @@ DBCP = "distance:4"
 PRESETS_TESTED = tuple(preset for preset in ("paper", "dense") if any(FOLDER.glob(f"{preset}_seed*.zip")))
 # What tells the cells of a part from each other; a cell that is flown again replaces its rows
 CELL = ("preset", "scenario", "condition", "n_robots")
-TEAMS = (4, 6, 8, 12, 16)
+# Other sizes than those it was trained with
+TEAMS = (6, 12, 16)
 CONDITIONS: dict[str, dict[str, Any]] = {
     "as trained": {},
     "state noise": {"noise": {"pos": 0.004, "vel": 0.02, "attitude": 0.006}},
@@ -401,6 +402,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
     parser.add_argument("--preset", nargs="+", default=PRESETS_TESTED, choices=PRESETS_TESTED)
     parser.add_argument("--scenario", nargs="+", default=NAMES, choices=NAMES)
+    parser.add_argument("--n-robots", nargs="+", type=int, default=TEAMS, choices=TEAMS, help="of the part teams")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each cell")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=absolute_path, default=FOLDER, help="folder of the JSON files (%(default)s)")
@@ -413,7 +415,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             jobs = [
                 job
                 for job in make_jobs(QUICK if args.quick else EPISODES[part])
-                if job[0]["preset"] in args.preset and job[2] in (*args.scenario, *UNSEEN)
+                if job[0]["preset"] in args.preset
+                and job[2] in (*args.scenario, *UNSEEN)
+                and job[0].get("n_robots", args.n_robots[0]) in args.n_robots
             ]
             for table in progress(pool.map(run, jobs), part, len(jobs)):
                 keys = ("preset", "scenario", "policy", "quantity") if part == "asking" else CELL
