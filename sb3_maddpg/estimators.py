@@ -48,17 +48,16 @@ class Estimator:
     categorical: EstimatorOfOneKind
 
 
-def nested_sets(scores: th.Tensor) -> th.Tensor:
+def nested_sets(order: th.Tensor) -> th.Tensor:
     """
     All joint bits that one shared threshold can produce: the bits of the m highest scores, for m = 0..k.
 
-    :param scores: (..., k)
-    :return: bits, (..., k + 1, k)
+    :param order: the numbers of the bits, highest score first, (..., k)
+    :return: bits, (..., k + 1, k) bool
     """
-    k = scores.shape[-1]
-    rank = scores.argsort(dim=-1, descending=True, stable=True).argsort(dim=-1)
-    sizes = th.arange(k + 1, device=scores.device)
-    return (rank.unsqueeze(-2) < sizes.unsqueeze(-1)).to(scores.dtype)
+    sizes = th.arange(order.shape[-1] + 1, device=order.device)
+    rank = th.empty_like(order).scatter_(-1, order, sizes[:-1].expand_as(order))
+    return rank.unsqueeze(-2) < sizes.unsqueeze(-1)
 
 
 def _ask(q: CriticOfOwnAction, action: th.Tensor, dim: int) -> th.Tensor:
@@ -123,9 +122,9 @@ def expected_bits(scores: th.Tensor, q: CriticOfOwnAction, temperature: float) -
     :param temperature: unused
     :return: (batch, n_agents)
     """
+    ordered, order = scores.sort(dim=-1, descending=True, stable=True)
     with th.no_grad():
-        values = q(nested_sets(scores))
-    ordered = scores.sort(dim=-1, descending=True, stable=True).values
+        values = q(nested_sets(order).to(scores.dtype))
     one = th.ones_like(ordered[..., :1])
     bounds = th.cat([one, ordered, th.zeros_like(one)], dim=-1)
     probabilities = bounds[..., :-1] - bounds[..., 1:]

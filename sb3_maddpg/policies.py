@@ -312,11 +312,12 @@ class TeamCritic(Critic):
         first = self._first(self._inputs(obs, actions), networks)
         weight = self.net.of_networks(self.net.weights[0], networks)
         own_weight = weight.gather(2, self.own_columns[agents].unsqueeze(1).expand(-1, weight.shape[1], -1))
-        change = (own - actions[:, agents].unsqueeze(2)).permute(1, 3, 0, 2)
-        batch, n_alternatives = change.shape[2:]
-        first = first.unsqueeze(3) + th.bmm(own_weight, change.flatten(2)).unflatten(2, (batch, n_alternatives))
-        values = self.net.after_first(first.flatten(2), networks)
-        return values.squeeze(1).unflatten(1, (batch, n_alternatives)).transpose(0, 1)
+        # The batch comes last: what is added to every alternative then runs along memory
+        change = (own - actions[:, agents].unsqueeze(2)).permute(1, 3, 2, 0)
+        shape = change.shape[2:]
+        change = th.bmm(own_weight, change.flatten(2)).unflatten(2, shape)
+        values = self.net.after_first(change.add_(first.unsqueeze(2)).flatten(2), networks)
+        return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
 
 
 def _places(groups: Sequence[int], agent: int) -> list[int]:

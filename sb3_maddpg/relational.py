@@ -10,6 +10,7 @@ from typing import Any, ClassVar, TypedDict
 import torch as th
 from gymnasium import spaces
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
@@ -151,6 +152,9 @@ class PairNet(nn.Module):
     encodings are pooled (mean and maximum, as in Deep Sets, Zaheer et al. 2017), and a second network reads the
     encoding, the pool and further inputs.
 
+    Nothing is changed in place that is a view, which a layer with a bias gives of more than two axes: autograd would
+    copy its gradient.
+
     :param in_features: length of a view
     :param extras: lengths of the further inputs, see ``extra``
     :param out_features: outputs for each pair
@@ -186,7 +190,7 @@ class PairNet(nn.Module):
         :return: what the second network makes of encoding and pool, before its activation, (..., n_neighbours, width),
             and the pool, (..., 2 * the encoding's width)
         """
-        encoded = self.activation(self.encoder(views))
+        encoded = self.activation(self.encoder(views.flatten(end_dim=-2))).unflatten(0, views.shape[:-1])
         if present is None:
             mean = encoded.mean(dim=-2)
         else:
@@ -197,7 +201,8 @@ class PairNet(nn.Module):
         else:
             largest = encoded.amax(dim=-2)
         pool = th.cat([mean, largest], dim=-1)
-        return self.of_pair(encoded).add_(self.of_pool(pool).unsqueeze(-2)), pool
+        of_pool = self.of_pool(pool).add_(self.of_pair.bias)
+        return F.linear(encoded, self.of_pair.weight).add_(of_pool.unsqueeze(-2)), pool
 
     def extra(self, index: int, x: th.Tensor) -> th.Tensor:
         """
@@ -212,9 +217,10 @@ class PairNet(nn.Module):
         :param hidden: before the activation, (..., width)
         :return: (..., out_features)
         """
+        shape = hidden.shape[:-1]
         for layer in self.later:
-            hidden = layer(self.activation(hidden))
-        return hidden
+            hidden = layer(self.activation(hidden).flatten(end_dim=-2))
+        return hidden.unflatten(0, shape)
 
 
 class PairActor(Actor):
