@@ -167,7 +167,7 @@ def test_a_robot_knows_what_the_others_believe_of_it():
     swarm, rng = make_swarm(2), np.random.default_rng(0)
     for _ in range(8):
         swarm.step(rng.random((2, 4, 3)) < 0.3)
-    told, outlook = View(swarm).told, swarm.beliefs.outlook(swarm.pos, swarm.vel)
+    told, outlook = View(swarm).told(range(swarm.config.planner.horizon)), swarm.beliefs.outlook(swarm.pos, swarm.vel)
     assert 0 < told.remembers.mean() < 1
     for i, m in np.ndindex(4, 3):
         j = swarm.beliefs.others[i, m]
@@ -181,10 +181,10 @@ def test_a_robot_takes_its_answers_to_have_arrived():
     for _ in range(5):
         swarm.step(all_ask(swarm))
     view = View(swarm)
-    assert view.told.remembers.all()
+    assert view.told([0]).remembers.all()
     assert not view.outlook.remembers.any()
     swarm.reset(0, swarm.pos[0], swarm.goal[0])
-    assert not View(swarm).told.remembers.any()
+    assert not View(swarm).told([0]).remembers.any()
 
 
 def test_late_answers_are_older_plans():

@@ -85,8 +85,8 @@ class Beliefs:
         # Remembered positions of now and of the next N steps; age in steps since they were planned, N or more: none.
         self._remembered = np.zeros((*shape, horizon + 1, 3))
         self._age = np.full(shape, horizon, dtype=np.int64)
-        # Positions, velocities and what was made of them: who decides looks first, and the step looks again.
-        self._known: tuple[np.ndarray, np.ndarray, Outlook] | None = None
+        # Positions, velocities and what `_look` made of them: who decides looks first, and the step looks again.
+        self._known: tuple[np.ndarray, np.ndarray, tuple[Outlook, np.ndarray]] | None = None
 
     def forget(self, swarms: np.ndarray) -> None:
         """Forget every received plan in the given swarms (indices or mask)."""
@@ -104,21 +104,25 @@ class Beliefs:
         :param pos: present positions, (E, n, 3), world frame (m)
         :param vel: present velocities, (E, n, 3), world frame (m/s)
         """
-        if self._known is not None and np.array_equal(self._known[0], pos) and np.array_equal(self._known[1], vel):
-            return self._known[2]
-        self._known = (pos.copy(), vel.copy(), self._look(pos, vel))
-        return self._known[2]
+        return self._look_once(pos, vel)[0]
 
-    def _look(self, pos: np.ndarray, vel: np.ndarray) -> Outlook:
-        steady = constant_velocity(pos, vel, self.horizon, self.dt)[:, self.others]
+    def _look_once(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Outlook, np.ndarray]:
+        known = self._known
+        if known is None or not (np.array_equal(known[0], pos) and np.array_equal(known[1], vel)):
+            known = self._known = (pos.copy(), vel.copy(), self._look(pos, vel))
+        return known[2]
+
+    def _look(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Outlook, np.ndarray]:
+        """:return: what is believed, and what is remembered, from now on; nothing else holds these arrays"""
+        believed = constant_velocity(pos, vel, self.horizon, self.dt)[:, self.others]
         if not self.memory:
             never = np.full(self._age.shape, self.horizon)
-            return Outlook(steady, np.zeros(never.shape, bool), never, np.zeros(never.shape))
+            return Outlook(believed, np.zeros(never.shape, bool), never, np.zeros(never.shape)), self._remembered
         remembered, age = advance(self._remembered), self._age + 1
         error = length(remembered[..., 0, :] - pos[:, self.others])
         remembers = (age < self.horizon) & (error <= self.memory)
-        believed = np.where(remembers[..., None, None], remembered[..., 1:, :], steady)
-        return Outlook(believed, remembers, age, error)
+        believed[remembers] = remembered[remembers, 1:]
+        return Outlook(believed, remembers, age, error), remembered
 
     def update(
         self, requests: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray, age: int = 1
@@ -133,14 +137,16 @@ class Beliefs:
         :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
             1)
         """
-        outlook = self.outlook(pos, vel)
-        current = advance(plans)[:, self.others]  # now, and the next N steps
-        asked = requests[..., None, None]
-        believed = np.where(asked, current[..., 1:, :], outlook.believed)
+        outlook, remembered = self._look_once(pos, vel)
+        swarms, robots, places = np.nonzero(requests)
+        received = advance(plans)[swarms, self.others[robots, places]]  # now, and the next N steps
+        believed = outlook.believed.copy()
+        believed[requests] = received[:, 1:]
         unasked = np.where(outlook.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
         source = np.where(requests, BeliefSource.REQUESTED, unasked)
         if self.memory:
-            self._remembered = np.where(asked, current, advance(self._remembered))
+            remembered[requests] = received
+            self._remembered = remembered
             self._age = np.where(requests, age, outlook.age)
         self._known = None
         return believed, source

@@ -165,7 +165,7 @@ def _memory(pair: PairView) -> np.ndarray:
     stages = _stages(pair.horizon)[1:]
     times = pair.dt * (np.array(stages) + 1)
     steady = view.pos[..., None, :] + times[:, None] * (view.vel + view.own_vel[:, :, None])[..., None, :]
-    bend = pair.turn(view.expected[..., stages, :] - steady)
+    bend = pair.turn(view.expected.take(stages, axis=-2) - steady)
     return np.concatenate([np.stack([remembers, age, np.exp(2 - view.age), drift], axis=-1), _flat(bend, 3)], axis=-1)
 
 
@@ -190,8 +190,8 @@ def _plan(pair: PairView) -> np.ndarray:
 def _told(pair: PairView) -> np.ndarray:
     """What the other knows of this robot: whether it still believes a plan that it was told, and how far it is off."""
     view, stages = pair.view, _stages(pair.horizon)
-    told = view.told
-    off = view.plan[:, :, None, stages] - (told.believed[..., stages, :] - pair.swarm.pos[:, :, None, None])
+    told = view.told(stages)
+    off = view.plan[:, :, None, stages] - (told.believed - pair.swarm.pos[:, :, None, None])
     parts = (
         np.stack(
             [told.remembers.astype(float), np.minimum(told.age / pair.horizon, 1.0), np.exp(2 - told.age)], axis=-1
@@ -210,12 +210,12 @@ def _critic(pair: PairView) -> np.ndarray:
     theirs = plans[:, others] - pair.swarm.pos[:, :, None, None]
     surprise = theirs - view.expected
     back = pair.swarm.beliefs.back  # the other's view of this robot: the same numbers with the two exchanged
-    size = length(surprise)
+    size = length(surprise)[..., stages]
     separation = length(view.plan[:, :, None] - theirs)
     parts = (
-        np.clip(2 * _flat(pair.turn(surprise[..., stages, :]), 3), -2, 2),
-        np.tanh(size[..., stages] / 0.1),
-        np.tanh(size[:, others, back][..., stages] / 0.1),
+        np.clip(2 * _flat(pair.turn(surprise.take(stages, axis=-2)), 3), -2, 2),
+        np.tanh(size / 0.1),
+        np.tanh(size[:, others, back] / 0.1),
         pair.closeness(separation.min(axis=-1)),
         pair.closeness(view.plan_separation.min(axis=-1)),
         view.outlook.remembers[:, others, back, None],

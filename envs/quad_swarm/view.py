@@ -66,14 +66,20 @@ class View:
     def expected(self) -> np.ndarray:
         """Where the others will be at the next N steps as far as the robot knows without asking, (E, n, n - 1, N, 3)
         (m)."""
-        return self.outlook.believed - self._swarm.pos[:, :, None, None]
+        believed, pos = self.outlook.believed, self._swarm.pos
+        # Stages and coordinates as one axis: numpy is slow along three numbers
+        relative = believed.reshape(*believed.shape[:3], -1) - np.tile(pos, self.horizon)[:, :, None]
+        return relative.reshape(believed.shape)
 
-    @cached_property
-    def told(self) -> Outlook:
+    def told(self, stages: Sequence[int]) -> Outlook:
         """What each of the others believes of this robot unless it asks, as far as this robot can tell: it knows what
-        it answered, and takes every answer to have arrived."""
+        it answered, and takes every answer to have arrived.
+
+        :param stages: which of the next N steps, from 0 on; `Outlook.believed` holds no others
+        """
         beliefs = self._swarm.told
         outlook = beliefs.outlook(self._swarm.pos, self._swarm.vel)
+        outlook = outlook._replace(believed=outlook.believed.take(stages, axis=-2))
         return Outlook(*(field[:, beliefs.others, beliefs.back] for field in outlook))
 
     @property
