@@ -266,16 +266,20 @@ def teams(episodes: int) -> list[Any]:
 def asking(episodes: int) -> list[Any]:
     """Jobs of the look at whom policies ask: pairs and steps counted by what the robots saw."""
     return [
-        ({"preset": preset}, policy, name, episodes)
+        ({"preset": preset}, [best_rules(preset)[name], *models(preset)[:1]], name, episodes)
         for preset in PRESETS_TESTED
         for name in NAMES
-        for policy in (best_rules(preset)[name], *models(preset)[:1])
     ]
 
 
-def ask(job: tuple[dict[str, Any], str, str, int]) -> list[dict[str, Any]]:
-    """For some quantities how often a policy asks at each of their values."""
-    keys, policy, scenario, episodes = job
+def ask(job: tuple[dict[str, Any], list[str], str, int]) -> list[dict[str, Any]]:
+    """For some quantities how often policies ask at each of their values."""
+    keys, policies, scenario, episodes = job
+    return [row for policy in policies for row in requests_by_quantity(keys, policy, scenario, episodes)]
+
+
+def requests_by_quantity(keys: dict[str, Any], policy: str, scenario: str, episodes: int) -> list[dict[str, Any]]:
+    """The rows of one policy."""
     config = make_config(keys["preset"])
     others = other_indices(config.n_robots)
     seen: dict[str, list[np.ndarray]] = {}
@@ -420,8 +424,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 and job[0].get("n_robots", args.n_robots[0]) in args.n_robots
             ]
             for table in progress(pool.map(run, jobs), part, len(jobs)):
-                keys = ("preset", "scenario", "policy", "quantity") if part == "asking" else CELL
-                replace_rows(path, table, tuple(key for key in keys if key in table[0]))
+                replace_rows(path, table, tuple(key for key in CELL if key in table[0]))
             print(f"wrote {path}, {len(read_rows(path))} rows", flush=True)
 
 

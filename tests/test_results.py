@@ -182,6 +182,17 @@ def test_rows_of_other_keys_stay(tmp_path):
     assert swarm_rules.read_rows(path) == [{"a": 2, "b": 3}, {"a": 1, "b": 4}]
 
 
+def test_rows_of_an_earlier_rule_do_not_stay(tmp_path, monkeypatch):
+    monkeypatch.setattr(swarm_results, "QUICK", 1)
+    for rule in ("none", "full"):
+        rules = dict.fromkeys(swarm_results.NAMES, rule)
+        monkeypatch.setattr(swarm_results, "best_rules", lambda preset, n_robots=None, rules=rules: rules)
+        command = "asking --quick --preset paper --scenario random --jobs 1 --out"
+        swarm_results.main([*command.split(), str(tmp_path)])
+    policies = {row["policy"] for row in swarm_rules.read_rows(tmp_path / "asking.json")}
+    assert policies == {"full", swarm_results.models("paper")[0]}
+
+
 def test_interventions_change_the_steps_that_they_should():
     one = swarm_rules.cell("none", "symmetric_swap", make_config("paper"))
     rows = fly_all([one], 8, swarm_rules.TEST)[one]
