@@ -220,7 +220,7 @@ class PairNet(nn.Module):
         shape = hidden.shape[:-1]
         for layer in self.later:
             hidden = layer(self.activation(hidden).flatten(end_dim=-2))
-        return hidden.reshape(*shape, -1)
+        return hidden.reshape(*shape, hidden.shape[-1])
 
 
 class PairActor(Actor):
