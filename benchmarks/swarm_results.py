@@ -254,8 +254,7 @@ def teams(episodes: int) -> list[Any]:
             ["full", best_rules("dense", n)[name], *models("any")[:1], *tuned("any", name, n)],
             name,
             world("dense", n),
-            # Where full communication collides often too, more episodes are needed to tell a difference
-            episodes * 3 if (n, name) == (16, "symmetric_swap") else episodes,
+            episodes,
         )
         for n in TEAMS
         for name in NAMES
