@@ -4,10 +4,10 @@
 set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds are tried from
 the highest on, in stages of more and more episodes, until the model is as safe as full communication
 (`swarm_rules.Standard`) and not at the edge of it (`RESERVE`): who takes the first threshold that passes takes one that
-was lucky in these episodes. With ``--n-robots`` every second threshold is tried. The smallest of them, with which it is
-safe everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with the keys of
-`quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe; those of
-other cells stay, and count for the model's threshold.
+was lucky in these episodes. With ``--n-robots`` other thresholds are tried (`TEAM_THRESHOLDS`). The smallest of them,
+with which it is safe everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with
+the keys of `quad_swarm.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario,
+safe; those of other cells stay, and count for the model's threshold.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ TUNED = ("paper", "dense", "ablation*")
 RESERVE = 4 / 9
 THRESHOLDS = [0.99, 0.98, 0.965, 0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7]
 THRESHOLDS += [0.675, 0.65, 0.625, 0.6, 0.575, 0.55, 0.525, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1]
+# In teams of another size: fewer between, and lower ones for crowds larger than any in training
+TEAM_THRESHOLDS = [*THRESHOLDS[::2], 0.1, 0.05, 0.02]
 
 
 @functools.cache
@@ -59,7 +61,7 @@ def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> l
     robots = world(preset, n).n_robots
     margin = (OF_PRESET if n is None else OF_TEAM).margin
     table: list[dict[str, Any]] = []
-    for threshold in THRESHOLDS if n is None else THRESHOLDS[::2]:
+    for threshold in THRESHOLDS if n is None else TEAM_THRESHOLDS:
         figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, rival, quick, n)
         safe &= quick or has_reserve(Comparison.of(figures, rival[: len(figures)]), margin)
         keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
