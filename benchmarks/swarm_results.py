@@ -247,11 +247,11 @@ def compare_unseen(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int])
 
 
 def teams(episodes: int) -> list[Any]:
-    """Jobs of other sizes of the team: all models with the thresholds tuned for it, the first with that for all."""
+    """Jobs of other sizes of the team: all models with the thresholds tuned for it."""
     return [
         (
             {"preset": "dense", "n_robots": n},
-            ["full", best_rules("dense", n)[name], *models("any")[:1], *tuned("any", name, n)],
+            ["full", best_rules("dense", n)[name], *tuned("any", name, n)],
             name,
             world("dense", n),
             episodes,

@@ -158,8 +158,7 @@ def wide_table(rows: Rows, first: str, preset: str) -> str:
 
 def teams_table(rows: Rows) -> str:
     """Every number of robots: collisions and requests, in bold where at most half a point less safe than asking
-    everybody, and the share of the best rule's requests. Models with their thresholds for each cell, and the first with
-    the one for all."""
+    everybody, and the share of the best rule's requests; models also with their threshold for the cell."""
     lines = []
     for n in dict.fromkeys(row["n_robots"] for row in rows):
         cells: dict[str, dict[str, str]] = {}
@@ -168,11 +167,11 @@ def teams_table(rows: Rows) -> str:
             rule = here["full"]["against_rule"]["rival"]
             for policy, row in here.items():
                 path, _, threshold = policy.partition("@")
-                kind = f"{label(path)}, {'tuned' if threshold else 'one for all'}" if is_model(policy) else "best rule"
+                kind = label(path) if is_model(policy) else "best rule"
                 mark = "**" if policy != "full" and row["against_full"]["high"] < OF_TEAM.margin else ""
                 text = f"{mark}{row['collisions']}/{row['episodes']}, {row['request_share']:.2%}{mark}"
                 if is_model(policy):
-                    text += f" ({row['request_share'] / max(here[rule]['request_share'], 1e-9):.0%})"
+                    text += f" ({row['request_share'] / max(here[rule]['request_share'], 1e-9):.0%}), δ = {threshold}"
                 cells.setdefault("`full`" if policy == "full" else kind, {})[name] = text
                 if policy == rule == "full":  # no rule is safe, or none was tuned
                     cells.setdefault("best rule", {})[name] = "none is safe"

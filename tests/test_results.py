@@ -129,22 +129,21 @@ def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
     policies = {
         "full": (1, 1, 0),
         "cpa:1:1": (30, 0.2, 0.009),
-        model: (9, 0.1, 0.004),
-        f"{model}@0.9": (12, 0.05, 0.006),
+        f"{model}@0.5": (9, 0.1, 0.004),
+        f"{model.replace('0', '1')}@0.9": (12, 0.05, 0.006),
     }
     rows = [row(name, policy, *figures) for name in page.NAMES[:-1] for policy, figures in policies.items()]
     rows += [row(page.NAMES[-1], k, *v, rule="full") for k, v in policies.items() if k != "cpa:1:1"]
     lines = page.teams_table(rows).splitlines()[2:]
     assert lines[0] == "| 6 | `full` " + "| 1/4000, 100.00% " * 4 + "|"
     assert lines[1] == "| 6 | best rule " + "| 30/4000, 20.00% " * 3 + "| none is safe |"
-    assert (
-        lines[2]
-        == "| 6 | any, seed 0, one for all " + "| **9/4000, 10.00%** (50%) " * 3 + "| **9/4000, 10.00%** (10%) |"
-    )
-    assert lines[3] == "| 6 | any, seed 0, tuned " + "| 12/4000, 5.00% (25%) " * 3 + "| 12/4000, 5.00% (5%) |"
+    cells = ["**9/4000, 10.00%** (50%), δ = 0.5 "] * 3 + ["**9/4000, 10.00%** (10%), δ = 0.5 "]
+    assert lines[2] == f"| 6 | any, seed 0 | {'| '.join(cells)}|"
+    cells = ["12/4000, 5.00% (25%), δ = 0.9 "] * 3 + ["12/4000, 5.00% (5%), δ = 0.9 "]
+    assert lines[3] == f"| 6 | any, seed 1 | {'| '.join(cells)}|"
     assert len(lines) == 4
-    rows.append(row(page.NAMES[1], model.replace("0", "1") + "@0.5", 0, 0.02, 0.006))
-    assert page.teams_table(rows).splitlines()[-1] == "| 6 | any, seed 1, tuned | - | 0/4000, 2.00% (10%) | - | - |"
+    rows.append(row(page.NAMES[1], model.replace("0", "2") + "@0.5", 0, 0.02, 0.006))
+    assert page.teams_table(rows).splitlines()[-1] == "| 6 | any, seed 2 | - | 0/4000, 2.00% (10%), δ = 0.5 | - | - |"
 
 
 def test_flights_of_teams_fill_their_table(monkeypatch):
