@@ -124,15 +124,17 @@ def in_stages(
     quick: bool,
     n_robots: int | None = None,
     flown: list[dict[str, float]] | None = None,
+    standard: Standard | None = None,
 ) -> tuple[list[dict[str, float]], bool]:
     """Fly a policy in more and more episodes, as long as there is hope and it is not yet decided (`Standard`).
 
     :param full: figures of full communication in the same episodes; those that are missing are flown and appended
     :param flown: the policy's figures in the first of them
+    :param standard: what is as safe; that of the preset or of teams unless given
     :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
     """
     figures = list(flown or [])
-    margin, enough = OF_PRESET if n_robots is None else OF_TEAM
+    margin, enough = standard or (OF_PRESET if n_robots is None else OF_TEAM)
     for episodes in QUICK_STAGES if quick else STAGES:
         for name, known in ((policy, figures), ("full", full)):
             if episodes > len(known):

@@ -228,9 +228,12 @@ def test_thresholds_are_kept_cell_by_cell_and_the_smallest_is_written_into_the_m
 
 
 def test_a_threshold_needs_a_reserve():
-    margin = swarm_rules.OF_PRESET.margin
-    assert swarm_models.has_reserve(Comparison(12000, 17, 1), margin)
-    assert not swarm_models.has_reserve(Comparison(12000, 17, 0), margin)
+    standard, share = swarm_models.STANDARDS["preset"]
+    assert swarm_models.has_reserve(Comparison(12000, 17, 1), standard.margin, share)
+    assert not swarm_models.has_reserve(Comparison(12000, 17, 0), standard.margin, share)
+    standard, share = swarm_models.STANDARDS["team"]
+    assert swarm_models.has_reserve(Comparison(4000, 7, 2), standard.margin, share)
+    assert not swarm_models.has_reserve(Comparison(4000, 7, 1), standard.margin, share)
     assert Comparison(12000, 25, 0).as_safe, "though it would do without"
 
 
