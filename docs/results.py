@@ -164,6 +164,8 @@ def teams_table(rows: Rows) -> str:
         cells: dict[str, dict[str, str]] = {}
         for name in NAMES:
             here = {row["policy"]: row for row in rows if (row["n_robots"], row["scenario"]) == (n, name)}
+            if not here:
+                continue
             rule = here["full"]["against_rule"]["rival"]
             for policy, row in here.items():
                 path, _, threshold = policy.partition("@")

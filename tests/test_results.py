@@ -144,6 +144,8 @@ def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
     assert len(lines) == 4
     rows.append(row(page.NAMES[1], model.replace("0", "2") + "@0.5", 0, 0.02, 0.006))
     assert page.teams_table(rows).splitlines()[-1] == "| 6 | any, seed 2 | - | 0/4000, 2.00% (10%), δ = 0.5 | - | - |"
+    rows = [row for row in rows if row["scenario"] != page.NAMES[0]]
+    assert page.teams_table(rows).splitlines()[2].startswith("| 6 | `full` | - | 1/4000, "), "not flown yet"
 
 
 def test_flights_of_teams_fill_their_table(monkeypatch):
