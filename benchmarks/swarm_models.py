@@ -40,8 +40,8 @@ TUNED = ("paper", "dense", "ablation*")
 STANDARDS = {"preset": (OF_PRESET, 4 / 9), "team": (OF_TEAM._replace(enough=4000), 1 / 4)}
 THRESHOLDS = [0.99, 0.98, 0.965, 0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7]
 THRESHOLDS += [0.675, 0.65, 0.625, 0.6, 0.575, 0.55, 0.525, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1]
-# In teams of another size: fewer between, and lower ones for crowds larger than any in training
-TEAM_THRESHOLDS = [*THRESHOLDS[::2], 0.1, 0.05, 0.02]
+# In teams of another size: fewer below 0.8, and lower ones for crowds larger than any in training
+TEAM_THRESHOLDS = [*THRESHOLDS[:10], *THRESHOLDS[10::2], 0.1, 0.05, 0.02, 0.01, 0.005]
 
 
 @functools.cache

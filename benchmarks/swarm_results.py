@@ -1,7 +1,7 @@
 """Fly everything that docs/results.md says again, from the models and rules in benchmarks/results/swarm.
 
-``python benchmarks/swarm_results.py [--quick] [--out FOLDER]`` flies the test set, which neither training nor tuning
-has seen, and writes test.json, sweep.json, robustness.json, unseen.json, teams.json, asking.json and
+``python benchmarks/swarm_results.py [--quick] [--out FOLDER]`` flies test sets, which neither training nor tuning
+have seen, and writes test.json, sweep.json, robustness.json, unseen.json, teams.json, asking.json and
 interventions.json; parts can be chosen by name, also presets, scenarios and teams, and the other rows stay.
 ``--quick`` flies few episodes and checks only that everything runs. `docs/results.py` makes the page of them.
 """
@@ -9,6 +9,7 @@ interventions.json; parts can be chosen by name, also presets, scenarios and tea
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import multiprocessing
 import os
@@ -28,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 if not __package__:
     sys.path[0] = str(ROOT)
 
-from benchmarks.swarm_rules import TEST, cell, progress, read_rows, replace_rows, world  # noqa: E402
+from benchmarks.swarm_rules import TEAM_TEST, TEST, cell, progress, read_rows, replace_rows, world  # noqa: E402
 from quad_swarm.beliefs import other_indices  # noqa: E402
 from quad_swarm.evaluation import Cell, Comparison, begin, first_episode, fly, fly_all, summarise  # noqa: E402
 from quad_swarm.presets import SwarmConfig, make_config  # noqa: E402
@@ -106,15 +107,16 @@ def tuned(recipe: str, scenario: str, n_robots: int | None = None) -> list[str]:
     ]
 
 
-def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int]) -> list[dict[str, Any]]:
+def compare(job: tuple[dict[str, Any], list[str], str, SwarmConfig, int], seed: int = TEST) -> list[dict[str, Any]]:
     """Fly policies over the same test episodes; the first is full communication, the second the rule to beat.
 
     :param job: keys of every row, policies, scenario, world, number of episodes
+    :param seed: set of held-out episodes
     :return: a row for each policy
     """
     keys, policies, scenario, config, episodes = job
     unique = list(dict.fromkeys(policies))
-    flown = fly_all([cell(policy, scenario, config) for policy in unique], episodes, TEST)
+    flown = fly_all([cell(policy, scenario, config) for policy in unique], episodes, seed)
     by_name = {c.policy: rows for c, rows in flown.items()}
     table = []
     for policy in unique:
@@ -393,7 +395,7 @@ PARTS: dict[str, tuple[Callable[[int], list[Any]], Callable[[Any], list[dict[str
     "sweep": (sweep, compare),
     "robustness": (robustness, compare),
     "unseen": (unseen, compare_unseen),
-    "teams": (teams, compare),
+    "teams": (teams, functools.partial(compare, seed=TEAM_TEST)),
     "asking": (asking, ask),
     "interventions": (interventions, intervene),
 }
