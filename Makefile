@@ -48,24 +48,24 @@ bench: install  ## speed of planner, environment and learner, and the estimators
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done
 
 results: install  ## fly everything that docs/results.md says again: tuned rules and thresholds, test set, tables and figures (hours)
-	$(BIN)/python benchmarks/swarm_rules.py --jobs $(JOBS) --json benchmarks/results/swarm/rules.json
-	$(BIN)/python benchmarks/swarm_rules.py --preset dense --n-robots $(TEAMS) --family $(TEAM_FAMILIES) --jobs $(JOBS) \
-		--json benchmarks/results/swarm/team_rules.json
-	$(BIN)/python benchmarks/swarm_models.py --jobs $(JOBS) --json benchmarks/results/swarm/thresholds.json
-	$(BIN)/python benchmarks/swarm_models.py benchmarks/results/swarm/any_seed*.zip --n-robots $(TEAMS) --jobs $(JOBS) \
-		--json benchmarks/results/swarm/thresholds.json
-	$(BIN)/python benchmarks/swarm_results.py --jobs $(JOBS)
-	$(BIN)/python benchmarks/swarm_ppo.py --models $(LOGS) --json benchmarks/results/swarm/ppo.json
-	$(BIN)/python benchmarks/swarm_counterfactual.py --models $(LOGS) --json benchmarks/results/swarm/counterfactual.json
-	$(BIN)/python docs/results.py
+	$(BIN)/python -m studies.swarm.tune_rules --jobs $(JOBS) --json studies/swarm/data/rules.json
+	$(BIN)/python -m studies.swarm.tune_rules --preset dense --n-robots $(TEAMS) --family $(TEAM_FAMILIES) --jobs $(JOBS) \
+		--json studies/swarm/data/team_rules.json
+	$(BIN)/python -m studies.swarm.tune_thresholds --jobs $(JOBS) --json studies/swarm/data/thresholds.json
+	$(BIN)/python -m studies.swarm.tune_thresholds studies/swarm/data/any_seed*.zip --n-robots $(TEAMS) --jobs $(JOBS) \
+		--json studies/swarm/data/thresholds.json
+	$(BIN)/python -m studies.swarm.fly --jobs $(JOBS)
+	$(BIN)/python -m studies.swarm.ppo --models $(LOGS) --json studies/swarm/data/ppo.json
+	$(BIN)/python -m studies.swarm.counterfactual --models $(LOGS) --json studies/swarm/data/counterfactual.json
+	$(BIN)/python -m studies.swarm.report
 
 results-quick: install  ## the same with few episodes and rules, into $(LOGS)/results
-	$(BIN)/python benchmarks/swarm_rules.py --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json
-	$(BIN)/python benchmarks/swarm_results.py --quick --jobs $(JOBS) --out $(LOGS)/results
-	$(BIN)/python benchmarks/swarm_ppo.py --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json
-	$(BIN)/python benchmarks/swarm_counterfactual.py --forks 10 --episodes 20 --models $(LOGS)/results \
+	$(BIN)/python -m studies.swarm.tune_rules --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json
+	$(BIN)/python -m studies.swarm.fly --quick --jobs $(JOBS) --out $(LOGS)/results
+	$(BIN)/python -m studies.swarm.ppo --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json
+	$(BIN)/python -m studies.swarm.counterfactual --forks 10 --episodes 20 --models $(LOGS)/results \
 		--json $(LOGS)/results/counterfactual.json
-	$(BIN)/python docs/results.py --data $(LOGS)/results --page $(LOGS)/results/results.md --images $(LOGS)/results
+	$(BIN)/python -m studies.swarm.report --data $(LOGS)/results --page $(LOGS)/results/results.md --images $(LOGS)/results
 
 bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against other libraries, each in its own environment
 	$(BIN)/python benchmarks/training.py --json benchmarks/results/training.json

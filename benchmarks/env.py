@@ -23,8 +23,8 @@ import gymnasium
 import numpy as np
 
 import quad_swarm
-from quad_swarm.task import RequestTask
-from sb3_maddpg.bench import timed
+from quad_swarm.task.request_task import RequestTask
+from sb3_maddpg.cli.bench import timed
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 CELLS = [(face, preset, 1) for face in ("gym", "render") for preset in ("paper", "dense")] + [

@@ -39,9 +39,9 @@ import numpy as np
 
 from quad_swarm.planner import FatropSolver, OptimalControlProblem, Problems, RtiSolver, Solution
 from quad_swarm.planner.fatrop import transcribe
-from quad_swarm.presets import SwarmConfig, make_config
-from quad_swarm.scenarios import SCENARIOS, ScenarioSampler
-from quad_swarm.swarm import Swarm
+from quad_swarm.world.presets import SwarmConfig, make_config
+from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from quad_swarm.world.swarm import Swarm
 
 HORIZONS = (10, 20)
 ROBOTS = (4, 8, 16)

@@ -4,11 +4,11 @@ import argparse
 
 import numpy as np
 
-from quad_swarm.communication import RULES
-from quad_swarm.evaluate import format_table
-from quad_swarm.evaluation import Cell, evaluate
-from quad_swarm.presets import make_config
-from quad_swarm.scenarios import SCENARIOS
+from quad_swarm.evaluation.command import format_table
+from quad_swarm.evaluation.evaluation import Cell, evaluate
+from quad_swarm.task.rules import RULES
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import SCENARIOS
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--quick", action="store_true", help="a few episodes, to see that it runs")

@@ -7,7 +7,7 @@ import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
-from quad_swarm.evaluate import main as evaluate
+from quad_swarm.evaluation.command import main as evaluate
 from sb3_maddpg import MADDPG
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 

@@ -9,8 +9,8 @@ from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import MADDPGPolicy
+from sb3_maddpg.pretrained_models import pretrained
 from sb3_maddpg.relational import PairPolicy
-from sb3_maddpg.shipped import pretrained
 
 __version__ = version("sb3-maddpg")
 __all__ = [

@@ -5,19 +5,19 @@ Importing registers ``QuadSwarm-v0`` with Gymnasium; `parallel_env` makes the Pe
 
 import gymnasium
 
-from .env import QuadSwarmEnv
-from .parallel import QuadSwarmParallelEnv
-from .presets import PRESET_VERSION, PRESETS
-from .scenarios import SCENARIOS
-from .vector import QuadSwarmVectorEnv
+from quad_swarm.interfaces.env import QuadSwarmEnv
+from quad_swarm.interfaces.parallel_env import QuadSwarmParallelEnv
+from quad_swarm.interfaces.vector_env import QuadSwarmVectorEnv
+from quad_swarm.world.presets import PRESET_VERSION, PRESETS
+from quad_swarm.world.scenarios import SCENARIOS
 
 parallel_env = QuadSwarmParallelEnv
 
 if "QuadSwarm-v0" not in gymnasium.registry:
     gymnasium.register(
         "QuadSwarm-v0",
-        entry_point="quad_swarm.env:QuadSwarmEnv",
-        vector_entry_point="quad_swarm.vector:QuadSwarmVectorEnv",
+        entry_point="quad_swarm.interfaces.env:QuadSwarmEnv",
+        vector_entry_point="quad_swarm.interfaces.vector_env:QuadSwarmVectorEnv",
     )
 
 __all__ = [

@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 import warnings
 
-from ..errors import unknown_name
-from ..quadrotor import QuadrotorModel, QuadrotorParams
-from .base import Planner, Plans, PlanStatus, Problems, Solution, Solver
-from .fatrop import FatropSolver
-from .problem import OptimalControlProblem, PlannerConfig
-from .rti import BuildError, RtiSolver
+from quad_swarm.errors import unknown_name
+from quad_swarm.planner.base import Planner, Plans, PlanStatus, Problems, Solution, Solver
+from quad_swarm.planner.fatrop import FatropSolver
+from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig
+from quad_swarm.planner.rti import BuildError, RtiSolver
+from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
 SOLVERS: dict[str, type[FatropSolver] | type[RtiSolver]] = {"rti": RtiSolver, "fatrop": FatropSolver}
 

@@ -7,8 +7,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..quadrotor import N_INPUTS, QuadrotorModel
-from .problem import PlannerConfig
+from quad_swarm.planner.problem import PlannerConfig
+from quad_swarm.quadrotor import N_INPUTS, QuadrotorModel
 
 
 class Problems(NamedTuple):

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from ..quadrotor import N_INPUTS, N_STATES
-from .base import Problems, Solution
-from .problem import OptimalControlProblem
+from quad_swarm.planner.base import Problems, Solution
+from quad_swarm.planner.problem import OptimalControlProblem
+from quad_swarm.quadrotor import N_INPUTS, N_STATES
 
 
 class FatropSolver:

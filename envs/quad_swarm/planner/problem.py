@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from ..quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
 
 
 @dataclass(frozen=True)

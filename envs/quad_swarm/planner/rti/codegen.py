@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 import numpy as np
 
-from ..problem import OptimalControlProblem
+from quad_swarm.planner.problem import OptimalControlProblem
 
 
 def generate_model(problem: OptimalControlProblem) -> str:

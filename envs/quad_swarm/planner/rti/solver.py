@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import unknown_name
-from ...quadrotor import N_INPUTS, N_STATES, QuadrotorParams
-from ..base import Problems, Solution
-from ..problem import OptimalControlProblem, PlannerConfig
-from .build import build, load
-from .codegen import generate_model
+from quad_swarm.errors import unknown_name
+from quad_swarm.planner.base import Problems, Solution
+from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig
+from quad_swarm.planner.rti.build import build, load
+from quad_swarm.planner.rti.codegen import generate_model
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams
 
 PRECISIONS = ("float32", "float64")
 

@@ -1,0 +1,106 @@
+"""What TensorBoard shows of a training beside its curves: a layout, who asks whom, and how the swarm flies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
+from quad_swarm.evaluation.evaluation import Cell, begin, first_episode, fly
+from quad_swarm.figures.plots import draw_flights
+from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import SCENARIOS
+
+# Of TensorBoard's page "Custom scalars": title -> chart -> kind and tags
+LAYOUT: dict[str, dict[str, list[Any]]] = {
+    "Safety": {
+        "episodes with a collision": ["Multiline", ["swarm/collision_rate", "symmetric_swap/collision_rate"]],
+        "smallest separation (m)": ["Multiline", ["swarm/min_separation"]],
+        "arrivals": ["Multiline", ["swarm/arrival_rate", "eval/success_rate"]],
+        "planner failures": ["Multiline", ["planner/failure_rate"]],
+    },
+    "Communication": {
+        "requests, of all possible": ["Multiline", ["comm/request_share", "symmetric_swap/request_share"]],
+        "reward for requests": ["Multiline", ["reward/requests"]],
+        "scores": ["Multiline", ["train/score_mean", "train/score_std"]],
+    },
+    "Learning": {
+        "return": ["Multiline", ["rollout/ep_rew_mean", "eval/mean_reward"]],
+        "critics": ["Multiline", ["train/critic_loss"]],
+        "actors": ["Multiline", ["train/actor_loss"]],
+        "steps per second": ["Multiline", ["time/fps"]],
+    },
+}
+# Episodes behind the heat map, a set of their own
+EPISODES, SET = 32, 9
+_OF_THE_WORLD = ("preset", "n_robots", "memory", "planner", "noise", "radio", "space")
+
+
+def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]:
+    """Fly some held-out episodes with a model.
+
+    :param model: with ``predict`` and ``env_spec``, see `evaluation.policy_of`
+    :param env_kwargs: arguments of `QuadSwarmEnv`, of which only the world's count
+    :return: for TensorBoard, by tag: a flight of each scenario, who asks whom in the symmetric swap, and figures of
+        the same episodes
+    """
+    config = make_config(**({"preset": "paper"} | {k: v for k, v in env_kwargs.items() if k in _OF_THE_WORLD}))
+    cells = [Cell("model", name, config, 100, "", "auto", linger=5) for name in SCENARIOS]
+    asked, steps, collisions = requests_by_pair(cells[-1], model)
+    n = config.n_robots
+    return {
+        "eval/flights": draw_flights(cells, [fly(cell, SET, model=model) for cell in cells]),
+        "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), cells[-1].scenario),
+        "symmetric_swap/request_share": float(asked.sum() / max(steps * n * (n - 1), 1)),
+        "symmetric_swap/collision_rate": collisions / EPISODES,
+    }
+
+
+def requests_by_pair(cell: Cell, model: Any) -> tuple[np.ndarray, int, int]:
+    """Who asks whom, until a collision or the arrival of all.
+
+    :param cell: scenario and world
+    :return: how often robot i asked robot j, (n, n); the number of steps; the number of episodes with a collision
+    """
+    policy, task, rngs = begin(cell, [first_episode(SET) + k for k in range(EPISODES)], model)
+    n = cell.config.n_robots
+    rows, others = np.arange(n)[:, None], other_indices(n)
+    asked, steps, collisions = np.zeros((n, n)), 0, 0
+    while rngs:
+        requests = policy(task, rngs)
+        asked[rows, others] += requests.sum(axis=0)
+        steps += len(rngs)
+        outcome = task.step(requests)
+        collisions += int(outcome.terminated.sum())
+        over = outcome.terminated | outcome.truncated | task.statistics.arrived
+        task.keep(~over)
+        rngs = [rng for rng, done in zip(rngs, over, strict=True) if not done]
+    return asked, steps, collisions
+
+
+def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:
+    """A heat map.
+
+    :param share: how often robot i asks robot j, of all steps, (n, n)
+    :param scenario: for the title
+    """
+    n = len(share)
+    figure, axes = plt.subplots(figsize=(4.2, 3.6), layout="constrained")
+    shown = axes.imshow(np.ma.masked_where(np.eye(n, dtype=bool), share), cmap="viridis", vmin=0)
+    for i, j in np.argwhere(~np.eye(n, dtype=bool)):
+        dark = share[i, j] < 0.6 * share.max()
+        axes.text(j, i, f"{100 * share[i, j]:.0f}", ha="center", va="center", color="white" if dark else "black")
+    axes.set_xticks(range(n))
+    axes.set_yticks(range(n))
+    axes.set_xlabel("is asked")
+    axes.set_ylabel("asks")
+    axes.set_title(f"{scenario.replace('_', ' ')}: % of the steps", fontsize=10)
+    figure.colorbar(shown, format=matplotlib.ticker.PercentFormatter(1.0))
+    return figure

@@ -1,0 +1,163 @@
+"""Figures of an evaluation: collisions and requests (the paper's Fig. 3 and 4), flights (Fig. 2) and an animation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+
+from quad_swarm.evaluation.evaluation import Cell, Flight, fly, short_name
+from quad_swarm.figures.colours import OKABE_ITO, colour_of
+from quad_swarm.figures.render import Renderer
+
+# Of a path, where a robot asks and where it does not: yellow and blue, as in the paper
+ASKING, SILENT = OKABE_ITO[6], OKABE_ITO[0]
+
+
+def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int, folder: Path) -> list[Path]:
+    """Draw every figure as PNG and as PDF into ``folder``, and a flight as an animation; returns their paths.
+
+    :param rows: what `evaluate` returned
+    :param cells: what it was given; the last policy's flights are drawn
+    :param seed: the same seed
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    last = [cell for cell in cells if cell.policy == cells[-1].policy]
+    flights = [fly(cell, seed) for cell in last]
+    figures = {
+        "collisions": draw_collisions(rows),
+        "requests": draw_requests(rows),
+        "front": draw_front(rows),
+        "flights": draw_flights(last, flights),
+    }
+    paths = []
+    for name, figure in figures.items():
+        for kind in ("png", "pdf"):
+            paths.append(folder / f"{name}.{kind}")
+            figure.savefig(paths[-1], dpi=130)
+        plt.close(figure)
+    paths.append(folder / "swarm.gif")
+    animate(last[-1], flights[-1], paths[-1])
+    return paths
+
+
+def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Share of episodes with a collision, with 95 % Wilson intervals."""
+    figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
+    _bars(axes, rows, lambda r: r["collisions"] / r["episodes"], lambda r: (r["collision_low"], r["collision_high"]))
+    axes.set_ylabel("episodes with a collision")
+    return figure
+
+
+def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Share of the possible requests that were made."""
+    figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
+    _bars(axes, rows, lambda r: r["request_share"], None)
+    axes.set_ylabel("requests made, of all possible")
+    return figure
+
+
+def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Requests against collisions, a panel for each scenario. A line joins the policies that none is better than in
+    both (the Pareto front); bars are 95 % Wilson intervals."""
+    policies = list(dict.fromkeys(row["policy"] for row in rows))
+    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
+    size = (3.4 * len(scenarios), 3.6)
+    figure, panels = plt.subplots(1, len(scenarios), figsize=size, layout="constrained", sharey="row", squeeze=False)
+    for axes, name in zip(panels[0], scenarios, strict=True):
+        mine = [row for row in rows if row["scenario"] == name]
+        points = {row["policy"]: (row["request_share"], row["collisions"] / row["episodes"]) for row in mine}
+        front = sorted(p for p in points.values() if not any(_dominates(q, p) for q in points.values()))
+        axes.plot(*zip(*front, strict=True), color="#999999", linewidth=1, zorder=1)
+        for row in mine:
+            x, y = points[row["policy"]]
+            k = policies.index(row["policy"])
+            bar = [[y - row["collision_low"]], [row["collision_high"] - y]]
+            style = {"fmt": "os^Dv"[k // 8 % 5], "color": colour_of(k), "capsize": 2}
+            axes.errorbar([x], [y], np.maximum(bar, 0), label=short_name(row["policy"]), **style)
+        axes.set_title(name.replace("_", " "), fontsize=10)
+        axes.set_xlabel("requests made, of all possible")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(matplotlib.ticker.PercentFormatter(1.0))
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0][0].set_ylabel("episodes with a collision")
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    return figure
+
+
+def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return one != other and one[0] <= other[0] and one[1] <= other[1]
+
+
+def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: Any) -> None:
+    policies = list(dict.fromkeys(row["policy"] for row in rows))
+    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
+    width = 0.8 / len(policies)
+    for k, policy in enumerate(policies):
+        mine = {row["scenario"]: row for row in rows if row["policy"] == policy}
+        x = np.arange(len(scenarios)) + (k - (len(policies) - 1) / 2) * width
+        heights = np.array([height(mine[name]) for name in scenarios])
+        axes.bar(x, heights, 0.9 * width, color=colour_of(k), label=short_name(policy))
+        if interval is not None:
+            bounds = np.array([interval(mine[name]) for name in scenarios]).T
+            axes.errorbar(x, heights, np.abs(bounds - heights), fmt="none", ecolor="#333333", capsize=2, linewidth=1)
+    axes.set_xticks(range(len(scenarios)), [name.replace("_", " ") for name in scenarios])
+    axes.yaxis.set_major_formatter(matplotlib.ticker.PercentFormatter(1.0, decimals=0))
+    axes.legend(frameon=False, ncols=min(len(policies), 5), loc="upper left", bbox_to_anchor=(0, 1.17))
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_flights(cells: Sequence[Cell], flights: Sequence[Flight]) -> Figure:
+    """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2)."""
+    columns = min(len(cells), 2)
+    size = (3.6 * columns, 3.6 * math.ceil(len(cells) / columns) + 0.3)
+    figure, panels = plt.subplots(
+        math.ceil(len(cells) / columns), columns, figsize=size, layout="constrained", squeeze=False
+    )
+    for axes in panels.flat[len(cells) :]:
+        axes.set_visible(False)
+    for axes, cell, flight in zip(panels.flat, cells, flights, strict=False):
+        draw_flight(axes, flight)
+        axes.set_title(cell.scenario.replace("_", " "), fontsize=10)
+    figure.suptitle(f"{short_name(cells[-1].policy)}: yellow where a robot asks, blue where it does not", fontsize=9)
+    return figure
+
+
+def animate(cell: Cell, flight: Flight, path: Path) -> None:
+    """The flight as an animated GIF in real time, until shortly after all have arrived."""
+    renderer = Renderer(cell.config)
+    at_goal = (np.linalg.norm(flight.state[1:, :, :3] - flight.goal, axis=-1) <= cell.config.goal_radius).all(axis=1)
+    steps = min(int(at_goal.argmax()) + 10 if at_goal.any() else len(at_goal), len(at_goal))
+    frames = []
+    for k in range(steps):
+        lines = [f"{short_name(cell.policy)}, {cell.scenario}", f"step {k + 1}   requests {flight.requests[k].sum()}"]
+        picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
+        frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
+    duration = round(1000 * cell.config.planner.dt)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
+
+
+def draw_flight(axes: Axes, flight: Flight) -> None:
+    """A flight from above: yellow where a robot asks, blue where it does not."""
+    asks = flight.requests.sum(axis=2) > 0
+    for i in range(len(flight.goal)):
+        path = flight.state[:, i, :2]
+        axes.plot(path[:, 0], path[:, 1], color=SILENT, linewidth=1)
+        asking = path[:-1][asks[:, i]]
+        axes.scatter(asking[:, 0], asking[:, 1], s=16, color=ASKING, edgecolor="#7a6000", linewidth=0.4, zorder=3)
+        axes.plot(*path[0], "o", color=colour_of(i), markersize=7, markerfacecolor="white")
+        axes.plot(*flight.goal[i, :2], "*", color=colour_of(i), markersize=11)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    axes.margins(0.08)

@@ -1,0 +1,243 @@
+"""The Gymnasium face: one swarm as a team environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from quad_swarm.errors import unknown_name
+from quad_swarm.task.request_task import make_task
+
+
+class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
+    """Quadrotors that fly to their goals and may ask each other for their plans.
+
+    ## Description
+    At every step each robot chooses whom to ask. It gets the plans it asked for, predicts the other robots with a
+    constant velocity, solves a nonlinear model predictive control problem with separation constraints, and flies its
+    first input (Serra-Gomez et al., IROS 2020).
+
+    ## Action Space
+    `MultiBinary(n * (n - 1))`: robot 0's bits for robots 1..n-1, robot 1's bits for robots 0, 2..n-1, and so on; 1
+    asks.
+
+    ## Observation Space
+    `Box(n, 6n)`, one row a robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the
+    others (3(n-1), m), their relative velocities (3(n-1), m/s); others in ascending order. ``observation`` chooses
+    another one, see `observation.GROUPS`.
+
+    ## Rewards
+    The team's: +1.3 in each step in which all robots are at their goals, -150 for a collision, -0.1 for each request.
+
+    ## Starting State
+    At rest; starts and goals as the scenario draws them. `reset(options={"starts": ..., "goals": ...})` sets them, both
+    (n, 3), m.
+
+    ## Episode End
+    Terminated by a collision, with `end_at_arrival` also by the arrival of all; truncated after `max_steps`.
+
+    ## Info
+    `reward_terms`, `pair_rewards` (n, n - 1: the part of the reward that belongs to a robot and one of the others),
+    `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
+    `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and at the end `is_success`
+    and `metrics`.
+
+    ## Arguments
+    :param preset: "paper" or "dense" (`presets.PRESETS`)
+    :param scenario: a name of `scenarios.SCENARIOS`, "mixed" or "curriculum", or names with weights
+    :param n_robots: number of robots; None: the preset's
+    :param max_steps: time limit (steps)
+    :param observation: "paper", or names of `observation.GROUPS` joined by "+", for example "state+memory+plan"
+    :param scale_observation: of the paper's: divide distances by 4 m and velocities by 4 m/s
+    :param continuous_collisions: end episodes at collisions between steps too
+    :param end_at_arrival: end episodes as soon as all robots are at their goals
+    :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the
+        preset's
+    :param reward: values of `RewardConfig` to replace
+    :param planner: values of `PlannerConfig` to replace
+    :param noise: values of `ProcessNoise` to replace
+    :param radio: values of `Radio` to replace
+    :param space: values of `ScenarioSpace` to replace
+    :param solver: "auto" or a name of `planner.SOLVERS`
+    :param render_mode: None, "rgb_array", or "human" for a window that shows every step in real time
+    :raises ValueError: a wrong value; the message names it and the remedy
+
+    ## Version History
+    * v0: initial release, presets of version 1
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
+    reset_options = ("starts", "goals")
+
+    def __init__(
+        self,
+        preset: str = "paper",
+        scenario: str | Mapping[str, float] = "mixed",
+        n_robots: int | None = None,
+        max_steps: int = 100,
+        observation: str = "paper",
+        scale_observation: bool = False,
+        continuous_collisions: bool = False,
+        end_at_arrival: bool = False,
+        memory: float | None = None,
+        reward: Mapping[str, float] | None = None,
+        planner: Mapping[str, Any] | None = None,
+        noise: Mapping[str, float] | None = None,
+        radio: Mapping[str, float] | None = None,
+        space: Mapping[str, Any] | None = None,
+        solver: str = "auto",
+        render_mode: str | None = None,
+    ):
+        self.task = make_task(
+            n_swarms=1,
+            preset=preset,
+            scenario=scenario,
+            n_robots=n_robots,
+            max_steps=max_steps,
+            observation=observation,
+            scale_observation=scale_observation,
+            continuous_collisions=continuous_collisions,
+            end_at_arrival=end_at_arrival,
+            memory=memory,
+            reward=reward,
+            planner=planner,
+            noise=noise,
+            radio=radio,
+            space=space,
+            solver=solver,
+        )
+        self.config = self.task.swarm.config
+        self.agent_names = self.task.agent_names
+        self.observation_layout = self.task.observation_layout
+        self.action_cost = self.task.action_cost
+        self.n_agents = n = self.config.n_robots
+        self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
+        self.action_space = spaces.MultiBinary(n * (n - 1))
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
+        self._renderer: Any = None
+        self._requests = np.zeros((n, n - 1), dtype=bool)
+
+    # The curriculum: a training callback sets the level, the environment itself never does.
+    @property
+    def n_curriculum_levels(self) -> int:
+        """Number of curriculum levels; 1 where the scenario has none."""
+        return self.task.sampler.n_levels
+
+    @property
+    def curriculum_level(self) -> int:
+        """The present level, from 0."""
+        return self.task.sampler.level
+
+    def set_curriculum_level(self, level: int) -> None:
+        """Draw later episodes from the first ``level + 1`` scenarios.
+
+        :raises ValueError: no such level
+        """
+        self.task.sampler.set_level(level)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode; see the class for ``options``."""
+        super().reset(seed=seed)
+        options = options or {}
+        if unknown := set(options).difference(self.reset_options):
+            raise unknown_name("reset option", unknown.pop(), self.reset_options)
+        if len(options) == 1:
+            raise ValueError(f"reset options name only {next(iter(options))!r}; give both 'starts' and 'goals'.")
+        if options:
+            starts, goals = (np.asarray(options[name], dtype=float) for name in self.reset_options)
+            self.task.place(0, "custom", starts, goals, self.np_random)
+        else:
+            self.task.reset(0, self.np_random)
+        self._requests = np.zeros_like(self._requests)
+        if self._renderer is not None:
+            self._renderer.reset()
+        if self.render_mode == "human":
+            self.render()
+        return self.task.observe()[0], {"scenario": self.task.scenario[0]}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Let every robot ask, plan and fly for one step.
+
+        :raises ValueError: the action is not n(n - 1) bits; a solver's failure never raises
+        """
+        self._requests = request_matrices(action, 1, self.n_agents)[0]
+        outcome = self.task.step(self._requests[None])
+        terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
+        info = info_of(self.task.info(outcome), 0)
+        if terminated or truncated:
+            final = info_of(self.task.final_info(), 0)
+            info["is_success"] = final["is_success"]
+            info["metrics"] |= final["metrics"]
+        if self.render_mode == "human":
+            self.render()
+        return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
+
+    def render(self) -> Any:
+        """The present step as an image, (480, 640, 3) uint8; in the mode "human" it is shown in a window instead.
+
+        :raises ValueError: the environment was made without a mode
+        :raises gymnasium.error.Error: no window can be opened
+        """
+        if self.render_mode is None:
+            raise ValueError("No render_mode: make the environment with render_mode='rgb_array'.")
+        if self._renderer is None:
+            from quad_swarm.figures.render import Renderer  # pygame is needed only here
+
+            self._renderer = Renderer(self.config)
+        swarm, statistics = self.task.swarm, self.task.statistics
+        lines = [
+            f"step {statistics.steps[0]}   {self.task.scenario[0]}",
+            f"requests {self._requests.sum()} now, {statistics.requests[0]} in all",
+            f"smallest separation {statistics.min_separation[0]:.2f} m",
+        ]
+        if statistics.collided[0]:
+            lines.append("COLLISION")
+        picture = self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, lines)
+        if self.render_mode == "human":
+            self._renderer.show(self.metadata["render_fps"])
+            return None
+        return picture
+
+    def close(self) -> None:
+        """Close the window and free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = None
+
+
+def request_matrices(actions: Any, n_swarms: int, n_robots: int) -> np.ndarray:
+    """Joint actions as whom each robot asks, (E, n, n - 1) bool.
+
+    :param actions: E times n(n - 1) bits, in any shape
+    :raises ValueError: wrong size, or anything but zeros and ones
+    """
+    bits = np.asarray(actions)
+    size = n_robots * (n_robots - 1)
+    if bits.size != n_swarms * size:
+        raise ValueError(
+            f"The action has {bits.size} entries; {n_robots} robots need {size} bits, {n_robots - 1} each"
+            + (f", in each of {n_swarms} swarms." if n_swarms > 1 else ".")
+        )
+    asked = bits == 1
+    if not (asked | (bits == 0)).all():
+        wrong = bits[~(asked | (bits == 0))].ravel()[0]
+        raise ValueError(f"The action contains {wrong!r}; every entry must be 0 or 1. Threshold scores before acting.")
+    return asked.reshape(n_swarms, n_robots, n_robots - 1)
+
+
+def info_of(batch: dict[str, Any], swarm: int) -> dict[str, Any]:
+    """One swarm's part of a batched `info`, in plain Python numbers and fresh arrays."""
+    return {
+        name: info_of(value, swarm)
+        if isinstance(value, dict)
+        else (value[swarm].copy() if value.ndim > 1 else value[swarm].item())
+        for name, value in batch.items()
+    }

@@ -1,0 +1,87 @@
+"""The PettingZoo face: the same swarm with one agent a robot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from quad_swarm.interfaces.env import QuadSwarmEnv
+
+
+class QuadSwarmParallelEnv(ParallelEnv):
+    """`QuadSwarmEnv` as a PettingZoo environment: same seed and same bits give the same episode.
+
+    Agents are called "robot_0", "robot_1", ...; each observes its row, acts with `MultiBinary(n - 1)` and gets the
+    team's reward.
+
+    :param render_mode: None, "rgb_array" or "human"
+    :param kwargs: arguments of `QuadSwarmEnv`
+    """
+
+    metadata = {"name": "quad_swarm_v0", "render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any):
+        self.team = QuadSwarmEnv(render_mode=render_mode, **kwargs)
+        self.render_mode = render_mode
+        self.observation_layout = self.team.observation_layout
+        self.action_cost = self.team.action_cost
+        n, size = self.team.observation_space.shape  # type: ignore[misc]
+        self.possible_agents = list(self.team.agent_names)
+        self.agents: list[str] = []
+        self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, (size,), np.float32) for a in self.possible_agents}
+        self.action_spaces = {a: spaces.MultiBinary(n - 1) for a in self.possible_agents}
+
+    def observation_space(self, agent: str) -> spaces.Space:
+        """Observation space of one robot, (6n,)."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space:
+        """Action space of one robot, n - 1 bits."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
+        """See `QuadSwarmEnv.reset`; unknown options are ignored, as PettingZoo's API test demands."""
+        known = {name: value for name, value in (options or {}).items() if name in QuadSwarmEnv.reset_options}
+        observation, info = self.team.reset(seed=seed, options=known)
+        self.agents = list(self.possible_agents)
+        return self._rows(observation), {agent: dict(info) for agent in self.agents}
+
+    def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
+        """See `QuadSwarmEnv.step`.
+
+        :raises ValueError: an agent's action is missing
+        """
+        if missing := [agent for agent in self.agents if agent not in actions]:
+            raise ValueError(f"No action for {', '.join(missing)}; every robot must act in every step.")
+        joint = np.concatenate([np.asarray(actions[agent]).ravel() for agent in self.possible_agents])
+        observation, reward, terminated, truncated, info = self.team.step(joint)
+        agents = self.agents
+        if terminated or truncated:
+            self.agents = []
+        return (
+            self._rows(observation),
+            dict.fromkeys(agents, reward),
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            {agent: dict(info) for agent in agents},
+        )
+
+    def state(self) -> np.ndarray:
+        """All observations, (n * 6n,)."""
+        return self.team.task.observe()[0].ravel()
+
+    def render(self) -> Any:
+        """See `QuadSwarmEnv.render`."""
+        return self.team.render()
+
+    def close(self) -> None:
+        """See `QuadSwarmEnv.close`."""
+        self.team.close()
+
+    def _rows(self, observation: np.ndarray) -> dict[str, np.ndarray]:
+        return dict(zip(self.possible_agents, observation.copy(), strict=True))

@@ -1,0 +1,112 @@
+"""Many swarms in one Gymnasium vector environment: all robots of all swarms go through one planner call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from quad_swarm.interfaces.env import request_matrices
+from quad_swarm.task.request_task import make_task
+
+
+class QuadSwarmVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """`QuadSwarmEnv`, E times: ``gymnasium.make_vec("QuadSwarm-v0", num_envs=256)``.
+
+    Each swarm flies step for step as it would alone. Episodes that end begin anew in the same step
+    (`AutoresetMode.SAME_STEP`): the last observation is in ``infos["final_obs"]`` and the last step's info in
+    ``infos["final_info"]``, valid where ``infos["_final_obs"]``.
+
+    :param num_envs: number of swarms E
+    :param kwargs: arguments of `QuadSwarmEnv`
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's convention
+
+    def __init__(self, num_envs: int = 1, render_mode: None = None, **kwargs: Any):
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs}: at least one swarm is needed.")
+        if render_mode is not None:
+            raise ValueError(f"render_mode={render_mode!r}: the vector environment draws nothing; use QuadSwarmEnv.")
+        self.num_envs = num_envs
+        self.task = make_task(num_envs, **kwargs)
+        self.agent_names = self.task.agent_names
+        self.observation_layout = self.task.observation_layout
+        self.action_cost = self.task.action_cost
+        self.n_agents = n = self.task.swarm.config.n_robots
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
+        self.single_action_space = spaces.MultiBinary(n * (n - 1))
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._rngs: list[np.random.Generator] = []
+
+    @property
+    def n_curriculum_levels(self) -> int:
+        """See `QuadSwarmEnv`."""
+        return self.task.sampler.n_levels
+
+    def set_curriculum_level(self, level: int) -> None:
+        """See `QuadSwarmEnv`."""
+        self.task.sampler.set_level(level)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode in every swarm.
+
+        :param seed: of swarm 0, the others count on from it; or one of each swarm
+        :param options: none are known
+        """
+        if options:
+            raise ValueError(f"Unknown reset options {sorted(options)}: the vector environment has none.")
+        if isinstance(seed, int):
+            seeds: list[int | None] = [seed + k for k in range(self.num_envs)]
+        else:
+            seeds = list(seed) if seed is not None else [None] * self.num_envs
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} swarms.")
+        fresh = not self._rngs
+        if fresh:
+            self._rngs = [np.random.default_rng() for _ in seeds]
+        for k, value in enumerate(seeds):
+            if value is not None:
+                self._rngs[k] = gym.utils.seeding.np_random(value)[0]
+            self.task.reset(k, self._rngs[k])
+        return self.task.observe(), self._with_masks({"scenario": np.array(self.task.scenario)})
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of every swarm; see `QuadSwarmEnv.step`.
+
+        :param actions: (E, n(n - 1)) bits
+        """
+        outcome = self.task.step(request_matrices(actions, self.num_envs, self.n_agents))
+        info = self.task.info(outcome)
+        infos = self._with_masks(info)
+        done = outcome.terminated | outcome.truncated
+        observations = self.task.observe()
+        if done.any():
+            final = self.task.final_info()
+            final = {**info, **final, "metrics": info["metrics"] | final["metrics"]}
+            infos |= _masked({"final_obs": observations, "final_info": final}, done)
+            for k in np.flatnonzero(done):
+                self.task.reset(int(k), self._rngs[k])
+            observations = observations.copy()
+            observations[done] = self.task.observe(done)
+        return observations, outcome.reward, outcome.terminated, outcome.truncated, infos
+
+    def _with_masks(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        return _masked(info, np.ones(self.num_envs, dtype=bool))
+
+
+def _masked(info: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's form of batched infos: beside every entry the mask of the environments that it is valid for."""
+    masked: dict[str, Any] = {}
+    for name, value in info.items():
+        masked[name] = _masked(value, mask) if isinstance(value, Mapping) else value
+        masked[f"_{name}"] = mask
+    return masked

@@ -1,0 +1,111 @@
+"""What happened in an episode, counted once for the environments' `info`, the logs and the evaluation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quad_swarm.planner import PlanStatus
+from quad_swarm.world.swarm import StepReport
+
+
+class EpisodeStatistics:
+    """Figures of the running episodes of E swarms, as arrays of length E.
+
+    Requests and path count from the start until all robots are at their goals at once, a collision, or the time limit,
+    whichever comes first.
+
+    :ivar steps: steps flown
+    :ivar steps_counted: steps in which requests and path counted
+    :ivar requests: requests made in them
+    :ivar path_length: distance flown in them, mean over the robots (m)
+    :ivar arrived: all robots were at their goals at once, before any collision
+    :ivar collided: ended by a collision
+    :ivar collided_continuous: a collision seen at or between steps
+    :ivar min_separation: smallest distance between two robots at a step (m)
+    :ivar min_separation_continuous: the same at or between steps (m)
+    :ivar planner_failures: plans that no solve stood behind (ladder at "shifted" or below)
+    :ivar solve_seconds: wall-clock time of the planner, this swarm's share of each batch call (s)
+    """
+
+    _START = {  # noqa: RUF012 - never changed
+        "steps": 0,
+        "steps_counted": 0,
+        "requests": 0,
+        "path_length": 0.0,
+        "arrived": False,
+        "collided": False,
+        "collided_continuous": False,
+        "min_separation": np.inf,
+        "min_separation_continuous": np.inf,
+        "planner_failures": 0,
+        "solve_seconds": 0.0,
+    }
+
+    steps: np.ndarray
+    steps_counted: np.ndarray
+    requests: np.ndarray
+    path_length: np.ndarray
+    arrived: np.ndarray
+    collided: np.ndarray
+    collided_continuous: np.ndarray
+    min_separation: np.ndarray
+    min_separation_continuous: np.ndarray
+    planner_failures: np.ndarray
+    solve_seconds: np.ndarray
+
+    def __init__(self, n_swarms: int, n_robots: int):
+        self.n_robots = n_robots
+        for name, value in self._START.items():
+            setattr(self, name, np.full(n_swarms, value))
+
+    def reset(self, swarm: int) -> None:
+        """Begin a new episode in one swarm."""
+        for name, value in self._START.items():
+            getattr(self, name)[swarm] = value
+
+    def keep(self, swarms: np.ndarray) -> None:
+        """Drop all but the given swarms (mask)."""
+        for name in self._START:
+            setattr(self, name, getattr(self, name)[swarms])
+
+    def add(self, report: StepReport, n_requests: np.ndarray, collided: np.ndarray) -> None:
+        """Count one step.
+
+        :param report: what happened in it
+        :param n_requests: requests made in it, (E,)
+        :param collided: whether it ended the episode by a collision, (E,) bool
+        """
+        counted = ~self.arrived
+        self.steps += 1
+        self.steps_counted += counted
+        self.requests += counted * n_requests
+        self.path_length += counted * report.moved.mean(axis=1)
+        self.collided |= collided
+        self.collided_continuous |= report.collision_continuous
+        self.arrived |= report.at_goal.all(axis=1) & ~collided
+        self.min_separation = np.minimum(self.min_separation, report.min_separation)
+        self.min_separation_continuous = np.minimum(self.min_separation_continuous, report.min_separation_continuous)
+        self.planner_failures += (report.plan_status >= PlanStatus.SHIFTED).sum(axis=1)
+        self.solve_seconds += report.solve_seconds / len(self.steps)
+
+    @property
+    def success(self) -> np.ndarray:
+        """All robots arrived and none collided, not even afterwards."""
+        return self.arrived & ~self.collided
+
+    def row(self, swarm: int) -> dict[str, float]:
+        """One swarm's figures by name."""
+        return {name: getattr(self, name)[swarm].item() for name in self._START}
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Figures of the episodes so far, each (E,), by the names under which they are logged."""
+        plans = self.steps * self.n_robots
+        possible = self.steps_counted * self.n_robots * (self.n_robots - 1)
+        return {
+            "swarm/collision_rate": self.collided.astype(float),
+            "swarm/arrival_rate": self.success.astype(float),
+            "swarm/min_separation": self.min_separation.copy(),
+            "comm/request_share": self.requests / possible,
+            "planner/failure_rate": self.planner_failures / plans,
+            "planner/solve_us": 1e6 * self.solve_seconds / plans,
+        }

@@ -1,0 +1,288 @@
+"""What robots observe, as arrays over E swarms, and what each column is about.
+
+The paper's observation is a flat list of relative states. The other one describes every pair (robot, other) by groups
+of features in a frame that is turned towards the other, and holds nothing that the robot does not know by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from quad_swarm.errors import unknown_name
+from quad_swarm.geometry import length
+from quad_swarm.task.view import View
+from quad_swarm.world.beliefs import advance, other_indices
+from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.swarm import Swarm
+
+# About the largest speed (m/s) and the usual distance (m): divide observations to unit size.
+_VELOCITY_SCALE = 4.0
+_POSITION_SCALE = 4.0
+
+
+class Observation(Protocol):
+    """How a swarm looks to its robots.
+
+    :ivar size: length of one robot's observation
+    """
+
+    size: int
+
+    @property
+    def layout(self) -> dict[str, Any]:
+        """Which columns are about the robot itself and which about each of the others: `own`, `neighbours`,
+        `acts_on_neighbours`, and `critic`, those about each of the others that no robot knows when it decides."""
+
+    def __call__(self, swarm: Swarm) -> np.ndarray:
+        """What every robot observes, (E, n, size) float32."""
+
+
+class PaperObservation:
+    """z_i = [v_i, p_ig, {p_ij}, {v_ij}] (Sec. IV-B): own velocity, goal relative to the robot, then all relative
+    positions of the others, then all their relative velocities, others in ascending order; length 6n.
+
+    :param n_robots: number of robots n
+    :param scaled: divide distances by 4 m and velocities by 4 m/s
+    """
+
+    def __init__(self, n_robots: int, scaled: bool = False):
+        self.n_robots, self.size = n_robots, 6 * n_robots
+        distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
+        self._others = other_indices(n_robots)
+        others = 3 * (n_robots - 1)
+        self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, others, others])
+
+    @property
+    def layout(self) -> dict[str, Any]:
+        m = self.n_robots - 1
+        others = [[6 + 3 * k + axis + part for part in (0, 3 * m) for axis in range(3)] for k in range(m)]
+        return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+
+    def __call__(self, swarm: Swarm) -> np.ndarray:
+        pos, vel = swarm.pos, swarm.vel
+        relative_pos = pos[:, self._others] - pos[:, :, None]
+        relative_vel = vel[:, self._others] - vel[:, :, None]
+        flat = (*pos.shape[:2], -1)
+        parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
+        return (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+
+
+class PairView:
+    """A view with vectors turned so that x points horizontally to the other robot and z up, and mirrored so that the
+    other moves to the left: what is to be learned about a pair does not depend on either.
+
+    :param view: what the robots know
+    :param swarm: everything, for what only critics see
+    :param config: the world
+    """
+
+    def __init__(self, view: View, swarm: Swarm, config: SwarmConfig):
+        self.view, self.swarm = view, swarm
+        self.contact = 2 * config.radius
+        self.horizon, self.dt = config.planner.horizon, config.planner.dt
+        flat = np.hypot(view.pos[..., 0], view.pos[..., 1])
+        above = flat < 1e-6
+        self.cos = np.where(above, 1.0, view.pos[..., 0] / np.maximum(flat, 1e-6))
+        self.sin = np.where(above, 0.0, view.pos[..., 1] / np.maximum(flat, 1e-6))
+        self.side = np.where(self.cos * view.vel[..., 1] < self.sin * view.vel[..., 0], -1.0, 1.0)
+
+    def turn(self, vectors: np.ndarray) -> np.ndarray:
+        """Vectors along the world's axes, (E, n, n - 1, ..., 3), seen from the pair's frame."""
+        more = (1,) * (vectors.ndim - self.cos.ndim - 1)
+        cos, sin, side = (a.reshape(a.shape + more) for a in (self.cos, self.sin, self.side))
+        x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+        return np.stack([cos * x + sin * y, side * (cos * y - sin * x), z], axis=-1)
+
+    def closeness(self, distance: np.ndarray) -> np.ndarray:
+        """A distance at several magnifications around contact, (..., 3)."""
+        return np.tanh((distance - self.contact)[..., None] / _MAGNIFICATIONS)
+
+
+_MAGNIFICATIONS = np.array([0.05, 0.2, 1.0])
+# Usual speed (m/s), which brings velocities in pairs' features to unit size.
+_SPEED = 1.5
+# Stages of a trajectory that are looked at, out of 1..N, as fractions of N.
+_STAGES = (0.2, 0.5, 1.0)
+
+
+def _stages(horizon: int) -> list[int]:
+    return [max(round(fraction * horizon), 1) - 1 for fraction in _STAGES]
+
+
+def _flat(array: np.ndarray, keep: int) -> np.ndarray:
+    return array.reshape(*array.shape[:keep], -1)
+
+
+def _own(view: View) -> np.ndarray:
+    """Own velocity and goal, in a frame whose x points horizontally to the goal: (E, n, 6)."""
+    goal, vel = view.goal, view.own_vel
+    flat = np.hypot(goal[..., 0], goal[..., 1])
+    cos, sin = (goal[..., k] / np.maximum(flat, 1e-6) for k in (0, 1))
+    along, across = cos * vel[..., 0] + sin * vel[..., 1], cos * vel[..., 1] - sin * vel[..., 0]
+    columns = (
+        along / _SPEED,
+        across / _SPEED,
+        vel[..., 2],
+        flat / _POSITION_SCALE,
+        np.minimum(flat, 1.0),
+        goal[..., 2],
+    )
+    return np.stack(columns, axis=-1)
+
+
+def _state(pair: PairView) -> np.ndarray:
+    """Positions, velocities and the own goal."""
+    view = pair.view
+    distance = length(view.pos)
+    own_vel, goal = (np.broadcast_to(a[:, :, None], view.pos.shape) for a in (view.own_vel, view.goal))
+    to_goal = goal / np.maximum(length(goal)[..., None], 1.0)
+    parts = (
+        np.stack([distance / _POSITION_SCALE, view.pos[..., 2]], axis=-1),
+        pair.closeness(distance)[..., 1:],
+        pair.turn(view.vel) / _SPEED,
+        pair.turn(own_vel) / _SPEED,
+        pair.turn(to_goal),
+    )
+    return np.concatenate(parts, axis=-1)
+
+
+def _approach(pair: PairView) -> np.ndarray:
+    """When and how close the two would come with constant velocities."""
+    distance, time = pair.view.approach(4.0)
+    times = np.stack([time / 4.0, np.exp(-time / 0.3), np.exp(-time)], axis=-1)
+    return np.concatenate([pair.closeness(distance), times], axis=-1)
+
+
+def _memory(pair: PairView) -> np.ndarray:
+    """The plan received last: its age, how far off it is, and where it departs from a constant velocity."""
+    view = pair.view
+    remembers = view.outlook.remembers.astype(float)
+    age = np.minimum(view.age / pair.horizon, 1.0)
+    drift = np.minimum(view.drift / max(view.memory, 1e-6), 2.0) * (age < 1.0)
+    stages = _stages(pair.horizon)[1:]
+    times = pair.dt * (np.array(stages) + 1)
+    steady = view.pos[..., None, :] + times[:, None] * (view.vel + view.own_vel[:, :, None])[..., None, :]
+    bend = pair.turn(view.expected.take(stages, axis=-2) - steady)
+    return np.concatenate([np.stack([remembers, age, np.exp(2 - view.age), drift], axis=-1), _flat(bend, 3)], axis=-1)
+
+
+def _plan(pair: PairView) -> np.ndarray:
+    """The own plan against what is expected of the other."""
+    view = pair.view
+    separation = view.plan_separation
+    stages = _stages(pair.horizon)
+    nearest = separation.argmin(axis=-1) / pair.horizon
+    times = pair.dt * (np.array(stages[1:]) + 1)
+    bend = view.plan[:, :, stages[1:]] - times[:, None] * view.own_vel[:, :, None]
+    bend = np.broadcast_to(bend[:, :, None], (*view.pos.shape[:3], *bend.shape[2:]))
+    parts = (
+        pair.closeness(separation.min(axis=-1)),
+        nearest[..., None],
+        pair.closeness(separation[..., -1])[..., 1:],
+        _flat(pair.turn(bend), 3),
+    )
+    return np.concatenate(parts, axis=-1)
+
+
+def _told(pair: PairView) -> np.ndarray:
+    """What the other knows of this robot: whether it still believes a plan that it was told, and how far it is off."""
+    view, stages = pair.view, _stages(pair.horizon)
+    told = view.told(stages)
+    off = view.plan[:, :, None, stages] - (told.believed - pair.swarm.pos[:, :, None, None])
+    parts = (
+        np.stack(
+            [told.remembers.astype(float), np.minimum(told.age / pair.horizon, 1.0), np.exp(2 - told.age)], axis=-1
+        ),
+        np.tanh(length(off) / 0.1),
+        np.clip(2 * _flat(pair.turn(off[..., 1:, :]), 3), -2, 2),
+    )
+    return np.concatenate(parts, axis=-1)
+
+
+def _critic(pair: PairView) -> np.ndarray:
+    """What no robot knows: how wrong the two are about each other, and how close their plans are."""
+    view, stages = pair.view, _stages(pair.horizon)
+    others = pair.swarm.beliefs.others
+    plans = advance(pair.swarm.plans[..., :3])[:, :, 1:]
+    theirs = plans[:, others] - pair.swarm.pos[:, :, None, None]
+    surprise = theirs - view.expected
+    back = pair.swarm.beliefs.back  # the other's view of this robot: the same numbers with the two exchanged
+    size = length(surprise)[..., stages]
+    separation = length(view.plan[:, :, None] - theirs)
+    parts = (
+        np.clip(2 * _flat(pair.turn(surprise.take(stages, axis=-2)), 3), -2, 2),
+        np.tanh(size / 0.1),
+        np.tanh(size[:, others, back] / 0.1),
+        pair.closeness(separation.min(axis=-1)),
+        pair.closeness(view.plan_separation.min(axis=-1)),
+        view.outlook.remembers[:, others, back, None],
+    )
+    return np.concatenate(parts, axis=-1)
+
+
+# Name -> features of every pair, (E, n, n - 1, any number).
+GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
+    "state": _state,
+    "approach": _approach,
+    "memory": _memory,
+    "plan": _plan,
+    "told": _told,
+    "critic": _critic,
+}
+
+
+class PairObservation:
+    """A row of a robot: six numbers of its own, then for each of the others the features of some groups.
+
+    :param config: the world
+    :param groups: names of `GROUPS`; "critic" holds what only critics may read
+    :param critics: whether there are any; otherwise their columns are zeros
+    :raises ValueError: unknown group
+    """
+
+    def __init__(self, config: SwarmConfig, groups: list[str], critics: bool = True):
+        for name in groups:
+            if name not in GROUPS:
+                raise unknown_name("observation", name, ["paper", *GROUPS])
+        self.config = config
+        self.groups = [name for name in GROUPS if name in groups]
+        sizes = [GROUPS[name](self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
+        self._seen = sum(sizes) - (sizes[-1] if self.groups[-1] == "critic" else 0)
+        self.size = 6 + (config.n_robots - 1) * sum(sizes)
+        self._blank = 0 if critics else sum(sizes) - self._seen
+
+    def _pair(self, swarm: Swarm) -> PairView:
+        return PairView(View(swarm), swarm, self.config)
+
+    @property
+    def layout(self) -> dict[str, Any]:
+        blocks = np.arange(6, self.size).reshape(self.config.n_robots - 1, -1)
+        seen, hidden = blocks[:, : self._seen], blocks[:, self._seen :]
+        layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True, "complete": True}
+        return layout | ({"critic": hidden.tolist()} if hidden.size else {})
+
+    def __call__(self, swarm: Swarm) -> np.ndarray:
+        pair = self._pair(swarm)
+        groups = [GROUPS[name](pair) for name in self.groups if name != "critic" or not self._blank]
+        groups.append(np.zeros((*pair.view.pos.shape[:-1], self._blank)))
+        blocks = np.concatenate(groups, axis=-1, dtype=np.float32)
+        return np.concatenate([_own(pair.view), _flat(blocks, 2)], axis=-1, dtype=np.float32)
+
+
+def make_observation(
+    config: SwarmConfig, observation: str = "paper", scale_observation: bool = False, critics: bool = True
+) -> Observation:
+    """What robots observe.
+
+    :param config: the world
+    :param observation: "paper", or names of `GROUPS` joined by "+"
+    :param scale_observation: of the paper's, see there
+    :param critics: see `PairObservation`
+    :raises ValueError: unknown name, or scaling of what is scaled
+    """
+    if observation == "paper":
+        return PaperObservation(config.n_robots, scale_observation)
+    return PairObservation(config, observation.split("+"), critics)

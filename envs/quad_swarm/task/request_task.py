@@ -1,0 +1,238 @@
+"""The Dec-POMDP of Sec. IV-B on top of the swarm: observation, reward, end of an episode. Batched over E swarms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_swarm.task.episode_statistics import EpisodeStatistics
+from quad_swarm.task.observation import Observation, PaperObservation, make_observation
+from quad_swarm.world.presets import make_config, replace_fields
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import StepReport, Swarm
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """R = w_g R_g + w_coll R_coll + w_c R_c with the paper's values (Sec. V-A).
+
+    :param goal: w_g r_g, paid in each step in which all robots are at their goals
+    :param collision: w_coll r_coll, taken when two robots collide
+    :param request: w_c, taken for each request
+    :param near_miss: not in the paper: taken in each step for each pair closer than ``near_miss_distance``, in full at
+        ``near_miss_width`` less than that and in proportion before; a signal that is less rare than collisions
+    :param near_miss_distance: see there (m)
+    :param near_miss_width: see there (m)
+    :param near_miss_ahead: count also how close the two come by their plans within so many further steps
+    :param near_miss_narrowing: by how much ``near_miss_distance`` is less for the last of those steps, in proportion
+        for those before: plans that are far ahead still change (m)
+    """
+
+    goal: float = 1.3
+    collision: float = 150.0
+    request: float = 0.1
+    near_miss: float = 0.0
+    near_miss_distance: float = 0.6
+    near_miss_width: float = 0.01
+    near_miss_ahead: int = 0
+    near_miss_narrowing: float = 0.0
+
+
+class Outcome(NamedTuple):
+    """Result of one step of E swarms.
+
+    :param reward: team rewards, (E,)
+    :param pair_rewards: the part of the reward that belongs to a robot and one of the others, (E, n, n - 1): its
+        request, their collision, and an equal share of the goal's reward
+    :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" where it has a
+        weight, each (E,)
+    :param terminated: ended by a collision, or by the arrival of all where that ends episodes, (E,) bool
+    :param truncated: ended by the time limit, (E,) bool
+    :param n_requests: requests made, (E,)
+    :param report: what happened in the world
+    """
+
+    reward: np.ndarray
+    pair_rewards: np.ndarray
+    reward_terms: dict[str, np.ndarray]
+    terminated: np.ndarray
+    truncated: np.ndarray
+    n_requests: np.ndarray
+    report: StepReport
+
+
+class RequestTask:
+    """Episodes of E swarms.
+
+    :ivar statistics: figures of the running episodes
+
+    :param swarm: the swarms
+    :param sampler: draws episodes
+    :param reward: weights of the reward
+    :param max_steps: time limit (steps)
+    :param observation: what robots observe, the paper's without scaling if None
+    :param continuous_collisions: end episodes at collisions between steps too; the paper looks at the steps alone
+    :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
+    """
+
+    def __init__(
+        self,
+        swarm: Swarm,
+        sampler: ScenarioSampler,
+        reward: RewardConfig,
+        max_steps: int = 100,
+        observation: Observation | None = None,
+        continuous_collisions: bool = False,
+        end_at_arrival: bool = False,
+    ):
+        if max_steps < 1:
+            raise ValueError(f"max_steps={max_steps}: an episode needs at least one step.")
+        self.swarm = swarm
+        self.sampler = sampler
+        self.reward = reward
+        self.max_steps = max_steps
+        self.continuous_collisions = continuous_collisions
+        self.end_at_arrival = end_at_arrival
+        n = swarm.config.n_robots
+        self.scenario = [""] * swarm.n_swarms
+        self.statistics = EpisodeStatistics(swarm.n_swarms, n)
+        self.observation = observation or PaperObservation(n, scaled=False)
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """The robots' names."""
+        return tuple(f"robot_{index}" for index in range(self.swarm.config.n_robots))
+
+    @property
+    def observation_layout(self) -> dict[str, Any]:
+        """Which columns of an observation are about the robot itself and which about each of the others."""
+        return self.observation.layout
+
+    @property
+    def action_cost(self) -> float:
+        """What a request costs."""
+        return self.reward.request
+
+    @property
+    def observation_size(self) -> int:
+        """Length of one robot's observation."""
+        return self.observation.size
+
+    def reset(self, swarm: int, rng: np.random.Generator) -> None:
+        """Draw a new episode for one swarm; every random number of the episode comes from ``rng``."""
+        self.place(swarm, *self.sampler.sample(rng), rng)
+
+    def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, rng: np.random.Generator) -> None:
+        """Begin a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
+        noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
+        self.swarm.reset(swarm, starts, goals, noise_seed)
+        self.scenario[swarm] = name
+        self.statistics.reset(swarm)
+
+    def keep(self, swarms: np.ndarray) -> None:
+        """Drop all but the given swarms (mask)."""
+        self.swarm.keep(swarms)
+        self.statistics.keep(swarms)
+        self.scenario = [name for name, kept in zip(self.scenario, swarms, strict=True) if kept]
+
+    def observe(self, swarms: np.ndarray | None = None) -> np.ndarray:
+        """What every robot observes, (E, n, observation_size) float32; of some swarms only if there is a mask."""
+        return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))
+
+    def step(self, requests: np.ndarray) -> Outcome:
+        """One step of every swarm; ``requests`` as in `Swarm.step`."""
+        report = self.swarm.step(requests)
+        collided = report.collision_continuous if self.continuous_collisions else report.collision
+        colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
+        n_requests = requests.sum(axis=(1, 2))
+        self.statistics.add(report, n_requests, collided)
+        terms = {
+            "goal": self.reward.goal * report.at_goal.all(axis=1),
+            "collision": -self.reward.collision * collided,
+            "requests": -self.reward.request * n_requests,
+        }
+        near_misses = np.zeros_like(report.separation)
+        if self.reward.near_miss:
+            near_misses = self.reward.near_miss * self._near_misses(report.separation)
+            terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
+        terminated = collided | self.statistics.arrived if self.end_at_arrival else collided
+        share = terms["goal"] / max(requests.shape[2], 1)
+        return Outcome(
+            reward=sum(terms.values(), start=np.zeros(len(n_requests))),
+            pair_rewards=(
+                share[:, None, None] - self.reward.collision * colliding - self.reward.request * requests - near_misses
+            ).astype(np.float32),
+            reward_terms=terms,
+            terminated=terminated,
+            truncated=~terminated & (self.statistics.steps >= self.max_steps),
+            n_requests=n_requests,
+            report=report,
+        )
+
+    def _near_misses(self, separation: np.ndarray) -> np.ndarray:
+        """How near each miss is, 0 to 1, (E, n, n - 1)."""
+        reward, ahead = self.reward, self.reward.near_miss_ahead
+        shortfall = reward.near_miss_distance - separation
+        if ahead:
+            limits = reward.near_miss_distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
+            planned = (limits - self.swarm.planned_separation(ahead)).max(axis=-1)
+            shortfall = np.maximum(shortfall, planned)
+        return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0)
+
+    def info(self, outcome: Outcome) -> dict[str, Any]:
+        """The last step for `info`: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
+        report = outcome.report
+        return {
+            "scenario": np.array(self.scenario),
+            "pair_rewards": outcome.pair_rewards,
+            "reward_terms": outcome.reward_terms,
+            "n_requests": outcome.n_requests,
+            "min_separation": report.min_separation,
+            "min_separation_continuous": report.min_separation_continuous,
+            "collision": report.collision,
+            "collision_continuous": report.collision_continuous,
+            "at_goal": report.at_goal,
+            "belief_source": report.belief_source,
+            "planner": {"status": report.plan_status, "iterations": report.iterations},
+            "metrics": {f"reward/{name}": term for name, term in outcome.reward_terms.items()},
+        }
+
+    def final_info(self) -> dict[str, Any]:
+        """What `info` says at the end of an episode beside that: arrays with a leading axis of swarms."""
+        return {"is_success": self.statistics.success, "metrics": self.statistics.metrics()}
+
+
+def make_task(
+    n_swarms: int = 1,
+    preset: str = "paper",
+    scenario: str | Mapping[str, float] = "mixed",
+    n_robots: int | None = None,
+    max_steps: int = 100,
+    observation: str = "paper",
+    scale_observation: bool = False,
+    continuous_collisions: bool = False,
+    end_at_arrival: bool = False,
+    memory: float | None = None,
+    reward: Mapping[str, float] | None = None,
+    planner: Mapping[str, Any] | None = None,
+    noise: Mapping[str, float] | None = None,
+    radio: Mapping[str, float] | None = None,
+    space: Mapping[str, Any] | None = None,
+    solver: str = "auto",
+) -> RequestTask:
+    """The task of an environment; arguments as in `QuadSwarmEnv`.
+
+    :param n_swarms: number of swarms E
+    :raises ValueError: a wrong value; the message names it and the remedy
+    """
+    config = make_config(
+        preset, n_robots=n_robots, memory=memory, planner=planner, noise=noise, radio=radio, space=space
+    )
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space)
+    weights = replace_fields(RewardConfig(), reward or {}, "reward")
+    swarm = Swarm(config, n_swarms, solver)
+    seen = make_observation(config, observation, scale_observation)
+    return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival)

@@ -1,0 +1,109 @@
+"""What a robot knows when it decides whom to ask, for rules and for observations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from quad_swarm.geometry import length
+from quad_swarm.world.beliefs import Outlook, advance
+from quad_swarm.world.swarm import Swarm
+
+
+class View:
+    """What the robots of E swarms know before they ask, relative to themselves, along the world's axes.
+
+    :param swarm: the swarms
+    :param rngs: one generator for each swarm, so that an episode's draws do not depend on what else is in the batch
+    """
+
+    def __init__(self, swarm: Swarm, rngs: Sequence[np.random.Generator] = ()):
+        self._swarm = swarm
+        self.rngs = rngs
+        self.memory = swarm.config.memory
+        self.horizon = swarm.config.planner.horizon
+
+    @cached_property
+    def pos(self) -> np.ndarray:
+        """Positions of the others, (E, n, n - 1, 3) (m)."""
+        pos = self._swarm.pos
+        return pos[:, self._swarm.beliefs.others] - pos[:, :, None]
+
+    @cached_property
+    def vel(self) -> np.ndarray:
+        """Velocities of the others relative to the robot's, (E, n, n - 1, 3) (m/s)."""
+        vel = self._swarm.vel
+        return vel[:, self._swarm.beliefs.others] - vel[:, :, None]
+
+    @cached_property
+    def own_vel(self) -> np.ndarray:
+        """The robot's velocity, (E, n, 3) (m/s)."""
+        return self._swarm.vel
+
+    @cached_property
+    def goal(self) -> np.ndarray:
+        """The robot's goal, (E, n, 3) (m)."""
+        return self._swarm.goal - self._swarm.pos
+
+    @cached_property
+    def plan(self) -> np.ndarray:
+        """The robot's positions at the next N steps by its last plan, (E, n, N, 3) (m)."""
+        return self.current_plans[:, :, 1:]
+
+    @cached_property
+    def current_plans(self) -> np.ndarray:
+        """The same from now on, stages 0..N, (E, n, N + 1, 3) (m)."""
+        return advance(self._swarm.plans[..., :3]) - self._swarm.pos[:, :, None]
+
+    @cached_property
+    def outlook(self) -> Outlook:
+        """What the robot believes of those it does not ask, `Outlook`; positions along the world's axes, absolute."""
+        return self._swarm.beliefs.outlook(self._swarm.pos, self._swarm.vel)
+
+    @cached_property
+    def expected(self) -> np.ndarray:
+        """Where the others will be at the next N steps as far as the robot knows without asking, (E, n, n - 1, N, 3)
+        (m)."""
+        believed, pos = self.outlook.believed, self._swarm.pos
+        # Stages and coordinates as one axis: numpy is slow along three numbers
+        relative = believed.reshape(*believed.shape[:3], -1) - np.tile(pos, self.horizon)[:, :, None]
+        return relative.reshape(believed.shape)
+
+    def told(self, stages: Sequence[int]) -> Outlook:
+        """What each of the others believes of this robot unless it asks, as far as this robot can tell: it knows what
+        it answered, and takes every answer to have arrived.
+
+        :param stages: which of the next N steps, from 0 on; `Outlook.believed` holds no others
+        """
+        beliefs = self._swarm.told
+        outlook = beliefs.outlook(self._swarm.pos, self._swarm.vel)
+        outlook = outlook._replace(believed=outlook.believed.take(stages, axis=-2))
+        return Outlook(*(field[:, beliefs.others, beliefs.back] for field in outlook))
+
+    @property
+    def age(self) -> np.ndarray:
+        """Steps since the newest plan of each of the others was made, N or more without any, (E, n, n - 1)."""
+        return self.outlook.age
+
+    @property
+    def drift(self) -> np.ndarray:
+        """How far off that plan is by now, (E, n, n - 1) (m)."""
+        return self.outlook.error
+
+    @cached_property
+    def plan_separation(self) -> np.ndarray:
+        """Distances between the robot's plan and what it expects of the others, (E, n, n - 1, N) (m)."""
+        return length(self.plan[:, :, None] - self.expected)
+
+    def approach(self, look_ahead: float) -> tuple[np.ndarray, np.ndarray]:
+        """Closest approach if everybody kept the present velocity.
+
+        :param look_ahead: latest time to look at (s)
+        :return: distance (m) and time from now (s), both (E, n, n - 1)
+        """
+        closing = -(self.pos * self.vel).sum(axis=-1)
+        speed2 = (self.vel**2).sum(axis=-1)
+        time = np.clip(closing / np.maximum(speed2, 1e-12), 0.0, look_ahead)
+        return length(self.pos + time[..., None] * self.vel), time

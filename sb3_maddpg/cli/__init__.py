@@ -1,0 +1,1 @@
+"""The command line: `sb3-maddpg`, rl_zoo3 with MADDPG, searches and the stopwatch."""

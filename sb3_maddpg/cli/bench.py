@@ -1,0 +1,101 @@
+"""``sb3-maddpg bench``: how fast a recipe trains on this machine, and where the time goes."""
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rl_zoo3.train
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_maddpg.cli import zoo
+from sb3_maddpg.cli.experiment import TeamExperimentManager
+from sb3_maddpg.cli.options import common_options
+
+# What of an algorithm is timed, by the attribute that does it. Those that an algorithm lacks take no time of their own.
+PARTS = {"learning": "train", "acting": "_sample_action"}
+
+
+def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
+    """
+    :param function: any
+    :param total: its only entry grows by the seconds of each call
+    :return: the function, with a stopwatch
+    """
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        started = time.perf_counter()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            total[0] += time.perf_counter() - started
+
+    return call
+
+
+class BenchManager(TeamExperimentManager):
+    """Trains with a stopwatch, and keeps nothing but the times."""
+
+    result: dict[str, Any]  # of the class, for rl_zoo3 keeps its manager to itself
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """
+        :param model: a new one
+        """
+        totals = {name: [0.0] for name in (*PARTS, "environments")}
+        for name, attribute in PARTS.items():
+            if hasattr(model, attribute):
+                setattr(model, attribute, timed(getattr(model, attribute), totals[name]))
+        assert model.env is not None
+        model.env.step = timed(model.env.step, totals["environments"])  # type: ignore[method-assign]
+        started = time.perf_counter()
+        super().learn(model)
+        seconds = time.perf_counter() - started
+        shares = {name: total[0] / seconds for name, total in totals.items()}
+        shares["rest"] = 1 - sum(shares.values())
+        updates = getattr(model, "_n_updates", 0)
+        BenchManager.result = {
+            "env": self.env_name.gym_id,
+            "algo": self.algo,
+            "steps": model.num_timesteps,
+            "updates": updates,
+            "seconds": seconds,
+            "steps_per_second": model.num_timesteps / seconds,
+            **{f"share_{name}": share for name, share in shares.items()},
+        }
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        :param model: not worth saving
+        """
+
+
+def main(argv: list[str]) -> int:
+    """
+    :param argv: options of ``sb3-maddpg train``, and ``--json FILE``
+    :return: exit status
+    """
+    parser = common_options()
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--n-timesteps", "-n", type=int, default=20_000)
+    known, given = parser.parse_known_args(argv)
+    zoo.register()
+    rl_zoo3.train.ExperimentManager = BenchManager  # type: ignore[misc]
+    with tempfile.TemporaryDirectory() as folder:
+        options = ["--algo", known.algo, "--n-timesteps", str(known.n_timesteps), "--log-folder", folder]
+        options += ["--env", known.env] if known.env else []
+        options += ["--progress"] if sys.stderr.isatty() else []
+        zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given])
+    result = BenchManager.result
+    print(f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="")
+    print(f"{result['steps_per_second']:.0f} steps/s")
+    for name in ("environments", "learning", "acting", "rest"):
+        print(f"  {name:13} {result[f'share_{name}']:6.1%}")
+    if known.json:
+        known.json.parent.mkdir(parents=True, exist_ok=True)
+        known.json.write_text(json.dumps(result) + "\n")
+        print(f"wrote {known.json}")
+    return 0

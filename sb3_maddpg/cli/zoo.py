@@ -1,0 +1,188 @@
+"""``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3 and the installed environments."""
+
+import ast
+import builtins
+import importlib
+import os
+import runpy
+import sys
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import yaml
+from gymnasium.envs.registration import load_env_creator
+
+try:
+    import rl_zoo3.enjoy
+    import rl_zoo3.train
+    import rl_zoo3.utils
+except ImportError as error:
+    raise ImportError(f"{error}. The zoo needs its own packages: pip install 'sb3-maddpg[zoo]'.") from error
+from huggingface_sb3 import EnvironmentName
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import ALGOS, StoreDict, get_latest_run_id, get_saved_hyperparams
+
+from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.cli.experiment import TeamExperimentManager
+from sb3_maddpg.cli.options import PROG, common_options
+from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.utils import suggest
+
+
+def register() -> None:
+    """Make the algorithms and every installed environment known to rl_zoo3, whose command line reads these dicts."""
+    ALGOS.update({"maddpg": MADDPG, "matd3": MATD3})
+    HYPERPARAMS_SAMPLER.update({"maddpg": sample_maddpg_params, "matd3": sample_matd3_params})
+    HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3"), convert_params))
+    rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
+    rl_zoo3.train.StoreDict = WordsAndPython  # type: ignore[misc]
+    importlib.import_module("sb3_maddpg.team_tasks")
+    for entry_point in entry_points(group="sb3_maddpg.environments"):
+        entry_point.load()
+
+
+class WordsAndPython(StoreDict):
+    """
+    rl_zoo3's ``key:value``, where values are Python, and beside it plain words: ``preset:dense`` as well as
+    ``preset:"'dense'"``.
+    """
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        try:
+            super().__call__(parser, namespace, [_quoted(word) for word in values], option_string)
+        except Exception as error:
+            raise ValueError(f"{option_string} {' '.join(values)}: {error}. Write key:value.") from error
+
+
+def _quoted(word: str) -> str:
+    """:return: ``key:value`` with a value that Python can read"""
+    key, colon, value = word.partition(":")
+    if not colon or not value:
+        raise ValueError(f"'{word}' has no value")
+    try:
+        tree = ast.parse(value, mode="eval")
+    except SyntaxError:
+        return f"{key}:{value!r}"
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    known = names <= vars(builtins).keys() | vars(rl_zoo3.utils).keys()
+    return word if known and not isinstance(tree.body, ast.Name) else f"{key}:{value!r}"
+
+
+def _call(function: Callable[[], Any], command: str, argv: list[str]) -> None:
+    """rl_zoo3's commands read ``sys.argv`` and have no other way in."""
+    saved, sys.argv = sys.argv, [f"{PROG} {command}", *argv]
+    try:
+        function()
+    finally:
+        sys.argv = saved
+
+
+def packaged_config(algo: str, env_id: str) -> str | None:
+    """
+    :param algo: name of the algorithm
+    :param env_id: Gymnasium id
+    :return: path of the packaged recipe for the two, if there is one
+    """
+    path = Path(str(files("sb3_maddpg.zoo_configs") / f"{algo}.yml"))
+    if path.is_file() and not {env_id, "default"}.isdisjoint(yaml.safe_load(path.read_text())):
+        return str(path)
+    return None
+
+
+def train(argv: list[str]) -> int:
+    """Train as rl_zoo3 does, by the packaged recipe unless another is given."""
+    parser = common_options()
+    parser.add_argument("-conf", "--conf-file")
+    known, rest = parser.parse_known_args(argv)
+    if known.env is not None and not {"-h", "--help"} & set(rest):
+        _find_env(known.env, known.gym_packages)
+    # One thread unless asked otherwise: small networks gain nothing by a second and lose badly where it is not free.
+    argv = ["--algo", known.algo, "--num-threads", "1", *argv]
+    if known.env is not None and known.conf_file is None:
+        path = packaged_config(known.algo, known.env)
+        argv += ["--conf-file", path] if path is not None else []
+    _call(rl_zoo3.train.train, "train", argv)
+    return 0
+
+
+def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
+    """Show a trained model in an environment with the arguments it was trained with."""
+    parser = common_options()
+    parser.add_argument("-f", "--folder", default="logs")
+    parser.add_argument("--exp-id", type=int, default=0)
+    parser.add_argument("--env-kwargs", nargs="+", action=WordsAndPython, default={})
+    known, rest = parser.parse_known_args(argv)
+    if known.env is not None and not {"-h", "--help"} & set(rest):
+        _find_env(known.env, known.gym_packages)
+        name = EnvironmentName(known.env)
+        exp_id = known.exp_id or get_latest_run_id(str(Path(known.folder, known.algo)), name)
+        run = Path(known.folder, known.algo, f"{name}_{exp_id}" if exp_id > 0 else "")
+        hyperparams, _ = get_saved_hyperparams(str(run / name))
+        env_kwargs = {**hyperparams.get("env_kwargs", {}), **known.env_kwargs}
+        rest += ["--env", known.env]
+        # rl_zoo3 reads these values as Python; its own merging forgets some of them
+        rest += ["--env-kwargs", *(f"{key}:{value!r}" for key, value in env_kwargs.items())] if env_kwargs else []
+        if command == "enjoy" and "--no-render" not in rest:
+            reason = "there is no display" if _is_headless() else f"{known.env} has no window to show"
+            if _is_headless() or not _has_window(known.env, env_kwargs):
+                print(f"Only the rewards are printed: {reason}. `record` makes a video.")
+                rest.append("--no-render")
+    _call(function, command, ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest])
+    return 0
+
+
+def enjoy(argv: list[str]) -> int:
+    """Watch a trained model."""
+    return _show("enjoy", rl_zoo3.enjoy.enjoy, argv)
+
+
+def record(argv: list[str]) -> int:
+    """Record a trained model on video."""
+    # A script without a function to call
+    return _show("record", lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), argv)
+
+
+def _find_env(env_id: str, packages: list[str]) -> None:
+    """Make the environment known to Gymnasium: one that is registered, or a PettingZoo module."""
+    for package in packages:
+        importlib.import_module(package)
+    if parallel.register(env_id):
+        return
+    package, slash, _ = env_id.rpartition("/")
+    known = parallel.siblings(env_id) or gymnasium.registry
+    if slash and not any(name.startswith(f"{package}/") for name in known):
+        raise ValueError(
+            f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
+            "parallel_env, as PettingZoo's have. Is its package installed, or in this folder?"
+        )
+    raise ValueError(suggest("environment", env_id, known))
+
+
+def _is_headless() -> bool:
+    """Whether windows would be drawn where nobody sees them. SDL_VIDEODRIVER is for those who want just that."""
+    known = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    return sys.platform.startswith("linux") and not any(os.environ.get(name) for name in known)
+
+
+def _has_window(env_id: str, env_kwargs: dict[str, Any]) -> bool:
+    spec = gymnasium.spec(env_id)
+    if spec.entry_point == parallel.ENTRY_POINT:
+        # Only the environment itself knows
+        env = parallel.make(**{**spec.kwargs, **env_kwargs})
+        env.close()
+        return "human" in env.metadata["render_modes"]
+    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    return "human" in getattr(creator, "metadata", {}).get("render_modes", ["human"])
+
+
+COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "train": train,
+    "tune": lambda argv: train(["-optimize", *argv]),
+    "enjoy": enjoy,
+    "record": record,
+}

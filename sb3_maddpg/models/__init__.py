@@ -1,1 +1,0 @@
-"""Trained models, one folder each; see `sb3_maddpg.pretrained`."""

@@ -1,0 +1,170 @@
+"""A reference for docs/results.md: what a regression on forked simulators learns in the swarm.
+
+``python -m studies.swarm.counterfactual [--forks N] [--episodes N] [--seed S] [--models FOLDER] [--json F]``: every
+few steps swarms are copied once for each request that could be turned round, the copies fly on for a second and a
+half, and the actor of zoo_configs/quad_swarm_paper.yml learns by regression how much more its pair would have paid
+without the request. No critic learns: this is what its estimates are worth beside the simulator's. Then the actor flies
+with several prices of a request on episodes of the validation set. JSON: one row a scenario and price with the keys of
+`quad_swarm.evaluation.evaluation.summarise`, and forks, steps (of a swarm), labels, seed, seconds, scenario, price.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from copy import copy, deepcopy
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch as th
+from torch.nn import functional as F
+
+from quad_swarm.evaluation.command import write_json
+from quad_swarm.task.request_task import RequestTask, make_task
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import SCENARIOS
+from sb3_maddpg import MADDPG
+from studies.swarm.ppo import env_kwargs, validate
+from studies.swarm.protocol import cell
+
+PRICES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+# Prices of the policy that flies while it learns are drawn between these, for each pair and step.
+LOWEST, HIGHEST = 0.002, 0.4
+# Swarms, steps from fork to fork, for which a request is turned round, and for which the copies fly
+SWARMS, APART, HELD, AHEAD = 32, 3, 3, 14
+DISCOUNT = 0.95
+# What an actor's logit is to a gain, and the largest gain: a collision would drown everything else
+SCALE, LARGEST = 4.0, 3.0
+
+
+class Labels(NamedTuple):
+    """What was learned from forks.
+
+    :param obs: of single robots, (B, size)
+    :param gain: how much less its pair pays if a robot asks, for each of the others, (B, n - 1)
+    """
+
+    obs: np.ndarray
+    gain: np.ndarray
+
+
+class Forks:
+    """Swarms that are copied and flown with one request turned round.
+
+    :param model: whose actor says the gain of each request
+    :param seed: of starts, goals and prices
+    """
+
+    def __init__(self, model: MADDPG, seed: int):
+        self.model = model
+        self.rng = np.random.default_rng(seed)
+        kwargs = env_kwargs(0.0)
+        n = make_config(kwargs["preset"]).n_robots
+        self.pairs = (n, n - 1)
+        self.copies = 1 + n * (n - 1)
+        self.task = make_task(SWARMS * self.copies, **kwargs)
+        self.steps = 0
+        self._begin(np.ones(SWARMS, dtype=bool))
+
+    def _begin(self, over: np.ndarray) -> None:
+        for k in np.flatnonzero(over):
+            seed = int(self.rng.integers(2**31))
+            for c in range(self.copies):
+                self.task.reset(c * SWARMS + k, np.random.default_rng(seed))
+
+    def _act(self, task: RequestTask) -> np.ndarray:
+        """Requests by the actor, with the same prices in all copies, (copies, SWARMS, n, n - 1)."""
+        prices = np.exp(self.rng.uniform(np.log(LOWEST), np.log(HIGHEST), (SWARMS, *self.pairs)))
+        with th.no_grad():
+            gain = self.model.actor.logits(th.as_tensor(task.observe())).numpy() / SCALE
+        return gain.reshape(self.copies, SWARMS, *self.pairs) > prices
+
+    def _step(self, task: RequestTask, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rewards by pair and who is over, both with a leading axis of copies."""
+        self.steps += bits.shape[0] * SWARMS
+        outcome = task.step(bits.reshape(-1, *self.pairs))
+        over = (outcome.terminated | outcome.truncated).reshape(self.copies, SWARMS)
+        return outcome.pair_rewards.reshape(self.copies, SWARMS, *self.pairs), over
+
+    def fork(self) -> Labels:
+        """Fly on for a few steps, then fork."""
+        for _ in range(APART):
+            over = self._step(self.task, self._act(self.task))[1][0]
+            self._begin(over)
+        obs = self.task.observe()[:SWARMS]
+        branch = copy(self.task)
+        branch.swarm = self.task.swarm.part(np.ones(SWARMS * self.copies, dtype=bool))
+        branch.statistics = deepcopy(self.task.statistics)
+        total, flying = np.zeros((self.copies, SWARMS, *self.pairs)), np.ones((self.copies, SWARMS), dtype=bool)
+        turned = np.arange(1, self.copies)
+        i, m = np.unravel_index(turned - 1, self.pairs)
+        first = np.empty(0, dtype=bool)
+        for t in range(AHEAD):
+            bits = self._act(branch)
+            if t == 0:
+                first = bits[0, :, i, m].copy()  # (copies - 1, SWARMS)
+            if t < HELD:
+                bits[turned, :, i, m] = ~first
+            rewards, over = self._step(branch, bits)
+            total += DISCOUNT**t * rewards * flying[..., None, None]
+            flying &= ~over
+        more = total[turned, :, i, m] - total[0, :, i, m]
+        gain = np.where(first, -more, more).T.reshape(-1, self.pairs[1])
+        return Labels(obs.reshape(-1, obs.shape[-1]), np.clip(gain, -LARGEST, LARGEST).astype(np.float32))
+
+
+def train(forks: int, seed: int) -> tuple[MADDPG, Forks]:
+    """Regress the actor on what forks say; it decides which states are seen meanwhile."""
+    env = gymnasium.make("QuadSwarm-v0", **env_kwargs(0.0))
+    policy_kwargs = {"net_arch": [64, 64], "pair_credit": True}
+    model = MADDPG("PairPolicy", env, policy_kwargs=policy_kwargs, buffer_size=1000, seed=seed, device="cpu")
+    source, n_robots = Forks(model, seed), make_config("paper").n_robots
+    known: list[Labels] = []
+    optimizer = th.optim.Adam(model.actor.parameters(), lr=1e-3)
+    for k in range(forks):
+        known.append(source.fork())
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-3 * (1 - k / forks)
+        for _ in range(10):
+            drawn = [known[source.rng.integers(len(known))] for _ in range(8)]
+            obs, gain = (th.as_tensor(np.concatenate(both)) for both in zip(*drawn, strict=True))
+            # An actor decides for a whole team, but looks at each of its robots by itself.
+            logits = model.actor.logits(obs.unflatten(0, (-1, n_robots))).flatten(0, 1)
+            loss = F.mse_loss(logits, SCALE * gain)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        if (k + 1) % 50 == 0:
+            print(f"fork {k + 1}: loss {loss:.3f}", flush=True)
+    return model, source
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--forks", type=int, default=600, help=f"of {SWARMS} swarms each (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=2000, help="of each scenario (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the model (%(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    args.models.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+    model, source = train(args.forks, args.seed)
+    keys: dict[str, Any] = {"forks": args.forks, "steps": source.steps, "seed": args.seed}
+    keys |= {"labels": args.forks * SWARMS * (source.copies - 1), "seconds": time.perf_counter() - started}
+    path = args.models / f"counterfactual_seed{args.seed}.zip"
+    model.save(path)
+    config = make_config("paper")
+    rows: list[dict[str, Any]] = []
+    for name in SCENARIOS:
+        cells = {price: cell(f"{path}@{1 / (1 + np.exp(-SCALE * price)):.6f}", name, config) for price in PRICES}
+        rows += validate(cells, "price", args.episodes, keys)
+    if args.json:
+        write_json(args.json, rows)
+
+
+if __name__ == "__main__":
+    main()

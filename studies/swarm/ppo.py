@@ -1,0 +1,171 @@
+"""A reference for docs/results.md: what PPO learns in the swarm, with one network for all robots.
+
+``python -m studies.swarm.ppo [--price P ...] [--steps N] [--episodes N] [--seed S] [--models FOLDER] [--json F]``
+trains Stable-Baselines3's PPO with every robot as an environment of its own, with the observations, scenarios and
+rewards of zoo_configs/quad_swarm_paper.yml, credit by robot and a price for each request. Then it flies each policy
+with several thresholds of the probability to ask, on episodes of the validation set. JSON: one row a price, scenario
+and threshold with the keys of `quad_swarm.evaluation.evaluation.summarise`, and price, steps, seed, seconds, scenario, threshold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch as th
+import yaml
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from quad_swarm.evaluation.command import write_json
+from quad_swarm.evaluation.evaluation import Cell, fly_all, summarise
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import SCENARIOS
+from sb3_maddpg.vec_env import GymnasiumVecEnv
+from studies.swarm.protocol import ROOT, VALIDATION, cell
+
+RECIPE = ROOT / "zoo_configs" / "quad_swarm_paper.yml"
+THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 0.7)
+
+
+def env_kwargs(price: float) -> dict[str, Any]:
+    """The world of the recipe, without what only its critics see, and with a price for each request."""
+    kwargs = yaml.safe_load(RECIPE.read_text())["QuadSwarm-v0"]["env_kwargs"]
+    kwargs["observation"] = kwargs["observation"].removesuffix("+critic")
+    kwargs["reward"]["request"] = price
+    return kwargs
+
+
+class Robots(VecEnvWrapper):
+    """Every robot of every team as an environment; its reward is the sum of what it pays for each of the others."""
+
+    def __init__(self, teams: GymnasiumVecEnv):
+        n, size = teams.observation_space.shape  # type: ignore[misc]
+        space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        super().__init__(teams, space, spaces.MultiBinary(n - 1))
+        self.teams, self.n = teams.num_envs, n
+        self.num_envs = self.teams * n
+
+    def reset(self) -> np.ndarray:
+        """As in Stable-Baselines3."""
+        return np.asarray(self.venv.reset()).reshape(self.num_envs, -1)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """As in Stable-Baselines3."""
+        self.venv.step_async(actions.reshape(self.teams, -1).astype(np.int8))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """As in Stable-Baselines3."""
+        obs, _, dones, infos = self.venv.step_wait()
+        rewards = np.stack([info["pair_rewards"].sum(axis=-1) for info in infos])
+        mine: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for k in np.flatnonzero(dones):
+            for i, last in enumerate(infos[k]["terminal_observation"]):
+                mine[k * self.n + i] = {
+                    "TimeLimit.truncated": infos[k]["TimeLimit.truncated"],
+                    "terminal_observation": last,
+                }
+        return np.asarray(obs).reshape(self.num_envs, -1), rewards.ravel(), np.repeat(dones, self.n), mine
+
+
+class SharedPPO:
+    """A trained PPO that decides for every robot of a team by itself, as `quad_swarm.evaluation.evaluation` flies models.
+
+    :param model: trained with one robot's observations and requests
+    """
+
+    def __init__(self, model: PPO):
+        self.policy, self.threshold = model.policy, 0.5
+        n_robots = model.action_space.n + 1  # type: ignore[attr-defined]
+        shape = (n_robots, *model.observation_space.shape)  # type: ignore[misc]
+        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float32)
+        self.env_spec = {"kwargs": env_kwargs(0.0)}
+
+    @classmethod
+    def load(cls, path: str, device: str = "auto") -> SharedPPO:
+        """As in Stable-Baselines3."""
+        return cls(PPO.load(path, device=device))
+
+    def set_threshold(self, threshold: float) -> None:
+        """:param threshold: of the probability with which the policy would ask"""
+        self.threshold = threshold
+
+    def predict(self, observation: np.ndarray, deterministic: bool = True) -> tuple[np.ndarray, None]:
+        """:return: bits of all robots, (E, n (n - 1)), and no state"""
+        with th.no_grad():
+            rows = th.as_tensor(observation.reshape(-1, observation.shape[-1]))
+            probabilities = self.policy.get_distribution(rows).distribution.probs  # type: ignore[union-attr]
+        return (probabilities > self.threshold).numpy().reshape(len(observation), -1), None
+
+
+def train(price: float, steps: int, seed: int) -> PPO:
+    """Train for so many steps of the swarm."""
+    env = Robots(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", 32, **env_kwargs(price))))
+    model = PPO(
+        "MlpPolicy",
+        env,
+        learning_rate=lambda left: 1e-3 * left,
+        n_steps=64,
+        batch_size=1024,
+        n_epochs=6,
+        gamma=0.95,
+        policy_kwargs={"net_arch": [128, 128]},
+        seed=seed,
+        device="cpu",
+    )
+    return model.learn(steps * env.n)
+
+
+def validate(cells: dict[float, Cell], what: str, episodes: int, keys: dict[str, Any]) -> list[dict[str, Any]]:
+    """Fly a scenario of the validation set with several values of something.
+
+    :param cells: what flies with each value
+    :param what: name of the values
+    :param keys: of every row
+    :return: a row for each value
+    """
+    flown = fly_all(list(cells.values()), episodes, VALIDATION)
+    rows = []
+    for value, one in cells.items():
+        row = {"scenario": one.scenario, what: value} | summarise(flown[one], one.config.n_robots)
+        rows.append(keys | row)
+        figures = f"{row['collisions']}/{row['episodes']} at {row['request_share']:.1%}"
+        print(f"{one.scenario}, {what} {value:g}: {figures}", flush=True)
+    return rows
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--price", type=float, nargs="+", default=[0.02, 0.1], help="of a request (%(default)s)")
+    parser.add_argument("--steps", type=int, default=400_000, help="of the swarm (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=2000, help="of each scenario (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the models (%(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    args.models.mkdir(parents=True, exist_ok=True)
+    config = make_config("paper")
+    rows: list[dict[str, Any]] = []
+    for price in args.price:
+        started = time.perf_counter()
+        model = train(price, args.steps, args.seed)
+        keys = {"price": price, "steps": args.steps, "seed": args.seed, "seconds": time.perf_counter() - started}
+        path = args.models / f"ppo_price{price:g}_seed{args.seed}.zip"
+        model.save(path)
+        print(f"price {price:g}", flush=True)
+        for name in SCENARIOS:
+            cells = {d: cell(f"{path}@{d}", name, config, algo="studies.swarm.ppo:SharedPPO") for d in THRESHOLDS}
+            rows += validate(cells, "threshold", args.episodes, keys)
+        if args.json:
+            write_json(args.json, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,410 @@
+"""Put tables and figures of the swarm's results into docs/results.md: ``python -m studies.swarm.report [--data FOLDER]``.
+
+The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
+come from `studies/swarm/tune_rules.py`, `studies/swarm/tune_thresholds.py`, `studies/swarm/fly.py`, of other learners
+from `studies/swarm/ppo.py` and `studies/swarm/counterfactual.py`, and how long trainings take from
+`studies/swarm/training_time.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from quad_swarm.evaluation.evaluation import Flight, fly, is_model
+from quad_swarm.figures.colours import colour_of
+from quad_swarm.figures.plots import draw_flight
+from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.presets import PRESETS, make_config
+from quad_swarm.world.scenarios import SCENARIOS
+from studies.swarm.protocol import (
+    DATA,
+    OF_TEAM,
+    ROOT,
+    TEST,
+    absolute_path,
+    best_rules,
+    cell,
+    models,
+    progress,
+    read_rows,
+)
+
+PAGE = ROOT / "docs" / "results.md"
+IMAGES = ROOT / "docs" / "images"
+NAMES = list(SCENARIOS)[::-1]
+Rows = list[dict[str, Any]]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    body = list(rows)
+    if not body:
+        return "Not flown yet."
+    lines = [head, ["---"] * len(head), *body]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def label(policy: str) -> str:
+    """How a policy is called in tables."""
+    if not is_model(policy):
+        return f"`{policy}`".replace("|", "\\|")
+    path, _, threshold = policy.partition("@")
+    return Path(path).stem.replace("_seed", ", seed ") + (f", δ = {threshold}" if threshold else "")
+
+
+def rate(row: dict[str, Any]) -> str:
+    """Collisions with their interval."""
+    low, high = 100 * row["collision_low"], 100 * row["collision_high"]
+    return f"{row['collisions']}/{row['episodes']} [{low:.2f}, {high:.2f}] %"
+
+
+def versus(row: dict[str, Any], rival: str) -> str:
+    """Paired difference of the collision rates."""
+    against = row[f"against_{rival}"]
+    if against["rival"] == row["policy"]:
+        return "-"
+    sign = "**" if against["as_safe"] and rival == "full" else ""
+    return f"{sign}[{100 * against['low']:+.2f}, {100 * against['high']:+.2f}]{sign}, p = {against['p_value']:.2g}"
+
+
+def main_table(rows: Rows, preset: str) -> str:
+    """All policies of a preset in all scenarios."""
+    chosen = [row for row in rows if row["preset"] == preset and "ablation" not in row["policy"]]
+    chosen.sort(key=lambda row: NAMES.index(row["scenario"]))
+    head = ["scenario", "policy", "collisions, 95 %", "against full (points)", "against the rule", "requests"]
+    head += ["of the rule's", "arrived", "steps", "path (m)", "between steps"]
+    lines = []
+    for row in chosen:
+        key = (row["scenario"], row["against_rule"]["rival"])
+        rule = next(r for r in chosen if (r["scenario"], r["policy"]) == key)
+        ratio = f"{row['request_share'] / rule['request_share']:.0%}" if rule["request_share"] else "-"
+        steps, path = row["steps_to_arrival"], row["path_length"]
+        line = [row["scenario"].replace("_", " "), label(row["policy"]), rate(row), versus(row, "full")]
+        line += [versus(row, "rule"), f"{row['request_share']:.2%}", ratio, f"{row['arrived']}/{row['episodes']}"]
+        line += ["-" if steps is None else f"{steps:.1f}", "-" if path is None else f"{path:.2f}"]
+        lines.append([*line, str(row["collisions_continuous"])])
+    return table(head, lines)
+
+
+def pooled(rows: Rows) -> float:
+    """Requests of all rows together, of all that were possible."""
+    return sum(row["requests"] for row in rows) / max(sum(row["possible_requests"] for row in rows), 1)
+
+
+def targets(rows: Rows) -> str:
+    """What was asked for and what came out, for every seed."""
+    lines = []
+    for preset in ("paper", "dense"):
+        learned = [row for row in rows if row["preset"] == preset and f"/{preset}_seed" in row["policy"]]
+        for path in dict.fromkeys(row["policy"].partition("@")[0] for row in learned):
+            one = {row["scenario"]: row for row in learned if row["policy"] == path}
+            own = {row["scenario"]: row for row in learned if row["policy"].startswith(f"{path}@")}
+            for how, mine in (("one for all", one), ("tuned", one | own)):
+                ratios = [f"{mine[name]['request_share'] / share_of_rule(rows, mine[name]):.0%}" for name in NAMES]
+                safe = sum(mine[name]["against_full"]["as_safe"] for name in NAMES)
+                saved = 1 - pooled(list(mine.values()))
+                lines.append([label(path), how, f"{safe} of {len(NAMES)}", *ratios, f"{saved:.1%}"])
+        rules = [row for row in rows if row["preset"] == preset and row["policy"] == row["against_rule"]["rival"]]
+        if rules:
+            saved = 1 - pooled(rules)
+            safe = sum(row["against_full"]["as_safe"] for row in rules)
+            lines.append([f"{preset}, rules", "tuned", f"{safe} of {len(NAMES)}", *["100%"] * 4, f"{saved:.1%}"])
+    head = ["policy", "threshold", "as safe as full in", *(name.replace("_", " ") for name in NAMES)]
+    return table([*head, "fewer than full, pooled"], lines)
+
+
+def share_of_rule(rows: Rows, row: dict[str, Any]) -> float:
+    """Share of the requests of the rule that a policy is compared with."""
+    key = (row["preset"], row["scenario"], row["against_rule"]["rival"])
+    return next(r["request_share"] for r in rows if (r["preset"], r["scenario"], r["policy"]) == key)
+
+
+def family_table(rules: Rows, preset: str) -> str:
+    """The cheapest safe rule of each family, in validation."""
+    families = list(dict.fromkeys(row["family"] for row in rules if row["preset"] == preset))
+    lines = []
+    for family in families:
+        line = [family]
+        for name in NAMES:
+            safe = [
+                r for r in rules if (r["preset"], r["scenario"], r["family"]) == (preset, name, family) and r["safe"]
+            ]
+            best = min(safe, key=lambda r: r["request_share"], default=None)
+            line.append(f"{best['request_share']:.2%} {label(best['rule'])}" if best else "none is safe")
+        lines.append(line)
+    return table(["family", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def wide_table(rows: Rows, first: str, preset: str) -> str:
+    """Collisions and requests of every policy, scenarios side by side."""
+    chosen = [row for row in rows if row["preset"] == preset]
+    kinds = dict.fromkeys((row[first], kind_of(row)) for row in chosen)
+    lines = []
+    for value, kind in kinds:
+        line = [str(value), kind]
+        for name in NAMES:
+            row = next((r for r in chosen if r[first] == value and r["scenario"] == name and kind_of(r) == kind), None)
+            line.append(f"{row['collisions']}/{row['episodes']}, {row['request_share']:.1%}" if row else "-")
+        lines.append(line)
+    return table([first.replace("_", " "), "policy", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def teams_table(rows: Rows) -> str:
+    """Every number of robots: collisions and requests, in bold where at most half a point less safe than asking
+    everybody, and the share of the best rule's requests; models also with their threshold for the cell."""
+    lines = []
+    for n in dict.fromkeys(row["n_robots"] for row in rows):
+        cells: dict[str, dict[str, str]] = {}
+        for name in NAMES:
+            here = {row["policy"]: row for row in rows if (row["n_robots"], row["scenario"]) == (n, name)}
+            if not here:
+                continue
+            rule = here["full"]["against_rule"]["rival"]
+            for policy, row in here.items():
+                path, _, threshold = policy.partition("@")
+                kind = label(path) if is_model(policy) else "best rule"
+                mark = "**" if policy != "full" and row["against_full"]["high"] < OF_TEAM.margin else ""
+                text = f"{mark}{row['collisions']}/{row['episodes']}, {row['request_share']:.2%}{mark}"
+                if is_model(policy):
+                    text += f" ({row['request_share'] / max(here[rule]['request_share'], 1e-9):.0%}), δ = {threshold}"
+                cells.setdefault("`full`" if policy == "full" else kind, {})[name] = text
+                if policy == rule == "full":  # no rule is safe, or none was tuned
+                    cells.setdefault("best rule", {})[name] = "none is safe"
+        lines += [[str(n), kind, *(by_name.get(name, "-") for name in NAMES)] for kind, by_name in cells.items()]
+    return table(["robots", "policy", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def unseen_table(rows: Rows) -> str:
+    """Policies in scenarios that nothing was trained or tuned in."""
+    lines = []
+    for row in rows:
+        line = [row["preset"], row["scenario"].replace("_", " "), label(row["policy"]), rate(row), versus(row, "full")]
+        lines.append([*line, f"{row['request_share']:.2%}"])
+    return table(["preset", "scenario", "policy", "collisions, 95 %", "against full (points)", "requests"], lines)
+
+
+def reference_table(rows: Rows, *names: str) -> str:
+    """Collisions and requests of another learner by what it was flown with."""
+    lines = []
+    for values in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
+        here = {row["scenario"]: row for row in rows if tuple(row[name] for name in names) == values}
+        cells = [f"{here[k]['collisions']}/{here[k]['episodes']}, {here[k]['request_share']:.1%}" for k in NAMES]
+        lines.append([*(f"{value:g}" for value in values), *cells])
+    return table([*names, *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def training_table(rows: Rows) -> str:
+    """How long trainings take, and what of."""
+    parts = ("planner", "learner", "acting", "rest")
+    lines = []
+    for row in rows:
+        line = [f"`{row['recipe']}`", f"{row['steps']:,}", f"{row['episodes']:,}", f"{row['updates']:,}"]
+        line += [str(row["threads"]), f"{row['seconds'] / 60:.1f}"]
+        lines.append([*line, *(f"{row[f'share_{part}']:.0%}" for part in parts)])
+    return table(["recipe", "steps", "episodes", "updates", "threads", "minutes", *parts], lines)
+
+
+def kind_of(row: dict[str, Any]) -> str:
+    """A policy by its part in a comparison."""
+    return label(row["policy"]) if is_model(row["policy"]) or row["policy"] in ("full", "none") else "best rule"
+
+
+def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
+    """Requests against collisions: rule families, the learned policy at all thresholds, and the tested policies."""
+    presets = [preset for preset in PRESETS if any(row["preset"] == preset for row in rules)]
+    size = (15, 3.5 * len(presets))
+    figure, panels = plt.subplots(len(presets), 4, figsize=size, layout="constrained", sharey="row", squeeze=False)
+    families = list(dict.fromkeys(row["family"] for row in rules))
+    for line, preset in zip(panels, presets, strict=True):
+        for axes, name in zip(line, NAMES, strict=True):
+            here = [r for r in rules if (r["preset"], r["scenario"]) == (preset, name) and r["episodes"] >= 250]
+            for k, family in enumerate(families):
+                points = sorted((r["request_share"], rate_of(r)) for r in here if r["family"] == family)
+                front = [(s, c) for s, c in points if not any(s2 <= s and c2 < c for s2, c2 in points)]
+                if front:
+                    marker = "o" if k < 7 else "s"  # colours repeat after eight
+                    style = {"marker": marker, "markersize": 4, "linewidth": 0.8, "color": colour_of(k + 1)}
+                    axes.plot(*zip(*front, strict=True), label=family, **style)
+            learned = sorted(
+                (r["request_share"], rate_of(r))
+                for r in sweep
+                if (r["preset"], r["scenario"]) == (preset, name) and is_model(r["policy"])
+            )
+            if learned:
+                axes.plot(*zip(*learned, strict=True), "o-", color="black", label="learned, one model, all thresholds")
+            seeds = [
+                (r["request_share"], rate_of(r))
+                for r in tests
+                if (r["preset"], r["scenario"]) == (preset, name) and f"/{preset}_seed" in r["policy"]
+            ]
+            if seeds:
+                axes.plot(*zip(*seeds, strict=True), "*", color="#d55e00", markersize=11, label="learned, five seeds")
+            axes.set_xscale("log")
+            axes.set_yscale("symlog", linthresh=1e-3)
+            axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("episodes with a collision")
+    for axes in panels[-1]:
+        axes.set_xlabel("requests, of all possible")
+    legends = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels.flat]
+    handles = {text: handle for legend in legends for handle, text in legend}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=8)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
+    """The first test episode of each scenario as a model flies it, and whom a rule would have asked on its way."""
+    config = make_config(preset)
+    names = progress(NAMES, f"flights, {preset}", len(NAMES))
+    return {name: fly(cell(model, name, config), TEST, beside=rule) for name in names}
+
+
+def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
+    """The paper's Fig. 2: the flights of each preset from above."""
+    size = (15, 4 * len(flown))
+    figure, panels = plt.subplots(len(flown), len(NAMES), figsize=size, layout="constrained", squeeze=False)
+    for line, (preset, by_name) in zip(panels, flown.items(), strict=True):
+        for axes, (name, flight) in zip(line, by_name.items(), strict=True):
+            draw_flight(axes, flight)
+            axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def told(flight: Flight) -> str:
+    """A flight step by step: who asks whom, what it sees of it, and whom the rule would have asked."""
+    n = len(flight.goal)
+    others = other_indices(n)
+    pos, vel = flight.state[..., :3], flight.state[..., 3:6]
+    last: dict[tuple[int, int], int] = {}
+    lines = []
+    for k, (asked, by_rule) in enumerate(zip(flight.requests, flight.beside, strict=True)):
+        texts = []
+        for i, m in np.argwhere(asked):
+            j = others[i, m]
+            away, moving = pos[k, j] - pos[k, i], vel[k, j] - vel[k, i]
+            time = max(0.0, -(away @ moving) / max(moving @ moving, 1e-12))
+            age = f"asked {k - last[i, j]} steps ago" if (i, j) in last else "not asked before"
+            near = np.linalg.norm(away + time * moving)
+            texts.append(f"**{i} → {j}** {np.linalg.norm(away):.1f} m away, {near:.2f} m in {time:.1f} s, {age}")
+            last[i, j] = k
+        rule = ", ".join(f"{i} → {others[i, m]}" for i, m in np.argwhere(by_rule))
+        if texts or rule:
+            apart = min(np.linalg.norm(pos[k, i] - pos[k, j]) for i in range(n) for j in range(i))
+            lines.append([str(k), f"{apart:.2f}", "<br>".join(texts) or "-", rule or "-"])
+    return table(["step", "closest two (m)", "asks", "the rule would ask"], lines)
+
+
+def interventions_table(rows: Rows) -> str:
+    """What would have avoided the collisions of a policy that asks too little."""
+    steps = list(dict.fromkeys(row["last_steps"] for row in rows))
+    lines = []
+    for preset, who in dict.fromkeys((row["preset"], row["who"]) for row in rows):
+        mine = {row["last_steps"]: row for row in rows if (row["preset"], row["who"]) == (preset, who)}
+        shares = [f"{mine[k]['avoided'] / max(mine[k]['n'], 1):.0%}" for k in steps]
+        lines.append([f"{preset}, {mine[steps[0]]['n']} collisions", who, *shares])
+    return table(["world", "from so many steps before the collision on", *(str(k) for k in steps)], lines)
+
+
+def rate_of(row: dict[str, Any]) -> float:
+    """Share of the episodes with a collision."""
+    return row["collisions"] / row["episodes"]
+
+
+def draw_asking(rows: Rows, path: Path) -> None:
+    """How often policies ask at what they see."""
+    quantities = list(dict.fromkeys(row["quantity"] for row in rows))
+    presets = list(dict.fromkeys(row["preset"] for row in rows))
+    size = (15, 2.8 * len(presets))
+    figure, panels = plt.subplots(
+        len(presets), len(quantities), figsize=size, layout="constrained", sharey="row", squeeze=False
+    )
+    for line, preset in zip(panels, presets, strict=True):
+        for axes, quantity in zip(line, quantities, strict=True):
+            for learned in (False, True):
+                sums: dict[float, list[int]] = {}
+                for row in rows:
+                    if (row["preset"], row["quantity"], is_model(row["policy"])) == (preset, quantity, learned):
+                        total = sums.setdefault((row["low"] + row["high"]) / 2, [0, 0])
+                        total[0] += row["asked"]
+                        total[1] += row["n"]
+                points = [(x, asked / n) for x, (asked, n) in sorted(sums.items()) if n >= 100]
+                if points:
+                    name, colour = ("learned", "#d55e00") if learned else ("best rule of each scenario", "#555555")
+                    axes.plot(*zip(*points, strict=True), ".-", color=colour, label=name)
+            axes.set_xlabel(quantity)
+            axes.spines[["top", "right"]].set_visible(False)
+        line[0].set_ylabel(f"{preset}: share asked")
+        line[0].legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=absolute_path, default=DATA, help="folder of the JSON files (%(default)s)")
+    parser.add_argument("--page", type=absolute_path, default=PAGE, help="page to fill (default %(default)s)")
+    parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
+    args = parser.parse_args()
+    os.chdir(ROOT)
+    names = ("rules", "test", "sweep", "robustness", "unseen", "teams", "asking", "interventions", "ppo")
+    rules, test, sweep, robustness, unseen, teams, asking, interventions, ppo, counterfactual, training = (
+        read_rows(args.data / f"{name}.json") for name in (*names, "counterfactual", "training")
+    )
+    blocks = {
+        "targets": targets(test),
+        "paper": main_table(test, "paper"),
+        "dense": main_table(test, "dense"),
+        "rules paper": family_table(rules, "paper"),
+        "rules dense": family_table(rules, "dense"),
+        "ablations": wide_table([r for r in test if "ablation" in r["policy"]], "preset", "paper"),
+        "sweep paper": wide_table([r for r in sweep if is_model(r["policy"])], "policy", "paper"),
+        "sweep dense": wide_table([r for r in sweep if is_model(r["policy"])], "policy", "dense"),
+        "robustness paper": wide_table(robustness, "condition", "paper"),
+        "robustness dense": wide_table(robustness, "condition", "dense"),
+        "interventions": interventions_table(interventions),
+        "unseen": unseen_table(unseen),
+        "teams": teams_table(teams),
+        "ppo": reference_table(ppo, "price", "threshold"),
+        "counterfactual": reference_table(counterfactual, "price"),
+        "training": training_table(training),
+    }
+    flown = {
+        preset: flights(models(preset)[0], best_rules(preset)["symmetric_swap"], preset)
+        for preset in dict.fromkeys(row["preset"] for row in asking)
+    }
+    for name in ("symmetric_swap", "asymmetric_swap"):
+        blocks[f"told {name}"] = told(flown["paper"][name]) if "paper" in flown else "Not flown yet."
+    picture = "![How often policies ask: distance, approach, time, way to go, crowd](images/asking.png)"
+    blocks["asking"] = picture if asking else "Not flown yet."
+    page = PAGE.read_text()
+    for name, block in blocks.items():
+        before, opening, rest = page.partition(f"<!-- {name} -->\n")
+        _, closing, after = rest.partition("<!-- end -->")
+        if not closing:
+            raise ValueError(f"{PAGE} has no place '<!-- {name} --> ... <!-- end -->'.")
+        page = f"{before}{opening}\n{block}\n\n{closing}{after}"
+    args.page.write_text(page)
+    args.images.mkdir(parents=True, exist_ok=True)
+    if rules:
+        draw_fronts(rules, sweep, test, args.images / "fronts.png")
+    if flown:
+        draw_trajectories(flown, args.images / "flights.png")
+    if asking:
+        draw_asking(asking, args.images / "asking.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""Tune every family of hand-made rules as hard as a learner: the cheapest of each that is as safe as asking everybody.
+
+``python -m studies.swarm.tune_rules [--quick] [--preset ...] [--n-robots ...] [--family ...] [--json F]``, on the
+validation set. In each scenario all rules of a family fly a few episodes, which tell their requests. Then they are
+tried from the cheapest on, in stages of more and more episodes, until one is as safe as full communication
+(`Standard`). One that collides clearly more often in an earlier stage is out. JSON: one row for each rule and scenario
+with the keys of `quad_swarm.evaluation.evaluation.summarise` over the episodes that it flew, and preset, scenario, family, rule,
+with ``--n-robots`` also n_robots, and safe: True or False, or None for those dearer than the one that was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from quad_swarm.evaluation.evaluation import summarise
+from quad_swarm.world.presets import PRESETS
+from quad_swarm.world.scenarios import SCENARIOS
+from studies.swarm.protocol import QUICK_STAGES, STAGES, fly, in_stages, progress, replace_rows, world
+
+DISTANCES = (0.62, 0.65, 0.7, 0.8, 0.9, 1.05, 1.2, 1.5)
+LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
+
+
+def families() -> dict[str, list[str]]:
+    """The rules of each family."""
+    cpa = [f"cpa:{d:g}:{t:g}" for d, t in itertools.product((0.6, *DISTANCES, 2.0), LOOK_AHEADS)]
+    some = [f"cpa:{d:g}:{t:g}" for d, t in itertools.product(DISTANCES[:-1], (1.5, 2.0, 3.0))]
+    return {
+        "distance": [f"distance:{d:g}" for d in (1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 6)],
+        "cpa": cpa,
+        "random": [f"random:{p:g}" for p in (0.1, 0.25, 0.5, 0.75, 0.9)],
+        "event": [f"event:{e:g}" for e in (0, 0.001, 0.003, 0.01, 0.02, 0.03)],
+        "plan": [f"plan:{d:g}" for d in (*DISTANCES, 2.0)],
+        "cpa and stale": [f"{rule}&stale:{k}" for rule in some for k in (3, 4, 5)],
+        "cpa and event": [f"{rule}&event:{e:g}" for rule in some[::2] for e in (0.003, 0.01)],
+        "cpa and plan": [f"{rule}&plan:{d:g}" for rule in some[::3] for d in (0.8, 1.0)],
+        "plan and stale": [f"plan:{d:g}&stale:{k}" for d in (0.62, 0.65, 0.7, 0.8, 1.0, 1.5) for k in (2, 3, 4, 6)],
+        "plan, or cpa and stale": [
+            f"plan:{d:g}{soon}|cpa:{near}&stale:{k}"
+            for d, soon in itertools.product((0.62, 0.7), ("", "&soon:0.3"))
+            for near in ("0.62:1.5", "0.65:2", "0.8:2", "0.8:3", "1.05:3")
+            for k in (2, 3, 4, 6)
+        ],
+        "cpa, soon or stale": [
+            f"{rule}&soon:{t:g}|{rule}&stale:{k}" for rule in some for t in (0.15, 0.3) for k in (4, 6)
+        ],
+        "two cpa": [
+            f"cpa:{near}|cpa:{far}&stale:{k}"
+            for near in ("0.65:1", "0.7:1.5", "0.8:1")
+            for far in ("0.8:3", "0.9:3", "1.05:3", "1.05:4", "1.2:3")
+            for k in (3, 4, 6)
+        ],
+    }
+
+
+def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], quick: bool) -> list[dict[str, Any]]:
+    """The rows of some families in one scenario."""
+    stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
+    n = world(preset, n_robots).n_robots
+    full: list[dict[str, float]] = []
+    table = []
+    for family in names:
+        rules = families()[family]
+        flown = fly(rules[::thin], preset, scenario, stages[0], n_robots)
+        safe: dict[str, bool] = {}
+        for rule in sorted(flown, key=lambda rule: summarise(flown[rule], n)["request_share"]):
+            flown[rule], safe[rule] = in_stages(rule, preset, scenario, full, quick, n_robots, flown[rule])
+            if safe[rule]:
+                break
+        keys: dict[str, Any] = {"preset": preset, "scenario": scenario, "family": family}
+        keys |= {} if n_robots is None else {"n_robots": n_robots}
+        table += [keys | {"rule": rule, "safe": safe.get(rule)} | summarise(flown[rule], n) for rule in flown]
+        best = [rule for rule in safe if safe[rule]]
+        share = f"{summarise(flown[best[0]], n)['request_share']:.2%}" if best else "-"
+        print(f"{preset:6} {n:2} {scenario:16} {family:24} {best[0] if best else 'none':45} {share:>8}", flush=True)
+    return table
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS))
+    parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
+    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
+    parser.add_argument("--family", nargs="+", default=list(families()), choices=list(families()))
+    parser.add_argument("--quick", action="store_true", help="few episodes and rules, to see that it runs")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    work = [
+        (preset, n, scenario, args.family, args.quick)
+        for preset in args.preset
+        for n in args.n_robots
+        for scenario in args.scenario
+    ]
+    keys = ("preset", "scenario", "family", "n_robots")
+    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+        for table in progress(pool.map(tune, *zip(*work, strict=True)), "rules", len(work)):
+            if args.json:
+                replace_rows(args.json, table, keys if "n_robots" in table[0] else keys[:-1])
+
+
+if __name__ == "__main__":
+    main()

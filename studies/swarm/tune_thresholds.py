@@ -1,0 +1,115 @@
+"""Choose the thresholds of trained models: the highest with which each is as safe as asking everybody.
+
+``python -m studies.swarm.tune_thresholds [MODEL.zip ...] [--scenario ...] [--n-robots ...] [--json F]``, on the validation
+set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds are tried from
+the highest on, in stages of more and more episodes, until the model is as safe as full communication
+(`swarm_rules.Standard`) and not at the edge of it (`has_reserve`): who takes the first that passes takes one that was
+lucky in these episodes. With ``--n-robots`` other thresholds are tried (`TEAM_THRESHOLDS`). The smallest of them, with
+which it is safe everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with the
+keys of `quad_swarm.evaluation.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe;
+those of other cells stay, and count for the model's threshold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from quad_swarm.evaluation.evaluation import Comparison, summarise
+from quad_swarm.world.scenarios import SCENARIOS
+from sb3_maddpg import MADDPG
+from studies.swarm.protocol import OF_PRESET, OF_TEAM, in_stages, models, progress, read_rows, replace_rows, world
+
+# The recipes whose threshold is free and whose team is the preset's; that of the faithful one is the paper's, one half.
+TUNED = ("paper", "dense", "ablation*")
+# What is as safe, and of its margin how many more episodes than full communication's may end in a collision: 16 of
+# 12,000 in a preset, two thirds of what the margin allows; of teams, on fewer episodes, 5 of 4,000, less than half
+STANDARDS = {"preset": (OF_PRESET, 4 / 9), "team": (OF_TEAM._replace(enough=4000), 1 / 4)}
+THRESHOLDS = [0.99, 0.98, 0.965, 0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7]
+THRESHOLDS += [0.675, 0.65, 0.625, 0.6, 0.575, 0.55, 0.525, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1]
+# In teams of another size: fewer below 0.8, and lower ones for crowds larger than any in training
+TEAM_THRESHOLDS = [*THRESHOLDS[:10], *THRESHOLDS[10::2], 0.1, 0.05, 0.02, 0.01, 0.005]
+
+
+@functools.cache
+def full(preset: str, scenario: str, n: int | None) -> list[dict[str, float]]:
+    """Figures of full communication as far as they have been flown, for `in_stages` to append to."""
+    return []
+
+
+def has_reserve(comparison: Comparison, margin: float, share: float) -> bool:
+    """Whether a threshold is not only as safe as full communication, but not at the edge of it: how many more episodes
+    end in a collision than with that is at most a share of the margin."""
+    return comparison.only_first - comparison.only_second <= share * margin * comparison.episodes
+
+
+def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
+    """The rows of a model in one scenario."""
+    rival = full(preset, scenario, n)
+    robots = world(preset, n).n_robots
+    standard, share = STANDARDS["preset" if n is None else "team"]
+    table: list[dict[str, Any]] = []
+    for threshold in THRESHOLDS if n is None else TEAM_THRESHOLDS:
+        figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, rival, quick, n, standard=standard)
+        safe &= quick or has_reserve(Comparison.of(figures, rival[: len(figures)]), standard.margin, share)
+        keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
+        table.append(keys | {"n_robots": robots} | summarise(figures, robots))
+        if safe:
+            print(f"{path} {scenario} {robots}: {threshold:g}, {table[-1]['request_share']:.2%}", flush=True)
+            break
+    else:
+        print(f"{path} {scenario} {robots}: no threshold is as safe as full communication", flush=True)
+    return table
+
+
+def preset_of(path: str) -> str:
+    """The world in which a model was trained."""
+    spec = MADDPG.load(path, device="cpu").env_spec
+    if spec is None:
+        raise ValueError(f"{path} does not say in which world it was trained.")
+    return spec["kwargs"]["preset"]
+
+
+def set_threshold(path: str, table: list[dict[str, Any]]) -> None:
+    """Write the smallest threshold that was needed in any of its cells into a model's file."""
+    last = {(row["scenario"], row["n_robots"]): row["threshold"] for row in table if row["model"] == path}
+    model = MADDPG.load(path, device="cpu")
+    model.set_threshold(min(last.values()))
+    model.save(path)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", metavar="MODEL.zip", help="all that swarm_results flies unless given")
+    parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS)[::-1], choices=list(SCENARIOS))
+    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
+    parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    paths = args.models or [path for recipe in TUNED for path in models(recipe)]
+    presets = {path: preset_of(path) for path in paths}
+    work = [
+        (path, presets[path], n, scenario, args.quick)
+        for n in args.n_robots
+        for scenario in args.scenario
+        for path in paths
+    ]
+    rows: list[dict[str, Any]] = []
+    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+        for table in progress(pool.map(tune, *zip(*work, strict=True)), "thresholds", len(work)):
+            rows += table
+            if args.json:
+                replace_rows(args.json, table, ("model", "scenario", "n_robots"))
+    for path in paths:
+        set_threshold(path, read_rows(args.json) if args.json else rows)
+
+
+if __name__ == "__main__":
+    main()

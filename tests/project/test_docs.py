@@ -1,0 +1,127 @@
+"""The pages of the learner: examples run, links lead somewhere, tables of arguments are those of the code."""
+
+import inspect
+import re
+from pathlib import Path
+
+import gymnasium
+import pytest
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+import quad_swarm  # registered before the first page, so that it stays so after it
+from quad_swarm.task.rules import RULES
+from sb3_maddpg import MADDPG, MATD3, MADDPGPolicy, PairPolicy
+from sb3_maddpg.estimators import ESTIMATORS
+
+ROOT = Path(__file__).parents[2]
+LEARNER = ("maddpg", "matd3", "pettingzoo", "relational", "migration", "support")
+SITE = ("quickstart", "tensorboard", "tutorials/swarm", "tutorials/pettingzoo")
+NO_LEARNING = ("tutorials/scenario", "tutorials/rule", "tutorials/reading", "index", "faq")
+PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (*LEARNER, *SITE, *NO_LEARNING)))
+STEPS, LEARNING_STARTS, BATCH_SIZE = 300, 100, 64
+FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def text_of(page: str) -> str:
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def examples(page: str) -> list[tuple[int, str]]:
+    """:return: the line on which each Python example begins, counted from 0, and the example"""
+    text = text_of(page)
+    blocks = [block for block in FENCED.finditer(text) if block[1] == "python"]
+    return [(text[: block.start(2)].count("\n"), block[2]) for block in blocks]
+
+
+@pytest.fixture
+def short_trainings(monkeypatch, tmp_path):
+    """An empty folder to work in, where ``learn`` soon begins and soon ends."""
+    learn = OffPolicyAlgorithm.learn
+    registries = (gymnasium.registry, quad_swarm.SCENARIOS, RULES)
+    known = [dict(registry) for registry in registries]
+
+    def learn_a_little(self, total_timesteps, *args, **kwargs):
+        self.learning_starts = min(self.learning_starts, LEARNING_STARTS)
+        self.batch_size = min(self.batch_size, BATCH_SIZE)
+        return learn(self, min(total_timesteps, STEPS), *args, **kwargs)
+
+    monkeypatch.setattr(OffPolicyAlgorithm, "learn", learn_a_little)
+    monkeypatch.chdir(tmp_path)
+    yield
+    for registry, entries in zip(registries, known, strict=True):
+        registry.clear()
+        registry.update(entries)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if examples(page)])
+def test_examples_run(page, short_trainings):
+    namespace = {"__name__": "__main__"}
+    for line, code in examples(page):
+        exec(compile("\n" * line + code, ROOT / page, "exec"), namespace)
+    models = [value for value in namespace.values() if isinstance(value, OffPolicyAlgorithm)]
+    assert all(model._n_updates > 0 for model in models if model.num_timesteps)
+    assert models or page.removeprefix("docs/").removesuffix(".md") in NO_LEARNING
+
+
+def anchors(page: Path) -> set[str]:
+    """:return: what GitHub makes of the headings"""
+    prose = FENCED.sub("", page.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ +(.*)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", FENCED.sub("", text_of(page))):
+        if re.match(r"\w+://", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (ROOT / page).parent / path if path else ROOT / page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def table(page: str, heading: str) -> dict[str, str]:
+    """:return: the first two columns of the first table below a heading, of rows that begin with a name"""
+    text = text_of(page).split(f"\n## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    rows = re.findall(r"^\| `([^`]+)` \| *(?:`([^`]+)`)?[^|]*\|", text, re.MULTILINE)
+    return dict(rows)
+
+
+def shown(default) -> str:
+    if default is inspect.Parameter.empty:
+        return ""
+    if isinstance(default, type):
+        return default.__name__
+    text = f'"{default}"' if isinstance(default, str) else repr(default)
+    return f"{default:_}" if type(default) is int and default > 9999 else text
+
+
+def arguments(function, *left_out: str) -> dict[str, str]:
+    parameters = inspect.signature(function).parameters.values()
+    kinds = {one.name: shown(one.default) for one in parameters if one.kind is not inspect.Parameter.VAR_KEYWORD}
+    return {name: value for name, value in kinds.items() if name not in ("self", "_init_setup_model", *left_out)}
+
+
+@pytest.mark.parametrize(
+    ("page", "heading", "expected"),
+    [
+        ("docs/maddpg.md", "Parameters", arguments(MADDPG.__init__)),
+        ("docs/matd3.md", "Parameters", arguments(MATD3.__init__, "policy", "env", "learning_rate")),
+        *(
+            (page, heading, arguments(policy.__init__, "observation_space", "action_space", "lr_schedule"))
+            for page, heading, policy in (
+                ("docs/maddpg.md", "Policies", MADDPGPolicy),
+                ("docs/relational.md", "Parameters", PairPolicy),
+            )
+        ),
+    ],
+)
+def test_tables_of_arguments_are_those_of_the_code(page, heading, expected):
+    assert table(page, heading) == expected
+    assert list(table(page, heading)) == list(expected)
+
+
+def test_every_estimator_is_described():
+    described = table("docs/maddpg.md", "How agents act and explore")
+    assert [name for name in described if name in ESTIMATORS] == list(ESTIMATORS)

@@ -1,0 +1,114 @@
+"""The vector environment: step for step what its swarms do one by one."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import quad_swarm
+from quad_swarm.interfaces.env import QuadSwarmEnv, info_of
+
+
+def plain(info: dict) -> dict:
+    """Without Gymnasium's masks and without times, which never repeat."""
+    kept = {name: value for name, value in info.items() if name[0] != "_" and name != "planner/solve_us"}
+    return {name: plain(value) if isinstance(value, dict) else value for name, value in kept.items()}
+
+
+def assert_same(a: dict, b: dict) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        if isinstance(a[name], dict):
+            assert_same(a[name], b[name])
+        else:
+            assert np.array_equal(a[name], b[name]), name
+
+
+EVERYTHING = {"preset": "dense", "observation": "state+approach+memory+plan+told+critic", "radio": {"loss": 0.3}}
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"max_steps": 12},
+        {"max_steps": 9, "n_robots": 3, "noise": {"vel": 0.05}},
+        {"max_steps": 7, "n_robots": 3, **EVERYTHING},
+    ],
+)
+def test_flies_what_single_environments_fly(kwargs):
+    n_envs, steps = 3, 40
+    together = gymnasium.make_vec("QuadSwarm-v0", num_envs=n_envs, scenario="symmetric_swap", **kwargs)
+    alone = [QuadSwarmEnv(scenario="symmetric_swap", **kwargs) for _ in range(n_envs)]
+    observations, _ = together.reset(seed=5)
+    for k, env in enumerate(alone):
+        assert np.array_equal(env.reset(seed=5 + k)[0], observations[k])
+    rng = np.random.default_rng(0)
+    ended = 0
+    for _ in range(steps):
+        actions = rng.integers(0, 2, together.action_space.shape, dtype=np.int8)
+        observations, rewards, terminations, truncations, infos = together.step(actions)
+        for k, env in enumerate(alone):
+            observation, reward, terminated, truncated, info = env.step(actions[k])
+            assert (reward, terminated, truncated) == (rewards[k], terminations[k], truncations[k])
+            if terminated or truncated:
+                ended += 1
+                assert infos["_final_obs"][k]
+                assert np.array_equal(observation, infos["final_obs"][k])
+                assert_same(plain(info), plain(info_of(plain(infos["final_info"]), k)))
+                observation, _ = env.reset()
+            else:
+                assert not infos.get("_final_obs", np.zeros(n_envs))[k]
+                batch = {name: value for name, value in plain(infos).items() if not name.startswith("final")}
+                assert_same(plain(info), info_of(batch, k))
+            assert np.array_equal(observation, observations[k])
+    assert ended >= n_envs
+
+
+def test_is_gymnasium_s_vector_environment():
+    env = gymnasium.make_vec("QuadSwarm-v0", num_envs=2, preset="dense")
+    assert isinstance(env.unwrapped, quad_swarm.QuadSwarmVectorEnv)
+    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    observations, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observations)
+    assert env.observation_space.shape == (2, 8, 48)
+    observations, rewards, *_ = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observations)
+    assert rewards.shape == (2,)
+
+
+def test_seeds_can_be_given_one_by_one_and_go_on_without():
+    env = gymnasium.make_vec("QuadSwarm-v0", num_envs=2)
+    first, _ = env.reset(seed=[3, 3])
+    assert np.array_equal(first[0], first[1])
+    second, _ = env.reset()
+    assert not np.array_equal(first, second)
+    assert np.array_equal(second[0], second[1])
+
+
+def test_curriculum_reaches_every_swarm():
+    env = gymnasium.make_vec("QuadSwarm-v0", num_envs=8, scenario="curriculum").unwrapped
+    assert set(env.reset(seed=0)[1]["scenario"]) == {"random"}
+    env.set_curriculum_level(env.n_curriculum_levels - 1)
+    names = [env.reset()[1]["scenario"] for _ in range(8)]
+    assert set(np.concatenate(names)) == set(quad_swarm.SCENARIOS)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: quad_swarm.QuadSwarmVectorEnv(0), "num_envs=0"),
+        (lambda: quad_swarm.QuadSwarmVectorEnv(2, render_mode="human"), "draws nothing"),
+        (lambda: quad_swarm.QuadSwarmVectorEnv(2).reset(seed=[1]), "1 seeds for 2 swarms"),
+        (lambda: quad_swarm.QuadSwarmVectorEnv(2).reset(options={"starts": 0}), "reset options"),
+    ],
+)
+def test_refuses_senseless_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_refuses_senseless_actions():
+    env = quad_swarm.QuadSwarmVectorEnv(2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"23 entries.*in each of 2 swarms"):
+        env.step(np.zeros(23))

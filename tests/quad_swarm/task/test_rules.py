@@ -1,0 +1,111 @@
+"""The hand-made rules."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.quadrotor import POSITION, VELOCITY
+from quad_swarm.task.rules import parse_rule
+from quad_swarm.task.view import View
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.swarm import Swarm
+
+
+def view(pos, vel, n_swarms: int = 1) -> View:
+    swarm = Swarm(make_config("paper", n_robots=len(pos)), n_swarms)
+    swarm.state[..., POSITION], swarm.state[..., VELOCITY] = pos, vel
+    return View(swarm, [np.random.default_rng(k) for k in range(n_swarms)])
+
+
+# Robot 1 comes towards robot 0 and passes it at 0.5 m after 2 s; robot 2 stands 3 m away.
+SCENE = view([[0, 0, 0], [4, 0.5, 0], [0, -3, 0]], [[0, 0, 0], [-2, 0, 0], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("text", "asked"),
+    [
+        ("none", [[0, 0], [0, 0], [0, 0]]),
+        ("full", [[1, 1], [1, 1], [1, 1]]),
+        ("distance:3.5", [[0, 1], [0, 0], [1, 0]]),
+        ("distance:4.5", [[1, 1], [1, 0], [1, 0]]),
+        ("cpa:0.6:3", [[1, 0], [1, 0], [0, 0]]),
+        ("cpa:0.6:1", [[0, 0], [0, 0], [0, 0]]),  # it is still 2 m away after 1 s
+        ("cpa:0.4:3", [[0, 0], [0, 0], [0, 0]]),
+        ("cpa:3.1:0", [[0, 1], [0, 0], [1, 0]]),
+        ("random:0", [[0, 0], [0, 0], [0, 0]]),
+        ("random:1", [[1, 1], [1, 1], [1, 1]]),
+        ("soon:2.1", [[1, 1], [1, 1], [1, 1]]),
+        ("soon:1.9", [[0, 1], [0, 0], [1, 0]]),  # robots at rest are at their closest already
+        ("distance:3.5&cpa:0.6:3", [[0, 0], [0, 0], [0, 0]]),
+        ("distance:3.5|cpa:0.6:3", [[1, 1], [1, 0], [1, 0]]),
+        ("none&full|cpa:0.6:3", [[1, 0], [1, 0], [0, 0]]),
+        ("event:0.1", [[1, 1], [1, 1], [1, 1]]),  # nobody has been asked yet
+        ("stale:3", [[1, 1], [1, 1], [1, 1]]),
+    ],
+)
+def test_whom_a_rule_asks(text, asked):
+    requests = parse_rule(text)(SCENE)
+    assert requests.dtype == bool
+    assert requests[0].astype(int).tolist() == asked
+
+
+def test_random_asks_with_its_probability_and_each_swarm_draws_for_itself():
+    many = view([[0, 0, 0]] * 5, [[0, 0, 0]] * 5, n_swarms=500)
+    requests = parse_rule("random:0.3")(many)
+    assert abs(requests.mean() - 0.3) < 0.02
+    alone = parse_rule("random:0.3")(view([[0, 0, 0]] * 5, [[0, 0, 0]] * 5, n_swarms=1))
+    assert np.array_equal(alone[0], requests[0])
+
+
+def test_robots_at_the_same_place_do_not_divide_by_zero():
+    with np.errstate(all="raise"):
+        assert parse_rule("cpa:0.5:1")(view([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [1, 0, 0]])).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("distnace:4", "Did you mean 'distance'"),
+        ("distance", "write distance:EPS"),
+        ("distance:far", "must be numbers; write distance:EPS"),
+        ("cpa:0.7", "write cpa:DIST:LOOKAHEAD"),
+        ("distance:-1", "non-negative"),
+        ("distance:nan", "finite"),
+        ("none:1", "takes 0"),
+        ("none&distnace:4", "Did you mean 'distance'"),
+        ("cpa:0.6:3|", "Unknown rule ''"),
+        ("random:2", r"\[0, 1\]"),
+    ],
+)
+def test_says_how_to_write_a_rule(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_rule(text)
+
+
+def test_rules_that_remember_ask_again_when_a_plan_is_old_or_wrong():
+    swarm = Swarm(make_config("paper", n_robots=2), 1)
+    swarm.reset(0, np.array([[-3.0, 0, 1], [3, 0, 1]]), np.array([[-3.0, 0, 1], [3, 0, 1]]))
+    ask, rest = np.ones((1, 2, 1), bool), np.zeros((1, 2, 1), bool)
+    swarm.step(ask)
+    ages = []
+    for _ in range(4):
+        view = View(swarm)
+        ages.append(int(view.age[0, 0, 0]))
+        assert not parse_rule("event:0.1")(view).any()
+        assert parse_rule("stale:4")(view).all() == (ages[-1] >= 4)
+        swarm.step(rest)
+    assert ages == [2, 3, 4, 5]
+    swarm.state[..., POSITION] += [0.0, 0.5, 0.0]
+    assert parse_rule("event:0.1")(View(swarm)).all()
+    assert parse_rule("stale:9")(View(swarm)).all(), "no longer believed"
+
+
+def test_plan_looks_at_the_own_plan():
+    swarm = Swarm(make_config("paper", n_robots=2), 1)
+    # Robot 0 flies to where robot 1 rests
+    swarm.reset(0, np.array([[-1.5, 0, 1], [1.5, 0, 1]]), np.array([[1.5, 0.2, 1], [1.5, 0, 1]]))
+    for _ in range(6):
+        swarm.step(np.zeros((1, 2, 1), bool))
+    near = View(swarm).plan_separation.min(axis=-1)
+    assert near[0, 0, 0] < 1.5
+    assert np.array_equal(parse_rule("plan:1.5")(View(swarm)), near < 1.5)
+    assert not parse_rule("plan:0.1")(View(swarm)).any()

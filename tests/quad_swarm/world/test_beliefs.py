@@ -1,0 +1,90 @@
+"""What robots believe: plans that were asked for, plans that are remembered, constant velocities."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.world.beliefs import Beliefs, BeliefSource, advance, constant_velocity, other_indices
+
+N, DT = 4, 0.1
+
+
+def straight_plans(pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
+    """Plans made one step ago by robots that now are at ``pos`` and fly straight: stages 0..N."""
+    times = DT * np.arange(-1, N)
+    return pos[:, :, None] + times[:, None] * vel[:, :, None]
+
+
+def test_other_indices():
+    assert other_indices(3).tolist() == [[1, 2], [0, 2], [0, 1]]
+
+
+def test_advance_goes_on_straight():
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 1, 0]])
+    assert advance(line).tolist() == [[1, 0, 0], [2, 1, 0], [3, 2, 0]]
+
+
+def test_constant_velocity_starts_one_step_ahead():
+    believed = constant_velocity(np.zeros(3), np.array([1.0, 0, -2]), 2, 0.5)
+    assert believed.tolist() == [[0.5, 0, -1], [1, 0, -2]]
+
+
+def test_a_requested_plan_is_shifted_to_now():
+    beliefs = Beliefs(1, 2, N, DT, memory=0.0)
+    pos = np.array([[[0.0, 0, 1], [3, 0, 1]]])
+    vel = np.array([[[1.0, 0, 0], [0, 2, 0]]])
+    plans = straight_plans(pos, np.array([[[0.0, 0, 0], [0, -1, 0]]]))  # robot 1 plans something else than it does now
+    believed, source = beliefs.update(np.array([[[True], [False]]]), pos, vel, plans)
+    assert source.ravel().tolist() == [BeliefSource.REQUESTED, BeliefSource.CONSTANT_VELOCITY]
+    # Stage k of the belief is stage k + 1 of the plan of one step ago.
+    np.testing.assert_allclose(believed[0, 0, 0, : N - 1], plans[0, 1, 2:])
+    np.testing.assert_allclose(believed[0, 1, 0], constant_velocity(pos[0, 0], vel[0, 0], N, DT))
+
+
+@pytest.mark.parametrize(("memory", "remembers"), [(0.0, False), (0.3, True)])
+def test_memory_is_a_switch(memory, remembers):
+    beliefs = Beliefs(1, 2, N, DT, memory)
+    pos, vel = np.array([[[0.0, 0, 1], [3, 0, 1]]]), np.zeros((1, 2, 3))
+    turning = np.array([[[0.0, 0, 0], [0, 1, 0]]])
+    asked, silent = np.ones((1, 2, 1), bool), np.zeros((1, 2, 1), bool)
+    beliefs.update(asked, pos, vel, straight_plans(pos, turning))
+    pos = pos + DT * turning
+    believed, source = beliefs.update(silent, pos, vel, straight_plans(pos, turning))
+    if remembers:
+        assert (source == BeliefSource.REMEMBERED).all()
+        np.testing.assert_allclose(believed[0, 0, 0], constant_velocity(pos[0, 1], turning[0, 1], N, DT))
+    else:
+        assert (source == BeliefSource.CONSTANT_VELOCITY).all()
+
+
+def test_memory_ends_when_the_plan_no_longer_fits_and_when_it_is_old():
+    pos, vel = np.array([[[0.0, 0, 1], [3, 0, 1]]]), np.zeros((1, 2, 3))
+    asked, silent = np.ones((1, 2, 1), bool), np.zeros((1, 2, 1), bool)
+
+    beliefs = Beliefs(1, 2, N, DT, memory=0.3)
+    beliefs.update(asked, pos, vel, straight_plans(pos, vel))
+    _, source = beliefs.update(silent, pos + np.array([[[0, 0, 0], [0.2, 0, 0]]]), vel, straight_plans(pos, vel))
+    assert (source == BeliefSource.REMEMBERED).all()
+    _, source = beliefs.update(silent, pos + np.array([[[0, 0, 0], [0.4, 0, 0]]]), vel, straight_plans(pos, vel))
+    assert source.ravel().tolist() == [BeliefSource.CONSTANT_VELOCITY, BeliefSource.REMEMBERED]
+
+    beliefs = Beliefs(1, 2, N, DT, memory=0.3)
+    beliefs.update(asked, pos, vel, straight_plans(pos, vel))
+    sources = [beliefs.update(silent, pos, vel, straight_plans(pos, vel))[1][0, 0, 0] for _ in range(N)]
+    assert sources == [BeliefSource.REMEMBERED] * (N - 2) + [BeliefSource.CONSTANT_VELOCITY] * 2
+
+
+def test_forget_and_keep_touch_only_the_given_swarms():
+    pos, vel = np.tile([[[0.0, 0, 1], [3, 0, 1]]], (3, 1, 1)), np.zeros((3, 2, 3))
+    asked, silent = np.ones((3, 2, 1), bool), np.zeros((3, 2, 1), bool)
+    beliefs = Beliefs(3, 2, N, DT, memory=0.3)
+    beliefs.update(asked, pos, vel, straight_plans(pos, vel))
+    beliefs.forget(np.array([1]))
+    beliefs.keep(np.array([False, True, True]))
+    _, source = beliefs.update(silent[1:], pos[1:], vel[1:], straight_plans(pos[1:], vel[1:]))
+    assert (source[0] == BeliefSource.CONSTANT_VELOCITY).all()
+    assert (source[1] == BeliefSource.REMEMBERED).all()
+
+
+def test_refuses_a_negative_memory():
+    with pytest.raises(ValueError, match=r"memory=-0\.1"):
+        Beliefs(1, 2, N, DT, memory=-0.1)

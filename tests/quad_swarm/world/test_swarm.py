@@ -1,0 +1,216 @@
+"""The world without RL: collisions at and between steps, disturbances, and swarms that do not see each other."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.planner import PlanStatus
+from quad_swarm.task.view import View
+from quad_swarm.world.beliefs import BeliefSource, advance
+from quad_swarm.world.presets import PRESETS, make_config
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import Swarm
+
+
+def make_swarm(n_swarms: int, scenario: str = "asymmetric_swap", **overrides) -> Swarm:
+    config = make_config("paper", **overrides)
+    swarm = Swarm(config, n_swarms)
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space)
+    for k in range(n_swarms):
+        _, starts, goals = sampler.sample(np.random.default_rng(k))
+        swarm.reset(k, starts, goals, noise_seed=k)
+    return swarm
+
+
+def all_ask(swarm: Swarm, ask: bool = True) -> np.ndarray:
+    n = swarm.config.n_robots
+    return np.full((swarm.n_swarms, n, n - 1), ask)
+
+
+def fly(swarm: Swarm, steps: int, ask: bool = True) -> np.ndarray:
+    return np.array([(swarm.step(all_ask(swarm, ask)), swarm.pos.copy())[1] for _ in range(steps)])
+
+
+def test_robots_reach_their_goals():
+    swarm = make_swarm(3)
+    fly(swarm, 60)
+    assert np.linalg.norm(swarm.pos - swarm.goal, axis=-1).max() < 0.1
+
+
+def test_a_swarm_flies_the_same_alone_and_in_company():
+    together = make_swarm(3)
+    positions = fly(together, 30)
+    for k in range(3):
+        alone = make_swarm(3)
+        alone.keep(np.arange(3) == k)
+        assert np.array_equal(fly(alone, 30)[:, 0], positions[:, k])
+
+
+def test_first_plan_asked_for_is_to_stay():
+    swarm = make_swarm(1)
+    believed, source = swarm.beliefs.update(all_ask(swarm), swarm.pos, swarm.vel, swarm.plans[..., :3])
+    assert (source == BeliefSource.REQUESTED).all()
+    assert np.array_equal(believed, np.broadcast_to(swarm.pos[:, swarm.beliefs.others, None], believed.shape))
+
+
+def test_robots_that_ask_believe_the_plan_of_one_step_ago_shifted_by_one(monkeypatch):
+    swarm = make_swarm(1)
+    fly(swarm, 5)
+    plans = swarm.plans[0, :, :, :3].copy()
+    asked, plan = [], swarm.planner.plan
+    monkeypatch.setattr(swarm.planner, "plan", lambda problems, last: asked.append(problems) or plan(problems, last))
+    fly(swarm, 1)
+    for i in range(4):
+        for k, j in enumerate(swarm.beliefs.others[i]):
+            assert np.array_equal(asked[0].others[i, k, :-1], plans[j, 2:])
+
+
+def test_a_plan_begins_with_the_state_that_is_flown():
+    swarm = make_swarm(1)
+    for _ in range(10):
+        report = swarm.step(all_ask(swarm))
+        assert (report.plan_status == PlanStatus.SOLVED).all()
+        np.testing.assert_allclose(swarm.state[0], swarm.plans[0, :, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "at_step", "between"),
+    [
+        ((1.0, 0, 0), (0.7, 0, 0), 0.7, 0.7),
+        ((1.0, 0.2, 0), (-1.0, 0.2, 0), np.hypot(1.0, 0.2), 0.2),  # passes at 0.2 m in mid-step
+        ((0.3, 0, 0), (0.9, 0, 0), 0.9, 0.3),
+    ],
+)
+def test_separation_at_and_between_steps(start, end, at_step, between):
+    swarm = make_swarm(1, n_robots=2)
+    before = np.array([[[0, 0, 1.0], np.add([0, 0, 1.0], start)]])
+    swarm.state[0, :, :3] = [[0, 0, 1.0], np.add([0, 0, 1.0], end)]
+    report = swarm._report(before, np.zeros((1, 2, 1)), 0.0)
+    assert report.min_separation[0] == pytest.approx(at_step)
+    assert report.min_separation_continuous[0] == pytest.approx(between)
+    assert report.collision[0] == (at_step < 0.599)
+    assert report.collision_continuous[0] == (between < 0.599)
+
+
+@pytest.mark.parametrize(("distance", "collides"), [(0.5985, True), (0.5995, False)])
+def test_collision_tolerance_is_one_millimetre(distance, collides):
+    swarm = make_swarm(1, n_robots=2)
+    swarm.state[0, :, :3] = [[0, 0, 1], [distance, 0, 1]]
+    report = swarm._report(swarm.pos.copy(), np.zeros((1, 2, 1)), 0.0)
+    assert report.collision[0] == collides
+
+
+def test_noise_is_off_by_default_and_repeats_from_its_seed():
+    assert not PRESETS["paper"].noise
+    noise = {"pos": 0.004, "vel": 0.02, "attitude": 0.006, "wind": 1.0}
+    first, second = (fly(make_swarm(2, noise=noise), 20) for _ in range(2))
+    assert np.array_equal(first, second)
+    assert np.abs(first - fly(make_swarm(2), 20)).max() > 0.01
+
+
+def test_noise_of_a_swarm_does_not_depend_on_its_company():
+    noise = {"vel": 0.05, "wind": 0.5}
+    together = fly(make_swarm(2, noise=noise), 15)
+    alone = make_swarm(2, noise=noise)
+    alone.keep(np.array([False, True]))
+    assert np.array_equal(fly(alone, 15)[:, 0], together[:, 1])
+
+
+def test_wind_blows_hovering_robots_until_they_lean_into_it():
+    swarm = make_swarm(1, noise={"wind": 2.0})
+    fly(swarm, 80)
+    tilt = np.abs(swarm.state[0, :, 6:8]).max(axis=1)
+    assert (tilt > 0.02).all()
+    assert np.abs(swarm.state[0, :, 8]).max() == 0
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.full((4, 3), np.nan)])
+def test_refuses_senseless_starts(bad):
+    swarm = make_swarm(1)
+    with pytest.raises(ValueError, match="starts must be 4 finite points"):
+        swarm.reset(0, bad, np.zeros((4, 3)))
+
+
+def test_presets_take_replacements_and_name_what_they_do_not_know():
+    config = make_config("dense", n_robots=5, planner={"separation": 0.7, "workspace_low": [-3, -3, 0.5]})
+    assert (config.n_robots, config.planner.separation, config.planner.max_speed) == (5, 0.7, 4.0)
+    assert config.planner.workspace_low == (-3, -3, 0.5)
+    assert make_config("paper", planner={"violation_weight": "1e5"}).planner.violation_weight == 1e5
+    assert make_config("dense", n_robots=None) == PRESETS["dense"]
+    for values, message in [
+        ({"planner": {"seperation": 1}}, "planner parameter 'seperation'.*Did you mean 'separation'"),
+        ({"speed": 1}, "world parameter 'speed'"),
+        ({"planner": {"dt": "fast"}}, "'dt' takes a number, not 'fast'"),
+        ({"planner": {"horizon": 9.5}}, "'horizon' takes an integer, not 9.5"),
+        ({"planner": {"workspace_low": [0, 0]}}, r"'workspace_low' takes 3 numbers"),
+        ({"radius": float("nan")}, "'radius' takes a finite number"),
+        ({"memory": {"far": 1}}, "takes a plain value"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            make_config("paper", **values)
+    with pytest.raises(ValueError, match="Did you mean 'dense'"):
+        make_config("dens")
+
+
+def test_lost_answers_count_as_not_received_and_repeat_with_the_seed():
+    sources = []
+    for _ in range(2):
+        swarm = make_swarm(2, radio={"loss": 0.5}, memory=0.0)
+        sources.append(np.array([swarm.step(all_ask(swarm)).belief_source for _ in range(20)]))
+    assert np.array_equal(*sources)
+    assert abs((sources[0] == BeliefSource.REQUESTED).mean() - 0.5) < 0.1
+    swarm = make_swarm(1, radio={"loss": 1.0}, memory=0.0)
+    silent = make_swarm(1, memory=0.0)
+    assert np.array_equal(fly(swarm, 15), fly(silent, 15, ask=False))
+
+
+def test_a_robot_knows_what_the_others_believe_of_it():
+    swarm, rng = make_swarm(2), np.random.default_rng(0)
+    for _ in range(8):
+        swarm.step(rng.random((2, 4, 3)) < 0.3)
+    told, outlook = View(swarm).told(range(swarm.config.planner.horizon)), swarm.beliefs.outlook(swarm.pos, swarm.vel)
+    assert 0 < told.remembers.mean() < 1
+    for i, m in np.ndindex(4, 3):
+        j = swarm.beliefs.others[i, m]
+        mine = swarm.beliefs.others[j].tolist().index(i)
+        for field, of_other in zip(told, outlook, strict=True):
+            assert np.array_equal(field[:, i, m], of_other[:, j, mine])
+
+
+def test_a_robot_takes_its_answers_to_have_arrived():
+    swarm = make_swarm(1, radio={"loss": 1.0})
+    for _ in range(5):
+        swarm.step(all_ask(swarm))
+    view = View(swarm)
+    assert view.told([0]).remembers.all()
+    assert not view.outlook.remembers.any()
+    swarm.reset(0, swarm.pos[0], swarm.goal[0])
+    assert not View(swarm).told([0]).remembers.any()
+
+
+def test_late_answers_are_older_plans():
+    swarm, late = make_swarm(1), make_swarm(1, radio={"delay": 2})
+    plans = []
+    for _ in range(6):
+        plans.append(late.plans[..., :3].copy())
+        late.step(all_ask(late))
+    # Asked in the last step, two steps late: the plan of three steps ago, three steps on
+    expected = plans[-3]
+    for _ in range(3):
+        expected = advance(expected)
+    remembered = late.beliefs._remembered
+    np.testing.assert_allclose(remembered, expected[:, late.beliefs.others])
+    assert (late.beliefs._age == 3).all()
+    assert not np.allclose(fly(swarm, 20)[-1], fly(late, 14)[-1])
+
+
+def test_wrong_radios_are_refused():
+    with pytest.raises(ValueError, match=r"radio\.loss=2"):
+        make_config("paper", radio={"loss": 2.0})
+
+
+def test_planned_separation_is_the_distance_between_plans():
+    swarm = make_swarm(1)
+    fly(swarm, 8)
+    plans = swarm.plans[0, :, 2:5, :3]
+    between = np.linalg.norm(plans[0] - plans[2], axis=-1)
+    assert swarm.planned_separation(3)[0, 0, 1] == pytest.approx(between)

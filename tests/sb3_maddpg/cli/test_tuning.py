@@ -1,0 +1,235 @@
+"""The search for hyperparameters, ``sb3-maddpg train -optimize``."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import optuna
+import pytest
+import yaml
+from optuna.distributions import CategoricalDistribution
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_maddpg import MADDPG
+from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.zoo import register
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.utils import arguments_of
+from toys import Neighbours, toy
+
+ALGOS = {"maddpg": MADDPG, "matd3": MATD3}
+NOISE = {"first_noise", "last_noise"}
+SHARING = {"share_actor", "share_critic"}
+RECIPE = {
+    "n_timesteps": 60,
+    "policy": "MlpPolicy",
+    "policy_kwargs": {"net_arch": [8], "threshold": 0.25},
+    "learning_starts": 20,
+    "buffer_size": 1000,
+}
+SEARCH = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+
+
+class Fails(BaseCallback):
+    """Goes wrong, by itself or because a network has."""
+
+    def __init__(self, in_the_network: bool):
+        super().__init__()
+        self.in_the_network = in_the_network
+
+    def _on_step(self):
+        if self.in_the_network:
+            self.model.actor.net.biases[0].data.fill_(float("nan"))
+        raise ValueError("a callback that is wrong")
+
+
+class Counts(BaseCallback):
+    """Counts the trials."""
+
+    trials = 0
+
+    def _on_training_start(self):
+        Counts.trials += 1
+
+    def _on_step(self):
+        return True
+
+
+class Worse(OwnBit):
+    """Pays the less, the later the trial."""
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, float(-Counts.trials), *rest
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty folder to work in, and a module that recipes can name."""
+    known = dict(gymnasium.registry)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "of_the_test", SimpleNamespace(Fails=Fails, Counts=Counts))
+    monkeypatch.setattr(Counts, "trials", 0)
+    gymnasium.register("Worse-v0", entry_point=Worse)
+    yield tmp_path
+    gymnasium.registry.clear()
+    gymnasium.registry.update(known)
+
+
+def train(*argv: str, env: str = "OwnBit-v0", algo: str = "maddpg", recipe: dict | None = None) -> int:
+    Path("recipe.yml").write_text(yaml.safe_dump({env: {**RECIPE, **(recipe or {})}}))
+    return main(
+        ["train", "--algo", algo, "--env", env, "--conf-file", "recipe.yml", "--verbose", "0", "--seed", "1", *argv]
+    )
+
+
+def study(storage: str = "s.log", name: str = "s") -> optuna.Study:
+    backend = optuna.storages.journal.JournalFileBackend(storage)
+    return optuna.load_study(study_name=name, storage=optuna.storages.JournalStorage(backend))
+
+
+def sample(algo: str, env, n_envs: int = 1, policy: str = "MlpPolicy", seed: int = 0, **hyperparams):
+    """:return: a trial, and the arguments of the algorithm"""
+    register()
+    sampler = optuna.samplers.RandomSampler(seed=seed)
+    trial = optuna.create_study(sampler=sampler).ask()
+    arguments = {
+        "env": env,
+        "hyperparams": hyperparams,
+        "policy_arguments": arguments_of(MADDPG.policy_aliases[policy]),
+    }
+    return trial, HYPERPARAMS_SAMPLER[algo](trial, 0, n_envs, arguments)
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+@pytest.mark.parametrize(
+    ("kind", "searched"),
+    [
+        ("bits", {"estimator"}),
+        ("numbers", NOISE),
+        ("categories", {"estimator"}),
+        ("unlike", {"estimator"} | NOISE),
+        ("mixed", {"estimator"} | NOISE),
+    ],
+)
+def test_what_matters_to_the_team_is_searched(algo, kind, searched):
+    env = toy(kind)
+    space = {"estimator", "policy_delay", "target_policy_noise"} | NOISE | SHARING
+    if algo == "matd3":
+        searched = searched | {"policy_delay"} | ({"target_policy_noise"} if searched & NOISE else set())
+    for seed in range(5):
+        trial, params = sample(algo, env, seed=seed)
+        # No two agents of these teams see as many numbers: they cannot share
+        assert trial.params.keys() & space == searched
+        assert ("temperature" in params) == (params.get("estimator", "score") not in ("score", "expected"))
+        model = ALGOS[algo]("MlpPolicy", env, **params)
+        assert model.gamma == pytest.approx(1 - trial.params["one_minus_gamma"])
+        assert HYPERPARAMS_CONVERTER[algo](trial.params) == params
+
+
+def test_agents_that_are_alike_may_share():
+    (equal, _), (unlike, _) = sample("maddpg", Neighbours()), sample("maddpg", toy("bits"))
+    assert equal.distributions["share_actor"] == CategoricalDistribution(["false", "true"])
+    assert not SHARING & unlike.params.keys()
+    trial, _ = sample("maddpg", Neighbours(), policy="PairPolicy")
+    assert not SHARING & trial.params.keys()
+
+    from mpe2 import simple_tag_v3
+
+    from sb3_maddpg.parallel import TeamEnv
+
+    tag = TeamEnv(simple_tag_v3.parallel_env(continuous_actions=True))
+    trials = [sample("maddpg", tag, seed=seed) for seed in range(9)]
+    choices = {json.dumps(params["policy_kwargs"]["share_critic"]) for _, params in trials}
+    assert choices == {"false", "[[0, 1, 2]]"}  # the adversaries
+    for _, params in trials[:3]:
+        MADDPG("MlpPolicy", tag, buffer_size=10, **params)
+
+
+def test_updates_are_counted_in_transitions_and_noise_is_left_to_action_noise():
+    env = DummyVecEnv([lambda: toy("numbers")] * 20)
+    trial, params = sample("maddpg", env, n_envs=20, action_noise="given")
+    assert (trial.distributions["train_freq"].low, trial.distributions["train_freq"].high) == (1, 10)
+    assert "exploration_noise" not in params
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_the_first_trial_of_a_study_is_taken_up_again(algo, folder, capsys):
+    stored = ["--storage", "s.log", "--study-name", "s"]
+    assert train(*SEARCH, *stored, algo=algo) == 0
+    assert sorted(path.suffix for path in (folder / "logs" / algo).iterdir()) == [".csv", ".pkl"]  # no run
+    (trial,) = study().trials
+    for trial_id in ("0", "1"):
+        code = train(*stored, "--trial-id", trial_id, "--eval-freq", "-1", "-params", "n_steps:2", algo=algo)
+        assert code == (0 if trial_id == "0" else 2)
+    assert "Study s has no trial 1" in capsys.readouterr().err
+    model = ALGOS[algo].load(f"logs/{algo}/OwnBit-v0_1/OwnBit-v0.zip")
+    expected = HYPERPARAMS_CONVERTER[algo](trial.params)
+    policy_kwargs = {**RECIPE["policy_kwargs"], **expected.pop("policy_kwargs")}
+    assert {key: model.policy_kwargs[key] for key in policy_kwargs} == policy_kwargs
+    assert model.n_steps == 2  # the command line has the last word
+    assert (model.tau, model.batch_size, model.estimator) == tuple(
+        expected[key] for key in ("tau", "batch_size", "estimator")
+    )
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--trial-id", "0"], "give --storage and --study-name"),
+        (["--trial-id", "0", "--storage", "t.log", "--study-name", "s"], "There is no file t.log"),
+        (["--trial-id", "0", "--storage", "s.log", "--study-name", "stud"], "did you mean 'study'"),
+    ],
+)
+def test_a_trial_that_is_not_there_is_refused(folder, capsys, argv, message):
+    backend = optuna.storages.journal.JournalFileBackend("s.log")
+    optuna.create_study(study_name="study", storage=optuna.storages.JournalStorage(backend))
+    assert train(*argv) == 2
+    assert message in capsys.readouterr().err
+    assert not Path("t.log").exists()
+
+
+def test_a_trial_whose_network_diverged_is_pruned_and_any_other_error_ends_the_search(folder, capsys):
+    stored = [*SEARCH, "--storage", "s.log", "--study-name", "s"]
+    callback = "of_the_test.Fails"
+    assert train(*stored, recipe={"callback": [{callback: {"in_the_network": True}}]}) == 2
+    out, error = capsys.readouterr()
+    assert "Trial 0 diverged" in out
+    assert "No trials are completed yet" in error
+    assert train(*stored, recipe={"callback": [{callback: {"in_the_network": False}}]}) == 2
+    assert "a callback that is wrong" in capsys.readouterr().err
+    assert [trial.state.name for trial in study().trials] == ["PRUNED", "FAIL"]
+    assert train(*stored, "-params", "estimater:'score'") == 2
+    assert "did you mean 'estimator'" in capsys.readouterr().err
+
+
+def test_a_trial_behind_the_others_is_pruned(folder):
+    search = [*SEARCH, "--storage", "s.log", "--study-name", "s", "--n-startup-trials", "1"]
+    argv = [*search, "--n-trials", "3", "--n-evaluations", "4"]
+    assert train(*argv, env="Worse-v0", recipe={"callback": ["of_the_test.Counts"]}) == 0
+    states = [trial.state.name for trial in study().trials]
+    assert states[0] == "COMPLETE"
+    assert states[-1] == "PRUNED"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", ["logs/s.log", "sqlite:///s.db"])
+def test_workers_share_a_study(folder, storage):
+    Path("recipe.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
+    command = [sys.executable, "-m", "sb3_maddpg", "train", "--env", "OwnBit-v0", "--conf-file", "recipe.yml"]
+    command += [*SEARCH, "--n-trials", "2", "--storage", storage, "--study-name", "s", "--seed", "1"]
+    workers = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) for _ in range(2)]
+    for worker in workers:
+        output, _ = worker.communicate(timeout=300)
+        assert worker.returncode == 0, output
+    both = study(storage) if storage.endswith(".log") else optuna.load_study(study_name="s", storage=storage)
+    assert [trial.state.name for trial in both.trials] == ["COMPLETE"] * 4
+    # The same seed, but no trial twice
+    assert len({trial.params["tau"] for trial in both.trials}) == 4
+    assert list(Path("logs/maddpg").glob("report*.csv"))
