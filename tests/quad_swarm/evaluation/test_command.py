@@ -9,12 +9,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-import sb3_maddpg
 from quad_swarm.evaluation.command import main
 from quad_swarm.evaluation.evaluation import Cell, evaluate, first_episode, fly, run_episodes, wilson_interval
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
+from sb3_maddpg.pretrained_models import pretrained_folder
 
 KEYS = {
     "policy", "scenario", "preset", "episodes", "collisions", "collision_low", "collision_high",
@@ -124,7 +124,7 @@ def test_writes_table_json_and_figures(tmp_path, capsys):
 
 
 def test_the_table_names_models_shortly_where_that_tells_them_apart(capsys, tmp_path):
-    path = str(Path(sb3_maddpg.__file__).parent / "models" / "quad-swarm-paper" / "model.zip")
+    path = str(pretrained_folder("quad-swarm-paper") / "model.zip")
     flags = ["--scenario", "random", "--episodes", "1"]
     assert main(["--policy", path, f"{path}@0.7", *flags]) == 0
     names = [line.split()[1] for line in capsys.readouterr().out.splitlines() if "quad-swarm-paper" in line]

@@ -8,8 +8,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from quad_swarm import dashboard
 from quad_swarm.evaluation.evaluation import Cell, run_episodes
+from quad_swarm.figures import dashboard
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG, DashboardCallback, pretrained
 from sb3_maddpg.callbacks import hyperparameters
