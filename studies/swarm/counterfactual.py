@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +20,13 @@ import numpy as np
 import torch as th
 from torch.nn import functional as F
 
-from quad_swarm.evaluation.command import write_json
+from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.task.request_task import RequestTask, make_task
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 from studies.swarm.ppo import env_kwargs, validate
-from studies.swarm.protocol import cell
+from studies.swarm.protocol import condition
 
 PRICES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 # Prices of the policy that flies while it learns are drawn between these, for each pair and step.
@@ -94,9 +93,7 @@ class Forks:
             over = self._step(self.task, self._act(self.task))[1][0]
             self._begin(over)
         obs = self.task.observe()[:SWARMS]
-        branch = copy(self.task)
-        branch.swarm = self.task.swarm.part(np.ones(SWARMS * self.copies, dtype=bool))
-        branch.statistics = deepcopy(self.task.statistics)
+        branch = self.task.fork()
         total, flying = np.zeros((self.copies, SWARMS, *self.pairs)), np.ones((self.copies, SWARMS), dtype=bool)
         turned = np.arange(1, self.copies)
         i, m = np.unravel_index(turned - 1, self.pairs)
@@ -160,10 +157,12 @@ def main() -> None:
     config = make_config("paper")
     rows: list[dict[str, Any]] = []
     for name in SCENARIOS:
-        cells = {price: cell(f"{path}@{1 / (1 + np.exp(-SCALE * price)):.6f}", name, config) for price in PRICES}
-        rows += validate(cells, "price", args.episodes, keys)
+        conditions = {
+            price: condition(f"{path}@{1 / (1 + np.exp(-SCALE * price)):.6f}", name, config) for price in PRICES
+        }
+        rows += validate(conditions, "price", args.episodes, keys)
     if args.json:
-        write_json(args.json, rows)
+        write_rows(args.json, rows)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 trains Stable-Baselines3's PPO with every robot as an environment of its own, with the observations, scenarios and
 rewards of zoo_configs/quad_swarm_paper.yml, credit by robot and a price for each request. Then it flies each policy
 with several thresholds of the probability to ask, on episodes of the validation set. JSON: one row a price, scenario
-and threshold with the keys of `quad_swarm.evaluation.evaluation.summarise`, and price, steps, seed, seconds, scenario, threshold.
+and threshold with the keys of `summarise`, and price, steps, seed, seconds, scenario, threshold.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from quad_swarm.evaluation.command import write_json
-from quad_swarm.evaluation.evaluation import Cell, fly_all, summarise
+from quad_swarm.evaluation.evaluation import fly_all, summarise
+from quad_swarm.evaluation.flight import Condition
+from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg.vec_env import GymnasiumVecEnv
-from studies.swarm.protocol import ROOT, VALIDATION, cell
+from studies.swarm.protocol import ROOT, VALIDATION, condition
 
 RECIPE = ROOT / "zoo_configs" / "quad_swarm_paper.yml"
 THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 0.7)
@@ -75,7 +76,7 @@ class Robots(VecEnvWrapper):
 
 
 class SharedPPO:
-    """A trained PPO that decides for every robot of a team by itself, as `quad_swarm.evaluation.evaluation` flies models.
+    """A trained PPO that decides for every robot of a team by itself, as the evaluation flies models.
 
     :param model: trained with one robot's observations and requests
     """
@@ -122,18 +123,20 @@ def train(price: float, steps: int, seed: int) -> PPO:
     return model.learn(steps * env.n)
 
 
-def validate(cells: dict[float, Cell], what: str, episodes: int, keys: dict[str, Any]) -> list[dict[str, Any]]:
+def validate(
+    conditions: dict[float, Condition], what: str, episodes: int, keys: dict[str, Any]
+) -> list[dict[str, Any]]:
     """Fly a scenario of the validation set with several values of something.
 
-    :param cells: what flies with each value
+    :param conditions: what flies with each value
     :param what: name of the values
     :param keys: of every row
     :return: a row for each value
     """
-    flown = fly_all(list(cells.values()), episodes, VALIDATION)
+    flown = fly_all(list(conditions.values()), episodes, VALIDATION)
     rows = []
-    for value, one in cells.items():
-        row = {"scenario": one.scenario, what: value} | summarise(flown[one], one.config.n_robots)
+    for value, one in conditions.items():
+        row = {"scenario": one.scenario, what: value} | summarise(flown[one], one.config)
         rows.append(keys | row)
         figures = f"{row['collisions']}/{row['episodes']} at {row['request_share']:.1%}"
         print(f"{one.scenario}, {what} {value:g}: {figures}", flush=True)
@@ -161,10 +164,12 @@ def main() -> None:
         model.save(path)
         print(f"price {price:g}", flush=True)
         for name in SCENARIOS:
-            cells = {d: cell(f"{path}@{d}", name, config, algo="studies.swarm.ppo:SharedPPO") for d in THRESHOLDS}
-            rows += validate(cells, "threshold", args.episodes, keys)
+            conditions = {
+                d: condition(f"{path}@{d}", name, config, algo="studies.swarm.ppo:SharedPPO") for d in THRESHOLDS
+            }
+            rows += validate(conditions, "threshold", args.episodes, keys)
         if args.json:
-            write_json(args.json, rows)
+            write_rows(args.json, rows)
 
 
 if __name__ == "__main__":

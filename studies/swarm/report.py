@@ -1,4 +1,4 @@
-"""Put tables and figures of the swarm's results into docs/results.md: ``python -m studies.swarm.report [--data FOLDER]``.
+"""Put tables and figures into docs/results.md: ``python -m studies.swarm.report [--data FOLDER]``.
 
 The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
 come from `studies/swarm/tune_rules.py`, `studies/swarm/tune_thresholds.py`, `studies/swarm/fly.py`, of other learners
@@ -14,30 +14,18 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
-from quad_swarm.evaluation.evaluation import Flight, fly, is_model
+from quad_swarm.evaluation.flight import Flight, fly
+from quad_swarm.evaluation.policies import is_model
+from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.figures.colours import colour_of
 from quad_swarm.figures.plots import draw_flight
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
-from studies.swarm.protocol import (
-    DATA,
-    OF_TEAM,
-    ROOT,
-    TEST,
-    absolute_path,
-    best_rules,
-    cell,
-    models,
-    progress,
-    read_rows,
-)
+from studies.swarm.protocol import DATA, EARLIER, OF_TEAM, ROOT, absolute_path, best_rules, condition, models, progress
 
 PAGE = ROOT / "docs" / "results.md"
 IMAGES = ROOT / "docs" / "images"
@@ -223,7 +211,8 @@ def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
     """Requests against collisions: rule families, the learned policy at all thresholds, and the tested policies."""
     presets = [preset for preset in PRESETS if any(row["preset"] == preset for row in rules)]
     size = (15, 3.5 * len(presets))
-    figure, panels = plt.subplots(len(presets), 4, figsize=size, layout="constrained", sharey="row", squeeze=False)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(presets), 4, sharey="row", squeeze=False)
     families = list(dict.fromkeys(row["family"] for row in rules))
     for line, preset in zip(panels, presets, strict=True):
         for axes, name in zip(line, NAMES, strict=True):
@@ -260,49 +249,44 @@ def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
     handles = {text: handle for legend in legends for handle, text in legend}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=8)
     figure.savefig(path, dpi=90)
-    plt.close(figure)
 
 
 def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
     """The first test episode of each scenario as a model flies it, and whom a rule would have asked on its way."""
     config = make_config(preset)
     names = progress(NAMES, f"flights, {preset}", len(NAMES))
-    return {name: fly(cell(model, name, config), TEST, beside=rule) for name in names}
+    return {name: fly(condition(model, name, config), EARLIER, other_rule=rule) for name in names}
 
 
 def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
     """The paper's Fig. 2: the flights of each preset from above."""
     size = (15, 4 * len(flown))
-    figure, panels = plt.subplots(len(flown), len(NAMES), figsize=size, layout="constrained", squeeze=False)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(flown), len(NAMES), squeeze=False)
     for line, (preset, by_name) in zip(panels, flown.items(), strict=True):
         for axes, (name, flight) in zip(line, by_name.items(), strict=True):
             draw_flight(axes, flight)
             axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
     figure.savefig(path, dpi=90)
-    plt.close(figure)
 
 
-def told(flight: Flight) -> str:
-    """A flight step by step: who asks whom, what it sees of it, and whom the rule would have asked."""
-    n = len(flight.goal)
-    others = other_indices(n)
-    pos, vel = flight.state[..., :3], flight.state[..., 3:6]
+def step_by_step(flight: Flight) -> str:
+    """A flight as a table: who asks whom, what it sees of it, and whom the rule would have asked."""
+    others = other_indices(flight.n_robots)
+    approach, time = flight.closest_approach
     last: dict[tuple[int, int], int] = {}
     lines = []
-    for k, (asked, by_rule) in enumerate(zip(flight.requests, flight.beside, strict=True)):
+    for k, (asked, by_rule) in enumerate(zip(flight.requests, flight.other_requests, strict=True)):
         texts = []
         for i, m in np.argwhere(asked):
             j = others[i, m]
-            away, moving = pos[k, j] - pos[k, i], vel[k, j] - vel[k, i]
-            time = max(0.0, -(away @ moving) / max(moving @ moving, 1e-12))
             age = f"asked {k - last[i, j]} steps ago" if (i, j) in last else "not asked before"
-            near = np.linalg.norm(away + time * moving)
-            texts.append(f"**{i} → {j}** {np.linalg.norm(away):.1f} m away, {near:.2f} m in {time:.1f} s, {age}")
+            seen = f"{flight.separation[k, i, m]:.1f} m away, {approach[k, i, m]:.2f} m in {time[k, i, m]:.1f} s"
+            texts.append(f"**{i} → {j}** {seen}, {age}")
             last[i, j] = k
         rule = ", ".join(f"{i} → {others[i, m]}" for i, m in np.argwhere(by_rule))
         if texts or rule:
-            apart = min(np.linalg.norm(pos[k, i] - pos[k, j]) for i in range(n) for j in range(i))
-            lines.append([str(k), f"{apart:.2f}", "<br>".join(texts) or "-", rule or "-"])
+            lines.append([str(k), f"{flight.separation[k].min():.2f}", "<br>".join(texts) or "-", rule or "-"])
     return table(["step", "closest two (m)", "asks", "the rule would ask"], lines)
 
 
@@ -327,9 +311,8 @@ def draw_asking(rows: Rows, path: Path) -> None:
     quantities = list(dict.fromkeys(row["quantity"] for row in rows))
     presets = list(dict.fromkeys(row["preset"] for row in rows))
     size = (15, 2.8 * len(presets))
-    figure, panels = plt.subplots(
-        len(presets), len(quantities), figsize=size, layout="constrained", sharey="row", squeeze=False
-    )
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(presets), len(quantities), sharey="row", squeeze=False)
     for line, preset in zip(panels, presets, strict=True):
         for axes, quantity in zip(line, quantities, strict=True):
             for learned in (False, True):
@@ -348,7 +331,6 @@ def draw_asking(rows: Rows, path: Path) -> None:
         line[0].set_ylabel(f"{preset}: share asked")
         line[0].legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=90)
-    plt.close(figure)
 
 
 def main() -> None:
@@ -386,7 +368,7 @@ def main() -> None:
         for preset in dict.fromkeys(row["preset"] for row in asking)
     }
     for name in ("symmetric_swap", "asymmetric_swap"):
-        blocks[f"told {name}"] = told(flown["paper"][name]) if "paper" in flown else "Not flown yet."
+        blocks[f"told {name}"] = step_by_step(flown["paper"][name]) if "paper" in flown else "Not flown yet."
     picture = "![How often policies ask: distance, approach, time, way to go, crowd](images/asking.png)"
     blocks["asking"] = picture if asking else "Not flown yet."
     page = PAGE.read_text()

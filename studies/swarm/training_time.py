@@ -19,7 +19,7 @@ import yaml
 from rl_zoo3.utils import get_class_by_name
 from stable_baselines3.common.vec_env import VecMonitor
 
-from quad_swarm.evaluation.command import write_json
+from quad_swarm.evaluation.rows import write_rows
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.bench import timed
 from sb3_maddpg.vec_env import GymnasiumVecEnv
@@ -71,7 +71,7 @@ def main() -> None:
         print(f"{recipe}: {row['steps']} steps, {row['updates']} updates, {row['episodes']} episodes in", end=" ")
         print(f"{row['seconds']:.0f} s; {shares}", flush=True)
     if args.json:
-        write_json(args.json, rows)
+        write_rows(args.json, rows)
 
 
 if __name__ == "__main__":

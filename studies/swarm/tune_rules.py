@@ -4,24 +4,22 @@
 validation set. In each scenario all rules of a family fly a few episodes, which tell their requests. Then they are
 tried from the cheapest on, in stages of more and more episodes, until one is as safe as full communication
 (`Standard`). One that collides clearly more often in an earlier stage is out. JSON: one row for each rule and scenario
-with the keys of `quad_swarm.evaluation.evaluation.summarise` over the episodes that it flew, and preset, scenario, family, rule,
-with ``--n-robots`` also n_robots, and safe: True or False, or None for those dearer than the one that was found.
+with the keys of `summarise` over the episodes that it flew, and preset, scenario, family, rule, with ``--n-robots``
+also n_robots, and safe: True or False, or None for those dearer than the one that was found.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from quad_swarm.evaluation.evaluation import summarise
+from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
 from quad_swarm.world.presets import PRESETS
 from quad_swarm.world.scenarios import SCENARIOS
-from studies.swarm.protocol import QUICK_STAGES, STAGES, fly, in_stages, progress, replace_rows, world
+from studies.swarm.protocol import QUICK_STAGES, STAGES, fly_validation, in_stages, progress, replace_rows, world
 
 DISTANCES = (0.62, 0.65, 0.7, 0.8, 0.9, 1.05, 1.2, 1.5)
 LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
@@ -56,29 +54,61 @@ def families() -> dict[str, list[str]]:
             for far in ("0.8:3", "0.9:3", "1.05:3", "1.05:4", "1.2:3")
             for k in (3, 4, 6)
         ],
+    } | fine_families()
+
+
+def fine_families() -> dict[str, list[str]]:
+    """The families that came out best, in steps as fine as those of models' thresholds."""
+    product = itertools.product
+    near = ("0.6:1.5", "0.62:1", "0.62:1.5", "0.62:2", "0.65:1.5", "0.7:1.5", "0.8:3", "1.05:3")
+    narrow = [f"cpa:{d:g}:{t:g}" for d, t in product((0.6, 0.61, 0.62, 0.63, 0.64, 0.65, 0.67, 0.7), (1.25, 1.5, 2))]
+    return {
+        "plan, or cpa and stale, fine": [
+            f"plan:{d:g}{soon}|cpa:{cpa}&stale:{k}"
+            for d, soon, cpa, k in product(
+                (0.6, 0.62, 0.64, 0.66, 0.68, 0.7, 0.75),
+                ("", "&soon:0.2", "&soon:0.3", "&soon:0.4"),
+                near,
+                (2, 3, 4, 6),
+            )
+        ],
+        "cpa, soon or stale, fine": [
+            f"{rule}&soon:{t:g}|{rule}&stale:{k}" for rule, t, k in product(narrow, (0.15, 0.2, 0.3, 0.4), (4, 5, 6, 8))
+        ],
+        "two cpa, fine": [
+            f"cpa:{d:g}:{t:g}|cpa:{far:g}:3&stale:{k}"
+            for d, t, far, k in product((0.62, 0.65, 0.68, 0.72), (0.75, 1, 1.25), (0.8, 0.9, 1, 1.1, 1.2), (4, 6, 8))
+        ],
+        "plan and stale, fine": [
+            f"plan:{0.6 + 0.01 * step:g}&stale:{k}" for step, k in product(range(11), (2, 3, 4, 5, 6, 8))
+        ],
+        "cpa and stale, fine": [f"{rule}&stale:{k}" for rule, k in product(narrow, (3, 4, 5, 6, 8))],
     }
 
 
 def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], quick: bool) -> list[dict[str, Any]]:
     """The rows of some families in one scenario."""
     stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
-    n = world(preset, n_robots).n_robots
-    full: list[dict[str, float]] = []
+    config = world(preset, n_robots)
+    full: Rows = []
     table = []
     for family in names:
         rules = families()[family]
-        flown = fly(rules[::thin], preset, scenario, stages[0], n_robots)
+        flown = fly_validation(rules[::thin], preset, scenario, stages[0], n_robots)
         safe: dict[str, bool] = {}
-        for rule in sorted(flown, key=lambda rule: summarise(flown[rule], n)["request_share"]):
+        for rule in sorted(flown, key=lambda rule: summarise(flown[rule], config)["request_share"]):
             flown[rule], safe[rule] = in_stages(rule, preset, scenario, full, quick, n_robots, flown[rule])
             if safe[rule]:
                 break
         keys: dict[str, Any] = {"preset": preset, "scenario": scenario, "family": family}
         keys |= {} if n_robots is None else {"n_robots": n_robots}
-        table += [keys | {"rule": rule, "safe": safe.get(rule)} | summarise(flown[rule], n) for rule in flown]
+        table += [keys | {"rule": rule, "safe": safe.get(rule)} | summarise(flown[rule], config) for rule in flown]
         best = [rule for rule in safe if safe[rule]]
-        share = f"{summarise(flown[best[0]], n)['request_share']:.2%}" if best else "-"
-        print(f"{preset:6} {n:2} {scenario:16} {family:24} {best[0] if best else 'none':45} {share:>8}", flush=True)
+        share = f"{summarise(flown[best[0]], config)['request_share']:.2%}" if best else "-"
+        print(
+            f"{preset:6} {config.n_robots:2} {scenario:16} {family:30} {best[0] if best else 'none':45} {share:>8}",
+            flush=True,
+        )
     return table
 
 
@@ -100,7 +130,7 @@ def main() -> None:
         for scenario in args.scenario
     ]
     keys = ("preset", "scenario", "family", "n_robots")
-    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+    with make_pool(args.jobs) as pool:
         for table in progress(pool.map(tune, *zip(*work, strict=True)), "rules", len(work)):
             if args.json:
                 replace_rows(args.json, table, keys if "n_robots" in table[0] else keys[:-1])

@@ -1,26 +1,25 @@
 """Choose the thresholds of trained models: the highest with which each is as safe as asking everybody.
 
-``python -m studies.swarm.tune_thresholds [MODEL.zip ...] [--scenario ...] [--n-robots ...] [--json F]``, on the validation
-set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds are tried from
-the highest on, in stages of more and more episodes, until the model is as safe as full communication
-(`swarm_rules.Standard`) and not at the edge of it (`has_reserve`): who takes the first that passes takes one that was
-lucky in these episodes. With ``--n-robots`` other thresholds are tried (`TEAM_THRESHOLDS`). The smallest of them, with
-which it is safe everywhere, is written into the model's file. JSON: one row a model, scenario and threshold with the
-keys of `quad_swarm.evaluation.evaluation.summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe;
-those of other cells stay, and count for the model's threshold.
+``python -m studies.swarm.tune_thresholds [MODEL.zip ...] [--scenario ...] [--n-robots ...] [--json F] [--write]``, on
+the validation set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds
+are tried from the highest on, in stages of more and more episodes, until the model is as safe as full communication
+(`Standard`) and not at the edge of it (`has_reserve`): who takes the first that passes takes one that was lucky in
+these episodes. With ``--n-robots`` other thresholds are tried (`TEAM_THRESHOLDS`). With ``--write`` the smallest of
+them, with which a model is safe everywhere, is written into its file. JSON: one row a model, scenario and threshold
+with the keys of `summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe; rows of other
+models, scenarios and teams stay, and count for a model's threshold.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
-import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from quad_swarm.evaluation.evaluation import Comparison, summarise
+from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
+from quad_swarm.evaluation.inference import Comparison
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 from studies.swarm.protocol import OF_PRESET, OF_TEAM, in_stages, models, progress, read_rows, replace_rows, world
@@ -37,7 +36,7 @@ TEAM_THRESHOLDS = [*THRESHOLDS[:10], *THRESHOLDS[10::2], 0.1, 0.05, 0.02, 0.01, 
 
 
 @functools.cache
-def full(preset: str, scenario: str, n: int | None) -> list[dict[str, float]]:
+def full(preset: str, scenario: str, n: int | None) -> Rows:
     """Figures of full communication as far as they have been flown, for `in_stages` to append to."""
     return []
 
@@ -51,19 +50,19 @@ def has_reserve(comparison: Comparison, margin: float, share: float) -> bool:
 def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
     """The rows of a model in one scenario."""
     rival = full(preset, scenario, n)
-    robots = world(preset, n).n_robots
+    config = world(preset, n)
     standard, share = STANDARDS["preset" if n is None else "team"]
     table: list[dict[str, Any]] = []
     for threshold in THRESHOLDS if n is None else TEAM_THRESHOLDS:
         figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, rival, quick, n, standard=standard)
         safe &= quick or has_reserve(Comparison.of(figures, rival[: len(figures)]), standard.margin, share)
         keys = {"model": path, "threshold": threshold, "preset": preset, "scenario": scenario, "safe": safe}
-        table.append(keys | {"n_robots": robots} | summarise(figures, robots))
+        table.append(keys | {"n_robots": config.n_robots} | summarise(figures, config))
         if safe:
-            print(f"{path} {scenario} {robots}: {threshold:g}, {table[-1]['request_share']:.2%}", flush=True)
+            print(f"{path} {scenario} {config.n_robots}: {threshold:g}, {table[-1]['request_share']:.2%}", flush=True)
             break
     else:
-        print(f"{path} {scenario} {robots}: no threshold is as safe as full communication", flush=True)
+        print(f"{path} {scenario} {config.n_robots}: no threshold is as safe as full communication", flush=True)
     return table
 
 
@@ -92,7 +91,10 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--write", action="store_true", help="write each model's threshold into its file")
     args = parser.parse_args()
+    if args.quick and args.write:
+        parser.error("--quick flies too few episodes to choose a threshold: leave out --write")
     paths = args.models or [path for recipe in TUNED for path in models(recipe)]
     presets = {path: preset_of(path) for path in paths}
     work = [
@@ -102,12 +104,12 @@ def main() -> None:
         for path in paths
     ]
     rows: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+    with make_pool(args.jobs) as pool:
         for table in progress(pool.map(tune, *zip(*work, strict=True)), "thresholds", len(work)):
             rows += table
             if args.json:
                 replace_rows(args.json, table, ("model", "scenario", "n_robots"))
-    for path in paths:
+    for path in paths if args.write else ():
         set_threshold(path, read_rows(args.json) if args.json else rows)
 
 

@@ -1,15 +1,10 @@
-"""The command that compares policies over the same held-out episodes.
-
-``python -m quad_swarm.evaluation.command --policy none full cpa:0.7:1.5 MODEL.zip --scenario all``
-"""
+"""``sb3-maddpg evaluate``: compare policies over the same held-out episodes."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
+import dataclasses
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +12,13 @@ from typing import Any
 import yaml
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.evaluation.evaluation import Cell, evaluate, short_name
-from quad_swarm.planner import BuildError
-from quad_swarm.world.presets import PRESET_VERSION, PRESETS, make_config
+from quad_swarm.evaluation.evaluation import evaluate
+from quad_swarm.evaluation.flight import Condition
+from quad_swarm.evaluation.policies import is_model, load_model, short_name, trained_in
+from quad_swarm.evaluation.rows import check_writable, write_rows
+from quad_swarm.planner import SOLVERS, BuildError
+from quad_swarm.task.rules import RULES
+from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
@@ -35,6 +34,7 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         ("collisions", lambda r: f"{r['collisions']}/{r['episodes']}"),
         ("rate", lambda r: f"{r['collisions'] / r['episodes']:.1%}"),
         ("95 % interval", lambda r: f"{r['collision_low']:.1%} - {r['collision_high']:.1%}"),
+        ("> 1 cm", lambda r: str(r["collisions_1cm"])),
         ("between steps", lambda r: str(r["collisions_continuous"])),
         ("requests/step", lambda r: f"{r['requests_per_step']:.2f}"),
         ("share", lambda r: f"{r['request_share']:.1%}"),
@@ -44,25 +44,16 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         ("failures", lambda r: str(r["planner_failures"])),
         ("us/solve", lambda r: f"{r['solve_us']:.0f}"),
     ]  # fmt: skip
-    cells = [[title for title, _ in columns]] + [[cell(row) for _, cell in columns] for row in rows]
-    widths = [max(len(line[k]) for line in cells) for k in range(len(columns))]
+    texts = [[title for title, _ in columns]] + [[text(row) for _, text in columns] for row in rows]
+    widths = [max(len(line[k]) for line in texts) for k in range(len(columns))]
     lines = [
         "  ".join(
             text.ljust(w) if k < 2 else text.rjust(w) for k, (text, w) in enumerate(zip(line, widths, strict=True))
         )
-        for line in cells
+        for line in texts
     ]
     lines.insert(1, "  ".join("-" * w for w in widths))
     return "\n".join(line.rstrip() for line in lines)
-
-
-def write_json(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write one JSON object a line; the file appears whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
-        file.writelines(json.dumps(row) + "\n" for row in rows)
-    os.chmod(file.name, 0o644)
-    os.replace(file.name, path)
 
 
 def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
@@ -76,8 +67,19 @@ def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
         place = world
         for parent in parents:
             place = place.setdefault(parent, {})
+            if not isinstance(place, dict):
+                raise ValueError(f"--world {assignment!r}: {parent!r} was given a plain value before.")
+        if leaf in place:
+            raise ValueError(f"--world {assignment!r}: {name!r} is given twice.")
         place[leaf] = yaml.safe_load(value)
+    for name in world:
+        if name not in (known := [field.name for field in dataclasses.fields(SwarmConfig)]):
+            raise unknown_name("--world parameter", name, known)
     return world
+
+
+def _rules_usage() -> str:
+    return ", ".join(":".join((name, *arguments)) for name, (_, arguments) in RULES.items())
 
 
 def add_policy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,42 +89,58 @@ def add_policy_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         required=True,
         metavar="POLICY",
-        help="none, full, distance:EPS, cpa:DIST:LOOKAHEAD, random:P, or a model's zip, also MODEL.zip@THRESHOLD",
+        help=f"a rule ({_rules_usage()}), rules joined by & (both) and | (either), a model's zip, MODEL.zip@THRESHOLD, "
+        "latest:LOGDIR or pretrained:NAME",
     )
     parser.add_argument("--seed", type=int, default=0, help="which set of held-out episodes (default 0)")
-    parser.add_argument("--preset", default="paper", help=f"{' or '.join(PRESETS)} (default paper)")
+    parser.add_argument(
+        "--preset", help=f"{', '.join(PRESETS)} (default: the one in which the models were trained, paper for rules)"
+    )
     parser.add_argument("--n-robots", type=int, default=None, help="number of robots (default: the preset's)")
     parser.add_argument("--max-steps", type=int, default=100, help="time limit in steps (default 100)")
     parser.add_argument(
         "--world", nargs="+", default=[], metavar="NAME=VALUE", help="fields of SwarmConfig, e.g. noise.wind=1"
     )
+    parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="imported first: own scenarios and rules")
     parser.add_argument(
         "--algo",
         default="sb3_maddpg:MADDPG",
         metavar="MODULE:CLASS",
         help="class that loads models (default %(default)s)",
     )
-    parser.add_argument("--solver", default="auto", help="planner's solver (default auto)")
+    parser.add_argument("--solver", default="auto", help=f"auto, {', '.join(SOLVERS)} (default auto)")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
-def make_cells(args: argparse.Namespace, scenarios: Sequence[str]) -> list[Cell]:
-    """The policies of a command line in some scenarios.
+def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[Condition]:
+    """The policies of a command line in some scenarios. Sets ``args.preset`` where it was not given.
 
     :param args: with what `add_policy_arguments` added
     :raises ValueError: unknown scenario, preset or field, or a world in which the robots do not fit
     """
     for name in scenarios:
         if name not in SCENARIOS:
-            raise unknown_name("scenario", name, ["all", *SCENARIOS])
+            raise unknown_name("scenario", name, SCENARIOS)
+    models = {policy: trained_in(load_model(policy, args.algo)) for policy in args.policy if is_model(policy)}
+    args.preset = args.preset or _preset_of(models)
     config = make_config(args.preset, **({"n_robots": args.n_robots} | _parse_world(args.world)))
+    for policy, trained in models.items():
+        if (preset := trained.get("preset", args.preset)) != args.preset:
+            print(f"note: {short_name(policy)} was trained in {preset!r}, this is {args.preset!r}", file=sys.stderr)
     for name in scenarios:
         ScenarioSampler(name, config.n_robots, config.space)  # raises where the robots do not fit
     return [
-        Cell(policy, name, config, args.max_steps, args.algo, args.solver)
-        for name in scenarios
+        Condition(policy, name, config, args.max_steps, args.algo, args.solver)
+        for name in dict.fromkeys(scenarios)
         for policy in dict.fromkeys(args.policy)
     ]
+
+
+def _preset_of(models: Mapping[str, Mapping[str, Any]]) -> str:
+    presets = {str(trained["preset"]) for trained in models.values() if "preset" in trained}
+    if len(presets) > 1:
+        raise ValueError(f"The models were trained in {', '.join(sorted(presets))}: choose one of these by --preset.")
+    return presets.pop() if presets else "paper"
 
 
 def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace) -> int:
@@ -142,9 +160,9 @@ def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace)
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m quad_swarm.evaluation.command",
+        prog="sb3-maddpg evaluate",
         description="Fly the same held-out episodes with several policies and compare them.",
-        epilog="Example: python -m quad_swarm.evaluation.command --policy none full cpa:0.7:1.5 --episodes 200 --jobs 2",
+        epilog="Example: sb3-maddpg evaluate --policy none full cpa:0.7:1.5 --episodes 200 --jobs 2",
     )
     add_policy_arguments(parser)
     parser.add_argument(
@@ -165,19 +183,25 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _compare(args: argparse.Namespace) -> None:
-    cells = make_cells(args, list(SCENARIOS) if args.scenario == ["all"] else args.scenario)
-    rows = evaluate(cells, args.episodes, args.seed, args.jobs)
-    solver = Swarm(cells[0].config, 1, args.solver).planner.solver.name
+    if "all" in args.scenario and len(args.scenario) > 1:
+        raise ValueError(f"--scenario {' '.join(args.scenario)}: 'all' already names every scenario.")
+    conditions = make_conditions(args, list(SCENARIOS) if args.scenario == ["all"] else args.scenario)
+    if args.json:
+        check_writable(args.json, "--json")
+    if args.plot:
+        check_writable(args.plot / "plot", "--plot")
+    rows = evaluate(conditions, args.episodes, args.seed, args.jobs)
+    solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name
     common = {"preset": args.preset, "preset_version": PRESET_VERSION, "seed": args.seed, "solver": solver}
     rows = [row | common | ({"world": _parse_world(args.world)} if args.world else {}) for row in rows]
     print(format_table(rows))
     if args.json:
-        write_json(args.json, rows)
+        write_rows(args.json, rows)
         print(f"\nwrote {args.json}")
     if args.plot:
         from quad_swarm.figures.plots import draw_all  # matplotlib is needed only here
 
-        for path in draw_all(rows, cells, args.seed, args.plot):
+        for path in draw_all(rows, conditions, args.seed, args.plot):
             print(f"drew {path}")
 
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
-from quad_swarm.evaluation.evaluation import Cell, begin, first_episode, fly
+from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, fly_steps
 from quad_swarm.figures.plots import draw_flights
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import make_config
@@ -52,37 +49,36 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
         the same episodes
     """
     config = make_config(**({"preset": "paper"} | {k: v for k, v in env_kwargs.items() if k in _OF_THE_WORLD}))
-    cells = [Cell("model", name, config, 100, "", "auto", linger=5) for name in SCENARIOS]
-    asked, steps, collisions = requests_by_pair(cells[-1], model)
+    conditions = [Condition("model", name, config, linger=5) for name in SCENARIOS]
+    asked, steps, collisions = requests_by_pair(conditions[-1], model)
     n = config.n_robots
     return {
-        "eval/flights": draw_flights(cells, [fly(cell, SET, model=model) for cell in cells]),
-        "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), cells[-1].scenario),
+        "eval/flights": draw_flights(conditions, [fly(one, SET, model=model) for one in conditions]),
+        "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), conditions[-1].scenario),
         "symmetric_swap/request_share": float(asked.sum() / max(steps * n * (n - 1), 1)),
         "symmetric_swap/collision_rate": collisions / EPISODES,
     }
 
 
-def requests_by_pair(cell: Cell, model: Any) -> tuple[np.ndarray, int, int]:
+def requests_by_pair(condition: Condition, model: Any) -> tuple[np.ndarray, int, int]:
     """Who asks whom, until a collision or the arrival of all.
 
-    :param cell: scenario and world
+    :param condition: scenario and world
     :return: how often robot i asked robot j, (n, n); the number of steps; the number of episodes with a collision
     """
-    policy, task, rngs = begin(cell, [first_episode(SET) + k for k in range(EPISODES)], model)
-    n = cell.config.n_robots
+    policy, task, rngs = begin(condition, [first_episode(SET) + k for k in range(EPISODES)], model)
+    n = condition.config.n_robots
     rows, others = np.arange(n)[:, None], other_indices(n)
-    asked, steps, collisions = np.zeros((n, n)), 0, 0
-    while rngs:
-        requests = policy(task, rngs)
-        asked[rows, others] += requests.sum(axis=0)
-        steps += len(rngs)
-        outcome = task.step(requests)
-        collisions += int(outcome.terminated.sum())
-        over = outcome.terminated | outcome.truncated | task.statistics.arrived
-        task.keep(~over)
-        rngs = [rng for rng, done in zip(rngs, over, strict=True) if not done]
-    return asked, steps, collisions
+    asked, steps = np.zeros((n, n)), 0
+    collided = np.zeros(EPISODES, dtype=bool)
+    done = np.zeros(EPISODES, dtype=bool)
+    for step in fly_steps(policy, task, rngs, linger=0):
+        counted = ~done[step.episodes]
+        asked[rows, others] += step.requests[counted].sum(axis=0)
+        steps += int(counted.sum())
+        collided[step.episodes] |= task.statistics.collided & counted
+        done[step.episodes] |= task.statistics.collided | task.statistics.reached
+    return asked, steps, int(collided.sum())
 
 
 def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:
@@ -92,7 +88,8 @@ def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:
     :param scenario: for the title
     """
     n = len(share)
-    figure, axes = plt.subplots(figsize=(4.2, 3.6), layout="constrained")
+    figure = Figure(figsize=(4.2, 3.6), layout="constrained")
+    axes = figure.subplots()
     shown = axes.imshow(np.ma.masked_where(np.eye(n, dtype=bool), share), cmap="viridis", vmin=0)
     for i, j in np.argwhere(~np.eye(n, dtype=bool)):
         dark = share[i, j] < 0.6 * share.max()
@@ -102,5 +99,5 @@ def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:
     axes.set_xlabel("is asked")
     axes.set_ylabel("asks")
     axes.set_title(f"{scenario.replace('_', ' ')}: % of the steps", fontsize=10)
-    figure.colorbar(shown, format=matplotlib.ticker.PercentFormatter(1.0))
+    figure.colorbar(shown, format=PercentFormatter(1.0))
     return figure

@@ -7,16 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 from PIL import Image
 
-from quad_swarm.evaluation.evaluation import Cell, Flight, fly, short_name
+from quad_swarm.evaluation.flight import Condition, Flight, fly
+from quad_swarm.evaluation.policies import short_name
 from quad_swarm.figures.colours import OKABE_ITO, colour_of
 from quad_swarm.figures.render import Renderer
 
@@ -24,16 +22,16 @@ from quad_swarm.figures.render import Renderer
 ASKING, SILENT = OKABE_ITO[6], OKABE_ITO[0]
 
 
-def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int, folder: Path) -> list[Path]:
+def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition], seed: int, folder: Path) -> list[Path]:
     """Draw every figure as PNG and as PDF into ``folder``, and a flight as an animation; returns their paths.
 
     :param rows: what `evaluate` returned
-    :param cells: what it was given; the last policy's flights are drawn
+    :param conditions: what it was given; the last policy's flights are drawn
     :param seed: the same seed
     """
     folder.mkdir(parents=True, exist_ok=True)
-    last = [cell for cell in cells if cell.policy == cells[-1].policy]
-    flights = [fly(cell, seed) for cell in last]
+    last = [one for one in conditions if one.policy == conditions[-1].policy]
+    flights = [fly(one, seed) for one in last]
     figures = {
         "collisions": draw_collisions(rows),
         "requests": draw_requests(rows),
@@ -45,7 +43,6 @@ def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int
         for kind in ("png", "pdf"):
             paths.append(folder / f"{name}.{kind}")
             figure.savefig(paths[-1], dpi=130)
-        plt.close(figure)
     paths.append(folder / "swarm.gif")
     animate(last[-1], flights[-1], paths[-1])
     return paths
@@ -53,7 +50,8 @@ def draw_all(rows: Sequence[Mapping[str, Any]], cells: Sequence[Cell], seed: int
 
 def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Share of episodes with a collision, with 95 % Wilson intervals."""
-    figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
+    figure = Figure(figsize=(8, 3.5), layout="constrained")
+    axes = figure.subplots()
     _bars(axes, rows, lambda r: r["collisions"] / r["episodes"], lambda r: (r["collision_low"], r["collision_high"]))
     axes.set_ylabel("episodes with a collision")
     return figure
@@ -61,7 +59,8 @@ def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Share of the possible requests that were made."""
-    figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
+    figure = Figure(figsize=(8, 3.5), layout="constrained")
+    axes = figure.subplots()
     _bars(axes, rows, lambda r: r["request_share"], None)
     axes.set_ylabel("requests made, of all possible")
     return figure
@@ -72,8 +71,8 @@ def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
     both (the Pareto front); bars are 95 % Wilson intervals."""
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
-    size = (3.4 * len(scenarios), 3.6)
-    figure, panels = plt.subplots(1, len(scenarios), figsize=size, layout="constrained", sharey="row", squeeze=False)
+    figure = Figure(figsize=(3.4 * len(scenarios), 3.6), layout="constrained")
+    panels = figure.subplots(1, len(scenarios), sharey="row", squeeze=False)
     for axes, name in zip(panels[0], scenarios, strict=True):
         mine = [row for row in rows if row["scenario"] == name]
         points = {row["policy"]: (row["request_share"], row["collisions"] / row["episodes"]) for row in mine}
@@ -88,7 +87,7 @@ def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
         axes.set_title(name.replace("_", " "), fontsize=10)
         axes.set_xlabel("requests made, of all possible")
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(matplotlib.ticker.PercentFormatter(1.0))
+            axis.set_major_formatter(PercentFormatter(1.0))
         axes.spines[["top", "right"]].set_visible(False)
     panels[0][0].set_ylabel("episodes with a collision")
     figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
@@ -112,38 +111,40 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
             bounds = np.array([interval(mine[name]) for name in scenarios]).T
             axes.errorbar(x, heights, np.abs(bounds - heights), fmt="none", ecolor="#333333", capsize=2, linewidth=1)
     axes.set_xticks(range(len(scenarios)), [name.replace("_", " ") for name in scenarios])
-    axes.yaxis.set_major_formatter(matplotlib.ticker.PercentFormatter(1.0, decimals=0))
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     axes.legend(frameon=False, ncols=min(len(policies), 5), loc="upper left", bbox_to_anchor=(0, 1.17))
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def draw_flights(cells: Sequence[Cell], flights: Sequence[Flight]) -> Figure:
+def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight]) -> Figure:
     """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2)."""
-    columns = min(len(cells), 2)
-    size = (3.6 * columns, 3.6 * math.ceil(len(cells) / columns) + 0.3)
-    figure, panels = plt.subplots(
-        math.ceil(len(cells) / columns), columns, figsize=size, layout="constrained", squeeze=False
-    )
-    for axes in panels.flat[len(cells) :]:
+    columns = min(len(conditions), 2)
+    lines = math.ceil(len(conditions) / columns)
+    figure = Figure(figsize=(3.6 * columns, 3.6 * lines + 0.3), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False)
+    for axes in panels.flat[len(conditions) :]:
         axes.set_visible(False)
-    for axes, cell, flight in zip(panels.flat, cells, flights, strict=False):
+    for axes, condition, flight in zip(panels.flat, conditions, flights, strict=False):
         draw_flight(axes, flight)
-        axes.set_title(cell.scenario.replace("_", " "), fontsize=10)
-    figure.suptitle(f"{short_name(cells[-1].policy)}: yellow where a robot asks, blue where it does not", fontsize=9)
+        axes.set_title(condition.scenario.replace("_", " "), fontsize=10)
+    name = short_name(conditions[-1].policy)
+    figure.suptitle(f"{name}: yellow where a robot asks, blue where it does not", fontsize=9)
     return figure
 
 
-def animate(cell: Cell, flight: Flight, path: Path) -> None:
+def animate(condition: Condition, flight: Flight, path: Path) -> None:
     """The flight as an animated GIF in real time, until shortly after all have arrived."""
-    renderer = Renderer(cell.config)
-    at_goal = (np.linalg.norm(flight.state[1:, :, :3] - flight.goal, axis=-1) <= cell.config.goal_radius).all(axis=1)
-    steps = min(int(at_goal.argmax()) + 10 if at_goal.any() else len(at_goal), len(at_goal))
+    renderer = Renderer(flight.config)
+    steps = len(flight.requests) if flight.arrival is None else min(flight.arrival + 9, len(flight.requests))
     frames = []
     for k in range(steps):
-        lines = [f"{short_name(cell.policy)}, {cell.scenario}", f"step {k + 1}   requests {flight.requests[k].sum()}"]
+        lines = [
+            f"{short_name(condition.policy)}, {condition.scenario}",
+            f"step {k + 1}   requests {flight.requests[k].sum()}",
+        ]
         picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
         frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
-    duration = round(1000 * cell.config.planner.dt)
+    duration = round(1000 * flight.config.planner.dt)
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
 
 

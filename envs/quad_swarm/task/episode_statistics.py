@@ -12,18 +12,21 @@ class EpisodeStatistics:
     """Figures of the running episodes of E swarms, as arrays of length E.
 
     Requests and path count from the start until all robots are at their goals at once, a collision, or the time limit,
-    whichever comes first.
+    whichever comes first. Separations are taken over all steps flown: where an episode goes on after a collision they
+    say how deep it got.
 
     :ivar steps: steps flown
     :ivar steps_counted: steps in which requests and path counted
     :ivar requests: requests made in them
-    :ivar path_length: distance flown in them, mean over the robots (m)
-    :ivar arrived: all robots were at their goals at once, before any collision
-    :ivar collided: ended by a collision
+    :ivar requests_flown: requests made in all steps flown
+    :ivar path_length: distance flown in the steps counted, mean over the robots (m)
+    :ivar reached: all robots were at their goals at once
+    :ivar arrived: the same, before any collision
+    :ivar collided: two robots collided, by the collisions that end episodes
     :ivar collided_continuous: a collision seen at or between steps
     :ivar min_separation: smallest distance between two robots at a step (m)
     :ivar min_separation_continuous: the same at or between steps (m)
-    :ivar planner_failures: plans that no solve stood behind (ladder at "shifted" or below)
+    :ivar planner_failures: plans without a successful solve (status SHIFTED or BRAKING)
     :ivar solve_seconds: wall-clock time of the planner, this swarm's share of each batch call (s)
     """
 
@@ -31,7 +34,9 @@ class EpisodeStatistics:
         "steps": 0,
         "steps_counted": 0,
         "requests": 0,
+        "requests_flown": 0,
         "path_length": 0.0,
+        "reached": False,
         "arrived": False,
         "collided": False,
         "collided_continuous": False,
@@ -44,7 +49,9 @@ class EpisodeStatistics:
     steps: np.ndarray
     steps_counted: np.ndarray
     requests: np.ndarray
+    requests_flown: np.ndarray
     path_length: np.ndarray
+    reached: np.ndarray
     arrived: np.ndarray
     collided: np.ndarray
     collided_continuous: np.ndarray
@@ -73,16 +80,19 @@ class EpisodeStatistics:
 
         :param report: what happened in it
         :param n_requests: requests made in it, (E,)
-        :param collided: whether it ended the episode by a collision, (E,) bool
+        :param collided: whether two robots collided in it, by the collisions that end episodes, (E,) bool
         """
-        counted = ~self.arrived
+        counted = ~(self.reached | self.collided)
         self.steps += 1
         self.steps_counted += counted
         self.requests += counted * n_requests
+        self.requests_flown += n_requests
         self.path_length += counted * report.moved.mean(axis=1)
         self.collided |= collided
         self.collided_continuous |= report.collision_continuous
-        self.arrived |= report.at_goal.all(axis=1) & ~collided
+        at_goals = report.at_goal.all(axis=1)
+        self.arrived |= at_goals & ~self.collided
+        self.reached |= at_goals
         self.min_separation = np.minimum(self.min_separation, report.min_separation)
         self.min_separation_continuous = np.minimum(self.min_separation_continuous, report.min_separation_continuous)
         self.planner_failures += (report.plan_status >= PlanStatus.SHIFTED).sum(axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -76,6 +77,7 @@ class RequestTask:
     :param observation: what robots observe, the paper's without scaling if None
     :param continuous_collisions: end episodes at collisions between steps too; the paper looks at the steps alone
     :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
+    :param end_at_collision: end episodes at collisions; otherwise they fly on, to see how deep a collision gets
     """
 
     def __init__(
@@ -87,6 +89,7 @@ class RequestTask:
         observation: Observation | None = None,
         continuous_collisions: bool = False,
         end_at_arrival: bool = False,
+        end_at_collision: bool = True,
     ):
         if max_steps < 1:
             raise ValueError(f"max_steps={max_steps}: an episode needs at least one step.")
@@ -96,6 +99,7 @@ class RequestTask:
         self.max_steps = max_steps
         self.continuous_collisions = continuous_collisions
         self.end_at_arrival = end_at_arrival
+        self.end_at_collision = end_at_collision
         n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, n)
@@ -138,6 +142,14 @@ class RequestTask:
         self.statistics.keep(swarms)
         self.scenario = [name for name, kept in zip(self.scenario, swarms, strict=True) if kept]
 
+    def fork(self) -> RequestTask:
+        """A copy of all episodes as they are now, which flies on by itself."""
+        fork = copy(self)
+        fork.swarm = self.swarm.part(np.ones(self.swarm.n_swarms, dtype=bool))
+        fork.statistics = deepcopy(self.statistics)
+        fork.scenario = list(self.scenario)
+        return fork
+
     def observe(self, swarms: np.ndarray | None = None) -> np.ndarray:
         """What every robot observes, (E, n, observation_size) float32; of some swarms only if there is a mask."""
         return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))
@@ -158,7 +170,9 @@ class RequestTask:
         if self.reward.near_miss:
             near_misses = self.reward.near_miss * self._near_misses(report.separation)
             terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
-        terminated = collided | self.statistics.arrived if self.end_at_arrival else collided
+        terminated = collided if self.end_at_collision else np.zeros_like(collided)
+        if self.end_at_arrival:
+            terminated = terminated | self.statistics.arrived
         share = terms["goal"] / max(requests.shape[2], 1)
         return Outcome(
             reward=sum(terms.values(), start=np.zeros(len(n_requests))),

@@ -30,6 +30,8 @@ class ScenarioSpace:
     :param circle_radius: smallest and largest radius of the circle of `symmetric_swap` (m)
     :param circle_jitter: starts and goals of `symmetric_swap` are moved by up to this much along each axis (m)
     :param sector_radius: smallest and largest distance of an `asymmetric_swap` start from the centre (m)
+    :param whole_sectors: `asymmetric_swap` as the paper describes it, for four robots one anywhere in each quadrant:
+        sectors begin at the x axis and are used in full; otherwise they are centred on it and used to 80 %
     """
 
     half_width: float = 4.0
@@ -38,6 +40,7 @@ class ScenarioSpace:
     circle_radius: tuple[float, float] = (2.0, 3.0)
     circle_jitter: float = 0.15
     sector_radius: tuple[float, float] = (2.0, 4.5)
+    whole_sectors: bool = False
 
 
 class DoesNotFit(ValueError):
@@ -90,13 +93,14 @@ def random_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarr
 def asymmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
     """Asymmetric swapping: one robot anywhere in each of n sectors; each flies to the start in the opposite sector.
 
-    A sector is drawn to 80 % of its width, as in the only such generator that the paper's laboratory published
-    (tud-amr/mrca_vc).
+    Sectors are centred on the axes and used to 80 % of their width, as in the only such generator that the paper's
+    laboratory published (tud-amr/mrca_vc), or as the paper has them with `ScenarioSpace.whole_sectors`.
     """
     sector = 2 * np.pi / n_robots
+    low, high = (0.0, 1.0) if space.whole_sectors else (-0.4, 0.4)
 
     def draw(i: int) -> np.ndarray:
-        angle = sector * (i + rng.uniform(-0.4, 0.4))
+        angle = sector * (i + rng.uniform(low, high))
         radius = rng.uniform(*space.sector_radius)
         return np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(*space.heights)])
 

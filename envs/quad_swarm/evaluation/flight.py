@@ -1,0 +1,239 @@
+"""Episodes flown by a policy: one of them step by step, or many at once for their figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_swarm.evaluation.policies import RequestPolicy, make_policy, policy_of
+from quad_swarm.geometry import length
+from quad_swarm.quadrotor import POSITION, VELOCITY
+from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig
+from quad_swarm.task.rules import parse_rule
+from quad_swarm.task.view import View
+from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import Swarm
+
+# Held-out episodes begin here; training seeds count from 0.
+_FIRST_SEED = 10**9
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One policy in one scenario and world.
+
+    :param policy: rule or path of a model's zip, as given on the command line
+    :param scenario: a name of `SCENARIOS`
+    :param config: the world
+    :param max_steps: time limit (steps)
+    :param algo: ``module:Class`` that loads models
+    :param solver: see `make_planner`
+    :param linger: steps that are flown on after all robots have reached their goals; None: until the time limit
+    """
+
+    policy: str
+    scenario: str
+    config: SwarmConfig
+    max_steps: int = 100
+    algo: str = "sb3_maddpg:MADDPG"
+    solver: str = "auto"
+    linger: int | None = None
+
+
+def first_episode(seed: int) -> int:
+    """Seed of the first held-out episode of set ``seed``; the others follow it.
+
+    :raises ValueError: the set is negative, where training's seeds are
+    """
+    if seed < 0:
+        raise ValueError(f"seed={seed}: sets of held-out episodes are counted from 0.")
+    return _FIRST_SEED + seed * 10**6
+
+
+def begin(
+    condition: Condition, episodes: Sequence[int], model: Any = None
+) -> tuple[RequestPolicy, RequestTask, list[np.random.Generator]]:
+    """A policy, its episodes at their start, and the generators of rules that draw.
+
+    A collision ends what is counted of an episode, but not its flight, which shows how deep the collision gets.
+
+    :param condition: policy, scenario and world
+    :param episodes: seeds, see `first_episode`; ``env.reset(seed=...)`` of `QuadSwarm-v0` draws the same episodes
+    :param model: flies instead of the condition's policy
+    """
+    config = condition.config
+    if model is None:
+        policy, observation = make_policy(condition.policy, config, condition.algo)
+    else:
+        policy, observation = policy_of(model, condition.policy, config)
+    task = RequestTask(
+        Swarm(config, len(episodes), condition.solver),
+        ScenarioSampler(condition.scenario, config.n_robots, config.space),
+        RewardConfig(),
+        condition.max_steps,
+        observation,
+        end_at_collision=False,
+    )
+    for k, seed in enumerate(episodes):
+        task.reset(k, np.random.default_rng(seed))
+    return policy, task, [np.random.default_rng([seed, 1]) for seed in episodes]
+
+
+class Step(NamedTuple):
+    """One step of a batch of episodes.
+
+    :param episodes: which of the episodes are still flying, (E,)
+    :param requests: who asked whom, (E, n, n - 1) bool
+    :param outcome: what came of it
+    :param over: which of them end with this step, (E,) bool
+    """
+
+    episodes: np.ndarray
+    requests: np.ndarray
+    outcome: Outcome
+    over: np.ndarray
+
+
+def fly_steps(
+    policy: RequestPolicy, task: RequestTask, rngs: Sequence[np.random.Generator], linger: int | None = None
+) -> Iterator[Step]:
+    """Fly all episodes of a task to their ends. One that is over leaves the batch after its last step was yielded.
+
+    :param linger: see `Condition`
+    """
+    episodes = np.arange(task.swarm.n_swarms)
+    since_arrival = np.zeros(episodes.size, dtype=int)
+    rngs = list(rngs)
+    while episodes.size:
+        requests = policy(task, rngs)
+        outcome = task.step(requests)
+        since_arrival += task.statistics.reached
+        over = outcome.terminated | outcome.truncated
+        if linger is not None:
+            over |= since_arrival > linger
+        yield Step(episodes, requests, outcome, over)
+        if over.any():
+            task.keep(~over)
+            episodes, since_arrival = episodes[~over], since_arrival[~over]
+            rngs = [rng for rng, ended in zip(rngs, over, strict=True) if not ended]
+
+
+def run_episodes(condition: Condition, episodes: Sequence[int]) -> list[dict[str, float]]:
+    """Fly some episodes of a condition, all at once.
+
+    :param condition: policy, scenario and world
+    :param episodes: seeds, see `begin`
+    :return: for each episode its figures, see `EpisodeStatistics`
+    """
+    policy, task, rngs = begin(condition, episodes)
+    rows: dict[int, dict[str, float]] = {}
+    for step in fly_steps(policy, task, rngs, condition.linger):
+        rows |= {int(step.episodes[k]): task.statistics.row(int(k)) for k in np.flatnonzero(step.over)}
+    return [rows[k] for k in range(len(episodes))]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One episode step by step: T steps of n robots.
+
+    :param config: the world
+    :param state: states, (T + 1, n, 9)
+    :param plans: planned states as of each step, stages 0..N, (T + 1, n, N + 1, 9)
+    :param goal: goals, (n, 3), world frame (m)
+    :param requests: who asked whom in each step, (T, n, n - 1) bool
+    :param other_requests: whom a second rule would have asked in each step, which was not executed, (T, n, n - 1) bool
+    """
+
+    config: SwarmConfig
+    state: np.ndarray
+    plans: np.ndarray
+    goal: np.ndarray
+    requests: np.ndarray
+    other_requests: np.ndarray
+
+    @property
+    def n_robots(self) -> int:
+        """Number of robots n."""
+        return len(self.goal)
+
+    @property
+    def pos(self) -> np.ndarray:
+        """Positions, (T + 1, n, 3), world frame (m)."""
+        return self.state[..., POSITION]
+
+    @cached_property
+    def relative_pos(self) -> np.ndarray:
+        """Position of each of the others seen from each robot, (T + 1, n, n - 1, 3) (m)."""
+        return self.pos[:, other_indices(self.n_robots)] - self.pos[:, :, None]
+
+    @cached_property
+    def relative_vel(self) -> np.ndarray:
+        """Velocity of each of the others seen from each robot, (T + 1, n, n - 1, 3) (m/s)."""
+        vel = self.state[..., VELOCITY]
+        return vel[:, other_indices(self.n_robots)] - vel[:, :, None]
+
+    @cached_property
+    def separation(self) -> np.ndarray:
+        """Distance of each robot to each of the others, (T + 1, n, n - 1) (m)."""
+        return length(self.relative_pos)
+
+    @cached_property
+    def closest_approach(self) -> tuple[np.ndarray, np.ndarray]:
+        """If all kept their velocities from each step on: the closest distance (m) and the time until then (s), not
+        limited; both (T + 1, n, n - 1)."""
+        closing = -(self.relative_pos * self.relative_vel).sum(axis=-1)
+        time = np.maximum(closing / np.maximum((self.relative_vel**2).sum(axis=-1), 1e-12), 0.0)
+        return length(self.relative_pos + time[..., None] * self.relative_vel), time
+
+    @cached_property
+    def arrival(self) -> int | None:
+        """The first step after which all robots are at their goals at once; None if they never are."""
+        at_goal = (length(self.pos[1:] - self.goal) <= self.config.goal_radius).all(axis=1)
+        return int(at_goal.argmax()) + 1 if at_goal.any() else None
+
+    @cached_property
+    def collision(self) -> int | None:
+        """The first step after which two robots collide; None if they never do."""
+        limit = 2 * self.config.radius - self.config.collision_tolerance
+        colliding = (self.separation[1:] < limit).any(axis=(1, 2))
+        return int(colliding.argmax()) + 1 if colliding.any() else None
+
+    def closest_pair(self, step: int) -> tuple[int, int]:
+        """The two robots that are closest to each other after a step."""
+        i, m = np.unravel_index(self.separation[step].argmin(), self.separation.shape[1:])
+        return int(i), int(other_indices(self.n_robots)[i, m])
+
+
+def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "none", model: Any = None) -> Flight:
+    """Fly a held-out episode of a set, step by step.
+
+    :param condition: policy, scenario and world
+    :param seed: which set
+    :param number: which episode of it
+    :param other_rule: a rule whose requests are recorded in every step too, but not executed
+    :param model: flies instead of the condition's policy
+    """
+    episode = first_episode(seed) + number
+    policy, task, rngs = begin(condition, [episode], model)
+    rule, other_rngs = parse_rule(other_rule), [np.random.default_rng([episode, 2])]
+    state, plans = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()]
+    requests: list[np.ndarray] = []
+    other_requests: list[np.ndarray] = []
+
+    def recorded(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
+        other_requests.append(rule(View(task.swarm, other_rngs))[0])
+        return policy(task, rngs)
+
+    for step in fly_steps(recorded, task, rngs, condition.linger):
+        requests.append(step.requests[0])
+        state.append(task.swarm.state[0].copy())
+        plans.append(task.swarm.plans[0].copy())
+        goal = task.swarm.goal[0].copy()
+    arrays = map(np.array, (state, plans, goal, requests, other_requests))
+    return Flight(condition.config, *arrays)

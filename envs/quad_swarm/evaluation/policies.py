@@ -1,0 +1,153 @@
+"""Policies as they are named on a command line: rules, and models by the path of their zip.
+
+A rule is one of `RULES`, see `quad_swarm.task.rules`. A model is loaded by the class that ``algo`` names;
+``MODEL.zip@0.3`` acts with the threshold 0.3 instead of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from quad_swarm.task.observation import Observation, PaperObservation, make_observation
+from quad_swarm.task.request_task import RequestTask
+from quad_swarm.task.rules import parse_rule
+from quad_swarm.task.view import View
+from quad_swarm.world.presets import SwarmConfig
+
+# From the present state of E swarms, and a generator for each, to who asks whom, (E, n, n - 1) bool
+RequestPolicy = Callable[[RequestTask, list[np.random.Generator]], np.ndarray]
+
+# Arguments of the environment that shape what a model observes: they are the model's, all others the evaluation's.
+OBSERVATION_ARGUMENTS = ("observation", "scale_observation")
+
+
+def is_model(policy: str) -> bool:
+    """Whether a policy's text names a model's file instead of a rule."""
+    return policy.partition("@")[0].endswith(".zip") or os.sep in policy
+
+
+def short_name(policy: str) -> str:
+    """A rule as it is written, a model by its file's name, or its folder's where many files are called model.zip."""
+    if not is_model(policy):
+        return policy
+    path, at, threshold = policy.partition("@")
+    name = Path(path).name
+    return (Path(path).parent.name or name if name == "model.zip" else name) + at + threshold
+
+
+def load_model(policy: str, algo: str) -> Any:
+    """A trained model; read again only if its file has changed.
+
+    :param policy: its zip, with a threshold where that is not to be its own: ``MODEL.zip@0.3``
+    :param algo: ``module:Class`` with a ``load(path, device=...)`` as in Stable-Baselines3, and a ``set_threshold`` if
+        one is given
+    :raises FileNotFoundError: no such file
+    :raises ValueError: the class does not exist or cannot read the file, the threshold is no number, or a weight of the
+        model is NaN or infinite
+    """
+    path = policy.partition("@")[0]
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"No model at {path!r}: train one first, or give the zip's full path.")
+    stat = Path(path).stat()
+    return _load(policy, algo, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
+
+
+@functools.lru_cache(maxsize=4)
+def _load(policy: str, algo: str, stamp: tuple[int, ...]) -> Any:
+    path, at, threshold = policy.partition("@")
+    module_name, _, class_name = algo.partition(":")
+    try:
+        loader = getattr(importlib.import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"--algo {algo!r} is no importable module:Class ({error}).") from error
+    try:
+        model = loader.load(path, device="cpu")
+    except Exception as error:  # whatever the loader raises for a damaged or foreign file
+        raise ValueError(
+            f"{path} cannot be loaded by {algo} ({type(error).__name__}: {error}). "
+            "Is the file complete, and was it saved by that class?"
+        ) from error
+    _check_weights(model, path)
+    if at:
+        if not hasattr(model, "set_threshold"):
+            raise ValueError(f"{policy}: {algo} has no threshold; leave out '@{threshold}'.")
+        model.set_threshold(_number(threshold, policy))
+    return model
+
+
+def _check_weights(model: Any, path: str) -> None:
+    """A comparison with NaN is False: a model of NaN would fly as one that never asks."""
+    for name, weight in getattr(getattr(model, "policy", None), "named_parameters", list)():
+        if not np.isfinite(weight.detach().cpu().numpy()).all():
+            raise ValueError(f"{path}: the weight {name} is not finite. Its training diverged; use an earlier model.")
+
+
+def _number(text: str, policy: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{policy}: the threshold {text!r} is no number; write MODEL.zip@0.3.") from None
+
+
+def make_policy(policy: str, config: SwarmConfig, algo: str) -> tuple[RequestPolicy, Observation]:
+    """A policy by its name, and the observation that it needs.
+
+    :param policy: a rule or a model's zip
+    :param config: the world
+    :param algo: see `load_model`
+    :raises ValueError: unknown rule, or a model that was trained for another number of robots or another space
+    """
+    if is_model(policy):
+        return policy_of(load_model(policy, algo), policy, config)
+    try:
+        rule = parse_rule(policy)
+    except ValueError as error:
+        hint = "A model is given by the path of its .zip"
+        if policy.startswith(("pretrained:", "latest:")):
+            hint += "; `sb3-maddpg evaluate` knows latest:LOGDIR and pretrained:NAME too"
+        raise ValueError(f"{error} {hint}.") from None
+    return (lambda task, rngs: rule(View(task.swarm, rngs))), PaperObservation(config.n_robots)
+
+
+def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:
+    """A model as a policy, and the observation that it needs.
+
+    :param name: what messages call it
+    :raises ValueError: it was trained for another number of robots or another space
+    """
+    arguments = {k: v for k, v in trained_in(model).items() if k in OBSERVATION_ARGUMENTS}
+    n = config.n_robots
+    observation = make_observation(config, **arguments, critics=False)
+    expected, trained = (n, observation.size), tuple(model.observation_space.shape)
+    predictor = model
+    if trained != expected:
+        if not hasattr(model, "policy_for") or not hasattr(model.policy, "observation_layout"):
+            robots = f"{trained[0]} robots" if len(trained) == 2 else "another environment"
+            raise ValueError(
+                f"{name} was trained for {robots} (observation {trained}); "
+                f"this world has {n} robots (observation {expected}). "
+                "Choose the preset or --n-robots that it was trained with."
+            )
+        # A policy that looks at its neighbours one by one fits any number of them
+        predictor = model.policy_for(
+            spaces.Box(-np.inf, np.inf, expected, np.float32), spaces.MultiBinary(n * (n - 1)), observation.layout
+        )
+
+    def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
+        bits, _ = predictor.predict(task.observe(), deterministic=True)
+        return np.asarray(bits).reshape(-1, n, n - 1) > 0.5
+
+    return request, observation
+
+
+def trained_in(model: Any) -> dict[str, Any]:
+    """Arguments of the environment that a model was trained in, as far as its file tells."""
+    return (getattr(model, "env_spec", None) or {}).get("kwargs", {})
