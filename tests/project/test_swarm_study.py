@@ -2,20 +2,20 @@
 
 import json
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[2]
-from quad_swarm.evaluation.evaluation import Comparison, fly_all
+from quad_swarm.evaluation.evaluation import fly_all
+from quad_swarm.evaluation.inference import Comparison
+from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 from sb3_maddpg.pretrained_models import pretrained_folder
-from studies.swarm import counterfactual, fly, ppo, tune_rules, tune_thresholds
+from studies.swarm import counterfactual, fly_tests, ppo, protocol, tune_rules, tune_thresholds
 from studies.swarm import report as page
 
 
@@ -28,46 +28,30 @@ def test_every_rule_of_every_family_can_be_read():
             parse_rule(rule)
 
 
-def test_comparison_counts_episodes_in_which_one_collided():
-    first = [{"collided": c} for c in (1, 1, 0, 0, 1)]
-    second = [{"collided": c} for c in (1, 0, 0, 1, 0)]
-    assert Comparison.of(first, second) == Comparison(5, 2, 1)
-
-
-def test_comparison_of_known_numbers():
-    # Agresti and Min (2005) for 4,000 pairs of which 5 and 1 differ; McNemar's exact p of 5 against 1 is 14/64
-    low, high = Comparison(4000, 5, 1).interval
-    assert (low, high) == (pytest.approx(-0.00030, abs=2e-5), pytest.approx(0.00230, abs=2e-5))
-    assert Comparison(4000, 5, 1).p_value == pytest.approx(14 / 64)
-    assert Comparison(4000, 0, 0).p_value == 1.0
-    assert Comparison(4000, 0, 0).interval[1] > 0, "no collisions in 4,000 episodes do not prove that there are none"
-    assert Comparison(4000, 5, 1).as_safe
-    assert not Comparison(4000, 12, 1).as_safe
-    assert not Comparison(100, 0, 0).as_safe, "too few episodes"
-    assert tune_rules.hopeless(Comparison(800, 9, 0))
-    assert not tune_rules.hopeless(Comparison(800, 1, 0))
+def test_hopeless_is_what_collides_clearly_more_often():
+    assert protocol.hopeless(Comparison(800, 9, 0))
+    assert not protocol.hopeless(Comparison(800, 1, 0))
 
 
 def test_stages_fly_every_episode_once_and_stop_where_there_is_no_hope(monkeypatch):
-    monkeypatch.setattr(tune_rules, "STAGES", (10, 30, 60))
-    flown = {policy: tune_rules.fly([policy], "paper", "random", 60)[policy] for policy in ("full", "cpa:0.7:1.5")}
-    full, all_60 = flown.values()
-    figures, safe = tune_rules.in_stages("cpa:0.7:1.5", "paper", "random", full, False, flown=all_60[:10])
+    monkeypatch.setattr(protocol, "STAGES", (10, 30, 60))
+    full, all_60 = protocol.fly_validation(["full", "cpa:0.7:1.5"], "paper", "random", 60).values()
+    figures, safe = protocol.in_stages("cpa:0.7:1.5", "paper", "random", full, False, flown=all_60[:10])
     same = [{key: row[key] for key in row if key != "solve_seconds"} for row in (*figures, *all_60)]
     assert same[:60] == same[60:]
     assert not safe, "60 episodes prove nothing"
-    collisions = tune_rules.fly(["full"], "paper", "symmetric_swap", 60)["full"]
-    figures, safe = tune_rules.in_stages("none", "paper", "symmetric_swap", collisions, False)
+    collisions = protocol.fly_validation(["full"], "paper", "symmetric_swap", 60)["full"]
+    figures, safe = protocol.in_stages("none", "paper", "symmetric_swap", collisions, False)
     assert (len(figures), safe) == (10, False)
 
 
 def test_teams_of_another_size_need_fewer_episodes_and_fly_full_communication_only_as_far(monkeypatch):
-    monkeypatch.setattr(tune_rules, "STAGES", (5, 10, 20))
-    monkeypatch.setattr(tune_rules, "OF_TEAM", tune_rules.Standard(0.3, 10))
+    monkeypatch.setattr(protocol, "STAGES", (5, 10, 20))
+    monkeypatch.setattr(protocol, "OF_TEAM", protocol.Standard(0.3, 10))
     rival: list[dict[str, float]] = []
-    figures, safe = tune_rules.in_stages("distance:4", "dense", "random", rival, False, 5)
+    figures, safe = protocol.in_stages("distance:4", "dense", "random", rival, False, 5)
     assert (len(figures), len(rival), safe) == (10, 10, True)
-    figures, safe = tune_rules.in_stages("distance:4", "dense", "random", rival, False)
+    figures, safe = protocol.in_stages("distance:4", "dense", "random", rival, False)
     assert (len(figures), len(rival), safe) == (20, 20, False), "a preset's own team has a standard of its own"
 
 
@@ -76,33 +60,33 @@ def test_rules_are_tuned_for_each_size_of_the_team(tmp_path, monkeypatch):
     words = ["tune_rules.py", "--preset", "dense", "--scenario", "random", "--family", "random", "--quick"]
     monkeypatch.setattr(sys, "argv", [*words, "--n-robots", "3", "4", "--jobs", "1", "--json", str(table)])
     tune_rules.main()
-    rows = tune_rules.read_rows(table)
+    rows = read_rows(table)
     assert [row["n_robots"] for row in rows] == [3, 4]
     assert rows[1]["possible_requests"] > rows[0]["possible_requests"]
-    monkeypatch.setattr(fly, "FOLDER", tmp_path)
-    assert fly.best_rules("dense", 3)["random"] == rows[0]["rule"]
-    assert fly.best_rules("dense", 3)["random_swap"] == "full", "not tuned"
-    assert fly.best_rules("dense", 5)["random"] == "full"
+    monkeypatch.setattr(protocol, "DATA", tmp_path)
+    assert protocol.best_rules("dense", 3)["random"] == rows[0]["rule"]
+    assert protocol.best_rules("dense", 3)["random_swap"] == "full", "not tuned"
+    assert protocol.best_rules("dense", 5)["random"] == "full"
 
 
 def test_thresholds_of_a_model_for_all_sizes_are_those_of_the_size_that_flies(tmp_path, monkeypatch):
-    monkeypatch.setattr(fly, "models", lambda recipe: ["any_seed0.zip"])
-    monkeypatch.setattr(fly, "FOLDER", tmp_path)
+    monkeypatch.setattr(protocol, "models", lambda recipe: ["any_seed0.zip"])
+    monkeypatch.setattr(protocol, "DATA", tmp_path)
     cells = [(4, "random", 0.9), (4, "random", 0.8), (8, "random", 0.7), (8, "symmetric_swap", 0.5)]
     rows = [
         dict(zip(("n_robots", "scenario", "threshold"), c, strict=True)) | {"model": "any_seed0.zip"} for c in cells
     ]
     (tmp_path / "thresholds.json").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    assert fly.tuned("any", "random", 4) == ["any_seed0.zip@0.8"], "the last that was tried"
-    assert fly.tuned("any", "random", 8) == ["any_seed0.zip@0.7"]
-    assert fly.tuned("any", "symmetric_swap", 8) == ["any_seed0.zip@0.5"]
-    assert fly.tuned("any", "symmetric_swap") == [], "it is the threshold for all"
+    assert protocol.tuned("any", "random", 4) == ["any_seed0.zip@0.8"], "the last that was tried"
+    assert protocol.tuned("any", "random", 8) == ["any_seed0.zip@0.7"]
+    assert protocol.tuned("any", "symmetric_swap", 8) == ["any_seed0.zip@0.5"]
+    assert protocol.tuned("any", "symmetric_swap") == [], "it is the threshold for all"
 
 
 def test_tables_of_flown_episodes(tmp_path):
-    rows = fly.compare(
-        ({"preset": "paper"}, ["full", "cpa:0.65:1.5", "none"], "symmetric_swap", make_config("paper"), 30)
-    )
+    policies = ["full", "cpa:0.65:1.5", "none"]
+    job = fly_tests.Job({"preset": "paper"}, policies, "symmetric_swap", make_config("paper"), 30, protocol.EARLIER)
+    rows = fly_tests.compare(job)
     assert [row["policy"] for row in rows] == ["full", "cpa:0.65:1.5", "none"]
     full, rule, none = rows
     assert full["against_full"]["only_policy"] == rule["against_rule"]["only_policy"] == 0
@@ -112,7 +96,7 @@ def test_tables_of_flown_episodes(tmp_path):
     )
     assert none["requests"] == 0 < rule["requests"] < full["requests"] == full["possible_requests"]
     (tmp_path / "test.json").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    text = page.main_table(tune_rules.read_rows(tmp_path / "test.json"), "paper")
+    text = page.main_table(read_rows(tmp_path / "test.json"), "paper")
     assert f"| symmetric swap | `none` | {none['collisions']}/30 [" in text
 
 
@@ -147,8 +131,8 @@ def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
 
 
 def test_flights_of_teams_fill_their_table(monkeypatch):
-    monkeypatch.setattr(fly, "TEAMS", (4, 6))  # flown in seconds
-    rows = [row for job in fly.teams(4) for row in fly.compare(job)]
+    monkeypatch.setattr(fly_tests, "TEAMS", (4, 6))  # flown in seconds
+    rows = [row for job in fly_tests.teams(4) for row in fly_tests.compare(job)]
     assert {(row["n_robots"], row["scenario"]) for row in rows} == {(n, name) for n in (4, 6) for name in page.NAMES}
     lines = page.teams_table(rows).splitlines()[2:]
     assert [line.split(" | ")[0] for line in lines] == sorted(line.split(" | ")[0] for line in lines)
@@ -156,18 +140,19 @@ def test_flights_of_teams_fill_their_table(monkeypatch):
     assert all(line.count("|") == 7 for line in lines)
 
 
-@pytest.mark.parametrize("name", fly.UNSEEN)
+@pytest.mark.parametrize("name", fly_tests.UNSEEN)
 @pytest.mark.parametrize("preset", ["paper", "dense"])
-def test_unseen_scenarios_are_other_ones_and_gone_after_the_flight(name, preset):
+def test_unseen_scenarios_are_other_ones(name, preset, monkeypatch):
     config = make_config(preset)
     for seed in range(20):
-        starts, goals = fly.UNSEEN[name](config.n_robots, config.space, np.random.default_rng(seed))
+        starts, goals = fly_tests.UNSEEN[name](config.n_robots, config.space, np.random.default_rng(seed))
         assert starts.shape == goals.shape == (config.n_robots, 3)
         for points in (starts, goals):
-            assert fly.apart(points) >= config.space.spacing - 1e-9
-    known = dict(SCENARIOS)
-    rows = fly.compare_unseen(({"preset": preset}, ["full", "none"], name, config, 60))
-    assert known == SCENARIOS
+            assert fly_tests.apart(points) >= config.space.spacing - 1e-9
+    for unseen in fly_tests.UNSEEN:
+        monkeypatch.setitem(SCENARIOS, unseen, None)  # so that they are taken out again
+    job = fly_tests.Job({"preset": preset}, ["full", "none"], name, config, 60, protocol.EARLIER)
+    rows = fly_tests.compare_unseen(job)
     assert [row["scenario"] for row in rows] == [name] * 2
     assert rows[1]["collisions"] > rows[0]["collisions"], "robots meet there"
     assert page.unseen_table(rows).count(f"| {name.replace('_', ' ')} |") == 2
@@ -175,40 +160,40 @@ def test_unseen_scenarios_are_other_ones_and_gone_after_the_flight(name, preset)
 
 def test_rows_of_other_keys_stay(tmp_path):
     path = tmp_path / "rows.json"
-    assert tune_rules.read_rows(path) == []
-    tune_rules.replace_rows(path, [{"a": 1, "b": 1}, {"a": 1, "b": 2}, {"a": 2, "b": 3}], ("a",))
-    tune_rules.replace_rows(path, [{"a": 1, "b": 4}], ("a",))
-    assert tune_rules.read_rows(path) == [{"a": 2, "b": 3}, {"a": 1, "b": 4}]
+    assert read_rows(path) == []
+    protocol.replace_rows(path, [{"a": 1, "b": 1}, {"a": 1, "b": 2}, {"a": 2, "b": 3}], ("a",))
+    protocol.replace_rows(path, [{"a": 1, "b": 4}], ("a",))
+    assert read_rows(path) == [{"a": 2, "b": 3}, {"a": 1, "b": 4}]
 
 
 def test_rows_of_an_earlier_rule_do_not_stay(tmp_path, monkeypatch):
-    monkeypatch.setattr(fly, "QUICK", 1)
+    monkeypatch.setattr(fly_tests, "QUICK", 1)
     for rule in ("none", "full"):
-        rules = dict.fromkeys(fly.NAMES, rule)
-        monkeypatch.setattr(fly, "best_rules", lambda preset, n_robots=None, rules=rules: rules)
+        rules = dict.fromkeys(protocol.NAMES, rule)
+        monkeypatch.setattr(fly_tests, "best_rules", lambda preset, n_robots=None, rules=rules: rules)
         command = "asking --quick --preset paper --scenario random --jobs 1 --out"
-        fly.main([*command.split(), str(tmp_path)])
-    policies = {row["policy"] for row in tune_rules.read_rows(tmp_path / "asking.json")}
-    assert policies == {"full", fly.models("paper")[0]}
+        fly_tests.main([*command.split(), str(tmp_path)])
+    policies = {row["policy"] for row in read_rows(tmp_path / "asking.json")}
+    assert policies == {"full", protocol.models("paper")[0]}
 
 
 def test_interventions_change_the_steps_that_they_should():
-    one = tune_rules.cell("none", "symmetric_swap", make_config("paper"))
-    rows = fly_all([one], 8, tune_rules.TEST)[one]
+    one = protocol.condition("none", "symmetric_swap", make_config("paper"))
+    rows = fly_all([one], 8, protocol.EARLIER)[one]
     number = next(k for k, row in enumerate(rows) if row["collided"])
-    collided, end, pair = fly.replay(one, number)
-    assert (collided, end) == (True, rows[number]["steps"])
-    everybody = fly.INTERVENTIONS["everybody asks everybody"]
-    assert fly.replay(one, number, everybody, pair, range(end, 100)) == (collided, end, pair)
-    assert not fly.replay(one, number, everybody, pair, range(100))[0]
+    collided, end, pair = fly_tests.replay(one, protocol.EARLIER, number)
+    assert (collided, end) == (True, rows[number]["steps_counted"])
+    everybody = fly_tests.INTERVENTIONS["everybody asks everybody"]
+    assert fly_tests.replay(one, protocol.EARLIER, number, everybody, pair, range(end, 100)) == (collided, end, pair)
+    assert not fly_tests.replay(one, protocol.EARLIER, number, everybody, pair, range(100))[0]
     asked = np.zeros((4, 4), dtype=bool)
-    each_other = fly.INTERVENTIONS["the two ask each other"](asked.copy(), 1, 3)
+    each_other = fly_tests.INTERVENTIONS["the two ask each other"](asked.copy(), 1, 3)
     assert {tuple(map(int, place)) for place in np.argwhere(each_other)} == {(1, 3), (3, 1)}
-    third = fly.INTERVENTIONS["all others ask the two"](asked.copy(), 1, 3)
+    third = fly_tests.INTERVENTIONS["all others ask the two"](asked.copy(), 1, 3)
     assert {tuple(map(int, place)) for place in np.argwhere(third)} == {(0, 1), (0, 3), (2, 1), (2, 3)}
 
 
-def test_thresholds_are_kept_cell_by_cell_and_the_smallest_is_written_into_the_model(tmp_path, monkeypatch):
+def test_thresholds_are_kept_by_scenario_and_written_into_the_model_only_when_asked(tmp_path, monkeypatch):
     path, table = tmp_path / "model.zip", tmp_path / "thresholds.json"
     path.write_bytes((pretrained_folder("quad-swarm-paper") / "model.zip").read_bytes())
     other_cell = {"model": str(path), "scenario": "symmetric_swap", "n_robots": 4, "threshold": 0.3, "safe": True}
@@ -216,15 +201,21 @@ def test_thresholds_are_kept_cell_by_cell_and_the_smallest_is_written_into_the_m
     table.write_text("".join(json.dumps(row) + "\n" for row in (other_cell, stale)))
     words = ["tune_thresholds.py", str(path), "--scenario", "random", "--quick", "--jobs", "1", "--json", str(table)]
     monkeypatch.setattr(sys, "argv", words)
+    before = path.read_bytes()
     tune_thresholds.main()
-    rows = tune_rules.read_rows(table)
+    rows = read_rows(table)
     assert rows[0] == other_cell
     assert stale not in rows
     chosen = rows[-1]
     assert chosen["scenario"] == "random"
     assert chosen["safe"]
     assert chosen["threshold"] > 0.3
+    assert path.read_bytes() == before, "nothing is written unless asked for"
+    tune_thresholds.set_threshold(str(path), rows)
     assert MADDPG.load(path, device="cpu").policy.threshold == 0.3
+    monkeypatch.setattr(sys, "argv", [*words, "--write"])
+    with pytest.raises(SystemExit):
+        tune_thresholds.main()  # so few episodes choose nothing
 
 
 def test_a_threshold_needs_a_reserve():
@@ -234,7 +225,7 @@ def test_a_threshold_needs_a_reserve():
     standard, share = tune_thresholds.STANDARDS["team"]
     assert tune_thresholds.has_reserve(Comparison(4000, 7, 2), standard.margin, share)
     assert not tune_thresholds.has_reserve(Comparison(4000, 7, 1), standard.margin, share)
-    assert Comparison(12000, 25, 0).as_safe, "though it would do without"
+    assert Comparison(12000, 25, 0).as_safe(), "though it would do without"
 
 
 def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
@@ -242,7 +233,7 @@ def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
     words = ["ppo.py", "--price", "0.05", "--steps", "2048", "--episodes", "3", "--models", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [*words, "--json", str(table)])
     ppo.main()
-    rows = tune_rules.read_rows(table)
+    rows = read_rows(table)
     assert len(rows) == 4 * len(ppo.THRESHOLDS)
     shares = [row["request_share"] for row in rows if row["scenario"] == "random"]
     assert shares == sorted(shares, reverse=True)
@@ -281,9 +272,35 @@ def test_a_regression_on_forks_is_trained_and_flown(tmp_path, monkeypatch):
     ]
     monkeypatch.setattr(sys, "argv", words)
     counterfactual.main()
-    rows = tune_rules.read_rows(table)
+    rows = read_rows(table)
     assert len(rows) == 4 * len(counterfactual.PRICES)
     shares = [row["request_share"] for row in rows if row["scenario"] == "symmetric_swap"]
     assert shares == sorted(shares, reverse=True)
     assert shares[0] > shares[-1]
     assert page.reference_table(rows, "price").count("/3, ") == len(rows)
+
+
+def test_the_test_set_is_one_that_nothing_was_chosen_on():
+    sealed = {"test", "teams", "counts", "quadrants"}
+    for part, (make_jobs, _) in fly_tests.PARTS.items():
+        sets = {job.seed for job in make_jobs(4)}
+        assert sets == {protocol.TEST if part in sealed else protocol.EARLIER}, part
+    assert len({protocol.VALIDATION, protocol.EARLIER, protocol.EARLIER_TEAMS, protocol.TEST}) == 4
+
+
+def test_requests_are_counted_over_whole_episodes_as_in_the_paper():
+    job = fly_tests.Job(
+        {"preset": "paper"}, ["full", "distance:4"], "random", make_config("paper"), 3, protocol.EARLIER
+    )
+    full, rule = fly_tests.compare_whole_episodes(job)
+    assert full["requests_flown"] == 3 * 100 * 12
+    assert full["steps_flown"] == rule["steps_flown"] == 300
+    assert 0 < rule["requests_flown"] < full["requests_flown"]
+
+
+def test_the_papers_asymmetric_swap_has_a_robot_in_each_quadrant():
+    (job,) = fly_tests.quadrants(4)
+    for seed in range(20):
+        starts, goals = SCENARIOS["asymmetric_swap"](4, job.config.space, np.random.default_rng(seed))
+        assert [(x > 0, y > 0) for x, y, _ in starts] == [(True, True), (False, True), (False, False), (True, False)]
+        assert (np.sign(goals[:, :2]) == -np.sign(starts[:, :2])).all()

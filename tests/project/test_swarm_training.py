@@ -1,7 +1,6 @@
 """The two packages together: training on the swarm, from recipes and by hand, and judging what was trained."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +14,9 @@ import quad_swarm
 from quad_swarm.evaluation.command import main as evaluate
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.commands import main as zoo
+from studies.swarm.training_time import measure
 
 ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT))
-
-from studies.swarm.training_time import measure
 
 SMALL = {
     "learning_starts": 30,

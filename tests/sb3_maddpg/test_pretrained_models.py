@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from quad_swarm.evaluation.evaluation import Cell, run_episodes, summarise
+from quad_swarm.evaluation import Condition, run_episodes, summarise
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import pretrained
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
@@ -28,8 +28,8 @@ def test_flies_safely_and_asks_seldom(name, n_robots):
     path = str(pretrained_folder(name) / "model.zip")
     figures = {}
     for policy in (path, "none"):
-        cell = Cell(policy, "symmetric_swap", config, 100, "sb3_maddpg:MADDPG", "auto", linger=5)
-        figures[policy] = summarise(run_episodes(cell, range(150)), n_robots)
+        condition = Condition(policy, "symmetric_swap", config, linger=5)
+        figures[policy] = summarise(run_episodes(condition, range(150)), config)
     assert figures["none"]["collisions"] > 75, "the world is a dangerous one"
     assert figures[path]["collisions"] <= 3
     assert 0.005 < figures[path]["request_share"] < most[n_robots]

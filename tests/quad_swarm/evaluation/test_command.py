@@ -1,19 +1,12 @@
-"""The evaluation: its figures against an episode flown by hand, its independence of processes, its messages."""
+"""``sb3-maddpg evaluate``: its table, its files, its messages."""
 
-import importlib
 import json
-import math
 from pathlib import Path
 
-import gymnasium
-import numpy as np
 import pytest
 
 from quad_swarm.evaluation.command import main
-from quad_swarm.evaluation.evaluation import Cell, evaluate, first_episode, fly, run_episodes, wilson_interval
 from quad_swarm.task.rules import RULES
-from quad_swarm.world.presets import make_config
-from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg.pretrained_models import pretrained_folder
 
 KEYS = {
@@ -21,86 +14,6 @@ KEYS = {
     "collisions_continuous", "requests_per_step", "request_share", "reduction", "arrived", "steps_to_arrival",
     "min_separation", "min_separation_continuous", "path_length", "planner_failures", "solver", "solve_us",
 }  # fmt: skip
-
-
-def cell(policy: str, max_steps: int = 100) -> Cell:
-    return Cell(policy, "asymmetric_swap", make_config("paper"), max_steps, "sb3_maddpg:MADDPG", "auto")
-
-
-def test_counts_what_the_environment_shows():
-    """The same episodes through Gymnasium, with the definitions of the figures written out again."""
-    seeds = [first_episode(0) + k for k in range(3)]
-    rows = run_episodes(cell("full"), seeds)
-    for seed, row in zip(seeds, rows, strict=True):
-        env = gymnasium.make("QuadSwarm-v0", scenario="asymmetric_swap").unwrapped
-        env.reset(seed=seed)
-        requests, path, closest, arrived_after = 0, 0.0, math.inf, None
-        for step in range(1, 101):
-            before = env.task.swarm.pos[0].copy()
-            *_, terminated, _, info = env.step(np.ones(12, dtype=np.int8))
-            closest = min(closest, info["min_separation"])
-            if arrived_after is None:
-                requests += 12
-                path += np.linalg.norm(env.task.swarm.pos[0] - before, axis=1).mean()
-                if info["at_goal"].all():
-                    arrived_after = step
-            if terminated:
-                break
-        assert row["requests"] == requests
-        assert row["steps_counted"] == (arrived_after or step)
-        assert row["arrived"] == (arrived_after is not None)
-        assert row["path_length"] == pytest.approx(path)
-        assert row["min_separation"] == closest
-
-
-def test_result_does_not_depend_on_the_number_of_processes():
-    cells = [cell("random:0.3", max_steps=25), cell("cpa:0.7:1.5", max_steps=25)]
-    one, two = (evaluate(cells, episodes=30, seed=1, jobs=jobs) for jobs in (1, 2))
-    for a, b in zip(one, two, strict=True):
-        assert a.pop("solve_us") > 0
-        assert b.pop("solve_us") > 0
-        assert a == b
-
-
-def test_other_processes_know_what_a_module_of_the_user_added(tmp_path, monkeypatch):
-    module = """
-import numpy as np
-from quad_swarm.task.rules import RULES
-from quad_swarm.world.scenarios import SCENARIOS, random
-
-def alone(n_robots, space, rng):
-    starts, _ = random(n_robots, space, rng)
-    return starts, starts + [0.2, 0, 0]
-
-def nobody():
-    return lambda view: np.zeros(view.age.shape, dtype=bool)
-
-SCENARIOS["alone"], RULES["nobody"] = alone, (nobody, ())
-"""
-    (tmp_path / "my_swarm.py").write_text(module)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(SCENARIOS, "alone", None)  # so that both are taken out again
-    monkeypatch.setitem(RULES, "nobody", None)
-    importlib.import_module("my_swarm")
-    mine = Cell("nobody", "alone", make_config("paper"), 100, "sb3_maddpg:MADDPG", "auto")
-    (row,) = evaluate([mine], episodes=4, jobs=2)
-    assert (row["requests"], row["arrived"]) == (0, 4)
-
-
-def test_other_seeds_are_other_episodes():
-    first, second = (fly(cell("none"), seed) for seed in (0, 1))
-    assert not np.array_equal(first.goal, second.goal)
-    assert first.requests.shape[1:] == (4, 3)
-    assert len(first.state) == len(first.plans) == len(first.requests) + 1
-
-
-@pytest.mark.parametrize(
-    ("successes", "trials", "low", "high"),
-    # Newcombe, Statistics in Medicine 17 (1998), table I, method 3.
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
-)
-def test_wilson_interval_as_published(successes, trials, low, high):
-    assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
 
 
 def test_writes_table_json_and_figures(tmp_path, capsys):
@@ -157,6 +70,13 @@ def test_world_can_be_changed(capsys):
         (["--policy", "none", "--solver", "fatrob"], "Did you mean 'fatrop'"),
         (["--policy", "none", "--world", "separation"], "write NAME=VALUE"),
         (["--policy", "none", "--world", "planner.seperation=1"], "Did you mean 'separation'"),
+        (["--policy", "none", "--world", "preset=dense"], "Unknown --world parameter 'preset'"),
+        (["--policy", "none", "--world", "noise=1", "noise.wind=2"], "was given a plain value before"),
+        (["--policy", "none", "--world", "noise.wind=1", "noise.wind=2"], "is given twice"),
+        (["--policy", "none", "--scenario", "all", "random"], "'all' already names every scenario"),
+        (["--policy", "pretrained:quad-swarm-paper"], "`sb3-maddpg evaluate` knows"),
+        (["--policy", "none", "--json", "."], "--json . is a folder"),
+        (["--policy", "none", "--json", "/proc/nowhere/table.json"], "choose another folder"),
     ],
 )
 def test_errors_are_one_line_with_the_remedy(arguments, message, capsys):
@@ -175,3 +95,34 @@ def test_a_damaged_model_is_named(tmp_path, capsys):
     assert "Is the file complete" in error
     assert main(["--policy", str(broken), "--algo", "quad_swarm:Nothing"]) == 2
     assert "no importable module:Class" in capsys.readouterr().err
+
+
+def test_a_scenario_named_twice_is_flown_once(capsys):
+    """Counted twice, the same episodes would pass for independent ones and narrow the interval."""
+    flags = ["--policy", "none", "none", "--episodes", "3", "--max-steps", "5"]
+    assert main([*flags, "--scenario", "random", "random"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("random")]
+    assert len(lines) == 1
+    assert "/3" in lines[0]
+
+
+def test_models_fly_in_the_world_that_they_were_trained_in(capsys):
+    dense = str(pretrained_folder("quad-swarm-dense") / "model.zip")
+    flags = ["--scenario", "random", "--episodes", "1", "--max-steps", "2"]
+    assert main(["--policy", "full", dense, *flags]) == 0
+    printed = capsys.readouterr()
+    assert "56.00" in printed.out  # requests a step of eight robots
+    assert not printed.err
+    assert main(["--policy", dense, *flags, "--preset", "paper"]) == 0
+    assert "note: quad-swarm-dense was trained in 'dense', this is 'paper'" in capsys.readouterr().err
+    paper = str(pretrained_folder("quad-swarm-paper") / "model.zip")
+    assert main(["--policy", dense, paper, *flags]) == 2
+    assert "choose one of these by --preset" in capsys.readouterr().err
+
+
+def test_the_help_names_every_rule_and_the_command(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "usage: sb3-maddpg evaluate" in printed
+    assert all(name in printed for name in (*RULES, "cpa:DIST:LOOKAHEAD", "pretrained:NAME", "--gym-packages"))

@@ -8,7 +8,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from quad_swarm.evaluation.evaluation import Cell, run_episodes
+from quad_swarm.evaluation.flight import Condition, run_episodes
 from quad_swarm.figures import dashboard
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG, DashboardCallback, pretrained
@@ -47,10 +47,10 @@ def test_the_zoo_logs_pictures_hyperparameters_and_the_swarms_layout(tmp_path, m
 def test_pairs_are_counted_as_episodes_are():
     path = str(pretrained_folder("quad-swarm-paper") / "model.zip")
     model = pretrained("quad-swarm-paper", device="cpu")
-    cell = Cell(path, "symmetric_swap", make_config("paper"), 100, "sb3_maddpg:MADDPG", "auto", linger=5)
-    asked, steps, collisions = dashboard.requests_by_pair(cell, model)
+    condition = Condition(path, "symmetric_swap", make_config("paper"), linger=5)
+    asked, steps, collisions = dashboard.requests_by_pair(condition, model)
     first = dashboard.first_episode(dashboard.SET)
-    rows = run_episodes(cell, range(first, first + dashboard.EPISODES))
+    rows = run_episodes(condition, range(first, first + dashboard.EPISODES))
     assert asked.sum() == sum(row["requests"] for row in rows) > 0
     assert steps == sum(row["steps_counted"] for row in rows)
     assert collisions == sum(row["collided"] for row in rows)

@@ -51,6 +51,11 @@ def test_controls_work_in_a_browser(tmp_path, browser):
         last = int(step.get_attribute("max"))
         assert page.locator("section").count() == 2
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing hangs over the edge"
+        asked = page.locator("section p").all_inner_texts()
+        data = json.loads(page.locator("#data").text_content())
+        for text, flight in zip(asked, data["flights"], strict=True):
+            steps = len(flight["requests"])
+            assert f"{steps} steps, {sum(map(len, flight['requests']))} of {12 * steps} requests" in text
         first = pixels(page)
         assert len(np.unique(first.reshape(-1, 3), axis=0)) > 50, "the picture is blank"
         assert (first.mean() > 128) == (scheme == "light")

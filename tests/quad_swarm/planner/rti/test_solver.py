@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_swarm.evaluation.evaluation import Cell, first_episode, run_episodes
+from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.planner import FatropSolver, OptimalControlProblem, Problems, RtiSolver
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 from quad_swarm.task.rules import parse_rule
@@ -143,7 +143,7 @@ def test_flies_no_worse_than_the_reference(preset, rule, episodes, noise):
         rows = [
             row
             for scenario in ("asymmetric_swap", "symmetric_swap")
-            for row in run_episodes(Cell(rule, scenario, config, 100, "", solver), seeds)
+            for row in run_episodes(Condition(rule, scenario, config, solver=solver), seeds)
         ]
         figures[solver] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     rti, reference = figures["rti"], figures["fatrop"]

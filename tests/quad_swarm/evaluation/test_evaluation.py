@@ -1,0 +1,146 @@
+"""The comparison of policies: its independence of processes, its figures, workers that die."""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from quad_swarm.evaluation.evaluation import _run_all, evaluate, summarise
+from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
+from quad_swarm.task.rules import RULES
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import SCENARIOS
+
+
+def condition(policy: str, max_steps: int = 25) -> Condition:
+    return Condition(policy, "asymmetric_swap", make_config("paper"), max_steps)
+
+
+def test_result_does_not_depend_on_the_number_of_processes():
+    conditions = [condition("random:0.3"), condition("cpa:0.7:1.5")]
+    one, two = (evaluate(conditions, episodes=30, seed=1, jobs=jobs) for jobs in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        assert a.pop("solve_us") > 0
+        assert b.pop("solve_us") > 0
+        assert a == b
+
+
+def test_other_processes_know_what_a_module_of_the_user_added(tmp_path, monkeypatch):
+    module = """
+import numpy as np
+from quad_swarm.task.rules import RULES
+from quad_swarm.world.scenarios import SCENARIOS, random
+
+def alone(n_robots, space, rng):
+    starts, _ = random(n_robots, space, rng)
+    return starts, starts + [0.2, 0, 0]
+
+def nobody():
+    return lambda view: np.zeros(view.age.shape, dtype=bool)
+
+SCENARIOS["alone"], RULES["nobody"] = alone, (nobody, ())
+"""
+    (tmp_path / "my_swarm.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(SCENARIOS, "alone", None)  # so that both are taken out again
+    monkeypatch.setitem(RULES, "nobody", None)
+    importlib.import_module("my_swarm")
+    mine = Condition("nobody", "alone", make_config("paper"))
+    (row,) = evaluate([mine], episodes=4, jobs=2)
+    assert (row["requests"], row["arrived"]) == (0, 4)
+
+
+def test_a_condition_named_twice_is_flown_once():
+    (row,) = evaluate([condition("none"), condition("none")], episodes=3)
+    assert row["episodes"] == 3
+
+
+def test_depths_of_collisions_are_counted_apart():
+    config = make_config("paper")
+    rows = run_episodes(Condition("none", "symmetric_swap", config), [first_episode(0)])
+    separations = [0.61, 0.5985, 0.595, 0.589, 0.575, 0.55]
+    collided = [s < 0.599 for s in separations]
+    rows = [
+        rows[0] | {"min_separation": s, "min_separation_continuous": s - 0.02, "collided": c}
+        for s, c in zip(separations, collided, strict=True)
+    ]
+    figures = summarise(rows, config)
+    assert (figures["collisions"], figures["collisions_1cm"], figures["collisions_3cm"]) == (5, 3, 1)
+    assert (figures["collisions_continuous_1cm"], figures["collisions_continuous_3cm"]) == (5, 3)
+
+
+def killed_once(condition: Condition, episodes: range) -> list[dict[str, float]]:
+    """As `run_episodes`, but the first process to fly the second piece dies."""
+    marker = Path(os.environ["MARKER"])
+    if episodes.start == first_episode(0) + 5 and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return run_episodes(condition, episodes)
+
+
+def killed_always(condition: Condition, episodes: range) -> list[dict[str, float]]:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return []
+
+
+def test_pieces_of_a_worker_that_died_are_flown_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("MARKER", str(tmp_path / "died"))
+    work = [(condition("none"), range(first_episode(0) + k, first_episode(0) + k + 5)) for k in (0, 5, 10)]
+    one = list(_run_all(work, 1))
+    monkeypatch.setattr("quad_swarm.evaluation.evaluation.run_episodes", killed_once)
+    monkeypatch.setattr("quad_swarm.evaluation.evaluation._CHUNK", 5)
+    two = list(_run_all(work, 2))
+    assert (tmp_path / "died").exists()
+    for a, b in zip((r for rows in one for r in rows), (r for rows in two for r in rows), strict=True):
+        assert {**a, "solve_seconds": 0} == {**b, "solve_seconds": 0}
+    monkeypatch.setattr("quad_swarm.evaluation.evaluation.run_episodes", killed_always)
+    with pytest.raises(ValueError, match="died 3 times"):
+        list(_run_all(work, 2))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM])
+def test_workers_end_with_their_parent(kind):
+    command = ["--policy", "none", "full", "--episodes", "1000000", "--jobs", "2"]
+    parent = subprocess.Popen([sys.executable, "-m", "quad_swarm.evaluation.command", *command])
+    workers: set[int] = set()
+    for _ in range(600):
+        workers = children(parent.pid)
+        if sum(busy(pid) for pid in workers) >= 2:
+            break
+        time.sleep(0.05)
+    assert len(workers) >= 2
+    parent.send_signal(kind)
+    parent.wait()
+    for _ in range(200):
+        if not any(Path(f"/proc/{pid}").exists() for pid in workers):
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"{workers} still run")
+
+
+def children(pid: int) -> set[int]:
+    """Ids of the processes that a process has begun."""
+    found = set()
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found.add(int(status.parent.name))
+    return found
+
+
+def busy(pid: int) -> bool:
+    """Whether a process has used more than a second of a processor."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return False
+    return int(fields[11]) > 100

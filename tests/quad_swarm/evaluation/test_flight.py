@@ -1,0 +1,104 @@
+"""Flights: their figures against episodes flown by hand, and what a flight tells of itself."""
+
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, fly_steps, run_episodes
+from quad_swarm.world.presets import make_config
+
+
+def condition(policy: str, scenario: str = "asymmetric_swap", linger: int | None = None) -> Condition:
+    return Condition(policy, scenario, make_config("paper"), linger=linger)
+
+
+def test_counts_what_the_environment_shows():
+    """The same episodes through Gymnasium, with the definitions of the figures written out again."""
+    seeds = [first_episode(0) + k for k in range(3)]
+    rows = run_episodes(condition("full"), seeds)
+    for seed, row in zip(seeds, rows, strict=True):
+        env = gymnasium.make("QuadSwarm-v0", scenario="asymmetric_swap").unwrapped
+        env.reset(seed=seed)
+        requests, path, closest, arrived_after = 0, 0.0, math.inf, None
+        for step in range(1, 101):
+            before = env.task.swarm.pos[0].copy()
+            *_, terminated, _, info = env.step(np.ones(12, dtype=np.int8))
+            closest = min(closest, info["min_separation"])
+            if arrived_after is None:
+                requests += 12
+                path += np.linalg.norm(env.task.swarm.pos[0] - before, axis=1).mean()
+                if info["at_goal"].all():
+                    arrived_after = step
+            if terminated:
+                break
+        assert row["requests"] == requests
+        assert row["steps_counted"] == (arrived_after or step)
+        assert row["arrived"] == (arrived_after is not None)
+        assert row["path_length"] == pytest.approx(path)
+        assert row["min_separation"] == closest
+
+
+def test_other_seeds_are_other_episodes():
+    first, second = (fly(condition("none"), seed) for seed in (0, 1))
+    assert not np.array_equal(first.goal, second.goal)
+    assert first.requests.shape[1:] == (4, 3)
+    assert len(first.state) == len(first.plans) == len(first.requests) + 1
+
+
+def test_a_rule_beside_does_not_change_the_flight():
+    alone, beside = (fly(condition("random:0.5"), 0, other_rule=rule) for rule in ("none", "random:0.5"))
+    assert np.array_equal(alone.requests, beside.requests)
+    assert np.array_equal(alone.state, beside.state)
+    assert 0 < beside.other_requests.mean() < 1
+    assert not np.array_equal(beside.requests, beside.other_requests), "generators of its own"
+
+
+def test_a_collision_ends_what_is_counted_but_not_the_flight():
+    one = condition("none", "symmetric_swap", linger=10)
+    seeds = [first_episode(0) + k for k in range(40)]
+    rows = run_episodes(one, seeds)
+    deep = [(seed, row) for seed, row in zip(seeds, rows, strict=True) if row["collided"]]
+    assert 10 < len(deep) < 40
+    for seed, row in deep[:5]:
+        env = gymnasium.make("QuadSwarm-v0", scenario="symmetric_swap").unwrapped
+        env.reset(seed=seed)
+        terminated = False
+        while not terminated:
+            *_, terminated, _, _ = env.step(np.zeros(12, dtype=np.int8))
+        statistics = env.task.statistics
+        assert row["steps_counted"] == statistics.steps_counted[0] < row["steps"]
+        assert row["min_separation"] <= statistics.min_separation[0]
+        assert not row["arrived"]
+        assert row["reached"]
+    assert any(row["min_separation"] < 0.5 for _, row in deep), "deeper than in the step of the collision"
+
+
+def test_episodes_leave_the_batch_when_they_are_over():
+    policy, task, rngs = begin(condition("full", linger=3), [first_episode(0) + k for k in range(6)])
+    flying, over = [], {}
+    for step in fly_steps(policy, task, rngs, linger=3):
+        assert len(step.requests) == len(step.episodes) == task.swarm.n_swarms
+        flying.append(len(step.episodes))
+        for k in np.flatnonzero(step.over):
+            over[int(step.episodes[k])] = int(task.statistics.steps[k]) - int(task.statistics.steps_counted[k])
+    assert flying == sorted(flying, reverse=True)
+    assert over == dict.fromkeys(range(6), 3), "so many steps after the arrival"
+
+
+def test_a_flight_knows_its_arrival_its_collision_and_its_closest_pair():
+    safe = fly(condition("full", "symmetric_swap", linger=10), 0)
+    crashes = (fly(condition("none", "symmetric_swap", linger=10), 0, number) for number in range(10))
+    crash = next(flight for flight in crashes if flight.collision is not None)
+    assert safe.collision is None
+    assert safe.arrival == len(safe.requests) - 10
+    at_goal = np.linalg.norm(safe.pos[safe.arrival] - safe.goal, axis=-1) <= 0.3
+    assert at_goal.all()
+    i, j = crash.closest_pair(crash.collision)
+    gap = np.linalg.norm(crash.pos[crash.collision, i] - crash.pos[crash.collision, j])
+    assert gap == pytest.approx(crash.separation[crash.collision].min())
+    assert gap < 0.599 <= crash.separation[crash.collision - 1].min()
+    distance, time = crash.closest_approach
+    assert (distance <= crash.separation + 1e-12).all()
+    assert (time >= 0).all()

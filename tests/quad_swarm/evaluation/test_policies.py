@@ -1,0 +1,64 @@
+"""Policies by their names: rules, and models by their files."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch as th
+
+from quad_swarm.evaluation.flight import Condition, run_episodes
+from quad_swarm.evaluation.policies import load_model, make_policy, short_name, trained_in
+from quad_swarm.world.presets import make_config
+from sb3_maddpg import MADDPG
+from sb3_maddpg.pretrained_models import pretrained_folder
+
+ALGO = "sb3_maddpg:MADDPG"
+
+
+@pytest.fixture
+def model(tmp_path):
+    """The path of a copy of a pretrained model."""
+    path = tmp_path / "model.zip"
+    shutil.copy(pretrained_folder("quad-swarm-paper") / "model.zip", path)
+    return str(path)
+
+
+def test_a_file_that_has_changed_is_read_again(model):
+    one = Condition(model, "symmetric_swap", make_config("paper"))
+    before = sum(row["requests"] for row in run_episodes(one, range(10)))
+    assert load_model(model, ALGO) is load_model(model, ALGO)
+    changed = MADDPG.load(model, device="cpu")
+    changed.set_threshold(0.999)
+    changed.save(model)
+    assert 0 <= sum(row["requests"] for row in run_episodes(one, range(10))) < before / 2
+
+
+def test_a_model_that_is_not_finite_does_not_fly(model):
+    poisoned = load_model(model, ALGO)
+    with th.no_grad():
+        next(poisoned.policy.parameters()).view(-1)[0] = np.nan
+
+    class Loader:
+        @staticmethod
+        def load(path, device):
+            return poisoned
+
+    import sb3_maddpg
+
+    sb3_maddpg.Loader = Loader
+    try:
+        with pytest.raises(ValueError, match="is not finite"):
+            make_policy(model, make_config("paper"), "sb3_maddpg:Loader")
+    finally:
+        del sb3_maddpg.Loader
+
+
+def test_names():
+    assert short_name("cpa:0.7:1.5") == "cpa:0.7:1.5"
+    assert short_name("logs/a/best_model.zip@0.3") == "best_model.zip@0.3"
+    assert short_name("models/quad-swarm-paper/model.zip") == "quad-swarm-paper"
+
+
+def test_a_model_tells_its_world(model):
+    assert trained_in(load_model(model, ALGO))["preset"] == "paper"
+    assert trained_in(object()) == {}

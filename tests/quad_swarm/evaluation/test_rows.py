@@ -1,0 +1,29 @@
+"""Tables of rows in files."""
+
+import pytest
+
+from quad_swarm.evaluation.rows import check_writable, read_rows, write_rows
+
+
+def test_rows_come_back(tmp_path):
+    path = tmp_path / "new" / "table.json"
+    assert read_rows(path) == []
+    rows = [{"a": 1, "b": None}, {"a": [1.5, "x"]}]
+    write_rows(path, rows)
+    assert read_rows(path) == rows
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_nothing_is_left_of_a_table_that_cannot_be_written(tmp_path):
+    with pytest.raises(TypeError):
+        write_rows(tmp_path / "table.json", [{"a": 1}, {"a": object()}])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_path_that_cannot_be_written_is_found_before_the_work(tmp_path):
+    check_writable(tmp_path / "new" / "table.json", "--json")
+    with pytest.raises(ValueError, match=r"--json .* is a folder"):
+        check_writable(tmp_path, "--json")
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="choose another folder"):
+        check_writable(tmp_path / "file" / "table.json", "--json")
