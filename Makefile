@@ -47,25 +47,25 @@ docs: install  ## the documentation site, in docs/_build; a warning is an error
 bench: install  ## speed of planner, environment and learner, and the estimators, as tables and as JSON
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done
 
+STUDY := $(BIN)/python -m studies.swarm
 results: install  ## fly everything that docs/results.md says again: tuned rules and thresholds, test set, tables and figures (hours)
-	$(BIN)/python -m studies.swarm.tune_rules --jobs $(JOBS) --json studies/swarm/data/rules.json
-	$(BIN)/python -m studies.swarm.tune_rules --preset dense --n-robots $(TEAMS) --family $(TEAM_FAMILIES) --jobs $(JOBS) \
+	$(STUDY).tune_rules --jobs $(JOBS) --json studies/swarm/data/rules.json
+	$(STUDY).tune_rules --preset dense --n-robots $(TEAMS) --family $(TEAM_FAMILIES) --jobs $(JOBS) \
 		--json studies/swarm/data/team_rules.json
-	$(BIN)/python -m studies.swarm.tune_thresholds --jobs $(JOBS) --json studies/swarm/data/thresholds.json
-	$(BIN)/python -m studies.swarm.tune_thresholds studies/swarm/data/any_seed*.zip --n-robots $(TEAMS) --jobs $(JOBS) \
-		--json studies/swarm/data/thresholds.json
-	$(BIN)/python -m studies.swarm.fly --jobs $(JOBS)
-	$(BIN)/python -m studies.swarm.ppo --models $(LOGS) --json studies/swarm/data/ppo.json
-	$(BIN)/python -m studies.swarm.counterfactual --models $(LOGS) --json studies/swarm/data/counterfactual.json
-	$(BIN)/python -m studies.swarm.report
+	$(STUDY).tune_thresholds --jobs $(JOBS) --json studies/swarm/data/thresholds.json --write
+	$(STUDY).tune_thresholds studies/swarm/data/any_seed*.zip --n-robots $(TEAMS) --jobs $(JOBS) \
+		--json studies/swarm/data/thresholds.json --write
+	$(STUDY).fly_tests --jobs $(JOBS)
+	$(STUDY).ppo --models $(LOGS) --json studies/swarm/data/ppo.json
+	$(STUDY).counterfactual --models $(LOGS) --json studies/swarm/data/counterfactual.json
+	$(STUDY).report
 
 results-quick: install  ## the same with few episodes and rules, into $(LOGS)/results
-	$(BIN)/python -m studies.swarm.tune_rules --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json
-	$(BIN)/python -m studies.swarm.fly --quick --jobs $(JOBS) --out $(LOGS)/results
-	$(BIN)/python -m studies.swarm.ppo --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json
-	$(BIN)/python -m studies.swarm.counterfactual --forks 10 --episodes 20 --models $(LOGS)/results \
-		--json $(LOGS)/results/counterfactual.json
-	$(BIN)/python -m studies.swarm.report --data $(LOGS)/results --page $(LOGS)/results/results.md --images $(LOGS)/results
+	$(STUDY).tune_rules --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json
+	$(STUDY).fly_tests --quick --jobs $(JOBS) --out $(LOGS)/results
+	$(STUDY).ppo --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json
+	$(STUDY).counterfactual --forks 10 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/counterfactual.json
+	$(STUDY).report --data $(LOGS)/results --pages $(LOGS)/results --images $(LOGS)/results
 
 bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against other libraries, each in its own environment
 	$(BIN)/python benchmarks/training.py --json benchmarks/results/training.json

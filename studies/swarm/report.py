@@ -1,4 +1,4 @@
-"""Put tables and figures into docs/results.md: ``python -m studies.swarm.report [--data FOLDER]``.
+"""Put tables and figures into the pages of results: ``python -m studies.swarm.report [--data FOLDER]``.
 
 The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
 come from `studies/swarm/tune_rules.py`, `studies/swarm/tune_thresholds.py`, `studies/swarm/fly.py`, of other learners
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from studies.swarm.protocol import DATA, EARLIER, OF_TEAM, ROOT, absolute_path, best_rules, condition, models, progress
 
-PAGE = ROOT / "docs" / "results.md"
+PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "swarm_learning.md")
 IMAGES = ROOT / "docs" / "images"
 NAMES = list(SCENARIOS)[::-1]
 Rows = list[dict[str, Any]]
@@ -65,23 +66,121 @@ def versus(row: dict[str, Any], rival: str) -> str:
     return f"{sign}[{100 * against['low']:+.2f}, {100 * against['high']:+.2f}]{sign}, p = {against['p_value']:.2g}"
 
 
+def depths(row: dict[str, Any], where: str = "") -> str:
+    """Collisions deeper than the tolerance of 1 mm, than 1 cm and than 3 cm."""
+    counts = (row[f"collisions{where}"], row.get(f"collisions{where}_1cm"), row.get(f"collisions{where}_3cm"))
+    return " / ".join("?" if count is None else str(count) for count in counts)
+
+
 def main_table(rows: Rows, preset: str) -> str:
     """All policies of a preset in all scenarios."""
     chosen = [row for row in rows if row["preset"] == preset and "ablation" not in row["policy"]]
     chosen.sort(key=lambda row: NAMES.index(row["scenario"]))
-    head = ["scenario", "policy", "collisions, 95 %", "against full (points)", "against the rule", "requests"]
-    head += ["of the rule's", "arrived", "steps", "path (m)", "between steps"]
+    head = ["scenario", "policy", "collisions, 95 %", "> 1 mm / 1 cm / 3 cm", "the same, also between steps"]
+    head += ["against full (points)", "against the rule", "requests", "of the rule's", "arrived", "steps", "path (m)"]
     lines = []
     for row in chosen:
         key = (row["scenario"], row["against_rule"]["rival"])
         rule = next(r for r in chosen if (r["scenario"], r["policy"]) == key)
         ratio = f"{row['request_share'] / rule['request_share']:.0%}" if rule["request_share"] else "-"
         steps, path = row["steps_to_arrival"], row["path_length"]
-        line = [row["scenario"].replace("_", " "), label(row["policy"]), rate(row), versus(row, "full")]
-        line += [versus(row, "rule"), f"{row['request_share']:.2%}", ratio, f"{row['arrived']}/{row['episodes']}"]
-        line += ["-" if steps is None else f"{steps:.1f}", "-" if path is None else f"{path:.2f}"]
-        lines.append([*line, str(row["collisions_continuous"])])
+        line = [row["scenario"].replace("_", " "), label(row["policy"]), rate(row), depths(row)]
+        line += [depths(row, "_continuous"), versus(row, "full"), versus(row, "rule"), f"{row['request_share']:.2%}"]
+        line += [ratio, f"{row['arrived']}/{row['episodes']}", "-" if steps is None else f"{steps:.1f}"]
+        lines.append([*line, "-" if path is None else f"{path:.2f}"])
     return table(head, lines)
+
+
+def worse_table(rows: Rows) -> str:
+    """Where a learned policy within the margin of full communication is significantly worse than it all the same."""
+    lines = []
+    for row in rows:
+        against = row["against_full"]
+        if is_model(row["policy"]) and against["as_safe"] and against["low"] > 0 and against["p_value"] < 0.01:
+            line = [row["preset"], row["scenario"].replace("_", " "), label(row["policy"])]
+            line += [str(against["only_policy"]), str(against["only_rival"]), str(row["episodes"])]
+            lines.append([*line, f"[{100 * against['low']:+.2f}, {100 * against['high']:+.2f}]"])
+    head = [
+        "preset",
+        "scenario",
+        "policy",
+        "only the policy collides",
+        "only `full`",
+        "episodes",
+        "difference (points)",
+    ]
+    return table(head, lines)
+
+
+def faithful_table(rows: Rows) -> str:
+    """The paper's settings, seed by seed: collisions, how many of them are deeper than 1 cm, and requests."""
+    chosen = [row for row in rows if row["preset"] == "paper" and "faithful" in row["policy"]]
+    policies = list(dict.fromkeys(row["policy"] for row in chosen))
+    lines = []
+    for policy in policies:
+        line = [Path(policy).stem.removeprefix("faithful_seed")]
+        for name in NAMES:
+            row = next(r for r in chosen if (r["policy"], r["scenario"]) == (policy, name))
+            deeper = row.get("collisions_1cm")
+            depth = "" if deeper is None else f" ({deeper / row['episodes']:.1%})"
+            line.append(f"{rate_of(row):.1%}{depth}, {row['request_share']:.0%}")
+        lines.append(line)
+    return table(["seed", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def counts_table(rows: Rows) -> str:
+    """The paper's own comparison: requests in whole episodes, against everybody asking everybody and 4-DBCP."""
+    lines = []
+    for name in NAMES:
+        here = {row["policy"]: row for row in rows if row["scenario"] == name}
+        if not here:
+            continue
+        full, dbcp = here["full"], here["distance:4"]
+        groups = {"`full`": [full], "4-DBCP (`distance:4`)": [dbcp], "`none`": [here["none"]]}
+        groups["the paper's settings, ten seeds"] = [r for k, r in here.items() if "faithful" in k]
+        groups["own recipe, five seeds"] = [r for k, r in here.items() if "/paper_seed" in k]
+        for what, members in groups.items():
+            episode = [r["requests_flown"] / r["episodes"] for r in members]
+            lines.append(
+                [
+                    name.replace("_", " "),
+                    what,
+                    spread([f"{value:.0f}" for value in sorted(episode)]),
+                    spread([f"{1 - r['requests_flown'] / full['requests_flown']:.0%}" for r in by_requests(members)]),
+                    spread([f"{1 - r['requests_flown'] / dbcp['requests_flown']:.0%}" for r in by_requests(members)]),
+                    spread([f"{rate_of(r):.1%}" for r in sorted(members, key=rate_of)]),
+                ]
+            )
+    head = ["scenario", "policy", "requests an episode", "fewer than `full`", "fewer than 4-DBCP"]
+    return table([*head, "episodes with a collision"], lines)
+
+
+def by_requests(rows: Rows) -> Rows:
+    """The rows, most requests first."""
+    return sorted(rows, key=lambda row: -row["requests_flown"])
+
+
+def spread(values: Sequence[str]) -> str:
+    """The first and the last of some values."""
+    return values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
+
+
+def checkpoints_table(rows: Rows) -> str:
+    """Which iterate of a training by the paper's settings to take."""
+    lines = []
+    for kind, choice in dict.fromkeys((row["run"].partition("_")[0], row["choice"]) for row in rows):
+        line = ["constant" if kind == "faithful" else "falls to 0", choice]
+        for name in NAMES:
+            mine = [
+                row
+                for row in rows
+                if (row["run"].startswith(kind), row["choice"], row["scenario"]) == (True, choice, name)
+            ]
+            rates, shares = sorted(map(rate_of, mine)), sorted(row["request_share"] for row in mine)
+            mean = sum(rates) / len(rates)
+            line.append(f"{rates[0]:.1%} to {rates[-1]:.1%} ({mean:.1%}), {shares[0]:.0%} to {shares[-1]:.0%}")
+        lines.append(line)
+    return table(["learning rate", "model taken", *(name.replace("_", " ") for name in NAMES)], lines)
 
 
 def pooled(rows: Rows) -> float:
@@ -333,20 +432,35 @@ def draw_asking(rows: Rows, path: Path) -> None:
     figure.savefig(path, dpi=90)
 
 
+def fill(page: str, blocks: dict[str, str]) -> str:
+    """A page with every place ``<!-- NAME --> ... <!-- end -->`` filled anew."""
+
+    def block(place: re.Match[str]) -> str:
+        return f"<!-- {place[1]} -->\n\n{blocks[place[1]]}\n\n<!-- end -->"
+
+    return re.sub(r"<!-- ((?!end )[\w ]+) -->\n.*?<!-- end -->", block, page, flags=re.DOTALL)
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=absolute_path, default=DATA, help="folder of the JSON files (%(default)s)")
-    parser.add_argument("--page", type=absolute_path, default=PAGE, help="page to fill (default %(default)s)")
+    parser.add_argument(
+        "--pages", type=absolute_path, default=PAGES[0].parent, help="folder of the pages (default %(default)s)"
+    )
     parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
     os.chdir(ROOT)
-    names = ("rules", "test", "sweep", "robustness", "unseen", "teams", "asking", "interventions", "ppo")
-    rules, test, sweep, robustness, unseen, teams, asking, interventions, ppo, counterfactual, training = (
-        read_rows(args.data / f"{name}.json") for name in (*names, "counterfactual", "training")
-    )
+    names = "rules test sweep robustness unseen teams asking interventions ppo counterfactual training counts quadrants"
+    rows = {name: read_rows(args.data / f"{name}.json") for name in [*names.split(), "checkpoints"]}
+    rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
     blocks = {
         "targets": targets(test),
+        "worse": worse_table(test),
+        "faithful": faithful_table(test),
+        "counts": counts_table(rows["counts"]),
+        "quadrants": main_table(rows["quadrants"], "paper"),
+        "checkpoints": checkpoints_table(rows["checkpoints"]),
         "paper": main_table(test, "paper"),
         "dense": main_table(test, "dense"),
         "rules paper": family_table(rules, "paper"),
@@ -356,12 +470,12 @@ def main() -> None:
         "sweep dense": wide_table([r for r in sweep if is_model(r["policy"])], "policy", "dense"),
         "robustness paper": wide_table(robustness, "condition", "paper"),
         "robustness dense": wide_table(robustness, "condition", "dense"),
-        "interventions": interventions_table(interventions),
-        "unseen": unseen_table(unseen),
-        "teams": teams_table(teams),
-        "ppo": reference_table(ppo, "price", "threshold"),
-        "counterfactual": reference_table(counterfactual, "price"),
-        "training": training_table(training),
+        "interventions": interventions_table(rows["interventions"]),
+        "unseen": unseen_table(rows["unseen"]),
+        "teams": teams_table(rows["teams"]),
+        "ppo": reference_table(rows["ppo"], "price", "threshold"),
+        "counterfactual": reference_table(rows["counterfactual"], "price"),
+        "training": training_table(rows["training"]),
     }
     flown = {
         preset: flights(models(preset)[0], best_rules(preset)["symmetric_swap"], preset)
@@ -371,14 +485,9 @@ def main() -> None:
         blocks[f"told {name}"] = step_by_step(flown["paper"][name]) if "paper" in flown else "Not flown yet."
     picture = "![How often policies ask: distance, approach, time, way to go, crowd](images/asking.png)"
     blocks["asking"] = picture if asking else "Not flown yet."
-    page = PAGE.read_text()
-    for name, block in blocks.items():
-        before, opening, rest = page.partition(f"<!-- {name} -->\n")
-        _, closing, after = rest.partition("<!-- end -->")
-        if not closing:
-            raise ValueError(f"{PAGE} has no place '<!-- {name} --> ... <!-- end -->'.")
-        page = f"{before}{opening}\n{block}\n\n{closing}{after}"
-    args.page.write_text(page)
+    args.pages.mkdir(parents=True, exist_ok=True)
+    for path in PAGES:
+        (args.pages / path.name).write_text(fill(path.read_text(), blocks))
     args.images.mkdir(parents=True, exist_ok=True)
     if rules:
         draw_fronts(rules, sweep, test, args.images / "fronts.png")

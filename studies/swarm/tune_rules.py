@@ -58,31 +58,26 @@ def families() -> dict[str, list[str]]:
 
 
 def fine_families() -> dict[str, list[str]]:
-    """The families that came out best, in steps as fine as those of models' thresholds."""
+    """The families that came out best, around what came out best, in steps as fine as those of models' thresholds."""
     product = itertools.product
-    near = ("0.6:1.5", "0.62:1", "0.62:1.5", "0.62:2", "0.65:1.5", "0.7:1.5", "0.8:3", "1.05:3")
-    narrow = [f"cpa:{d:g}:{t:g}" for d, t in product((0.6, 0.61, 0.62, 0.63, 0.64, 0.65, 0.67, 0.7), (1.25, 1.5, 2))]
+    near = [f"cpa:{cpa}" for cpa in ("0.6:1.5", "0.62:1.25", "0.62:1.5", "0.62:2", "0.65:1.5", "0.65:2")]
+    far = ["cpa:0.8:3", "cpa:0.95:3", "cpa:1.05:2.5", "cpa:1.05:3"]
     return {
         "plan, or cpa and stale, fine": [
-            f"plan:{d:g}{soon}|cpa:{cpa}&stale:{k}"
-            for d, soon, cpa, k in product(
-                (0.6, 0.62, 0.64, 0.66, 0.68, 0.7, 0.75),
-                ("", "&soon:0.2", "&soon:0.3", "&soon:0.4"),
-                near,
-                (2, 3, 4, 6),
-            )
-        ],
+            f"plan:{d:g}&soon:{t:g}|{cpa}&stale:{k}"
+            for d, t, cpa, k in product((0.62, 0.64, 0.66, 0.68, 0.7), (0.2, 0.3, 0.4), near, (2, 3, 4, 6))
+        ]
+        + [f"plan:{d:g}|{cpa}&stale:{k}" for d, cpa, k in product((0.65, 0.67, 0.7, 0.73), far, (3, 4, 5, 6))],
         "cpa, soon or stale, fine": [
-            f"{rule}&soon:{t:g}|{rule}&stale:{k}" for rule, t, k in product(narrow, (0.15, 0.2, 0.3, 0.4), (4, 5, 6, 8))
+            f"{cpa}&soon:{t:g}|{cpa}&stale:{k}" for cpa, t, k in product(near, (0.2, 0.3, 0.4), (4, 5, 6, 8))
         ],
         "two cpa, fine": [
-            f"cpa:{d:g}:{t:g}|cpa:{far:g}:3&stale:{k}"
-            for d, t, far, k in product((0.62, 0.65, 0.68, 0.72), (0.75, 1, 1.25), (0.8, 0.9, 1, 1.1, 1.2), (4, 6, 8))
+            f"cpa:{d:g}:1|{cpa}&stale:{k}" for d, cpa, k in product((0.62, 0.65, 0.68, 0.72), far, (4, 5, 6, 8))
         ],
         "plan and stale, fine": [
-            f"plan:{0.6 + 0.01 * step:g}&stale:{k}" for step, k in product(range(11), (2, 3, 4, 5, 6, 8))
+            f"plan:{d:g}&stale:{k}" for d, k in product((0.6, 0.61, 0.62, 0.63, 0.64), (2, 3, 4, 5))
         ],
-        "cpa and stale, fine": [f"{rule}&stale:{k}" for rule, k in product(narrow, (3, 4, 5, 6, 8))],
+        "cpa and stale, fine": [f"{cpa}&stale:{k}" for cpa, k in product(near, (4, 5, 6, 8))],
     }
 
 
