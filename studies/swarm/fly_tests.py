@@ -49,8 +49,8 @@ SETS = {"test": TEST, "teams": TEST, "counts": TEST, "quadrants": TEST}
 QUICK = 20
 # A threshold with which there are collisions to look at
 RECKLESS = 0.6
-# The rule that the paper compares with
-DBCP = "distance:4"
+# The rule that the paper compares with, and the simplest one that is better
+DBCP, CPA = "distance:4", "cpa:0.7:1.5"
 PRESETS_TESTED = ("paper", "dense")
 # What tells the conditions of a part from each other; one that is flown again replaces its rows
 CONDITION = ("preset", "scenario", "condition", "n_robots")
@@ -135,7 +135,7 @@ def test(episodes: int) -> list[Job]:
     """The main tables."""
 
     def policies(preset: str, name: str) -> list[str]:
-        others = ["none", DBCP, *models(preset)]
+        others = ["none", DBCP, CPA, *models(preset)]
         if preset == "paper":
             others += [*models("faithful"), *models("ablation*")]
         return ["full", best_rules(preset)[name], *others, *tuned(preset, name)]
