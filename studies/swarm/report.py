@@ -28,7 +28,7 @@ from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from studies.swarm.protocol import DATA, EARLIER, OF_TEAM, ROOT, absolute_path, best_rules, condition, models, progress
 
-PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "swarm_learning.md")
+PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "swarm_learning.md", ROOT / "README.md")
 IMAGES = ROOT / "docs" / "images"
 NAMES = list(SCENARIOS)[::-1]
 Rows = list[dict[str, Any]]
@@ -126,6 +126,29 @@ def faithful_table(rows: Rows) -> str:
             line.append(f"{rate_of(row):.1%}{depth}, {row['request_share']:.0%}")
         lines.append(line)
     return table(["seed", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def overview_table(rows: Rows) -> str:
+    """Four robots in short: collisions, in brackets those deeper than 1 cm, and requests, seeds as ranges."""
+    chosen = [row for row in rows if row["preset"] == "paper"]
+    groups = {f"`{name}`": [name] for name in ("none", "full", "distance:4", "cpa:0.7:1.5")}
+    for what, recipe in {"the paper's settings": "faithful", "`quad_swarm_paper.yml`": "paper"}.items():
+        groups[f"MADDPG, {what}, {len(models(recipe))} seeds"] = models(recipe)
+    lines = []
+    for what, policies in groups.items():
+        by_scenario = ([r for r in chosen if r["policy"] in policies and r["scenario"] == name] for name in NAMES)
+        lines.append([what, *map(overview, by_scenario)])
+    return table(["policy", *(name.replace("_", " ") for name in NAMES)], lines)
+
+
+def overview(rows: Rows) -> str:
+    """Some rows of one scenario in short."""
+    if not rows:
+        return "-"
+    rates = [f"{100 * rate:.2g} %" for rate in sorted(map(rate_of, rows))]
+    deeper = [f"{100 * rate:.2g} %" for rate in sorted(r["collisions_1cm"] / r["episodes"] for r in rows)]
+    shares = [f"{100 * share:.2g} %" for share in sorted(row["request_share"] for row in rows)]
+    return f"{spread(rates)} ({spread(deeper)}), asks {spread(shares)}"
 
 
 def counts_table(rows: Rows) -> str:
@@ -445,9 +468,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=absolute_path, default=DATA, help="folder of the JSON files (%(default)s)")
-    parser.add_argument(
-        "--pages", type=absolute_path, default=PAGES[0].parent, help="folder of the pages (default %(default)s)"
-    )
+    parser.add_argument("--pages", type=absolute_path, default=ROOT, help="folder of the pages (default %(default)s)")
     parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
     args = parser.parse_args()
     os.chdir(ROOT)
@@ -457,6 +478,7 @@ def main() -> None:
     blocks = {
         "targets": targets(test),
         "worse": worse_table(test),
+        "overview": overview_table(test),
         "faithful": faithful_table(test),
         "counts": counts_table(rows["counts"]),
         "quadrants": main_table(rows["quadrants"], "paper"),
@@ -485,9 +507,10 @@ def main() -> None:
         blocks[f"told {name}"] = step_by_step(flown["paper"][name]) if "paper" in flown else "Not flown yet."
     picture = "![How often policies ask: distance, approach, time, way to go, crowd](images/asking.png)"
     blocks["asking"] = picture if asking else "Not flown yet."
-    args.pages.mkdir(parents=True, exist_ok=True)
-    for path in PAGES:
-        (args.pages / path.name).write_text(fill(path.read_text(), blocks))
+    for page in PAGES:
+        target = args.pages / page.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(fill(page.read_text(), blocks))
     args.images.mkdir(parents=True, exist_ok=True)
     if rules:
         draw_fronts(rules, sweep, test, args.images / "fronts.png")
