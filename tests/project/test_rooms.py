@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SOURCES = {"sb3_maddpg": ROOT / "sb3_maddpg", "quad_swarm": ROOT / "envs" / "quad_swarm"}
 
-# What a room of quad_swarm may import beside itself. "" are the modules in the folder of the package: errors, geometry, ...
+# What a room of quad_swarm may import beside itself. "" are the modules in the package folder: errors, geometry, ...
 ROOMS = {
     "": set(),
     "planner": {""},
