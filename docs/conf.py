@@ -33,8 +33,9 @@ def _headings(app, what, name, obj, options, lines: list[str]) -> None:
 
 def _links(app, docname: str, source: list[str]) -> None:
     """Files that lie above this folder have a page here."""
+    folder = "../" * docname.count("/")
     for name in ("CONTRIBUTING", "CHANGELOG"):
-        source[0] = source[0].replace(f"](../{name}.md", f"]({name.lower()}.md")
+        source[0] = source[0].replace(f"]({folder}../{name}.md", f"]({folder}{name.lower()}.md")
 
 
 def setup(app) -> None:

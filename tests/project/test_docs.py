@@ -1,4 +1,4 @@
-"""The pages of the learner: examples run, links lead somewhere, tables of arguments are those of the code."""
+"""The pages of the site: examples run, links lead somewhere, tables of arguments are those of the code."""
 
 import inspect
 import re
@@ -16,7 +16,7 @@ from sb3_maddpg.estimators import ESTIMATORS
 ROOT = Path(__file__).parents[2]
 LEARNER = ("maddpg", "matd3", "pettingzoo", "relational", "migration", "support")
 SITE = ("quickstart", "tensorboard", "tutorials/swarm", "tutorials/pettingzoo")
-NO_LEARNING = ("tutorials/scenario", "tutorials/rule", "tutorials/reading", "index", "faq")
+NO_LEARNING = ("tutorials/scenario", "tutorials/rule", "tutorials/reading", "planner", "index", "faq")
 PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (*LEARNER, *SITE, *NO_LEARNING)))
 STEPS, LEARNING_STARTS, BATCH_SIZE = 300, 100, 64
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -1,0 +1,149 @@
+"""The rooms of the house, as CONTRIBUTING.md describes them: who imports whom, and where a module's test lies.
+
+Imports are read from the source, those inside functions included.
+"""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCES = {"sb3_maddpg": ROOT / "sb3_maddpg", "quad_swarm": ROOT / "envs" / "quad_swarm"}
+
+# What a room of quad_swarm may import beside itself. "" are the modules in the package folder: errors, geometry, ...
+ROOMS = {
+    "": set(),
+    "planner": {""},
+    "world": {"", "planner"},
+    "task": {"", "planner", "world"},
+    "interfaces": {"", "planner", "world", "task"},
+    "evaluation": {"", "planner", "world", "task"},
+    "figures": {"", "planner", "world", "task", "evaluation"},
+    "models": set(),
+}
+# Drawing is optional, so whoever draws imports figures inside a function, where it is asked for.
+DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command"}
+
+NEED_NO_TEST = {"sb3_maddpg.__main__", "quad_swarm.figures.colours", "quad_swarm.errors"}
+# Modules that have no test file of their own yet, and the file that covers them.
+TESTED_ELSEWHERE = {
+    "quad_swarm.evaluation.evaluation": "tests/quad_swarm/evaluation/test_command.py",
+    "quad_swarm.figures.plots": "tests/quad_swarm/evaluation/test_command.py",
+    "quad_swarm.figures.render": "tests/quad_swarm/interfaces/test_env.py",
+    "quad_swarm.geometry": "tests/quad_swarm/world/test_beliefs.py",
+    "quad_swarm.interfaces.parallel_env": "tests/quad_swarm/interfaces/test_env.py",
+    "quad_swarm.planner.base": "tests/quad_swarm/planner/test_planner.py",
+    "quad_swarm.planner.fatrop": "tests/quad_swarm/planner/test_planner.py",
+    "quad_swarm.planner.problem": "tests/quad_swarm/planner/test_planner.py",
+    "quad_swarm.planner.rti.codegen": "tests/quad_swarm/planner/rti/test_solver.py",
+    "quad_swarm.task.episode_statistics": "tests/quad_swarm/interfaces/test_env.py",
+    "quad_swarm.task.request_task": "tests/quad_swarm/interfaces/test_vector_env.py",
+    "quad_swarm.task.view": "tests/quad_swarm/task/test_rules.py",
+    "quad_swarm.world.presets": "tests/quad_swarm/world/test_swarm.py",
+    "sb3_maddpg.cli.bench": "tests/sb3_maddpg/cli/test_commands.py",
+    "sb3_maddpg.cli.experiment": "tests/sb3_maddpg/cli/test_zoo.py",
+    "sb3_maddpg.cli.options": "tests/sb3_maddpg/cli/test_commands.py",
+    "sb3_maddpg.team_tasks": "tests/sb3_maddpg/test_learning.py",
+    "sb3_maddpg.utils": "tests/sb3_maddpg/test_save_load.py",
+}
+
+
+def modules(package: str) -> dict[str, Path]:
+    """:return: a package's modules by name; an ``__init__`` has the name of its folder"""
+    folder = SOURCES[package]
+    names = {}
+    for path in sorted(folder.rglob("*.py")):
+        parts = path.relative_to(folder).with_suffix("").parts
+        names[".".join((package, *(part for part in parts if part != "__init__")))] = path
+    return names
+
+
+ALL = {name: path for package in SOURCES for name, path in modules(package).items()}
+
+
+def imports(name: str, tree: ast.AST) -> set[str]:
+    """:return: the modules of the project that a module imports, by full name"""
+    found = set()
+    folder = name if ALL[name].name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parents = folder.split(".")[: len(folder.split(".")) - node.level + 1]
+            source = ".".join((*parents, *filter(None, [node.module]))) if node.level else node.module
+            found |= {f"{source}.{alias.name}" if f"{source}.{alias.name}" in ALL else source for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            found |= {arg.value for arg in node.args if isinstance(arg, ast.Constant)}
+    return {one for one in found if one.partition(".")[0] in {*SOURCES, "studies", "benchmarks", "tests"}}
+
+
+def imports_of(name: str) -> set[str]:
+    return imports(name, ast.parse(ALL[name].read_text(encoding="utf-8")))
+
+
+def room(name: str) -> str:
+    """:return: the folder of a module of quad_swarm; that of the package's ``__init__`` is "top" """
+    parts = name.split(".")
+    if len(parts) == 1:
+        return "top"
+    return parts[1] if parts[1] in ROOMS else ""
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_package_imports_itself_only(name):
+    package = name.partition(".")[0]
+    assert {one.partition(".")[0] for one in imports_of(name)} <= {package}
+
+
+@pytest.mark.parametrize("name", [name for name in modules("sb3_maddpg") if not name.startswith("sb3_maddpg.cli")])
+def test_the_library_does_not_import_its_command_line(name):
+    if name != "sb3_maddpg.__main__":
+        assert not [one for one in imports_of(name) if one.startswith("sb3_maddpg.cli")]
+
+
+@pytest.mark.parametrize("name", [name for name in modules("quad_swarm") if name != "quad_swarm"])
+def test_a_room_imports_what_lies_below_it(name):
+    allowed = {room(name), *ROOMS[room(name)]}
+    if name in DRAW_ON_REQUEST:
+        allowed.add("figures")
+    beyond = {one for one in imports_of(name) if room(one) not in allowed}
+    assert not beyond, f"{name} may import {sorted(allowed)}"
+
+
+@pytest.mark.parametrize("name", sorted(DRAW_ON_REQUEST))
+def test_figures_are_imported_on_request_only(name):
+    tree = ast.parse(ALL[name].read_text(encoding="utf-8"))
+    top = ast.Module([node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))], [])
+    assert not [one for one in imports(name, top) if room(one) == "figures"]
+
+
+def test_every_folder_of_the_swarm_is_a_room_with_a_rule():
+    folders = {path.parent.name for path in SOURCES["quad_swarm"].glob("*/__init__.py")}
+    assert folders == set(ROOMS) - {""}
+
+
+def test_of(name: str) -> str:
+    """:return: where the test of a module lies, relative to the root"""
+    package, *folders, module = name.split(".")
+    return "/".join(("tests", package, *folders, f"test_{module}.py"))
+
+
+test_of.__test__ = False
+
+
+def test_every_module_has_its_test_file():
+    named = {name for name, path in ALL.items() if path.name != "__init__.py"} - NEED_NO_TEST
+    without = {name for name in named if not (ROOT / test_of(name)).exists()}
+    assert without <= set(TESTED_ELSEWHERE), "write " + ", ".join(map(test_of, sorted(without - set(TESTED_ELSEWHERE))))
+    assert without >= set(TESTED_ELSEWHERE), "they have a test file now, or are gone: strike them off TESTED_ELSEWHERE"
+    assert all((ROOT / path).exists() for path in TESTED_ELSEWHERE.values())
+
+
+def test_the_guide_names_every_room():
+    guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    paths = set(re.findall(r"^\| `([\w/]+/)`", guide, re.MULTILINE))
+    rooms = {f"envs/quad_swarm/{room}/" for room in ROOMS if room}
+    assert {"sb3_maddpg/", "sb3_maddpg/cli/", "envs/quad_swarm/", *rooms} <= paths
+    assert all((ROOT / path).is_dir() for path in paths)
