@@ -4,8 +4,8 @@ import argparse
 
 import numpy as np
 
+from quad_swarm.evaluation import Condition, evaluate
 from quad_swarm.evaluation.command import format_table
-from quad_swarm.evaluation.evaluation import Cell, evaluate
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
@@ -43,5 +43,5 @@ worlds = {
 }
 for name, config in worlds.items():
     policies = ("none", "full", "cpa:0.7:1.5", "crowded:2.5:2")
-    cells = [Cell(policy, "gate", config, 100, "sb3_maddpg:MADDPG", "auto") for policy in policies]
-    print(f"{name}:\n{format_table(evaluate(cells, episodes=5 if quick else 200))}\n")
+    conditions = [Condition(policy, "gate", config) for policy in policies]
+    print(f"{name}:\n{format_table(evaluate(conditions, episodes=5 if quick else 200))}\n")

@@ -29,7 +29,6 @@ DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command"}
 NEED_NO_TEST = {"sb3_maddpg.__main__", "quad_swarm.figures.colours", "quad_swarm.errors"}
 # Modules that have no test file of their own yet, and the file that covers them.
 TESTED_ELSEWHERE = {
-    "quad_swarm.evaluation.evaluation": "tests/quad_swarm/evaluation/test_command.py",
     "quad_swarm.figures.plots": "tests/quad_swarm/evaluation/test_command.py",
     "quad_swarm.figures.render": "tests/quad_swarm/interfaces/test_env.py",
     "quad_swarm.geometry": "tests/quad_swarm/world/test_beliefs.py",

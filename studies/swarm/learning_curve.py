@@ -1,4 +1,4 @@
-"""Draw how training went: ``python docs/learning_curve.py RUN [RUN ...] --out curve.png``.
+"""Draw how training went: ``python -m studies.swarm.learning_curve RUN [RUN ...] --out curve.png``.
 
 A RUN is a folder that `sb3-maddpg train` made, with its `evaluations.npz`; several seeds of one recipe
 give a mean and the range between the worst and the best.
