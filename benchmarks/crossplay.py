@@ -1,6 +1,6 @@
 """Whose agents win: the agents that learning.py has trained, of all libraries, against each other.
 
-``python benchmarks/crossplay.py [--json F]`` after ``python benchmarks/learning.py --peers``. In tag and adversary one
+``python -m benchmarks.crossplay [--json F]`` after ``python -m benchmarks.learning --peers``. In tag and adversary one
 side gains what the other loses, and both learn, so a library's return against its own agents does not say how good
 they are. Here the side of every training meets the other side of every training, of its own library and the others,
 in the same episodes without exploration. For each side and library:
@@ -23,12 +23,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
-# So that scripts find each other by the names mypy knows them by
-sys.path[0] = str(Path(__file__).resolve().parent.parent)
-sys.path.append(str(Path(__file__).resolve().parent / "peers"))
-
-import common  # noqa: E402
-from benchmarks.learning import EVERYTHING, FOLDER, OURS, actors_of, interval, read, sides, welch, write  # noqa: E402
+from benchmarks.learning import EVERYTHING, FOLDER, OURS, actors_of, interval, read, sides, welch, write
+from benchmarks.peers import common
 
 COMPETITIVE = ("simple_tag_v3", "simple_adversary_v3")
 EPISODES = range(10_000, 10_100)
@@ -262,7 +258,7 @@ def main() -> None:
             key=lambda training: (EVERYTHING.index(training[0]), training[1]),
         )
         if not trainings:
-            print(f"No trainings of {name}: python benchmarks/learning.py --peers", file=sys.stderr)
+            print(f"No trainings of {name}: python -m benchmarks.learning --peers", file=sys.stderr)
             continue
         print(f"{name}: {len(trainings)} trainings", file=sys.stderr, flush=True)
         rows += summarise(name, trainings, play(name, trainings, args.folder, EPISODES))

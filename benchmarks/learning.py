@@ -1,6 +1,6 @@
 """How well MADDPG learns here and in other libraries, on the tasks of Lowe et al. (mpe2, continuous actions).
 
-``python benchmarks/learning.py [--json F]`` trains ours and the plain loop; with ``--peers`` all libraries, which
+``python -m benchmarks.learning [--json F]`` trains ours and the plain loop; with ``--peers`` all libraries, which
 ``make bench-peers`` installs. Every training has the settings of benchmarks/peers/common.py, one core and one thread.
 Each that has ended is a line of runs.jsonl in ``--folder``, beside its policies: the script trains only what is not
 there yet, so it can be stopped and called again. Rows, for each task, side and library:
@@ -27,10 +27,7 @@ from typing import Any
 import numpy as np
 from scipy import stats  # type: ignore[import-untyped]
 
-# So that scripts find each other by the names mypy knows them by
-sys.path[0] = str(Path(__file__).resolve().parent.parent)
-
-from benchmarks.training import DRIVERS, OURS, REFERENCE, ROOT, machine, missing, python_of  # noqa: E402
+from benchmarks.training import DRIVERS, OURS, REFERENCE, ROOT, machine, missing, python_of
 
 TASKS = ("simple_speaker_listener_v4", "simple_tag_v3", "simple_adversary_v3", "simple_spread_v3")
 TWIN = "matd3"
