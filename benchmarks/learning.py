@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from scipy import stats  # type: ignore[import-untyped]
 
-from benchmarks.training import DRIVERS, OURS, REFERENCE, ROOT, machine, missing, python_of
+from benchmarks.training import OURS, REFERENCE, ROOT, machine, missing, python_of
 
 TASKS = ("simple_speaker_listener_v4", "simple_tag_v3", "simple_adversary_v3", "simple_spread_v3")
 TWIN = "matd3"
@@ -97,11 +97,11 @@ def train(name: str, env: str, seed: int, steps: int, folder: Path, core: int | 
 
     :raises RuntimeError: it failed
     """
-    command = [str(python_of(name)), str(DRIVERS / f"{name}_bench.py"), "learn", "--env", env]
+    command = [str(python_of(name)), "-m", f"benchmarks.peers.{name}_bench", "learn", "--env", env]
     command += ["--steps", str(steps), "--seed", str(seed), "--export", str(actors_of(folder, name, env, seed, steps))]
     command += [] if core is None else ["--core", str(core)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    run = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT, check=False)
     if run.returncode:
         raise RuntimeError(f"{name}, {env}, seed {seed}: {' '.join(command)}\n{run.stderr[-2000:]}")
     return {"driver": name, **json.loads(run.stdout.splitlines()[-1]), "machine": machine()}

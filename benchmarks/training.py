@@ -26,7 +26,6 @@ from statistics import median
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-DRIVERS = ROOT / "benchmarks" / "peers"
 OURS, REFERENCE, PEERS = "ours", "plain", ("agilerl", "benchmarl", "xuance")
 RATES = ("updates_per_s", "steps_per_s_100", "steps_per_s_1")
 AMOUNTS = {"updates": 300, "steps-100": 5_000, "steps-1": 400}
@@ -54,11 +53,11 @@ def measure(name: str, networks: str, amounts: Mapping[str, int], core: int | No
 
     :raises RuntimeError: it failed
     """
-    command = [str(python_of(name)), str(DRIVERS / f"{name}_bench.py"), "speed", "--networks", networks]
+    command = [str(python_of(name)), "-m", f"benchmarks.peers.{name}_bench", "speed", "--networks", networks]
     for option, value in [*amounts.items(), *([] if core is None else [("core", core)])]:
         command += [f"--{option}", str(value)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    run = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT, check=False)
     if run.returncode:
         raise RuntimeError(f"{name}, {networks}: {' '.join(command)}\n{run.stderr[-2000:]}")
     return json.loads(run.stdout.splitlines()[-1])

@@ -17,7 +17,7 @@ from agilerl.training.train_multi_agent_off_policy import train_multi_agent_off_
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 from torch import nn
 
-import common
+from benchmarks.peers import common
 
 # Its actors answer in [-1, 1], twice as wide as the actions
 NOISE = common.SIGMA_START + common.SIGMA_END

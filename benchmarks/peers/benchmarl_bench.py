@@ -14,7 +14,7 @@ import torch as th
 from tensordict import TensorDict
 from torch import nn
 
-import common
+from benchmarks.peers import common
 
 common.restore_pettingzoo_mpe()
 

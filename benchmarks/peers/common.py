@@ -2,8 +2,8 @@
 
 A driver runs in the Python of its own library and prints one line of JSON::
 
-    python benchmarks/peers/xuance_bench.py speed --networks separate
-    python benchmarks/peers/xuance_bench.py learn --env simple_tag_v3 --steps 100000 --seed 0 --export actors
+    python -m benchmarks.peers.xuance_bench speed --networks separate
+    python -m benchmarks.peers.xuance_bench learn --env simple_tag_v3 --steps 100000 --seed 0 --export actors
 
 With ``--export`` it leaves each agent's policy as a TorchScript program, so that other libraries' agents can play with
 it. It stays on one core and one thread, works in a scratch directory, and sends all that the library prints to stderr.

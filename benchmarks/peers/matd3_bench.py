@@ -5,7 +5,7 @@ Not like for like: twin critics, an actor that learns every second time, and noi
 
 from ours_bench import Ours
 
-import common
+from benchmarks.peers import common
 from sb3_maddpg import MATD3
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from torch import nn
 
-import common
+from benchmarks.peers import common
 from sb3_maddpg import MADDPG
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-import common
+from benchmarks.peers import common
 
 
 def mlp(inputs: int, outputs: int) -> nn.Sequential:

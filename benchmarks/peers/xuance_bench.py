@@ -13,7 +13,7 @@ import xuance
 import yaml
 from torch import nn
 
-import common
+from benchmarks.peers import common
 
 common.restore_pettingzoo_mpe()
 
