@@ -3,9 +3,8 @@
 Not like for like: twin critics, an actor that learns every second time, and noise on target actions.
 """
 
-from ours_bench import Ours
-
 from benchmarks.peers import common
+from benchmarks.peers.ours_bench import Ours
 from sb3_maddpg import MATD3
 
 
