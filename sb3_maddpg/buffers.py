@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg.team import InfoKey, Team, heads_of
+from sb3_maddpg.utils import all_finite
 
 
 class TeamReplayBufferSamples(NamedTuple):
@@ -230,7 +231,7 @@ class TeamReplayBuffer(ReplayBuffer):
         some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
         if self.n_pairs:
             self._read_infos("pair_rewards", new.pair_rewards, infos, None)
-        if not _all_finite(self._new):
+        if not all_finite(self._new):
             self._refuse_numbers(infos)
 
         pos = self.pos
@@ -265,7 +266,7 @@ class TeamReplayBuffer(ReplayBuffer):
                 f"{self.n_agents} agents: it must be {shape}. A buffer fits only the team and the number of "
                 "environments that it was made for."
             )
-        if _all_finite(values):
+        if all_finite(values):
             return
         with np.errstate(over="ignore"):
             values = values.reshape(shape).astype(np.float32)
@@ -582,17 +583,6 @@ class SumTree:
             rest -= left * goes_right
             nodes += goes_right
         return nodes - (1 << self.depth), self.sums[nodes] / self.sums[1]
-
-
-def _all_finite(values: np.ndarray) -> bool:
-    """Whether all are finite numbers in the networks' single precision."""
-    if values.dtype != np.float32:
-        if values.dtype.kind != "f":
-            return True
-        with np.errstate(over="ignore"):
-            values = values.astype(np.float32)
-    # One quick look at all of them. Large numbers fail it too, and pass the thorough one
-    return math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
 
 
 def _check_arguments(

@@ -3,12 +3,15 @@
 import difflib
 import inspect
 import json
+import math
+import operator
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -91,3 +94,34 @@ def arguments_of(cls: type) -> set[str]:
             if not further:
                 break
     return names - {"self"}
+
+
+def all_finite(values: np.ndarray) -> bool:
+    """
+    :param values: any shape
+    :return: whether all are finite numbers in the networks' single precision
+    """
+    if values.dtype != np.float32:
+        if values.dtype.kind != "f":
+            return True
+        with np.errstate(over="ignore"):
+            values = values.astype(np.float32)
+    # One quick look at all of them. Large numbers fail it too, and pass the thorough one
+    return math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
+
+
+def as_seed(seed: Any) -> int | None:
+    """
+    :param seed: None, or an integer of any type
+    :return: the same as Gymnasium takes it
+    :raises ValueError: anything else
+    """
+    if seed is None:
+        return None
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise ValueError(f"seed={seed!r} must be an integer of at least 0, or None.")
+    return number
