@@ -1,6 +1,7 @@
 """Small helpers shared by the algorithm, its policy, its buffer and the zoo."""
 
 import difflib
+import errno
 import inspect
 import json
 import math
@@ -62,21 +63,41 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
 
     :param path: where to write; missing folders are made
     :param suffix: added to a path without suffix, as Stable-Baselines3 does
+    :raises OSError: the path is a folder or cannot be written, said before anything is done
     """
     target = Path(path)
     if not target.suffix:
         target = Path(f"{target}.{suffix}")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # In the same folder, because a file cannot be renamed across file systems.
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "This is a folder: name a file in it", str(target))
+    # In the same folder, because a file cannot be renamed across file systems
     temporary = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        with temporary.open("wb") as file:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        file = temporary.open("wb")
+    except OSError as error:
+        reason = f"Cannot write here ({error.strerror}): choose another folder"
+        raise OSError(error.errno, reason, str(target)) from error
+    try:
+        with file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, target)
+        _sync_folder(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Without it the new name of a file may be gone after a loss of power."""
+    if os.name == "nt":  # folders cannot be opened there
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def arguments_of(cls: type) -> set[str]:
