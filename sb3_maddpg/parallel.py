@@ -8,6 +8,7 @@ import math
 import pkgutil
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -248,8 +249,9 @@ class TeamEnv(gymnasium.Env):
             ) from None
 
     def _number(self, agent: Any, reward: Any) -> float:
-        if isinstance(reward, (int, float, np.number, np.bool_)) or getattr(reward, "shape", None) == ():
-            return float(reward)
+        if isinstance(reward, (int, float)) or getattr(reward, "shape", None) == ():
+            with suppress(TypeError, ValueError, OverflowError):
+                return float(reward)
         raise ValueError(
             f"{self.parallel_env} gave a reward of {_short(reward)} for agent {agent!r} {self._when}: a reward must be "
             "a number."
@@ -323,7 +325,7 @@ class TeamEnv(gymnasium.Env):
                 if fits:
                     flat = observation if isinstance(space, spaces.Box) else flatten(space, observation)
                     matrix[row, :length] = np.asarray(flat).reshape(-1)
-            except (TypeError, ValueError, LookupError):
+            except (TypeError, ValueError, LookupError, OverflowError):
                 fits = False
             if not fits:
                 shape = getattr(observation, "shape", None)
@@ -465,10 +467,12 @@ def _space_of(env: ParallelEnv, kind: str, agent: Any) -> spaces.Space:
 def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
     try:
         flat = flatten_space(space)
-    except NotImplementedError:
+    except (NotImplementedError, ValueError):  # of a space that is not known, or empty
         flat = space
     if not isinstance(flat, spaces.Box):
-        raise ValueError(f"The space that {what}, {space}, has no fixed length and cannot become a row of numbers.")
+        raise ValueError(
+            f"The space that {what}, {space}, is empty or has no fixed length and cannot become a row of numbers."
+        )
     if not np.prod(flat.shape):
         raise ValueError(f"The space that {what}, {space}, is empty: where there is nothing, give Box(0, 1, (1,)).")
     return flat

@@ -239,6 +239,7 @@ def test_a_terminated_agent_need_not_see_its_end():
         (Broken(action_space=lambda agent: spaces.Box(0, 1, (0,))), "at least one number"),
         (Broken(observation_space=lambda agent: spaces.Sequence(spaces.Discrete(2))), "agent 'a' observes.*no fixed"),
         (Broken(observation_space=lambda agent: spaces.Box(0, 1, (0,))), "agent 'a' observes.*is empty"),
+        (Broken(observation_space=lambda agent: spaces.Dict({})), "agent 'a' observes.*is empty"),
         (Broken(observation_space=lambda agent: {}[agent]), r"observation_space\('a'\) of script failed \(KeyError"),
         (Broken(action_space=lambda agent: None), r"action_space\('a'\) of script is None"),
         (Broken(possible_agents=3), "possible_agents"),
