@@ -270,10 +270,11 @@ class TeamReplayBuffer(ReplayBuffer):
             return
         with np.errstate(over="ignore"):
             values = values.reshape(shape).astype(np.float32)
-        env, *place = np.argwhere(~np.isfinite(values))[0].tolist()
+        index = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
+        env, *place = index
         agent, column = place if what != "action" else self._place_of_action(place[0])
         raise ValueError(
-            f"The {what} of agent {agent} ({self.team.names[agent]}) is {values[(env, *place)]} in column {column}, "
+            f"The {what} of agent {agent} ({self.team.names[agent]}) is {values[index]} in column {column}, "
             f"{self._where(env)}: it must be finite. {_REMEDY_ACTION if what == 'action' else _REMEDY}"
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium
@@ -74,7 +75,7 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         if not all_finite(np.asarray(obs)):
             agent = np.argwhere(~np.isfinite(obs))[0][0]
             raise ValueError(f"The observation of agent {team.names[agent]} {where} holds NaN or infinity.")
-        if not np.isfinite(reward):
+        if not math.isfinite(reward):
             raise ValueError(f"The team's reward {where} is {reward}: it must be finite.")
         _check_info(info, team, where)
         acts = np.asarray(info.get("agent_active", ~gone), bool)

@@ -216,9 +216,9 @@ class TeamEnv(gymnasium.Env):
 
     def _parts(self, method: str, returned: Any) -> Sequence[Mapping[Any, Any]]:
         """The dicts that the environment returned, ``infos`` empty where it gives none."""
-        names = ("observations", "infos")
+        names = ["observations", "infos"]
         if method == "step":
-            names = ("observations", "rewards", "terminations", "truncations", "infos")
+            names = ["observations", "rewards", "terminations", "truncations", "infos"]
         if not isinstance(returned, (tuple, list)) or len(returned) != len(names):
             raise ValueError(
                 f"{method}() of {self.parallel_env} returned {_short(returned)}: it must return ({', '.join(names)})."
@@ -448,9 +448,12 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
     return agents
 
 
-def _space_of(env: ParallelEnv, kind: str, agent: Any) -> spaces.Space:
+def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:
     """
+    :param env: the environment
     :param kind: "observation_space" or "action_space"
+    :param agent: of the environment
+    :raises ValueError: there is none
     """
     try:
         space = getattr(env, kind)(agent)
@@ -465,6 +468,7 @@ def _space_of(env: ParallelEnv, kind: str, agent: Any) -> spaces.Space:
 
 
 def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
+    flat: spaces.Space
     try:
         flat = flatten_space(space)
     except (NotImplementedError, ValueError):  # of a space that is not known, or empty
