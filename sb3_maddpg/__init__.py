@@ -1,10 +1,11 @@
-"""MADDPG for Stable-Baselines3: decentralised actors, centralised critics, every kind of action."""
+"""MADDPG for Stable-Baselines3: decentralised actors, centralised critics, all kinds of actions."""
 
 from importlib.metadata import version
 
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
+from sb3_maddpg.env_checker import check_team_env
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.parallel import TeamEnv
@@ -25,5 +26,6 @@ __all__ = [
     "PrioritizedTeamReplayBuffer",
     "TeamEnv",
     "TeamReplayBuffer",
+    "check_team_env",
     "pretrained",
 ]

@@ -1,4 +1,4 @@
-"""Replay buffers of a team."""
+"""Replay buffers of a team, uniform and prioritised."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_maddpg.team import Team
+from sb3_maddpg.team import InfoKey, Team, heads_of
+from sb3_maddpg.utils import all_finite
 
 
 class TeamReplayBufferSamples(NamedTuple):
@@ -45,6 +46,28 @@ class TeamReplayBufferSamples(NamedTuple):
     weights: th.Tensor | None = None
 
 
+class _Columns(NamedTuple):
+    """Views of what is kept of transitions besides observations and actions, each (..., its own shape)."""
+
+    agent_rewards: np.ndarray
+    agent_terminated: np.ndarray
+    agent_active: np.ndarray
+    rewards: np.ndarray
+    dones: np.ndarray
+    timeouts: np.ndarray
+    cuts: np.ndarray
+    """Where the environment went on elsewhere without an end, as when learn() is called again"""
+    pair_rewards: np.ndarray
+
+
+# Attributes that are not pickled, because they lie in the records or are made of them
+_VIEWS = {"observations", "next_observations", "actions", "numbers", *_Columns._fields, "_new", "_new_columns"}
+_REMEDY = (
+    "Look there for a division by zero or a simulation that diverged, end the episode before it does, or bound it."
+)
+_REMEDY_ACTION = "Look for networks that diverged (lower learning_rate) or a Box whose bounds are equal or too large."
+
+
 class TeamReplayBuffer(ReplayBuffer):
     """
     SB3's replay buffer with rewards and ends of each agent, which come from ``infos``:
@@ -55,12 +78,15 @@ class TeamReplayBuffer(ReplayBuffer):
     - ``pair_rewards`` (n_agents, n_pairs), needed if ``n_pairs`` is set: the part of an agent's reward that belongs to
       each of its neighbours.
 
-    A time limit ends no agent's return. With ``n_steps`` > 1 rewards are summed over a window of that many
-    transitions. It stops early at the end of the episode, at the newest transition and where an agent drops out
-    without having terminated, for all agents, since they share the next observation; the sum of an agent that
-    terminates stops there while those of the others go on.
+    Time limits are treated as truncation: targets still bootstrap from the next observation. With ``n_steps`` > 1
+    rewards are summed over a window of that many transitions. It stops early at the end of the episode, at the newest
+    transition and where an agent is truncated (inactive without having terminated), for all agents, since they share
+    the next observation; the sum of an agent that terminates stops there while those of the others go on.
 
-    ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running spread of the team's return.
+    ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running standard deviation of the team's
+    return.
+
+    Nothing that is NaN or infinite is stored: ``add`` refuses it, and the buffer stays as it was.
 
     All arrays are views into ``records``, (buffer_size, n_envs), so that one transition lies in one place.
 
@@ -74,15 +100,8 @@ class TeamReplayBuffer(ReplayBuffer):
     :param n_steps: how many rewards to sum before the value of the next observation is used
     :param gamma: discount factor
     :param n_pairs: number of neighbours of an agent with a reward of their own, 0 if there are no such rewards
+    :raises ValueError: spaces that describe no team, or an argument out of its range
     """
-
-    records: np.ndarray
-    numbers: np.ndarray
-    agent_rewards: np.ndarray
-    agent_terminated: np.ndarray
-    agent_active: np.ndarray
-    pair_rewards: np.ndarray
-    cuts: np.ndarray
 
     def __init__(
         self,
@@ -98,7 +117,7 @@ class TeamReplayBuffer(ReplayBuffer):
         n_pairs: int = 0,
     ):
         self.team = Team.from_spaces(observation_space, action_space)
-        _check_arguments(n_steps, gamma, n_pairs, optimize_memory_usage)
+        _check_arguments(buffer_size, n_envs, n_steps, gamma, n_pairs, optimize_memory_usage)
         super().__init__(
             buffer_size,
             observation_space,
@@ -113,6 +132,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self.gamma = gamma
         self.n_pairs = n_pairs
         self.all_active = True
+        self.n_added = 0
         names = ["observations", "actions"]
         if not optimize_memory_usage:
             names.append("next_observations")
@@ -123,31 +143,43 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def _use(self, records: np.ndarray) -> None:
         self.records = records
-        views = {name: records[name] for name in records.dtype.names or ()}
-        views |= self._columns(views["numbers"])
-        self._views = tuple(views)
-        self.__dict__.update(views)
+        self.observations = records["observations"]
+        self.actions = records["actions"]
+        if not self.optimize_memory_usage:
+            self.next_observations = records["next_observations"]
+        self.numbers = records["numbers"]
+        columns = self._columns(self.numbers)
+        self.agent_rewards = columns.agent_rewards
+        self.agent_terminated = columns.agent_terminated
+        self.agent_active = columns.agent_active
+        self.rewards = columns.rewards
+        self.dones = columns.dones
+        self.timeouts = columns.timeouts
+        self.cuts = columns.cuts
+        self.pair_rewards = columns.pair_rewards
+        # The numbers of a transition that is being added, stored once they are known to be finite
+        self._new = np.zeros(self.numbers.shape[1:], np.float32)
+        self._new_columns = self._columns(self._new)
 
-    def _columns(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
+    def _columns(self, numbers: np.ndarray) -> _Columns:
         """
         :param numbers: what is kept of transitions besides observations and actions, in the last axis
         :return: views of it
         """
         n = self.n_agents
-        return {
-            "agent_rewards": numbers[..., :n],
-            "agent_terminated": numbers[..., n : 2 * n],
-            "agent_active": numbers[..., 2 * n : 3 * n],
-            "rewards": numbers[..., 3 * n],
-            "dones": numbers[..., 3 * n + 1],
-            "timeouts": numbers[..., 3 * n + 2],
-            # Where the environment went on elsewhere without an end, as when learn() is called again
-            "cuts": numbers[..., 3 * n + 3],
-            "pair_rewards": numbers[..., 3 * n + 4 :].reshape(*numbers.shape[:-1], n, self.n_pairs),
-        }
+        return _Columns(
+            agent_rewards=numbers[..., :n],
+            agent_terminated=numbers[..., n : 2 * n],
+            agent_active=numbers[..., 2 * n : 3 * n],
+            rewards=numbers[..., 3 * n],
+            dones=numbers[..., 3 * n + 1],
+            timeouts=numbers[..., 3 * n + 2],
+            cuts=numbers[..., 3 * n + 3],
+            pair_rewards=numbers[..., 3 * n + 4 :].reshape(*numbers.shape[:-1], n, self.n_pairs),
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        state = {name: value for name, value in self.__dict__.items() if name not in self._views}
+        state = {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
         # The part in use. Without next_observations the last of them stands one further
         state["records"] = self.records[: self.size() + int(self.optimize_memory_usage)]
         return state
@@ -163,6 +195,7 @@ class TeamReplayBuffer(ReplayBuffer):
     def reset(self) -> None:
         super().reset()
         self.all_active = True
+        self.n_added = 0
 
     def add(
         self,
@@ -182,8 +215,25 @@ class TeamReplayBuffer(ReplayBuffer):
         :param reward: (n_envs,), the team's
         :param done: (n_envs,), whether the episode ended or was cut off
         :param infos: of each environment
-        :raises ValueError: an entry of ``infos`` has another shape than it must, is missing or not finite
+        :raises ValueError: a shape that does not fit, a missing entry of ``infos``, or NaN or infinity anywhere
         """
+        team = (self.n_envs, *self.obs_shape)
+        self._check("observation", obs, team)
+        self._check("next observation", next_obs, team)
+        self._check("action", action, (self.n_envs, self.action_dim))
+        new = self._new_columns
+        new.rewards[:] = reward
+        new.dones[:] = done
+        if self.handle_timeout_termination:
+            new.timeouts[:] = [info.get("TimeLimit.truncated", False) for info in infos]
+        self._read_infos("agent_rewards", new.agent_rewards, infos, new.rewards[:, None])
+        self._read_infos("agent_terminated", new.agent_terminated, infos, 0.0)
+        some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
+        if self.n_pairs:
+            self._read_infos("pair_rewards", new.pair_rewards, infos, None)
+        if not all_finite(self._new):
+            self._refuse_numbers(infos)
+
         pos = self.pos
         self.observations[pos] = obs
         if self.optimize_memory_usage:
@@ -191,35 +241,62 @@ class TeamReplayBuffer(ReplayBuffer):
         else:
             self.next_observations[pos] = next_obs
         self.actions[pos] = action.reshape(self.n_envs, self.action_dim)
-        self.rewards[pos] = reward
-        self.dones[pos] = done
-        if self.handle_timeout_termination:
-            self.timeouts[pos] = [info.get("TimeLimit.truncated", False) for info in infos]
-        self._add_infos("agent_rewards", infos, self.rewards[pos, :, None])
-        self._add_infos("agent_terminated", infos, 0.0)
-        if self._add_infos("agent_active", infos, 1.0) and self.all_active:
-            self.all_active = bool(self.agent_active[pos].all())
-        if self.n_pairs:
-            self._add_infos("pair_rewards", infos, None)
-        numbers = self.numbers[pos]
-        # One quick look at all of them. Large numbers fail it too, and pass the thorough one
-        if not math.isfinite(np.vdot(numbers, numbers)):
-            self._check_finite(infos)
+        self.numbers[pos] = self._new
+        if some_say and self.all_active:
+            self.all_active = bool(new.agent_active.all())
         if self.n_steps > 1:
             self.cuts[pos - 1] = (self.next_observations[pos - 1] != self.observations[pos]).any(axis=(1, 2))
+        self.n_added += 1
         self.pos += 1
         if self.pos == self.buffer_size:
             self.full = True
             self.pos = 0
 
-    def _add_infos(self, key: str, infos: Sequence[dict[str, Any]], default: np.ndarray | float | None) -> bool:
+    def _check(self, what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
         """
-        :param key: of infos, and name of the array to write to
+        :param what: name of the values, for the error's message
+        :param values: of all environments, with an entry per agent, or the joint actions
+        :param shape: that they must have; actions may come in another one of the same size
+        :raises ValueError: another shape, or NaN or infinity
+        """
+        fits = values.shape == shape or (what == "action" and values.size == math.prod(shape))
+        if not fits or len(values) != self.n_envs:
+            raise ValueError(
+                f"The {what} has shape {values.shape}, but this replay buffer is for {self.n_envs} environment(s) of "
+                f"{self.n_agents} agents: it must be {shape}. A buffer fits only the team and the number of "
+                "environments that it was made for."
+            )
+        if all_finite(values):
+            return
+        with np.errstate(over="ignore"):
+            values = values.reshape(shape).astype(np.float32)
+        index = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
+        env, *place = index
+        agent, column = place if what != "action" else self._place_of_action(place[0])
+        raise ValueError(
+            f"The {what} of agent {agent} ({self.team.names[agent]}) is {values[index]} in column {column}, "
+            f"{self._where(env)}: it must be finite. {_REMEDY_ACTION if what == 'action' else _REMEDY}"
+        )
+
+    def _place_of_action(self, column: int) -> tuple[int, int]:
+        """:return: the agent, and the column in its own action, of a column of the joint action"""
+        ends = np.cumsum([len(heads_of(space)) for space in self.team.action_spaces])
+        agent = int(np.searchsorted(ends, column, side="right"))
+        return agent, column - (int(ends[agent - 1]) if agent else 0)
+
+    def _where(self, env: int) -> str:
+        return f"in environment {env} at step {self.n_added + 1} (counted since the replay buffer was made)"
+
+    def _read_infos(
+        self, key: InfoKey, array: np.ndarray, infos: Sequence[dict[str, Any]], default: np.ndarray | float | None
+    ) -> bool:
+        """
+        :param key: of infos
+        :param array: to write to, (n_envs, ...)
         :param infos: of each environment
         :param default: for environments that leave the key out, None if they must not
         :return: whether any environment has the key
         """
-        array = getattr(self, key)[self.pos]
         if len(infos) == 1 and getattr(infos[0].get(key), "shape", None) == array.shape[1:]:
             array[0] = infos[0][key]  # the common case, in a fraction of the time
             return True
@@ -238,15 +315,14 @@ class TeamReplayBuffer(ReplayBuffer):
         try:
             rows = np.array(values, np.float32)
         except (TypeError, ValueError):
-            self._check_shapes(key, values)
-            raise
+            self._check_shapes(key, values, array.shape[1:])
+            raise ValueError(f"info['{key}'] of {values} does not hold numbers.") from None
         if rows.shape[1:] != array.shape[1:]:
-            self._check_shapes(key, values)
+            self._check_shapes(key, values, array.shape[1:])
         array[where] = rows
         return True
 
-    def _check_shapes(self, key: str, values: Sequence[Any]) -> None:
-        needed = getattr(self, key).shape[2:]
+    def _check_shapes(self, key: InfoKey, values: Sequence[Any], needed: tuple[int, ...]) -> None:
         for value in values:
             if np.shape(value) != needed:
                 pairs = f" and n_pairs={self.n_pairs}" if key == "pair_rewards" else ""
@@ -256,18 +332,16 @@ class TeamReplayBuffer(ReplayBuffer):
                     f"the environment must give shape {needed}{remedy}."
                 )
 
-    def _check_finite(self, infos: Sequence[dict[str, Any]]) -> None:
-        for key in ("agent_rewards", "pair_rewards", "agent_terminated", "agent_active", "rewards"):
-            array = getattr(self, key)[self.pos]
+    def _refuse_numbers(self, infos: Sequence[dict[str, Any]]) -> None:
+        keys = ("agent_rewards", "pair_rewards", "agent_terminated", "agent_active", "rewards")
+        for key in keys:
+            array = getattr(self._new_columns, key)
             for index in np.argwhere(~np.isfinite(array)):
-                env, agent = index[0], index[-1 if key != "pair_rewards" else 1]
+                env, agent = index[0], index[1 if key != "rewards" else 0]
                 source = "The team's reward"
                 if key in infos[env]:
                     source = f"info['{key}'] of agent {agent} ({self.team.names[agent]})"
-                raise ValueError(
-                    f"{source} is {array[tuple(index)]} in environment {env}: it must be finite. Look there for a "
-                    "division by zero or a simulation that diverged, end the episode before it does, or bound it."
-                )
+                raise ValueError(f"{source} is {array[tuple(index)]} {self._where(env)}: it must be finite. {_REMEDY}")
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
@@ -308,7 +382,7 @@ class TeamReplayBuffer(ReplayBuffer):
             observations=self.to_torch(self._normalize_obs(batch["observations"], env)),  # type: ignore[arg-type]
             actions=self.to_torch(batch["actions"]),
             next_observations=self.to_torch(self._normalize_obs(next_obs, env)),  # type: ignore[arg-type]
-            active=None if self.all_active else self.to_torch(self._columns(batch["numbers"])["agent_active"]),
+            active=None if self.all_active else self.to_torch(self._columns(batch["numbers"]).agent_active),
             **rest,
         )
 
@@ -330,14 +404,14 @@ class TeamReplayBuffer(ReplayBuffer):
         """
         columns = self._columns(numbers)
         # timeouts stays zero if they are not handled
-        team_done = columns["dones"] * (1 - columns["timeouts"])
-        terminated = columns["agent_terminated"]
+        team_done = columns.dones * (1 - columns.timeouts)
+        terminated = columns.agent_terminated
         return {
             "dones": np.maximum(terminated, team_done[:, None]),
-            "rewards": self._normalize_reward(columns["agent_rewards"], env),
+            "rewards": self._normalize_reward(columns.agent_rewards, env),
             "discounts": self.gamma,
-            "next_active": None if self.all_active else columns["agent_active"] * (1 - terminated),
-            "pair_rewards": self._normalize_reward(columns["pair_rewards"], env) if self.n_pairs else None,
+            "next_active": None if self.all_active else columns.agent_active * (1 - terminated),
+            "pair_rewards": self._normalize_reward(columns.pair_rewards, env) if self.n_pairs else None,
         }
 
     def _windows(
@@ -353,10 +427,10 @@ class TeamReplayBuffer(ReplayBuffer):
         numbers = self._read("numbers", (rows * self.n_envs + env_inds).ravel())
         # One column after the other in memory: what follows then works along the batch, not along a few agents
         columns = self._columns(np.moveaxis(numbers.T.copy().reshape(-1, *rows.shape), 0, -1))
-        rewards = self._normalize_reward(columns["agent_rewards"], env)
-        pairs = self._normalize_reward(columns["pair_rewards"], env)
-        terminated, active = columns["agent_terminated"] > 0, columns["agent_active"] > 0
-        ends = (columns["dones"] > 0) | (columns["cuts"] > 0)
+        rewards = self._normalize_reward(columns.agent_rewards, env)
+        pairs = self._normalize_reward(columns.pair_rewards, env)
+        terminated, active = columns.agent_terminated > 0, columns.agent_active > 0
+        ends = (columns.dones > 0) | (columns.cuts > 0)
         newer = (self.pos - 1 - batch_inds) % self.buffer_size
 
         total, pair_total = rewards[0].copy(order="K"), pairs[0].copy(order="K")
@@ -376,7 +450,7 @@ class TeamReplayBuffer(ReplayBuffer):
             gone |= counts & terminated[step]
             alive &= ~terminated[step]
         at_end = (last, np.arange(len(last)))
-        team_done = columns["dones"][at_end] * (1 - columns["timeouts"][at_end])
+        team_done = columns.dones[at_end] * (1 - columns.timeouts[at_end])
         return (batch_inds + last) % self.buffer_size, {
             "dones": np.maximum(gone, team_done[:, None]),
             "rewards": total,
@@ -388,15 +462,15 @@ class TeamReplayBuffer(ReplayBuffer):
 
 class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     """
-    A team's replay buffer that replays what the critic was wrong about more often: proportional prioritised experience
-    replay (Schaul et al. 2016, Algorithm 1). A transition is drawn in proportion to its priority to the power of
-    ``alpha``, and its losses count ``(size * probability) ** -beta``, divided by the largest such weight in the batch.
-    Its priority is its error when it was last replayed, plus ``epsilon``; new ones get the largest there has been.
-    Batches are drawn from as many equal shares of the priorities as they have samples.
+    A team's replay buffer with proportional prioritised experience replay (Schaul et al. 2016, arXiv:1511.05952,
+    Algorithm 1). A transition's priority is its TD error when it was last sampled, plus ``epsilon``; new ones get the
+    largest priority so far. It is sampled in proportion to its priority to the power of ``alpha``, and its losses have
+    the importance-sampling weight ``(size * probability) ** -beta``, divided by the largest such weight in the batch.
+    Sampling is stratified: the total of the priorities falls into as many equal shares as a batch has samples.
 
-    :param alpha: how much priorities count, 0 for uniform replay
-    :param beta: how much of the bias of such replay the weights take away, 1 for all of it
-    :param epsilon: added to errors, so that nothing is never replayed again
+    :param alpha: exponent of the priorities, 0 for uniform replay
+    :param beta: exponent of the importance-sampling weights, 1 to correct all of the bias of prioritised replay
+    :param epsilon: keeps every transition's sampling probability positive
     :param args: see ``TeamReplayBuffer``
     :param kwargs: see ``TeamReplayBuffer``
     """
@@ -404,8 +478,10 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.5, epsilon: float = 0.01, **kwargs: Any):
         if not (0 <= alpha <= 1 and 0 <= beta <= 1):
             raise ValueError(f"alpha={alpha} and beta={beta} must be between 0 and 1.")
-        if not epsilon > 0:
-            raise ValueError(f"epsilon={epsilon} must be positive: what had no error would never be replayed again.")
+        if not 0 < epsilon < math.inf:
+            raise ValueError(
+                f"epsilon={epsilon} must be positive and finite: without it, what has no error is never sampled."
+            )
         super().__init__(*args, **kwargs)
         self.alpha = alpha
         self.beta = beta
@@ -423,7 +499,7 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         self.new_rows = min(self.new_rows + 1, self.buffer_size)
 
     def _prioritize_new(self) -> None:
-        """All that were added since the last call at once, which is much faster than one by one."""
+        """Set the priorities of all that were added since the last call at once, much faster than one by one."""
         if not self.new_rows:
             return
         rows = (self.pos - 1 - np.arange(self.new_rows)) % self.buffer_size
@@ -454,32 +530,38 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
 
     def update_priorities(self, indices: np.ndarray, errors: np.ndarray) -> None:
         """
-        Set priorities by what the critic has been wrong by.
+        Set priorities from TD errors.
 
         :param indices: (batch,), of the samples
-        :param errors: (batch,), at least 0
+        :param errors: (batch,), absolute TD errors
+        :raises ValueError: NaN or infinity
         """
         self._prioritize_new()
         priorities = (errors.astype(np.float64) + self.epsilon) ** self.alpha
-        self.largest_priority = max(self.largest_priority, priorities.max())
+        largest = priorities.max()
+        if not math.isfinite(largest):
+            raise ValueError(
+                f"The critics' error is {errors[~np.isfinite(errors)][0]}: the critics diverged. Choose a lower "
+                "learning_rate, or smaller rewards."
+            )
+        self.largest_priority = max(self.largest_priority, largest)
         self.priorities.set(indices, priorities)
 
 
 class SumTree:
     """
-    Numbers with all sums that finding a share of their total needs, in a time that grows with the logarithm of their
-    number.
+    Sum tree for sampling indices in proportion to priority in O(log n).
 
-    :param size: how many numbers, all 0 at first
+    :param size: number n of priorities, all 0 at first
     """
 
     def __init__(self, size: int):
         self.depth = max(size - 1, 0).bit_length()
-        self.sums = np.zeros(2 << self.depth)  # the total at 1, below i are 2 i and 2 i + 1, the numbers come last
+        self.sums = np.zeros(2 << self.depth)  # the total at 1, children of i at 2 i and 2 i + 1, priorities last
 
     def set(self, indices: np.ndarray, values: np.ndarray | float) -> None:
         """
-        :param indices: (n,), which numbers
+        :param indices: (n,), of priorities
         :param values: (n,), at least 0, or one for all
         """
         nodes = indices + (1 << self.depth)
@@ -490,8 +572,8 @@ class SumTree:
 
     def find(self, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        :param shares: (n,), of the total, from 0 to below 1
-        :return: (n,), the numbers that contain these points of their running sum, and (n,), what share of it each is
+        :param shares: (n,), of the total of all priorities, from 0 to below 1
+        :return: (n,), indices whose intervals of the cumulative sum contain these points, and (n,), their probabilities
         """
         nodes = np.ones(len(shares), np.intp)
         rest = shares * self.sums[1]
@@ -504,13 +586,19 @@ class SumTree:
         return nodes - (1 << self.depth), self.sums[nodes] / self.sums[1]
 
 
-def _check_arguments(n_steps: int, gamma: float, n_pairs: int, optimize_memory_usage: bool) -> None:
-    if n_steps < 1:
-        raise ValueError(f"n_steps={n_steps} must be at least 1, which sums no rewards.")
+def _check_arguments(
+    buffer_size: int, n_envs: int, n_steps: int, gamma: float, n_pairs: int, optimize_memory_usage: bool
+) -> None:
+    for name, number, least in (
+        ("buffer_size", buffer_size, 1),
+        ("n_envs", n_envs, 1),
+        ("n_steps", n_steps, 1),
+        ("n_pairs", n_pairs, 0),
+    ):
+        if not isinstance(number, (int, np.integer)) or number < least:
+            raise ValueError(f"{name}={number!r} must be an integer of at least {least}.")
     if not 0 <= gamma <= 1:
         raise ValueError(f"gamma={gamma} must be between 0 and 1.")
-    if n_pairs < 0:
-        raise ValueError(f"n_pairs={n_pairs} must be the number of an agent's neighbours, 0 for no rewards of pairs.")
     if n_steps > 1 and optimize_memory_usage:
         raise ValueError(
             f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not keep "

@@ -19,11 +19,16 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
     Log the numbers an environment puts into ``info["metrics"]``, as means over the steps until the next log dump.
 
     :param logger: of the algorithm
-    :param infos: of one step, one per environment
+    :param infos: of one step, one per environment, see ``TeamInfo``
+    :raises ValueError: a metric that is no number
     """
     for info in infos:
         for name, value in info.get("metrics", {}).items():
-            logger.record_mean(name, float(value))
+            try:
+                number = float(value)
+            except (TypeError, ValueError):
+                raise ValueError(f"info['metrics'][{name!r}] is {value!r}: a metric must be a number.") from None
+            logger.record_mean(name, number)
 
 
 class MetricsCallback(BaseCallback):
@@ -50,8 +55,8 @@ class CurriculumCallback(BaseCallback):
         super().__init__(verbose)
         if not 0.0 < success_threshold <= 1.0:
             raise ValueError(f"success_threshold={success_threshold} is a share of episodes: choose it in (0, 1].")
-        if window < 1:
-            raise ValueError(f"window={window} is a number of episodes: choose at least 1.")
+        if not isinstance(window, int) or window < 1:
+            raise ValueError(f"window={window} is a number of episodes: choose an integer of at least 1.")
         self.success_threshold = success_threshold
         self.successes: deque[bool] = deque(maxlen=window)
         self.n_levels = 0

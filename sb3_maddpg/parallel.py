@@ -8,6 +8,7 @@ import math
 import pkgutil
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -17,7 +18,8 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 
-from sb3_maddpg.team import ACTION_SPACES, TeamObservation, heads_of, joint_action_space
+from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint_action_space
+from sb3_maddpg.utils import all_finite, as_seed
 
 ENTRY_POINT = f"{__name__}:make"
 
@@ -43,7 +45,16 @@ class TeamEnv(gymnasium.Env):
     agent that ends is shown its last observation once; from then on its row is zero and it is sent no action. The
     episode ends with the last agent: by truncation, if it was truncated (or one that ended in the same step was).
 
-    ``info`` of a step, all but the last two with one entry per agent:
+    MADDPG makes a ``TeamEnv`` of a ``ParallelEnv`` by itself. Stable-Baselines3's functions need one where they take an
+    environment: ``evaluate_policy(model, Monitor(TeamEnv(env)))``, and likewise ``EvalCallback``.
+
+    What the environment offers besides, such as ``observation_layout`` or a curriculum, is found by Gymnasium's
+    ``get_wrapper_attr``, hence by ``get_attr`` and ``env_method`` of SB3's vector environments.
+
+    What the environment returns is checked in each step; what does not fit is refused with the agent, the step and the
+    value.
+
+    ``info`` of a step, see ``TeamInfo``, all but the last two with one entry per agent:
 
     - ``agent_rewards``: float32
     - ``agent_terminated``, ``agent_truncated``: whether it ended in this step
@@ -56,23 +67,28 @@ class TeamEnv(gymnasium.Env):
     :raises ValueError: an environment or a space that cannot be treated so
     """
 
+    observation_space: TeamObservation
+
     def __init__(self, env: ParallelEnv, state: bool = False):
         agents = _possible_agents(env)
+        self._agents = agents
+        self._rows = {agent: row for row, agent in enumerate(agents)}
+        self._observation_spaces = [_space_of(env, "observation_space", agent) for agent in agents]
         self.parallel_env = env
         self.metadata = {"render_modes": [], **getattr(env, "metadata", {})}
         self.render_mode = getattr(env, "render_mode", None)
         self.agent_names = tuple(map(str, agents))
         self.observation_space = TeamObservation(
-            {str(agent): _flat_space(env.observation_space(agent), f"agent {agent!r} observes") for agent in agents},
+            {
+                str(agent): _flat_space(space, f"agent {agent!r} observes")
+                for agent, space in zip(agents, self._observation_spaces, strict=True)
+            },
             _state_space(env) if state else None,
         )
-        action_spaces = [env.action_space(agent) for agent in agents]
+        action_spaces = [_space_of(env, "action_space", agent) for agent in agents]
         for agent, space in zip(agents, action_spaces, strict=True):
-            _check_action_space(agent, space)
+            check_action_space(agent, space)
         self.action_space = joint_action_space(action_spaces)
-        self._agents = agents
-        self._rows = {agent: row for row, agent in enumerate(agents)}
-        self._observation_spaces = [env.observation_space(agent) for agent in agents]
         self._state_space: Any = env.state_space if state else None
         self._metric_names = [f"rollout/ep_rew_{name}" for name in self.agent_names]
         self._lay_out(action_spaces)
@@ -80,35 +96,43 @@ class TeamEnv(gymnasium.Env):
         self._taking_part: list[int] = []
         self._returns = [0.0] * len(agents)
 
-    def __getattr__(self, name: str) -> Any:
-        # What the environment offers besides PettingZoo's interface, such as a curriculum. Only asked for what is
-        # missing here; private names and "env" are what copying, pickling and the search for wrappers look for.
-        if name.startswith("_") or name in ("env", "parallel_env"):
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        return getattr(self.parallel_env, name)
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Whether this or the PettingZoo environment has the attribute."""
+        return hasattr(self, name) or hasattr(self.parallel_env, name)
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """The attribute of this, or else of the PettingZoo environment."""
+        return getattr(self if hasattr(self, name) else self.parallel_env, name)
 
     def _lay_out(self, action_spaces: Sequence[Any]) -> None:
         ends = np.cumsum([len(heads_of(space)) for space in action_spaces]).tolist()
         self._actions = []
-        # Only numbers of a Box are clipped
+        # Continuous actions are clipped to the first two, all have to lie within the last two
         self._low = np.full(ends[-1], -np.inf, np.float32)
         self._high = np.full(ends[-1], np.inf, np.float32)
+        self._least = np.full(ends[-1], np.finfo(np.float32).min)
+        self._most = -self._least
         for space, begin, end in zip(action_spaces, [0, *ends], ends, strict=False):
             if isinstance(space, spaces.Box):
                 self._low[begin:end], self._high[begin:end] = space.low.ravel(), space.high.ravel()
+            else:
+                self._least[begin:end], self._most[begin:end] = 0, np.array(heads_of(space)) - 1
             clips = isinstance(space, spaces.Box) and space.dtype != np.float32
             self._actions.append(_Action(begin, end, space, clips, getattr(space, "start", None)))
         self._clip = any(isinstance(space, spaces.Box) for space in action_spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """
-        :param seed: for the environment
+        :param seed: for the environment, an integer of at least 0
         :param options: for the environment
         :return: observation, (n_agents, columns), and info
+        :raises ValueError: a seed that is none, or something the environment must not return
         """
+        seed = as_seed(seed)
         super().reset(seed=seed)
-        observations, infos = self.parallel_env.reset(seed=seed, options=options)
-        present = set(self.parallel_env.agents)
+        self._live, self._steps = [], 0
+        observations, infos = self._parts("reset", self.parallel_env.reset(seed=seed, options=options))
+        present = self._present()
         if unknown := present - self._rows.keys():
             raise ValueError(self._unknown(unknown))
         self._live = [row for row, agent in enumerate(self._agents) if agent in present]
@@ -122,26 +146,35 @@ class TeamEnv(gymnasium.Env):
         """
         :param action: joint action, flat
         :return: observation, (n_agents, columns), mean reward, terminated, truncated, info
+        :raises ValueError: an action outside of its space, or something the environment must not return
         """
         acted = self._live
         if not acted:
             raise gymnasium.error.ResetNeeded("No agent is left in this episode, or none has begun: call reset().")
-        observations, agent_rewards, terminations, truncations, infos = self.parallel_env.step(self._decode(action))
+        actions = self._decode(action)
+        self._steps += 1
+        observations, agent_rewards, terminations, truncations, infos = self._parts(
+            "step", self.parallel_env.step(actions)
+        )
         agents, n_agents = self._agents, len(self._agents)
         rewards, active = [0.0] * n_agents, [False] * n_agents
         terminated, truncated = [False] * n_agents, [False] * n_agents
-        left = set(self.parallel_env.agents)
+        left = self._present()
         seen, live = [], []
         for row in acted:
             agent = agents[row]
             try:
-                rewards[row] = reward = float(agent_rewards[agent])
-                ends, cut = bool(terminations[agent]), bool(truncations[agent])
+                reward, ends, cut = agent_rewards[agent], terminations[agent], truncations[agent]
             except KeyError:
                 raise ValueError(
-                    f"step() of {self.parallel_env} left out reward, termination or truncation of agent {agent!r}: "
-                    "it must give them for every agent that acted."
+                    f"step() of {self.parallel_env} left out reward, termination or truncation of agent {agent!r} "
+                    f"{self._when}: it must give them for every agent that acted."
                 ) from None
+            if type(reward) is not float:
+                reward = self._number(agent, reward)
+            if type(ends) is not bool or type(cut) is not bool:
+                ends, cut = self._flag(agent, "termination", ends), self._flag(agent, "truncation", cut)
+            rewards[row] = reward
             active[row], terminated[row], truncated[row] = True, ends, cut
             self._returns[row] += reward
             if not (ends or cut):
@@ -164,7 +197,7 @@ class TeamEnv(gymnasium.Env):
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
         if over:
             info["metrics"] = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
-            successes = [told["is_success"] for told in infos.values() if "is_success" in told]
+            successes = [told["is_success"] for told in infos.values() if told and "is_success" in told]
             if successes:
                 info["is_success"] = all(successes)
         return self._observe(observations, seen), total / n_agents, over and not cut, cut, info
@@ -177,6 +210,61 @@ class TeamEnv(gymnasium.Env):
         """Close the environment."""
         self.parallel_env.close()
 
+    @property
+    def _when(self) -> str:
+        return f"in step {self._steps} of the episode" if self._steps else "after reset()"
+
+    def _parts(self, method: str, returned: Any) -> Sequence[Mapping[Any, Any]]:
+        """The dicts that the environment returned, ``infos`` empty where it gives none."""
+        names = ["observations", "infos"]
+        if method == "step":
+            names = ["observations", "rewards", "terminations", "truncations", "infos"]
+        if not isinstance(returned, (tuple, list)) or len(returned) != len(names):
+            raise ValueError(
+                f"{method}() of {self.parallel_env} returned {_short(returned)}: it must return ({', '.join(names)})."
+            )
+        for name, part in zip(names, returned, strict=True):
+            if type(part) is not dict and not isinstance(part, Mapping) and not (part is None and name == "infos"):
+                raise ValueError(
+                    f"{method}() of {self.parallel_env} gave {_short(part)} as {name} {self._when}: it must give a "
+                    "dict with an entry for each agent."
+                )
+        *others, infos = returned
+        for agent, info in (infos or {}).items():
+            if type(info) is not dict and info is not None and not isinstance(info, Mapping):
+                raise ValueError(
+                    f"{method}() of {self.parallel_env} gave {_short(info)} as info of agent {agent!r} {self._when}: "
+                    "it must be a dict."
+                )
+        return *others, infos or {}
+
+    def _present(self) -> set[Any]:
+        agents = getattr(self.parallel_env, "agents", None)
+        try:
+            return set(agents)  # type: ignore[arg-type]
+        except TypeError:
+            raise ValueError(
+                f"`agents` of {self.parallel_env} is {_short(agents)} {self._when}: it must be the list of agents that "
+                "are taking part."
+            ) from None
+
+    def _number(self, agent: Any, reward: Any) -> float:
+        if isinstance(reward, (int, float)) or getattr(reward, "shape", None) == ():
+            with suppress(TypeError, ValueError, OverflowError):
+                return float(reward)
+        raise ValueError(
+            f"{self.parallel_env} gave a reward of {_short(reward)} for agent {agent!r} {self._when}: a reward must be "
+            "a number."
+        )
+
+    def _flag(self, agent: Any, name: str, value: Any) -> bool:
+        if isinstance(value, (bool, np.bool_, int, np.integer)) or getattr(value, "shape", None) == ():
+            return bool(value)
+        raise ValueError(
+            f"{self.parallel_env} gave {_short(value)} as {name} of agent {agent!r} {self._when}: it must be True or "
+            "False."
+        )
+
     def _decode(self, action: Any) -> dict[Any, Any]:
         """The actions of the live agents, each as its own space has it."""
         values = np.asarray(action)
@@ -185,6 +273,8 @@ class TeamEnv(gymnasium.Env):
                 f"The joint action has shape {values.shape}, not {self.action_space.shape}: it is flat, agent after "
                 f"agent ({', '.join(self.agent_names)})."
             )
+        if values.dtype.kind not in "biuf" or not self._inside(values).all():
+            self._refuse_action(values)
         if self._clip:
             values = np.minimum(np.maximum(values, self._low), self._high, dtype=np.float32)
         actions = {}
@@ -205,32 +295,57 @@ class TeamEnv(gymnasium.Env):
             actions[self._agents[row]] = part
         return actions
 
+    def _inside(self, values: np.ndarray) -> np.ndarray:
+        """Which numbers are finite and, unless they will be clipped, in their space, (length,)."""
+        return (values >= self._least) & (values <= self._most)
+
+    def _refuse_action(self, values: np.ndarray) -> None:
+        for agent, (begin, end, space, *_) in zip(self.agent_names, self._actions, strict=True):
+            if values.dtype.kind not in "biuf" or not self._inside(values)[begin:end].all():
+                raise ValueError(
+                    f"The action of agent {agent!r} is {values[begin:end].tolist()} in step {self._steps + 1} of the "
+                    f"episode, but its space is {space}: give finite numbers, binary actions as 0 or 1, categories "
+                    "from 0 on."
+                )
+
     def _observe(self, observations: Mapping[Any, Any], rows: list[int]) -> np.ndarray:
         """The team's observation, all rows but the given ones zero, (n_agents, columns)."""
         team = self.observation_space
-        assert isinstance(team, TeamObservation)
         matrix = np.zeros(team.shape, np.float32)
         for row in rows:
             agent, space, length = self._agents[row], self._observation_spaces[row], team.obs_dims[row]
             if agent not in observations:
                 raise ValueError(
                     f"{self.parallel_env} gave no observation for agent {agent!r}, which takes part or was just "
-                    "truncated: reset() and step() must return one."
+                    f"truncated, {self._when}: reset() and step() must return one."
                 )
-            if isinstance(space, spaces.Box):
-                observation = np.asarray(observations[agent])
-                if observation.shape != space.shape:
-                    raise ValueError(
-                        f"The observation of agent {agent!r} has shape {observation.shape}, but its space is {space}."
-                    )
-                matrix[row, :length] = observation.reshape(-1)
-            else:
-                matrix[row, :length] = np.asarray(flatten(space, observations[agent]))
+            observation = observations[agent]
+            try:
+                fits = _fits(space, observation)
+                if fits:
+                    flat = observation if isinstance(space, spaces.Box) else flatten(space, observation)
+                    matrix[row, :length] = np.asarray(flat).reshape(-1)
+            except (TypeError, ValueError, LookupError, OverflowError):
+                fits = False
+            if not fits:
+                shape = getattr(observation, "shape", None)
+                what = f"is {_short(observation)}" if shape in (None, space.shape) else f"has shape {shape}"
+                raise ValueError(
+                    f"The observation of agent {agent!r} {what}, but its space is {space} ({self._when} of "
+                    f"{self.parallel_env})."
+                )
         if self._state_space is not None:
             columns = matrix.shape[1] - team.obs_dim
             state = np.zeros(len(matrix) * columns, np.float32)
             state[: team.state_dim] = self._state(team.state_dim)
             matrix[:, team.obs_dim :] = state.reshape(len(matrix), columns)
+        if not all_finite(matrix):
+            row, column = np.argwhere(~np.isfinite(matrix))[0].tolist()
+            whose = f"The observation of agent {self._agents[row]!r}" if column < team.obs_dim else "The state"
+            raise ValueError(
+                f"{whose} is {matrix[row, column]} in column {column} {self._when} of {self.parallel_env}: it must be "
+                "finite. Bound it, or end the episode before a simulation diverges."
+            )
         return matrix
 
     def _state(self, size: int) -> np.ndarray:
@@ -238,6 +353,8 @@ class TeamEnv(gymnasium.Env):
             state = np.asarray(flatten(self._state_space, self.parallel_env.state()))
         except NotImplementedError as error:
             raise ValueError(f"{self.parallel_env} has a state_space but no state(): choose state=False.") from error
+        except (TypeError, ValueError, LookupError) as error:
+            raise ValueError(f"state() of {self.parallel_env} does not fit its state_space: {error}.") from error
         if state.size != size:
             raise ValueError(f"state() of {self.parallel_env} has {state.size} numbers, its state_space {size}.")
         return state
@@ -280,13 +397,38 @@ class TeamEnv(gymnasium.Env):
             name: reward for name, reward in zip(self.agent_names, rewards, strict=True) if not math.isfinite(reward)
         }
         wrong = ", ".join(f"{reward} for agent {name!r}" for name, reward in found.items())
-        raise ValueError(f"{self.parallel_env} gave a reward of {wrong}: rewards must be finite.")
+        raise ValueError(f"{self.parallel_env} gave a reward of {wrong} {self._when}: rewards must be finite.")
 
 
-def _agent_infos(infos: Mapping[Any, Any] | None) -> dict[str, Any]:
-    if not infos or not any(infos.values()):
+def _agent_infos(infos: Mapping[Any, Any]) -> dict[str, Any]:
+    if not any(infos.values()):
         return {}
     return {"agent_infos": {str(agent): info for agent, info in infos.items() if info}}
+
+
+def _short(value: Any, length: int = 80) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= length else f"{text[:length]}..."
+
+
+def _fits(space: spaces.Space, value: Any) -> bool:
+    """Whether a value has the space's structure, shapes and categories. Unlike ``contains`` it takes any data type."""
+    if isinstance(space, spaces.Box):
+        return np.shape(value) == space.shape
+    if isinstance(space, spaces.Dict):
+        return isinstance(value, Mapping) and all(
+            name in value and _fits(part, value[name]) for name, part in space.items()
+        )
+    if isinstance(space, spaces.Tuple):
+        return isinstance(value, (tuple, list)) and len(value) == len(space) and all(map(_fits, space, value))
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+        array = np.asarray(value)
+        sizes = np.array(heads_of(space))
+        if array.dtype.kind not in "biuf" or array.size != len(sizes):
+            return False
+        index = array.ravel() - np.ravel(getattr(space, "start", 0))
+        return bool(((index == np.rint(index)) & (index >= 0) & (index < sizes)).all())
+    return bool(space.contains(value))
 
 
 def _possible_agents(env: Any) -> tuple[Any, ...]:
@@ -297,7 +439,8 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
         )
     if not isinstance(env, ParallelEnv):
         raise ValueError(f"{env!r} is no PettingZoo ParallelEnv.")
-    agents = tuple(getattr(env, "possible_agents", None) or ())
+    agents = getattr(env, "possible_agents", None) or ()
+    agents = tuple(agents) if isinstance(agents, Iterable) else ()
     if not agents:
         raise ValueError(f"{env} has no possible_agents: it must name every agent that can ever take part.")
     if len(set(map(str, agents))) < len(agents):
@@ -305,10 +448,37 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
     return agents
 
 
+def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:
+    """
+    :param env: the environment
+    :param kind: "observation_space" or "action_space"
+    :param agent: of the environment
+    :raises ValueError: there is none
+    """
+    try:
+        space = getattr(env, kind)(agent)
+    except (LookupError, AttributeError, TypeError, NotImplementedError) as error:
+        raise ValueError(
+            f"{kind}({agent!r}) of {env} failed ({type(error).__name__}: {error}): it must give a space for every "
+            "agent in possible_agents."
+        ) from error
+    if not isinstance(space, spaces.Space):
+        raise ValueError(f"{kind}({agent!r}) of {env} is {_short(space)}: it must be a Gymnasium space.")
+    return space
+
+
 def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
-    flat = flatten_space(space)
+    flat: spaces.Space
+    try:
+        flat = flatten_space(space)
+    except (NotImplementedError, ValueError):  # of a space that is not known, or empty
+        flat = space
     if not isinstance(flat, spaces.Box):
-        raise ValueError(f"The space that {what}, {space}, has no fixed length and cannot become a row of numbers.")
+        raise ValueError(
+            f"The space that {what}, {space}, is empty or has no fixed length and cannot become a row of numbers."
+        )
+    if not np.prod(flat.shape):
+        raise ValueError(f"The space that {what}, {space}, is empty: where there is nothing, give Box(0, 1, (1,)).")
     return flat
 
 
@@ -317,19 +487,6 @@ def _state_space(env: Any) -> spaces.Box:
     if space is None:
         raise ValueError(f"{env} has no state_space, which state=True needs: choose state=False.")
     return _flat_space(space, f"the state of {env} has")
-
-
-def _check_action_space(agent: Any, space: spaces.Space) -> None:
-    if not isinstance(space, ACTION_SPACES) or not heads_of(space):
-        raise ValueError(
-            f"Agent {agent!r} has the action space {space}: only Discrete, MultiDiscrete, MultiBinary and Box with at "
-            "least one number are supported. Flatten it with a wrapper."
-        )
-    if isinstance(space, spaces.Box) and not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-        raise ValueError(
-            f"Agent {agent!r} has the action space {space} without bounds, which say how far actions reach. "
-            "Give it finite ones."
-        )
 
 
 def make(

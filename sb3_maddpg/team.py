@@ -1,16 +1,82 @@
-"""What a team is: how many agents, what each observes, how each acts. Read out of an environment's two spaces."""
+"""
+What a team is: how many agents, what each observes, how each acts. Read from an environment's two spaces. And what else
+a team environment may say of itself, see ``TeamEnvironment``, ``TeamAttributes`` and ``TeamInfo``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, Protocol, TypedDict
 
 import numpy as np
 from gymnasium import spaces
 
 AgentActionSpace = spaces.MultiBinary | spaces.Box | spaces.Discrete | spaces.MultiDiscrete
 ACTION_SPACES = (spaces.MultiBinary, spaces.Box, spaces.Discrete, spaces.MultiDiscrete)
+
+
+class TeamInfo(TypedDict, total=False):
+    """
+    What ``info`` of a step of a team environment may hold. Each entry may be left out, and may hold any array-like.
+    """
+
+    agent_rewards: np.ndarray
+    """(n_agents,), each agent's reward. If left out: the team's reward for each"""
+    agent_terminated: np.ndarray
+    """(n_agents,) bool, whether the agent terminated in this step, not counting truncation. If left out: none did
+    before the team"""
+    agent_active: np.ndarray
+    """(n_agents,) bool, whether the agent acted in this step. If left out: all did"""
+    pair_rewards: np.ndarray
+    """(n_agents, n_neighbours), the part of an agent's reward that belongs to each of its neighbours. If left out:
+    ``pair_credit`` is refused"""
+    is_success: bool
+    """In the last step of an episode, for ``rollout/success_rate`` and ``CurriculumCallback``"""
+    metrics: dict[str, float]
+    """Numbers, averaged and logged under their names"""
+
+
+InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards"]
+
+
+class TeamEnvironment(Protocol):
+    """
+    What MADDPG needs of an environment: Gymnasium's interface with these spaces. ``check_team_env`` tells whether an
+    environment keeps to it. Nothing has to be imported from here: the names are all that counts.
+    """
+
+    observation_space: spaces.Box
+    """(n_agents, obs_dim), a row per agent; ``TeamObservation`` where rows are padded or carry a global state"""
+    action_space: spaces.MultiBinary | spaces.MultiDiscrete | spaces.Box
+    """Flat joint action, agent after agent, of length n_agents * k; ``MixedActions`` where agents act differently"""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """:return: observation, (n_agents, obs_dim), and info"""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: joint action, flat
+        :return: observation, the team's reward, terminated, truncated, and info, see ``TeamInfo``
+        """
+
+
+class TeamAttributes(Protocol):
+    """What a team environment may have besides. Each attribute may be left out."""
+
+    agent_names: Sequence[str]
+    """Names of the agents, for ``agent_policy``, parameter sharing and messages. If left out: agent_0, agent_1, ..."""
+    observation_layout: Mapping[str, Any]
+    """Which columns are about which neighbour, ``sb3_maddpg.relational.ObservationLayout``. If left out:
+    ``PairPolicy`` is refused"""
+    action_cost: float | np.ndarray
+    """Cost of an action that the reward holds as a plain sum, a number or (n_agents, width). If left out:
+    ``use_action_cost`` is refused"""
+    n_curriculum_levels: int
+    """Number of levels, for ``CurriculumCallback``, which is refused if this or the next is left out"""
+
+    def set_curriculum_level(self, level: int) -> None:
+        """:param level: from 0 to ``n_curriculum_levels - 1``, for the next episodes"""
 
 
 class TeamObservation(spaces.Box):
@@ -54,8 +120,8 @@ class TeamObservation(spaces.Box):
 
 class MixedActions(spaces.Box):
     """
-    The joint action of a team whose agents act in unlike ways, as one flat ``Box``: agent after agent, numbers of a
-    ``Box`` as they are, bits as 0 or 1, a category as its index.
+    The joint action of a team with heterogeneous action spaces, as one flat ``Box``: agent after agent, continuous
+    actions as they are, binary ones as 0 or 1, categorical ones as their index from 0.
 
     :param agent_spaces: each agent's action space
     """
@@ -85,8 +151,8 @@ class MixedActions(spaces.Box):
 
 class CategoricalActions(spaces.MultiDiscrete):
     """
-    The joint action of a team whose agents all choose categories: a ``MultiDiscrete`` of their indices from 0 that
-    remembers the agents' own spaces.
+    The joint action of a team whose agents all have categorical actions: a ``MultiDiscrete`` of their indices from 0
+    that remembers the agents' own spaces.
 
     :param agent_spaces: each agent's action space, all of one length
     """
@@ -116,7 +182,7 @@ def _bounds(space: AgentActionSpace) -> tuple[np.ndarray, np.ndarray]:
 def heads_of(space: AgentActionSpace) -> tuple[int, ...]:
     """
     :param space: an agent's action space
-    :return: number of values of each of its sub-actions, 0 for a number of a ``Box``
+    :return: number of values of each of its sub-actions, 0 for a continuous one
     """
     if isinstance(space, spaces.Box):
         return (0,) * int(np.prod(space.shape))
@@ -153,7 +219,7 @@ class Team:
     """
     A team as its networks see it.
 
-    :param names: of the agents
+    :param names: of the agents, each once
     :param obs_dims: length of each agent's observation without padding
     :param obs_dim: the longest of them
     :param state_dim: length of the global state, 0 without
@@ -196,7 +262,7 @@ class Team:
         :param action_space: flat joint action, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` of
             length ``n_agents * k``, or ``MixedActions``
         :param names: of the agents; those of the observation space, or agent_0, agent_1, ..., unless given
-        :raises ValueError: other spaces
+        :raises ValueError: other spaces, or names that do not fit
         """
         if isinstance(observation_space, spaces.Dict):
             raise ValueError(
@@ -208,6 +274,11 @@ class Team:
                 f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. "
                 "Stack the agents' observations along a first axis; pad them if they differ in length."
             )
+        if not all(observation_space.shape):
+            raise ValueError(
+                f"The observation space {observation_space} is empty: a team needs at least one agent, and an agent at "
+                "least one column."
+            )
         n_agents, obs_dim = observation_space.shape
         if isinstance(observation_space, TeamObservation):
             shape = (observation_space.obs_dims, observation_space.obs_dim, observation_space.state_dim)
@@ -215,12 +286,40 @@ class Team:
         else:
             shape = ((obs_dim,) * n_agents, obs_dim, 0)
             names = names or [f"agent_{index}" for index in range(n_agents)]
+        names = tuple(map(str, names))
         if len(names) != n_agents:
             raise ValueError(f"There are {len(names)} names, {', '.join(names)}, for {n_agents} agents.")
-        return cls(tuple(names), *shape, _split(action_space, n_agents))
+        if len(set(names)) < n_agents:
+            raise ValueError(f"An agent's name occurs twice: {', '.join(names)}.")
+        action_spaces = _agents_spaces(action_space, n_agents)
+        for name, space in zip(names, action_spaces, strict=True):
+            check_action_space(name, space)
+        return cls(names, *shape, action_spaces)
 
 
-def _split(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace, ...]:
+def check_action_space(agent: Any, space: spaces.Space) -> None:
+    """
+    :param agent: its name, for the message
+    :param space: its action space
+    :raises ValueError: an action space that actors cannot have
+    """
+    if not isinstance(space, ACTION_SPACES) or not heads_of(space):
+        raise ValueError(
+            f"Agent {agent!r} has the action space {space}: only Discrete, MultiDiscrete, MultiBinary and Box with at "
+            "least one number are supported. Flatten it with a wrapper."
+        )
+    if isinstance(space, spaces.Box):
+        low, high = _bounds(space)
+        with np.errstate(over="ignore", invalid="ignore"):
+            bounded = np.isfinite(high - low).all()
+        if not bounded:
+            raise ValueError(
+                f"Agent {agent!r} has the action space {space} without bounds, which say how far actions reach, or "
+                "with bounds too large for single precision. Give it smaller, finite ones."
+            )
+
+
+def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace, ...]:
     if isinstance(action_space, (MixedActions, CategoricalActions)):
         parts = action_space.agent_spaces
         if len(parts) != n_agents:
@@ -232,6 +331,12 @@ def _split(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace,
             f"{action_space}. Flatten it in the environment and reshape it there to (n_agents, action_dim)."
         )
     (length,) = action_space.shape
+    if isinstance(action_space, spaces.MultiDiscrete) and action_space.start.any():
+        raise ValueError(
+            f"The categories of a team action count from 0, but those of {action_space} from "
+            f"start={action_space.start.tolist()}. Leave `start` out and add it in step(), or make a TeamEnv of a "
+            "PettingZoo environment, which does so."
+        )
     if length % n_agents:
         raise ValueError(
             f"A joint action of {length} numbers cannot be shared out evenly among {n_agents} agents. "

@@ -2,7 +2,7 @@
 Small team tasks with known optimum, to check that a learner learns. Import this module to register them.
 
 Every step the observations are drawn anew, so that the best joint policy maximises each step's reward by itself and the
-optimum has a closed form. Episodes of ten steps end by the time limit.
+optimum has a closed form. Episodes are truncated after ten steps.
 """
 
 from typing import Any, ClassVar
@@ -11,12 +11,16 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_maddpg.utils import as_seed
+
 
 class TeamTask(gym.Env):
     """
     A repeated game with fresh observations. Sub-classes give ``payoff`` and the constants.
 
     :param episode_length: steps until the episode is truncated
+    :param render_mode: None or "rgb_array"
+    :raises ValueError: an episode without a step
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - Gymnasium's own convention
@@ -29,13 +33,14 @@ class TeamTask(gym.Env):
     """Expected team reward per step of uniformly random actions."""
 
     def __init__(self, episode_length: int = 10, render_mode: str | None = None):
-        if episode_length < 1:
-            raise ValueError(f"episode_length={episode_length} must be at least 1.")
+        if not isinstance(episode_length, (int, np.integer)) or episode_length < 1:
+            raise ValueError(f"episode_length={episode_length!r} must be an integer of at least 1.")
         self.episode_length = episode_length
         self.render_mode = render_mode
         self.observation_space = spaces.Box(-1.0, 1.0, (self.n_agents, self.obs_dim), np.float32)
         self.action_space: spaces.Space = spaces.MultiBinary(self.n_agents * self.action_dim)
         self._steps = 0
+        self._obs: np.ndarray | None = None
 
     def draw(self, rng: np.random.Generator, batch: int) -> np.ndarray:
         """
@@ -54,13 +59,15 @@ class TeamTask(gym.Env):
         raise NotImplementedError
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        super().reset(seed=seed)
+        super().reset(seed=as_seed(seed))
         self._steps = 0
         self._obs = self.draw(self.np_random, 1)
         self._actions = np.zeros((self.n_agents, self.action_dim))
         return self._obs[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if self._obs is None:
+            raise gym.error.ResetNeeded("No episode has begun: call reset() before step().")
         actions = np.asarray(action).reshape(1, self.n_agents, self.action_dim)
         rewards = self.payoff(self._obs, actions)[0].astype(np.float32)
         self._steps += 1
@@ -69,8 +76,8 @@ class TeamTask(gym.Env):
         return self._obs[0], float(rewards.mean()), False, self._steps >= self.episode_length, info
 
     def render(self) -> np.ndarray | None:
-        """A row per agent: its observation in grey, then the bits it just set in white."""
-        if self.render_mode is None:
+        """A row per agent: its observation in grey, then the binary actions it just set in white."""
+        if self.render_mode is None or self._obs is None:
             return None
         cells = np.hstack([96 + 64 * self._obs[0], 255.0 * np.clip(self._actions, 0, 1)])
         return np.repeat(np.kron(cells, np.ones((32, 32)))[..., None], 3, axis=2).astype(np.uint8)
@@ -89,7 +96,7 @@ class TeamTask(gym.Env):
 
 
 class OwnBit(TeamTask):
-    """The best bits are the signs of the own observation. Each right bit pays 1 to its agent."""
+    """The best binary actions are the signs of the own observation. Each right one pays 1 to its agent."""
 
     n_agents, action_dim, obs_dim = 3, 3, 3
     optimum, random = 3.0, 1.5

@@ -1,14 +1,18 @@
 """Small helpers shared by the algorithm, its policy, its buffer and the zoo."""
 
 import difflib
+import errno
 import inspect
 import json
+import math
+import operator
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -59,21 +63,41 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
 
     :param path: where to write; missing folders are made
     :param suffix: added to a path without suffix, as Stable-Baselines3 does
+    :raises OSError: the path is a folder or cannot be written, said before anything is done
     """
     target = Path(path)
     if not target.suffix:
         target = Path(f"{target}.{suffix}")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # In the same folder, because a file cannot be renamed across file systems.
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "This is a folder: name a file in it", str(target))
+    # In the same folder, because a file cannot be renamed across file systems
     temporary = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        with temporary.open("wb") as file:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        file = temporary.open("wb")
+    except OSError as error:
+        reason = f"Cannot write here ({error.strerror}): choose another folder"
+        raise OSError(error.errno, reason, str(target)) from error
+    try:
+        with file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, target)
+        _sync_folder(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Without it the new name of a file may be gone after a loss of power."""
+    if os.name == "nt":  # folders cannot be opened there
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def arguments_of(cls: type) -> set[str]:
@@ -91,3 +115,34 @@ def arguments_of(cls: type) -> set[str]:
             if not further:
                 break
     return names - {"self"}
+
+
+def all_finite(values: np.ndarray) -> bool:
+    """
+    :param values: any shape
+    :return: whether all are finite numbers in the networks' single precision
+    """
+    if values.dtype != np.float32:
+        if values.dtype.kind != "f":
+            return True
+        with np.errstate(over="ignore"):
+            values = values.astype(np.float32)
+    # One quick look at all of them. Large numbers fail it too, and pass the thorough one
+    return math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
+
+
+def as_seed(seed: Any) -> int | None:
+    """
+    :param seed: None, or an integer of any type
+    :return: the same as Gymnasium takes it
+    :raises ValueError: anything else
+    """
+    if seed is None:
+        return None
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise ValueError(f"seed={seed!r} must be an integer of at least 0, or None.")
+    return number

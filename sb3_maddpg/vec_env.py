@@ -4,8 +4,11 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Wrapper
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from sb3_maddpg.utils import all_finite, as_seed
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -15,10 +18,15 @@ class GymnasiumVecEnv(VecEnv):
 
     :param envs: a vector environment that begins anew in the step in which an episode ends
         (``AutoresetMode.SAME_STEP``), as SB3's do
-    :raises ValueError: another autoreset mode
+    :raises ValueError: no vector environment, or another autoreset mode
     """
 
     def __init__(self, envs: VectorEnv):
+        if not isinstance(envs, VectorEnv):
+            raise ValueError(
+                f"{envs!r} is no Gymnasium VectorEnv: make one with gymnasium.make_vec. For a single environment use "
+                "Stable-Baselines3's make_vec_env."
+            )
         mode = envs.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(
@@ -27,18 +35,37 @@ class GymnasiumVecEnv(VecEnv):
             )
         self.envs = envs
         self._actions: np.ndarray | None = None
+        self._begun = False
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> VecEnvObs:
         if any(self._options):
             raise ValueError(f"Options for single environments, {self._options}, cannot be passed on to {self.envs}.")
-        seeds = list(self._seeds) if any(seed is not None for seed in self._seeds) else None
+        seeds = [as_seed(seed) for seed in self._seeds] if any(seed is not None for seed in self._seeds) else None
         observations, infos = self.envs.reset(seed=seeds)  # type: ignore[arg-type]  # one of each is allowed too
         self.reset_infos = unbatch(infos, self.num_envs)
         self._reset_seeds()
+        self._begun = True
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
+        """
+        :param actions: (num_envs, ...)
+        :raises ValueError: actions of another shape, or not finite
+        :raises ResetNeeded: before the first ``reset``
+        """
+        if not self._begun:
+            raise ResetNeeded("The environments have not begun: call reset() before step().")
+        actions = np.asarray(actions)
+        shape = (self.num_envs, *(self.action_space.shape or ()))
+        if actions.shape != shape:
+            raise ValueError(
+                f"The actions have shape {actions.shape}, but there are {self.num_envs} environments with the action "
+                f"space {self.action_space}: they must have shape {shape}."
+            )
+        if not all_finite(actions):
+            env = np.argwhere(~np.isfinite(actions))[0][0]
+            raise ValueError(f"The action of environment {env} is {actions[env].tolist()}: it must be finite.")
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -46,6 +73,11 @@ class GymnasiumVecEnv(VecEnv):
         rows = unbatch(infos, self.num_envs)
         dones = terminations | truncations
         for k in np.flatnonzero(dones):
+            if "final_obs" not in rows[k]:
+                raise ValueError(
+                    f"{self.envs} ended an episode of environment {k} without info['final_obs'], its last observation, "
+                    "which AutoresetMode.SAME_STEP promises."
+                )
             # The info that came with the observation belongs to the next episode.
             self.reset_infos[k] = {name: v for name, v in rows[k].items() if name not in ("final_obs", "final_info")}
             rows[k] = {**rows[k].get("final_info", {}), "terminal_observation": rows[k]["final_obs"]}

@@ -414,3 +414,113 @@ def test_training_sets_priorities_to_the_critics_errors():
     assert (leaves > 0).all()
     assert len(np.unique(leaves)) > 100
     assert 0 < float(weights.min()) < float(weights.max()) <= 1.0
+
+
+@pytest.mark.parametrize("optimized", [False, True])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize("what", ["observation", "next observation", "action", "agent_rewards", "pair_rewards"])
+def test_nothing_that_is_not_finite_is_stored(what, wrong, optimized):
+    kwargs = {"optimize_memory_usage": True, "handle_timeout_termination": False} if optimized else {}
+    space = spaces.Box(-9, 9, (N, D), np.float64)
+    memory = TeamReplayBuffer(4, space, spaces.MultiBinary(N * K), "cpu", n_envs=2, n_pairs=2, **kwargs)
+    given = {
+        "observation": np.ones((2, N, D)),
+        "next observation": np.ones((2, N, D)),
+        "action": np.ones((2, N * K), np.float32),
+        "agent_rewards": np.ones((2, N)),
+        "pair_rewards": np.ones((2, N, 2)),
+    }
+
+    def add_all() -> None:
+        infos = [{key: given[key][env] for key in ("agent_rewards", "pair_rewards")} for env in range(2)]
+        obs, next_obs, action = (given[name] for name in ("observation", "next observation", "action"))
+        memory.add(obs, next_obs, action, np.zeros(2), np.zeros(2, bool), infos)
+
+    for _ in range(5):
+        add_all()
+    before, pos = memory.records.copy(), memory.pos
+    with np.errstate(over="ignore"):
+        given[what].reshape(2, N, -1)[1, 2, 1 if what != "agent_rewards" else 0] = wrong
+        with pytest.raises(
+            ValueError, match=rf"{what}.* of agent 2 \(agent_2\) is .*in environment 1 at step 6 .*finite"
+        ):
+            add_all()
+    assert np.array_equal(memory.records, before)
+    assert (memory.pos, memory.n_added) == (pos, 5)
+
+
+class Diverging(OwnBit):
+    """One number of an observation is not finite: after reset(), in the middle, or the last one of the episode."""
+
+    def __init__(self, kind: str, when: int, wrong: float):
+        super().__init__(episode_length=5)
+        length = self.n_agents * self.action_dim
+        boxes = {"binary": self.action_space, "continuous": spaces.Box(-1, 1, (length,))}
+        self.action_space = boxes.get(kind, spaces.MultiDiscrete([2] * length))
+        self.when, self.wrong = when, wrong
+
+    def spoilt(self, obs: np.ndarray) -> np.ndarray:
+        if self._steps == self.when:
+            obs = obs.copy()
+            obs[1, 2] = self.wrong
+        return obs
+
+    def reset(self, **kwargs):
+        obs, info = super().reset(**kwargs)
+        return self.spoilt(obs), info
+
+    def step(self, action):
+        obs, *rest = super().step(action)
+        return self.spoilt(obs), *rest
+
+
+@pytest.mark.parametrize("kind", ["binary", "categorical", "continuous"])
+@pytest.mark.parametrize(
+    ("when", "learning_starts", "wrong"), [(5, 4, np.nan), (2, 0, np.nan), (2, 100, np.inf), (0, 100, np.nan)]
+)
+def test_observations_that_are_not_finite_never_reach_the_networks(kind, when, learning_starts, wrong):
+    model = MADDPG(
+        "MlpPolicy", Diverging(kind, when, wrong), learning_starts=learning_starts, batch_size=4, train_freq=1, seed=0
+    )
+    with pytest.raises(ValueError, match=r"agent.*agent_1.*(finite|NaN or infinity)"):
+        model.learn(20)
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+    assert np.isfinite(model.replay_buffer.observations).all()
+    assert np.isfinite(model.replay_buffer.next_observations).all()
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        ({"obs": (2, N, D)}, r"observation has shape \(2, 3, 2\).* 1 environment.*must be \(1, 3, 2\)"),
+        ({"next_obs": (1, 2, D)}, r"next observation has shape \(1, 2, 2\).*of 3 agents"),
+        ({"action": (1, 5)}, r"action has shape \(1, 5\).*must be \(1, 6\)"),
+    ],
+)
+def test_transitions_of_another_team_are_refused(shapes, message):
+    given = {"obs": (1, N, D), "next_obs": (1, N, D), "action": (1, N * K), **shapes}
+    arrays = {name: np.zeros(shape, np.float32) for name, shape in given.items()}
+    with pytest.raises(ValueError, match=message):
+        buffer().add(**arrays, reward=np.zeros(1), done=np.zeros(1, bool), infos=[{}])
+
+
+@pytest.mark.parametrize("name", ["buffer_size", "n_envs", "n_steps"])
+@pytest.mark.parametrize("wrong", [0, -5, 2.5])
+def test_sizes_that_are_no_positive_integers_are_refused(name, wrong):
+    kwargs = {"buffer_size": 8, name: wrong}
+    with pytest.raises(ValueError, match=rf"{name}={wrong} must be an integer of at least 1"):
+        TeamReplayBuffer(observation_space=BOX, action_space=spaces.MultiBinary(N * K), **kwargs)
+
+
+def test_errors_of_critics_that_diverged_are_no_priorities():
+    memory = prioritized()
+    add(memory, 0)
+    with pytest.raises(ValueError, match="critics' error is nan: the critics diverged"):
+        memory.update_priorities(np.array([0]), np.array([np.nan]))
+    assert memory.largest_priority == 1.0
+
+
+def test_arrays_of_the_buffer_are_views_of_its_records():
+    memory = buffer(n_pairs=1)
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pair_rewards"):
+        assert np.shares_memory(getattr(memory, name), memory.records), name

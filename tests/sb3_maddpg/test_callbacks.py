@@ -5,10 +5,12 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_maddpg import MADDPG, CurriculumCallback, MetricsCallback
+from sb3_maddpg.callbacks import record_metrics
 from sb3_maddpg.team_tasks import OwnBit
 
 SMALL = {"learning_starts": 50, "batch_size": 16, "train_freq": 10, "buffer_size": 500, "seed": 0}
@@ -103,7 +105,9 @@ def test_an_environment_that_never_says_whether_it_succeeded_is_refused():
         MADDPG("MlpPolicy", Silent(), **SMALL).learn(20, callback=CurriculumCallback())
 
 
-@pytest.mark.parametrize("kwargs", [{"success_threshold": 0.0}, {"success_threshold": 1.1}, {"window": 0}])
+@pytest.mark.parametrize(
+    "kwargs", [{"success_threshold": 0.0}, {"success_threshold": 1.1}, {"window": 0}, {"window": 2.5}]
+)
 def test_bad_arguments_are_refused(kwargs):
     with pytest.raises(ValueError, match="choose"):
         CurriculumCallback(**kwargs)
@@ -122,3 +126,8 @@ def test_metrics_of_another_algorithm(tmp_path):
     assert [values["task/level"] for values in logged] == [0, 0]
     assert all(0.3 < values["task/mean_action"] < 0.7 for values in logged)
     assert np.diff([values["task/mean_action"] for values in logged]) != 0
+
+
+def test_a_metric_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match=r"info\['metrics'\]\['task/x'\] is None: a metric must be a number"):
+        record_metrics(Logger(None, []), [{"metrics": {"task/x": None}}])

@@ -8,9 +8,13 @@ import pytest
 from gymnasium import spaces
 from mpe2 import simple_spread_v3
 from pettingzoo import ParallelEnv
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 
+from sb3_maddpg import MADDPG
 from sb3_maddpg.parallel import TeamEnv
 
+SHORT = spaces.Box(-1, 1, (2,))
 TERMINATED, TRUNCATED, BOTH = (True, False), (False, True), (True, True)
 
 
@@ -182,7 +186,10 @@ def forgotten(env, observations, rewards, terminations, truncations, infos):
         (lambda env, observations, *_: observations.pop("b"), "no observation for agent 'b'"),
         (lambda env, observations, *_: observations.update(a=np.zeros(2)), r"agent 'a' has shape \(2,\), but"),
         (lambda env, observations, *_: env.time == 2 and observations.pop("a"), "no observation for agent 'a'"),
-        (lambda env, _, rewards, *__: rewards.update(b=np.nan), "reward of nan for agent 'b': rewards must be finite"),
+        (
+            lambda env, _, rewards, *__: rewards.update(b=np.nan),
+            "reward of nan for agent 'b' in step 1 of the episode: rewards must be finite",
+        ),
         (lambda env, _, rewards, *__: rewards.update(a=-np.inf, b=np.inf), "-inf for agent 'a', inf for agent 'b'"),
         (lambda env, _, rewards, *__: rewards.pop("a"), "left out reward, termination or truncation of agent 'a'"),
         (lambda env, _, __, terminations, *___: terminations.pop("b"), "truncation of agent 'b'"),
@@ -231,6 +238,11 @@ def test_a_terminated_agent_need_not_see_its_end():
         (Broken(action_space=lambda agent: spaces.Box(-1, np.inf, (2,))), r"'a' has the action space Box.*bounds"),
         (Broken(action_space=lambda agent: spaces.Box(0, 1, (0,))), "at least one number"),
         (Broken(observation_space=lambda agent: spaces.Sequence(spaces.Discrete(2))), "agent 'a' observes.*no fixed"),
+        (Broken(observation_space=lambda agent: spaces.Box(0, 1, (0,))), "agent 'a' observes.*is empty"),
+        (Broken(observation_space=lambda agent: spaces.Dict({})), "agent 'a' observes.*is empty"),
+        (Broken(observation_space=lambda agent: {}[agent]), r"observation_space\('a'\) of script failed \(KeyError"),
+        (Broken(action_space=lambda agent: None), r"action_space\('a'\) of script is None"),
+        (Broken(possible_agents=3), "possible_agents"),
     ],
 )
 def test_an_environment_that_does_not_fit_is_refused(env, message):
@@ -247,3 +259,139 @@ def test_a_state_that_is_not_there_is_refused():
     env = TeamEnv(Broken(state_space=spaces.Box(0, 1, (3,)), state=lambda: np.zeros(4)), state=True)
     with pytest.raises(ValueError, match="has 4 numbers, its state_space 3"):
         env.reset()
+
+
+def changed(where, agent, value):
+    """:return: a function that puts a value into one of the dicts that step() returns"""
+    names = ("observations", "rewards", "terminations", "truncations", "infos")
+
+    def spoil(env, *given):
+        given[names.index(where)][agent] = value
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            changed("rewards", "b", None),
+            "reward of None for agent 'b' in step 1 of the episode: a reward must be a number",
+        ),
+        (changed("rewards", "b", "x"), "reward of 'x' for agent 'b'"),
+        (changed("rewards", "a", np.array([1.0])), r"reward of array\(\[1.\]\) for agent 'a'"),
+        (changed("terminations", "a", None), "None as termination of agent 'a' in step 1.*True or False"),
+        (changed("truncations", "b", np.zeros(2)), r"array\(\[0., 0.\]\) as truncation of agent 'b'"),
+        (changed("observations", "b", np.array([np.nan, 0])), "observation of agent 'b' is nan in column 0 in step 1"),
+        (changed("observations", "b", np.array([0, -np.inf])), "observation of agent 'b' is -inf in column 1"),
+        (changed("observations", "b", np.array(["x", "y"])), "observation of agent 'b' is array.*but its space is Box"),
+        (changed("observations", "a", None), "observation of agent 'a' is None, but its space is Box"),
+        (changed("infos", "a", "x"), "'x' as info of agent 'a'.*must be a dict"),
+        (lambda env, *_: setattr(env, "agents", None), "`agents` of script is None in step 1"),
+    ],
+)
+def test_values_that_mean_nothing_are_refused(spoil, message):
+    with pytest.raises(ValueError, match=message):
+        play(TeamEnv(Broken(spoil)))
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (None, r"step\(\) of script returned None: it must return \(observations, rewards"),
+        (({}, {}, {}, {}), r"it must return \(observations, rewards"),
+        ((None, {}, {}, {}, {}), "gave None as observations in step 1"),
+        (({}, [1.0], {}, {}, {}), r"gave \[1.0\] as rewards in step 1"),
+    ],
+)
+def test_a_step_must_return_five_dicts(returned, message):
+    env = TeamEnv(Broken())
+    env.reset()
+    env.parallel_env.step = lambda actions: returned
+    with pytest.raises(ValueError, match=message):
+        env.step(np.zeros(2))
+    env.parallel_env.reset = lambda seed, options: {}
+    with pytest.raises(ValueError, match=r"reset\(\) of script returned {}: it must return \(observations, infos\)"):
+        env.reset()
+
+
+def test_an_environment_need_not_say_anything_about_agents():
+    script = Script({"a": (2, TRUNCATED)})
+    step = script.step
+    script.step = lambda actions: (*step(actions)[:4], None)
+    assert len(play(TeamEnv(script))) == 2
+
+
+@pytest.mark.parametrize(
+    ("space", "wrong"),
+    [
+        (spaces.Discrete(4, start=1), 0),
+        (spaces.Discrete(4), 4),
+        (spaces.Discrete(4), 1.5),
+        (spaces.MultiDiscrete([2, 3]), np.array([2, 0])),
+        (spaces.MultiBinary(2), np.array([1])),
+        (spaces.Dict({"x": SHORT, "y": SHORT}), {"x": np.zeros(2)}),
+        (spaces.Dict({"x": spaces.Discrete(2)}), {"x": -1}),
+        (spaces.Tuple([SHORT, SHORT]), (np.zeros(2),)),
+        (spaces.Text(3), "toolong"),
+    ],
+)
+def test_observations_outside_of_their_space_are_refused(space, wrong):
+    class Watcher(Script):
+        def observation_space(self, agent):
+            return space
+
+        def observe(self, agents):
+            return dict.fromkeys(agents, wrong if self.time else space.sample())
+
+    env = TeamEnv(Watcher({"a": (3, TRUNCATED)}))
+    env.reset()
+    with pytest.raises(ValueError, match=r"observation of agent 'a' .*, but its space is .*in step 1 of the episode"):
+        env.step(np.zeros(1))
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "x", np.float64(3.0)])
+def test_seeds_that_are_none_are_refused(seed):
+    with pytest.raises(ValueError, match="must be an integer of at least 0"):
+        TeamEnv(Script({"a": (2, TRUNCATED)})).reset(seed=seed)
+
+
+def test_a_seed_of_numpy_is_a_seed():
+    one, other = TeamEnv(simple_spread_v3.parallel_env()), TeamEnv(simple_spread_v3.parallel_env())
+    assert np.array_equal(one.reset(seed=np.int64(3))[0], other.reset(seed=3)[0])
+
+
+@pytest.mark.parametrize(
+    ("space", "wrong"),
+    [
+        (spaces.Box(-1, 1, (2,)), [0.0, np.nan]),
+        (spaces.Discrete(3), [np.nan]),
+        (spaces.Discrete(3), [3]),
+        (spaces.Discrete(3, start=1), [-1]),
+        (spaces.MultiBinary(2), [0, 2]),
+        (spaces.MultiDiscrete([2, 3]), [2, 0]),
+        (spaces.MultiBinary(1), ["x"]),
+    ],
+)
+def test_actions_outside_of_their_space_are_refused(space, wrong):
+    script = Broken(action_space=lambda agent: space)
+    env = TeamEnv(script)
+    env.reset()
+    length = env.action_space.shape[0] // 2
+    with pytest.raises(ValueError, match=r"action of agent '[ab]' is \[.*in step 1 of the episode, but its space is"):
+        env.step(np.array([0] * length + wrong))
+    assert script.sent == []
+
+
+def test_steps_before_and_after_an_episode_ask_for_a_reset():
+    env = TeamEnv(Script({"a": (1, TERMINATED)}))
+    for _ in range(2):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\)"):
+            env.step(np.zeros(1))
+        play(env)
+
+
+def test_stable_baselines3_evaluates_on_an_adapted_environment():
+    model = MADDPG("MlpPolicy", simple_spread_v3.parallel_env(), seed=0)
+    mean, _ = evaluate_policy(model, Monitor(TeamEnv(simple_spread_v3.parallel_env())), n_eval_episodes=2)
+    assert np.isfinite(mean)

@@ -133,7 +133,7 @@ def test_the_swarm_is_the_same_from_both_sides():
         assert info2["agent_infos"]["robot_3"]["metrics"].keys() == info["metrics"].keys()
     assert info2["is_success"] == info["is_success"]
     for name in ("agent_names", "observation_layout", "action_cost"):
-        assert getattr(env, name) == single.get_wrapper_attr(name)
+        assert env.get_wrapper_attr(name) == single.get_wrapper_attr(name)
 
 
 @pytest.mark.parametrize(

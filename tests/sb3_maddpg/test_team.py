@@ -166,9 +166,22 @@ def test_agents_are_found_by_name_and_number():
         (spaces.Box(-1, 1, (2, 3)), spaces.Discrete(4), "A team action is flat"),
         (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary((2, 2)), "A team action is flat"),
         (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(5), "5 numbers cannot be shared out evenly among 2"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.MultiDiscrete([3, 3], start=[0, 1]), r"start=\[0, 1\].*add it in step"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.Box(-np.inf, 1, (2,)), "'agent_0' has the action space .*without bounds"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.Box(-3e38, 3e38, (2,)), "'agent_0' .*too large for single precision"),
+        (spaces.Box(-1, 1, (0, 3)), spaces.MultiBinary(4), "at least one agent"),
+        (spaces.Box(-1, 1, (2, 0)), spaces.MultiBinary(4), "at least one column"),
         (spaces.Box(-1, 1, (2, 3)), MixedActions(MIXED), "has 4 agents, but the observation has 2 rows"),
     ],
 )
 def test_what_is_no_team_is_refused(observation, action, message):
     with pytest.raises(ValueError, match=message):
         Team.from_spaces(observation, action)
+
+
+def test_names_that_do_not_fit_are_refused():
+    given = spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(4)
+    with pytest.raises(ValueError, match="3 names, a, b, c, for 2 agents"):
+        Team.from_spaces(*given, names=["a", "b", "c"])
+    with pytest.raises(ValueError, match="occurs twice: a, a"):
+        Team.from_spaces(*given, names=["a", "a"])

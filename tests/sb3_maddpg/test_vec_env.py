@@ -107,3 +107,44 @@ def test_agrees_with_single_environments_under_sb3():
         actions = np.ones((2, 12), dtype=np.int8)
         for mine, theirs in zip(many.step(actions)[:3], single.step(actions)[:3], strict=True):
             assert np.array_equal(mine, theirs)
+
+
+def test_a_seed_of_numpy_is_a_seed():
+    one, other = cartpoles(2), cartpoles(2)
+    one.seed(np.int64(3))
+    other.seed(3)
+    assert np.array_equal(one.reset(), other.reset())
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        cartpoles(2).step(np.zeros(2, int))
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (2, 12, 1), (24,), (2, 11)])
+def test_actions_of_another_shape_are_refused(shape):
+    env = GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=2))
+    env.reset()
+    with pytest.raises(ValueError, match=r"actions have shape .*2 environments .*must have shape \(2, 12\)"):
+        env.step(np.zeros(shape, np.int8))
+
+
+def test_actions_that_are_not_finite_are_refused():
+    env = GymnasiumVecEnv(gymnasium.make_vec("Pendulum-v1", 2, "sync", vector_kwargs=SAME_STEP))
+    env.reset()
+    with pytest.raises(ValueError, match=r"action of environment 1 is \[nan\]"):
+        env.step(np.array([[0.0], [np.nan]], np.float32))
+
+
+def test_what_is_no_vector_environment_is_refused():
+    with pytest.raises(ValueError, match=r"no Gymnasium VectorEnv: .*make_vec"):
+        GymnasiumVecEnv(gymnasium.make("CartPole-v1"))
+
+
+def test_an_episode_that_ends_without_its_last_observation_is_refused():
+    env = cartpoles(2)
+    step = env.envs.step
+    env.envs.step = lambda actions: (*step(actions)[:4], {})
+    env.reset()
+    with pytest.raises(ValueError, match=r"without info\['final_obs'\]"):
+        [env.step(np.zeros(2, int)) for _ in range(20)]

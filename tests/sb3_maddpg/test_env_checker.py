@@ -1,0 +1,96 @@
+"""Environments of one's own, checked against the team convention."""
+
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from mpe2 import simple_spread_v3
+
+import quad_swarm
+from sb3_maddpg import check_team_env, team_tasks
+from sb3_maddpg.team import TeamAttributes, TeamInfo
+from toys import AGENT_SPACES, Neighbours, Toy
+
+CONVENTION = (
+    (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text().split("## The team convention")[1].split("\n## ")[0]
+)
+
+
+@pytest.mark.parametrize(
+    "make", [*(*team_tasks.BINARY_TASKS, team_tasks.FollowTarget, team_tasks.OwnCategory), Neighbours]
+)
+def test_environments_that_keep_to_the_convention_pass(make):
+    env = make()
+    assert check_team_env(env).n_agents == env.n_agents
+
+
+@pytest.mark.parametrize("kind", AGENT_SPACES)
+def test_teams_of_every_kind_of_action_pass(kind):
+    assert check_team_env(Toy(kind)).names == tuple(Toy(kind).possible_agents)
+
+
+@pytest.mark.parametrize("scenario", ["random", "curriculum"])
+def test_the_swarm_mirrors_the_convention_without_knowing_it(scenario):
+    kwargs = {"scenario": scenario, "max_steps": 5}
+    assert check_team_env(gymnasium.make("QuadSwarm-v0", **kwargs)) == check_team_env(quad_swarm.parallel_env(**kwargs))
+
+
+def test_pettingzoo_environments_pass():
+    assert check_team_env(simple_spread_v3.parallel_env()).names == ("agent_0", "agent_1", "agent_2")
+
+
+def unseeded(rng: np.random.Generator, batch: int) -> np.ndarray:
+    return np.random.default_rng().uniform(-1, 1, (batch, 3, 3)).astype(np.float32)
+
+
+class Wrong(team_tasks.OwnBit):
+    """``info`` of a step is spoilt."""
+
+    def __init__(self, attributes=None, **info):
+        super().__init__()
+        self.info = info
+        for name, value in (attributes or {}).items():
+            setattr(self, name, value)
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, {**info, **self.info}
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (Wrong(agent_rewards=[1.0, 2.0]), r"info\['agent_rewards'\] in step 1 is \[1.0, 2.0\].*each of the 3 agents"),
+        (Wrong(agent_rewards=[0.0, np.nan, 0.0]), "'agent_rewards'.* of agent agent_1 in step 1 is not finite"),
+        (Wrong(agent_reward=[0.0] * 3), "Unknown entry 'agent_reward': did you mean 'agent_rewards'"),
+        (Wrong(agent_active=[0.5, 1, 1]), "must hold True or False for each agent"),
+        (Wrong(agent_terminated=[True, False, False], agent_active=[True] * 3), "agent_0 acts in step 2, although it"),
+        (Wrong(pair_rewards=np.zeros(3)[None]), "each of its neighbours"),
+        (Wrong(metrics={"x": {"y": 1}}), "flat dict of numbers"),
+        (Wrong({"agent_names": ["a", "b"]}), "2 names, a, b, for 3 agents"),
+        (Wrong({"action_cost": np.nan}), "action_cost=nan must be a finite number"),
+        (Wrong({"n_curriculum_levels": 2}), "needs both"),
+        (Wrong({"n_curriculum_levels": 0, "set_curriculum_level": print}), "n_curriculum_levels=0"),
+        (Wrong({"n_curriculum_levels": 2, "set_curriculum_level": print}), "is_success"),
+        (Wrong({"observation_layout": {"own": [0]}}), "needs `own` and `neighbours`"),
+        (Wrong({"action_space": spaces.MultiBinary(10)}), "10 numbers cannot be shared out evenly"),
+        (
+            Wrong({"draw": unseeded}),
+            "different observations",
+        ),
+        (gymnasium.make("CartPole-v1"), r"shape \(n_agents, obs_dim\)"),
+        ("CartPole-v1", "neither a Gymnasium environment"),
+    ],
+)
+def test_what_is_wrong_is_said(env, message):
+    with pytest.raises(ValueError, match=message):
+        check_team_env(env)
+
+
+def test_the_tables_of_the_convention_name_what_the_contract_does():
+    attributes = {*TeamAttributes.__annotations__, "set_curriculum_level"}
+    in_tables = set(re.findall(r"`(\w+)(?:\(level\))?`", "\n".join(re.findall(r"^\| (`[^|]+) \|", CONVENTION, re.M))))
+    assert in_tables == {*TeamInfo.__annotations__, *attributes}

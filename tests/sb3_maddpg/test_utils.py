@@ -1,0 +1,61 @@
+"""Files that appear whole, seeds, and what is finite."""
+
+import os
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from sb3_maddpg.utils import all_finite, as_seed, atomic_write
+
+
+def test_a_file_is_replaced_whole_and_its_folder_synced(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
+    target = tmp_path / "new" / "model.zip"
+    with atomic_write(target.with_suffix(""), suffix="zip") as file:
+        file.write(b"one")
+        assert not target.exists()
+    assert synced == [target.stat().st_ino, target.parent.stat().st_ino]
+    with suppress(RuntimeError), atomic_write(target, suffix="zip") as file:
+        file.write(b"half")
+        raise RuntimeError
+    assert target.read_bytes() == b"one"
+    assert os.listdir(target.parent) == ["model.zip"]
+
+
+def test_a_path_that_cannot_be_written_is_refused_before_any_work(tmp_path):
+    (tmp_path / "folder.zip").mkdir()
+    (tmp_path / "file").write_text("")
+    for path, message in (
+        (tmp_path / "folder", "This is a folder: name a file in it: '.*folder.zip'"),
+        (tmp_path / "file" / "model", "Cannot write here .*choose another folder: '.*file/model.zip'"),
+    ):
+        worked = False
+        with pytest.raises(OSError, match=message), atomic_write(path, suffix="zip"):
+            worked = True
+        assert not worked
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder.zip"]
+
+
+def test_seeds_are_integers_of_any_type():
+    assert [as_seed(seed) for seed in (None, 3, np.int64(3), True)] == [None, 3, 3, 1]
+    assert type(as_seed(np.uint8(3))) is int
+    for wrong in (-1, np.int64(-1), 2.5, "3"):
+        with pytest.raises(ValueError, match="must be an integer of at least 0"):
+            as_seed(wrong)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_one_number_that_is_not_finite_is_found(dtype, wrong):
+    values = np.ones((3, 4), dtype)
+    assert all_finite(values)
+    values[2, 1] = wrong
+    assert not all_finite(values)
+
+
+def test_large_numbers_are_finite_if_single_precision_holds_them():
+    assert all_finite(np.array([1e30, -3e38], np.float32))
+    assert not all_finite(np.array([1e39]))
+    assert all_finite(np.array([2**62]))
