@@ -11,11 +11,11 @@ import yaml
 import quad_swarm
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.commands import latest_model, main
-from sb3_maddpg.cli.experiment import check_env_kwargs, check_keys
+from sb3_maddpg.cli.pettingzoo_ids import register
+from sb3_maddpg.cli.recipes import check_env_kwargs, check_keys
 from sb3_maddpg.cli.zoo import packaged_config
 from sb3_maddpg.cli.zoo import register as register_all
 from sb3_maddpg.matd3 import MATD3
-from sb3_maddpg.parallel import register
 
 SPREAD = ["--env", "mpe2/simple_spread_v3"]
 

@@ -13,7 +13,7 @@ import yaml
 
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
 from sb3_maddpg.cli.commands import main
-from sb3_maddpg.cli.zoo import WordsAndPython
+from sb3_maddpg.cli.literals import StoreValues
 
 PACKAGE = """
 import json, sys
@@ -119,7 +119,7 @@ def test_arguments_of_the_environment_reach_training_and_evaluation(arena, tmp_p
 )
 def test_arguments_are_words_or_python(words, meant):
     parser = argparse.ArgumentParser()
-    parser.add_argument("--env-kwargs", nargs="+", action=WordsAndPython)
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreValues)
     assert parser.parse_args(["--env-kwargs", *words]).env_kwargs == meant
 
 
