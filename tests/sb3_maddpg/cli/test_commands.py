@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.cli.commands import COMMANDS, main
+from sb3_maddpg.cli.commands import COMMANDS, examples, main
 from sb3_maddpg.pretrained_models import pretrained_folder
 
 
@@ -22,10 +22,11 @@ def test_every_command_helps_with_an_example(name, capsys):
     assert stopped.value.code == 0
     shown = capsys.readouterr().out
     assert "usage:" in shown
-    assert COMMANDS[name].examples.splitlines()[0].strip() in shown
+    assert examples(name).splitlines()[0].strip() in shown
+    assert not any(word in COMMANDS[name].examples for word in ("Swarm", "swarm"))
 
 
-def test_shipped_models_are_listed_shown_and_copied(capsys):
+def test_pretrained_models_are_listed_shown_and_copied(capsys):
     assert main(["pretrained"]) == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     assert "quad-swarm-paper" in listed
@@ -40,7 +41,7 @@ def test_shipped_models_are_listed_shown_and_copied(capsys):
     assert "did you mean 'quad-swarm-paper'" in capsys.readouterr().err
 
 
-def test_a_shipped_model_is_evaluated_and_replayed_by_its_name(capsys):
+def test_a_pretrained_model_is_evaluated_and_replayed_by_its_name(capsys):
     flown = ["--policy", "pretrained:quad-swarm-paper@0.5"]
     argv = ["evaluate", *flown, "--scenario", "random", "--episodes", "2", "--json", "table.json"]
     assert main(argv) == 0
