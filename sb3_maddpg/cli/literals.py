@@ -44,13 +44,11 @@ def parse_value(text: str) -> Any:
     """
     if text.lower() in WORDS:
         return WORDS[text.lower()]
-    if text.lower().lstrip("+-.") in NOT_FINITE:
-        raise ValueError(f"{text} is not a finite number")
     try:
-        return parse_literal(text)
+        return parse_literal(_finite(text))
     except ValueError as error:
         if _is_word(text):
-            return text
+            return _finite(text)
         if text[0] not in "[{":
             raise error
     try:
@@ -108,7 +106,8 @@ def _key(node: ast.expr | None) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
+    not_finite = isinstance(value, float) and not math.isfinite(value)
+    if not_finite or (isinstance(value, str) and value.lower().lstrip("+-.") in NOT_FINITE):
         raise ValueError(f"{value} is not a finite number")
     if isinstance(value, dict):
         contents = [*value, *value.values()]

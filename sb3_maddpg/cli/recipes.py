@@ -185,6 +185,9 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
         raise ValueError(f"{path} has no recipe for {env_id} and no `default`. {form}")
     if not isinstance(recipes[name], dict):
         raise ValueError(f"{path}: the recipe {name} is {_kind(recipes[name])}. {form}")
+    for key in recipes[name]:
+        if not isinstance(key, str):
+            raise ValueError(suggest(f"key in the recipe for {algo}", str(key), set(ZooKeys.model_fields)))
 
 
 def _kind(value: Any) -> str:
