@@ -40,7 +40,7 @@ def test_a_value_is_what_python_or_yaml_means_by_it_or_a_word(text, meant):
 
 @pytest.mark.parametrize(
     "text",
-    ["nan", "-inf", ".nan", "1e999", "[nan, 1e999]", "{a: .inf}", "1/0", "2**9999999", "print(1)", "[1, 2", "f(x=1)"],
+    ["nan", "-inf", ".nan", "1e999", "[nan, 1]", "{a: .inf}", "1/0", "2**9999999", "print(1)", "[1, 2", "f(x=1)"],
 )
 def test_what_is_not_finite_or_would_have_to_be_evaluated_is_refused(text):
     with pytest.raises(ValueError, match=r"finite|not evaluated|not valid Python|neither a list nor a dict"):
