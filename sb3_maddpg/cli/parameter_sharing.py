@@ -12,7 +12,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import create_empty_array, iterate
 from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
@@ -53,7 +55,7 @@ class AgentsVecEnv(VecEnv):
         self.agents = _homogeneous_agents(env_id, env)
         with warnings.catch_warnings():  # it looks for a Gymnasium environment
             warnings.filterwarnings("ignore", module="supersuit")
-            self.envs = concat_vec_envs_v1(pettingzoo_env_to_vec_env_v1(env), n_envs)
+            self.envs = concat_vec_envs_v1(pettingzoo_env_to_vec_env_v1(EveryAgent(env)), n_envs)
         env.close()  # the copies go on
         self.actions: np.ndarray | None = None
         super().__init__(self.envs.num_envs, self.envs.observation_space, self.envs.action_space)
@@ -78,15 +80,8 @@ class AgentsVecEnv(VecEnv):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """
         :return: observations, rewards, dones and infos of all agents
-        :raises ValueError: an agent ended before the others
         """
-        try:
-            observations, rewards, terminations, truncations, infos = self.envs.step(self.actions)
-        except AssertionError as error:
-            raise ValueError(
-                f"Agents of {self.spec.id} leave before the episode ends ({error}). "
-                f"Add supersuit.black_death_v3 to `wrappers` of env_kwargs."
-            ) from error
+        observations, rewards, terminations, truncations, infos = self.envs.step(self.actions)
         terminated, truncated = terminations.astype(bool), truncations.astype(bool)
         for k, info in enumerate(infos):
             if truncated[k]:
@@ -160,6 +155,55 @@ def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
                     "to `wrappers` of env_kwargs, or train with --algo maddpg or matd3."
                 )
     return agents
+
+
+class EveryAgent(BaseParallelWrapper):
+    """
+    Shows agents that ended before the others zeros, and rewards them with nothing, until the episode ends. SuperSuit's
+    ``black_death_v3`` should do so, but in version 3.11 an episode goes on until all agents terminate and are truncated
+    in the same step.
+
+    :param env: the environment
+    """
+
+    def __init__(self, env: ParallelEnv):
+        super().__init__(env)
+        self.agents = self.possible_agents
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        """
+        :param seed: for the environment
+        :param options: for the environment
+        :return: observations and infos of all agents
+        """
+        observations, infos = self.env.reset(seed=seed, options=options)
+        return self._fill(observations), {agent: infos.get(agent, {}) for agent in self.agents}
+
+    def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
+        """
+        :param actions: of all agents
+        :return: observations, rewards, terminations, truncations and infos of all agents; all end together
+        """
+        given = {agent: actions[agent] for agent in self.env.agents}
+        observations, rewards, terminations, truncations, infos = self.env.step(given)
+        over = not self.env.agents
+        # Some environments go on telling of agents that have left
+        truncated = {agent: over and agent in given and bool(truncations[agent]) for agent in self.agents}
+        terminated = {agent: over and (not truncated[agent] or bool(terminations[agent])) for agent in self.agents}
+        return (
+            self._fill({agent: observations[agent] for agent in given if agent in observations}),
+            {agent: rewards[agent] if agent in given else 0.0 for agent in self.agents},
+            terminated,
+            truncated,
+            {agent: infos.get(agent, {}) for agent in self.agents},
+        )
+
+    def _fill(self, observations: dict) -> dict:
+        for agent in self.agents:
+            if agent not in observations:
+                space = self.observation_space(agent)
+                observations = {**observations, agent: next(iter(iterate(space, create_empty_array(space))))}
+        return observations
 
 
 class SharedPolicy:

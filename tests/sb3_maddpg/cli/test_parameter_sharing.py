@@ -101,17 +101,20 @@ def test_teams_that_cannot_share_a_policy_are_refused(kwargs, message):
     assert AgentsVecEnv(TAG, 1, {"wrappers": PADDED}).num_envs == 4
 
 
-def test_agents_that_leave_need_black_death(tmp_path, monkeypatch):
+def test_agents_that_leave_see_zeros_until_the_episode_ends(tmp_path, monkeypatch):
     (tmp_path / "leaving.py").write_text(LEAVING)
     monkeypatch.syspath_prepend(tmp_path)
     register("leaving")
-    env = AgentsVecEnv("leaving", 1, {})
+    env = AgentsVecEnv("leaving", 1, {"max_cycles": 4})
     env.reset()
-    with pytest.raises(ValueError, match=r"Agents of leaving leave before .* Add supersuit.black_death_v3"):
-        env.step(np.zeros(3))
-    env = AgentsVecEnv("leaving", 1, {"wrappers": ["supersuit.black_death_v3"], "max_cycles": 5})
-    env.reset()
-    assert [bool(env.step(np.zeros(3))[2].all()) for _ in range(5)] == [False] * 4 + [True]
+    for step in range(8):
+        observations, rewards, dones, infos = env.step(np.zeros(3))
+        assert dones.tolist() == [step % 4 == 3] * 3
+        assert (rewards[0] == 0) == (step % 4 > 0)
+        assert observations[0].any() == (step % 4 in (0, 3))  # it has left, or the next episode has begun
+        assert observations[1].any()
+    # The one terminated long ago, the others are cut off
+    assert [bool(info.get("TimeLimit.truncated")) for info in infos] == [False, True, True]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +169,7 @@ def test_the_packaged_recipes_for_ppo_train(env_id):
 def test_wrappers_of_supersuit_in_recipes_for_a_team(env_id):
     stack = {"supersuit.frame_stack_v2": {"stack_size": 3}}
     plain = gymnasium.make(env_id).observation_space.obs_dims
-    env = gymnasium.make(env_id, wrappers=[stack, "supersuit.black_death_v3", "supersuit.agent_indicator_v0"])
+    env = gymnasium.make(env_id, wrappers=[stack, "supersuit.clip_reward_v0", "supersuit.agent_indicator_v0"])
     assert env.observation_space.obs_dims == tuple(3 * size + len(plain) for size in plain)
     env.reset(seed=0)
     observation, reward, *_ = env.step(env.action_space.sample())
