@@ -157,16 +157,18 @@ class TeamExperimentManager(ExperimentManager):
             {key: one for key, one in hyperparams.items() if one is not None}
         )
         for key, one in found.items():
-            if isinstance(one, SimpleLinearSchedule):  # a model that is saved with it loads with rl_zoo3 alone
+            if isinstance(one, SimpleLinearSchedule):  # to load a model with it takes rl_zoo3
                 found[key] = LinearSchedule(one.initial_value, 0.0, 1.0)
         return found
 
     def create_callbacks(self) -> None:
         """rl_zoo3's, and what TensorBoard shows beside the curves."""
         if self.shares_parameters:  # rl_zoo3 counts in steps of all copies and in episodes
-            n_agents = self.create_envs(1, eval_env=True).num_envs
-            self.eval_freq, self.save_freq = self.eval_freq // n_agents, self.save_freq // n_agents
-            self.n_eval_episodes *= n_agents
+            env = self.create_envs(1, eval_env=True)
+            env.close()
+            self.eval_freq = max(self.eval_freq // env.num_envs, 1) if self.eval_freq > 0 else -1
+            self.save_freq = max(self.save_freq // env.num_envs, 1) if self.save_freq > 0 else -1
+            self.n_eval_episodes *= env.num_envs
         super().create_callbacks()
         if not self.tensorboard_log or self.optimize_hyperparameters:
             return

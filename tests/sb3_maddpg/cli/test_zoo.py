@@ -217,6 +217,18 @@ def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
     assert json.loads(capsys.readouterr().out) == ["none", "--algo", "sb3_maddpg.matd3:MATD3"]
 
 
+def test_examples_of_a_command_are_those_of_what_is_installed(arena, monkeypatch, capsys):
+    for shown in ("  sb3-maddpg evaluate --env Arena-v0 --policy latest:logs\n", "  sb3-maddpg evaluate spicy\n"):
+        assert main(["evaluate", "--env", "Arena-v0", "--help"]) == 3
+        assert shown in capsys.readouterr().out
+        monkeypatch.setattr(arena, "EXAMPLES", "  sb3-maddpg evaluate spicy\n", raising=False)
+
+
+def test_an_environment_is_chosen_where_several_have_evaluators(arena, capsys):
+    assert main(["evaluate", "none"]) == 2
+    assert "--env is missing: choose one of Arena-v0, QuadSwarm-v0." in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
