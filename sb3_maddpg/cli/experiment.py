@@ -67,7 +67,7 @@ class TeamExperimentManager(ExperimentManager):
 
     def __init__(self, args: Any, *rest: Any, uuid_str: str = "", **kwargs: Any):
         check_options(args)
-        super().__init__(args, *rest, uuid_str=uuid_str, **kwargs)
+        super().__init__(args, *rest, **{**kwargs, "uuid_str": uuid_str})
         self.uuid_str = uuid_str
         self.shares_parameters = shares_parameters(ALGOS[self.algo], self.env_name.gym_id)
 
@@ -115,9 +115,9 @@ class TeamExperimentManager(ExperimentManager):
                 f"vec_env: gymnasium in the recipe does not go with {', '.join(sorted(wrappers))}: leave one out."
             )
         others = ("env_wrapper", "frame_stack", "monitor_kwargs", "normalize", "vec_env_wrapper")
-        if self.shares_parameters and (wrappers := [key for key in others if hyperparams.get(key)]):
+        if self.shares_parameters and (refused := [key for key in others if hyperparams.get(key)]):
             raise ValueError(
-                f"{', '.join(wrappers)} in the recipe: {self.algo} shares its policy among the agents of "
+                f"{', '.join(refused)} in the recipe: {self.algo} shares its policy among the agents of "
                 f"{self.env_name.gym_id}, whose wrappers are PettingZoo's. Name them in `wrappers` of env_kwargs, such "
                 "as supersuit.frame_stack_v2."
             )

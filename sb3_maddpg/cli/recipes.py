@@ -208,7 +208,8 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     fields = {key: hint for key, hint in _hints(ALGOS[algo]).items() if key in hyperparams}
     fields |= {key: Schedule for key in SCHEDULES if key in hyperparams}
     fields |= {key: Arguments | None for key in ("policy_kwargs", "replay_buffer_kwargs") if key in hyperparams}
-    model: Any = create_model("Recipe", __base__=ZooKeys, **{key: (hint, ...) for key, hint in fields.items()})
+    definitions: Any = {key: (hint, ...) for key, hint in fields.items()}
+    model = create_model("Recipe", __base__=ZooKeys, **definitions)
     try:
         checked = model.model_validate(dict(hyperparams))
     except ValidationError as error:

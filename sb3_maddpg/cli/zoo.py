@@ -44,7 +44,7 @@ def register() -> None:
     HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3"), convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
     for module in (rl_zoo3.train, rl_zoo3.enjoy, rl_zoo3.utils):  # record takes it from the last
-        module.StoreDict = StoreValues  # type: ignore[misc, attr-defined]
+        module.StoreDict = StoreValues  # type: ignore[attr-defined]
     importlib.import_module("sb3_maddpg.team_tasks")
     for entry_point in entry_points(group="sb3_maddpg.environments"):
         entry_point.load()
