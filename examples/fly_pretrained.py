@@ -1,4 +1,4 @@
-"""Fly a model that comes with the package, and draw it: ``python examples/fly_pretrained.py [--quick]``."""
+"""Fly a pretrained model, and draw it: ``python examples/fly_pretrained.py [--quick]``."""
 
 import argparse
 
@@ -20,8 +20,8 @@ for n_robots in (4, 6):
     observation, _ = env.reset(seed=5)
     pictures, requests, over = [], 0, False
     while not over:
-        bits, _ = model.predict(observation, deterministic=True)
-        observation, _, terminated, truncated, info = env.step(bits)
+        action, _ = model.predict(observation, deterministic=True)
+        observation, _, terminated, truncated, info = env.step(action)
         requests += info["n_requests"]
         pictures.append(Image.fromarray(env.render()))
         over = terminated or truncated or (quick and len(pictures) == 10)

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import math
-import pkgutil
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from types import ModuleType
@@ -501,10 +498,23 @@ def make(
         wrapper's arguments, e.g. ``["supersuit.pad_observations_v0", {"supersuit.frame_stack_v2": {"stack_size": 2}}]``
     :param kwargs: arguments of ``parallel_env``
     """
-    env = _parallel_env(entry)(**kwargs)
+    return TeamEnv(make_parallel_env(entry, wrappers, **kwargs), state=state)
+
+
+def make_parallel_env(
+    entry: str, wrappers: Iterable[str | Mapping[str, Any]] | None = None, **kwargs: Any
+) -> ParallelEnv:
+    """
+    Make the parallel environment of a module, with its wrappers.
+
+    :param entry: see ``make``
+    :param wrappers: see ``make``
+    :param kwargs: arguments of ``parallel_env``
+    """
+    env = find_parallel_env(entry)(**kwargs)
     for path, arguments in _wrappers(wrappers):
         env = _load(path)(env, **arguments)
-    return TeamEnv(env, state=state)
+    return env
 
 
 def _wrappers(wrappers: Iterable[str | Mapping[str, Any]] | None) -> list[tuple[str, dict[str, Any]]]:
@@ -527,7 +537,7 @@ def _load(path: str) -> Callable[..., Any]:
         raise ValueError(f"The wrapper {path} cannot be imported: {error}") from error
 
 
-def _module(name: str) -> ModuleType | None:
+def find_module(name: str) -> ModuleType | None:
     """The module, or None if there is no such module."""
     try:
         return importlib.import_module(name)
@@ -537,57 +547,8 @@ def _module(name: str) -> ModuleType | None:
         raise ValueError(f"{name} cannot be imported: {error}. Install what it needs.") from error
 
 
-def _parallel_env(entry: str) -> Callable[..., ParallelEnv]:
-    parallel_env = getattr(_module(entry), "parallel_env", None)
+def find_parallel_env(entry: str) -> Callable[..., ParallelEnv]:
+    parallel_env = getattr(find_module(entry), "parallel_env", None)
     if not callable(parallel_env):
         raise ValueError(f"There is no function parallel_env in {entry}: name a module that has one.")
     return parallel_env
-
-
-def register(env_id: str) -> bool:
-    """
-    Make a module with a function ``parallel_env`` known to Gymnasium: "mpe2/simple_spread_v3" stands for
-    ``mpe2.simple_spread_v3``, and "quad_swarm/parallel_env" for the function of the package itself.
-
-    :param env_id: Gymnasium id
-    :return: whether Gymnasium knows the id now
-    :raises ValueError: a module that is there, but cannot be imported
-    """
-    if env_id in gymnasium.registry:
-        return True
-    entry = env_id.removesuffix("/parallel_env").replace("/", ".")
-    if "/" not in env_id or not all(part.isidentifier() for part in entry.split(".")):
-        return False
-    if not callable(getattr(_module(entry), "parallel_env", None)):
-        return False
-    # Gymnasium's checker would warn of padding, whose bounds are both zero
-    gymnasium.register(env_id, entry_point=ENTRY_POINT, kwargs={"entry": entry}, disable_env_checker=True)
-    return True
-
-
-def siblings(env_id: str) -> list[str]:
-    """
-    :param env_id: an id like those of ``register``, of a module that may not exist
-    :return: ids of the versioned modules beside it
-    """
-    package, _, _ = env_id.rpartition("/")
-    if not package.isidentifier():
-        return []
-    paths = getattr(_module(package), "__path__", [])
-    return [f"{package}/{found.name}" for found in pkgutil.iter_modules(paths) if re.search(r"_v\d+$", found.name)]
-
-
-def arguments(entry: str) -> set[str] | None:
-    """
-    Names of the arguments of ``make`` for a module. PettingZoo's modules take any in ``parallel_env`` and hand them
-    on to ``raw_env``, which is asked instead.
-
-    :param entry: see ``make``
-    :return: the names, or None if any is taken
-    """
-    for function in (_parallel_env(entry), getattr(_module(entry), "raw_env", None)):
-        if callable(function):
-            parameters = inspect.signature(function).parameters.values()
-            if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
-                return {parameter.name for parameter in parameters} | {"state", "wrappers"}
-    return None

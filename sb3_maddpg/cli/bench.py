@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_maddpg.cli import zoo
 from sb3_maddpg.cli.experiment import TeamExperimentManager
-from sb3_maddpg.cli.options import common_options
+from sb3_maddpg.cli.options import check_writable, common_options
 
 # What of an algorithm is timed, by the attribute that does it. Those that an algorithm lacks take no time of their own.
 PARTS = {"learning": "train", "acting": "_sample_action"}
@@ -82,6 +82,10 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--n-timesteps", "-n", type=int, default=20_000)
     known, given = parser.parse_known_args(argv)
+    if known.json:
+        check_writable(known.json)
+    if known.n_timesteps < 1:
+        raise ValueError(f"--n-timesteps {known.n_timesteps}: give 1 or more")
     zoo.register()
     rl_zoo3.train.ExperimentManager = BenchManager  # type: ignore[misc]
     with tempfile.TemporaryDirectory() as folder:
@@ -95,7 +99,10 @@ def main(argv: list[str]) -> int:
     for name in ("environments", "learning", "acting", "rest"):
         print(f"  {name:13} {result[f'share_{name}']:6.1%}")
     if known.json:
-        known.json.parent.mkdir(parents=True, exist_ok=True)
         known.json.write_text(json.dumps(result) + "\n")
         print(f"wrote {known.json}")
     return 0
+
+
+if __name__ == "__main__":
+    sys.exit("error: this module is no command: use `sb3-maddpg bench` or `python -m sb3_maddpg bench`.")

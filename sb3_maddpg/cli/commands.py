@@ -2,8 +2,8 @@
 
 import argparse
 import importlib
-import json
 import os
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -17,22 +17,23 @@ from sb3_maddpg.cli.options import PROG, common_options
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.utils import suggest
 
-# Where evaluate and replay look unless --env says otherwise
-ENV = "QuadSwarm-v0"
-# Mistakes in what the user gave. Their messages say what to do, so one line is enough.
-USER_ERRORS = (ValueError, FileNotFoundError, FileExistsError, AssertionError, ImportError, gymnasium.error.Error)
+# Mistakes in what the user gave, and what the system refuses. Their messages say what to do, so one line is enough.
+USER_ERRORS = (ValueError, OSError, AssertionError, ImportError, gymnasium.error.Error)
 
 DESCRIPTION = """\
-MADDPG for Stable-Baselines3, and a swarm of quadrotors that learns whom to ask.
+Multi-agent reinforcement learning with MADDPG and MATD3 for Stable-Baselines3.
 
 {commands}
 
 `<command> --help` lists a command's options and shows an example. Those of train, tune, enjoy and record are rl_zoo3's.
 What differs: --algo is maddpg unless given (or matd3), the packaged recipe is used unless --conf-file is given,
 --env-kwargs are merged over the recipe's, --num-threads is 1 unless given, and -i MODEL.zip continues the training
-where it ended. --env PACKAGE/MODULE is a PettingZoo environment; its --env-kwargs are those of its parallel_env,
-`state:True` for critics that read the global state, and `wrappers`. Where a command takes a model's zip,
-`latest:LOGDIR` is the newest one there and `pretrained:NAME` one that comes with the package."""
+where it ended. Values of --env-kwargs and -params are written as in Python or YAML; nothing is evaluated.
+--gym-packages PACKAGE ... imports packages that register environments, rules or scenarios, in every command.
+--env PACKAGE/MODULE is a PettingZoo environment (MODULE for a file in the present folder); its --env-kwargs are those
+of its parallel_env, `state:true` for critics that read the global state, and `wrappers` by SuperSuit. There, --algo
+ppo, a2c, dqn, sac or td3 trains one policy whose parameters all agents share. Where a command takes a model's zip,
+`latest:LOGDIR` is the newest one there and `pretrained:NAME` a pretrained one."""
 
 
 class Command(NamedTuple):
@@ -41,6 +42,8 @@ class Command(NamedTuple):
     run: Callable[[list[str]], int]
     help: str
     examples: str
+    offers: str = ""
+    """Group of entry points by which packages offer the command for their environments"""
 
 
 def _zoo(command: str) -> Callable[[list[str]], int]:
@@ -63,16 +66,19 @@ def _replay(argv: list[str]) -> int:
 
 
 def _hand_over(group: str, argv: list[str]) -> int:
-    """Call what a package offers for its environment.
+    """
+    Call what a package offers for its environment; without --env the only one that is offered for.
 
     :param group: last part of the entry points' group
     """
     offers = entry_points(group=f"sb3_maddpg.{group}")
-    parser = common_options()
-    parser.set_defaults(env=ENV)
-    known, rest = parser.parse_known_args(argv)
+    known, rest = common_options().parse_known_args(argv)
     for package in known.gym_packages:
         importlib.import_module(package)
+    if known.env is None and len(offers.names) != 1:
+        choice = f"choose one of {', '.join(sorted(offers.names))}" if offers else f"no installed package has {group}"
+        raise ValueError(f"--env is missing: {choice}.")
+    known.env = known.env or next(iter(offers.names))
     if known.env not in offers.names:
         raise ValueError(suggest(f"environment with {group}", known.env, offers.names))
     main: Callable[[list[str]], int] = offers[known.env].load()
@@ -127,7 +133,7 @@ def _bench(argv: list[str]) -> int:
 
 
 def _pretrained(argv: list[str]) -> int:
-    """List the shipped models, or show one or copy it."""
+    """List the pretrained models, or show one or copy it."""
     parser = argparse.ArgumentParser(prog=f"{PROG} pretrained")
     parser.add_argument("name", nargs="?", metavar="NAME", help=f"{', '.join(pretrained_models())}; all unless given")
     parser.add_argument("--out", type=Path, metavar="DIR", help="copy the model and what belongs to it into DIR/NAME")
@@ -136,8 +142,7 @@ def _pretrained(argv: list[str]) -> int:
         if args.out:
             parser.error("--out needs the NAME of a model")
         for name in pretrained_models():
-            metrics = json.loads((pretrained_folder(name) / "metrics.json").read_text().splitlines()[0])
-            print(f"{name:20} {metrics['preset']}, {metrics['n_robots']} robots; {pretrained_folder(name)}")
+            print(f"{name:20} {_headline(pretrained_folder(name) / 'README.md')}")
         return 0
     folder = pretrained_folder(args.name)
     if args.out:
@@ -150,43 +155,69 @@ def _pretrained(argv: list[str]) -> int:
     return 0
 
 
+def _headline(readme: Path) -> str:
+    """The first sentence of a model's README, without Markdown; a colon ends it too."""
+    text = " ".join(readme.read_text().split("\n\n")[0].split()) if readme.is_file() else ""
+    return re.split(r"(?<=[.:])\s", text.lstrip("# ").replace("`", ""), maxsplit=1)[0].rstrip(".:")
+
+
+def examples(name: str) -> str:
+    """
+    :param name: of a command
+    :return: its examples, for a command that packages offer those of theirs: ``EXAMPLES`` of the module that has it
+    """
+    command = COMMANDS[name]
+    if not command.offers:
+        return command.examples
+    found = []
+    for offer in entry_points(group=f"sb3_maddpg.{command.offers}"):
+        own = getattr(importlib.import_module(offer.module), "EXAMPLES", "")
+        found.append(own.rstrip("\n") or command.examples.replace("ENV", offer.name))
+    return "\n".join(found) or command.examples
+
+
 COMMANDS: dict[str, Command] = {
     "train": Command(
         _zoo("train"),
         "train a team and evaluate it now and then",
         f"""\
-  {PROG} train --env QuadSwarm-v0 --progress --tensorboard-log logs/tensorboard
-  {PROG} train --algo matd3 --env mpe2/simple_spread_v3
-  {PROG} train --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:False""",
+  {PROG} train --env mpe2/simple_spread_v3 --progress --tensorboard-log logs/tensorboard
+  {PROG} train --algo matd3 --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:false
+  {PROG} train --algo ppo --env mpe2/simple_spread_v3 -params n_envs:8 learning_rate:lin_1e-3
+  {PROG} train --gym-packages my_package --env MyTeam-v0 --conf-file recipes.yml""",
     ),
     "tune": Command(
         _zoo("tune"),
         "search hyperparameters (train -optimize)",
         f"  {PROG} tune --env OwnBit-v0 --n-trials 50 --storage logs/tune.log --study-name a",
     ),
-    "enjoy": Command(_zoo("enjoy"), "watch a trained model", f"  {PROG} enjoy --env QuadSwarm-v0 -f logs"),
+    "enjoy": Command(_zoo("enjoy"), "watch a trained model", f"  {PROG} enjoy --env mpe2/simple_spread_v3 -f logs"),
     "record": Command(
-        _zoo("record"), "record a trained model on video", f"  {PROG} record --env QuadSwarm-v0 -f logs -n 200"
+        _zoo("record"),
+        "record a trained model on video",
+        f"  {PROG} record --env mpe2/simple_spread_v3 -f logs -n 200",
     ),
     "evaluate": Command(
         _evaluate,
         "compare policies over the same episodes",
-        f"  {PROG} evaluate --policy none full cpa:0.7:1.5 pretrained:quad-swarm-paper --scenario all --jobs 2",
+        f"  {PROG} evaluate --env ENV --policy latest:logs",
+        "evaluators",
     ),
     "replay": Command(
         _replay,
         "make a page that replays an episode in three dimensions",
-        f"  {PROG} replay --policy full pretrained:quad-swarm-paper --scenario symmetric_swap --out replay.html",
+        f"  {PROG} replay --env ENV --policy latest:logs --out replay.html",
+        "replays",
     ),
     "bench": Command(
         _bench,
         "measure how fast a recipe trains on this machine, and where the time goes",
-        f"  {PROG} bench --env QuadSwarm-v0 --n-timesteps 20000",
+        f"  {PROG} bench --env mpe2/simple_spread_v3 --n-timesteps 20000",
     ),
     "pretrained": Command(
         _pretrained,
-        "list, show or copy the models that come with the package",
-        f"  {PROG} pretrained\n  {PROG} pretrained quad-swarm-paper --out models",
+        "list, show or copy the pretrained models of the installed packages",
+        f"  {PROG} pretrained\n  {PROG} pretrained NAME --out models",
     ),
 }
 
@@ -219,11 +250,18 @@ def main(argv: list[str] | None = None) -> int:
     if command not in ("evaluate", "replay"):
         rest = [word for word in rest if word != "--debug"]
     if {"-h", "--help"} & set(rest):
-        print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{COMMANDS[command].examples}\n")
+        print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
     try:
         return COMMANDS[command].run(rest)
     except USER_ERRORS as error:
         if debug:
             raise
-        print(f"error: {error or type(error).__name__} (--debug shows the traceback)", file=sys.stderr)
+        text = str(error)
+        if isinstance(error, OSError) and error.strerror:
+            text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        print(f"error: {text or type(error).__name__} (--debug shows the traceback)", file=sys.stderr)
         return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,7 +1,7 @@
 """rl_zoo3's experiment manager, with its known faults around environment arguments, resuming and tuning mended."""
 
 import functools
-import inspect
+import itertools
 import time
 import warnings
 from importlib.metadata import entry_points
@@ -10,98 +10,94 @@ from typing import Any
 
 import gymnasium
 import optuna
-import rl_zoo3.exp_manager
-from gymnasium.envs.registration import load_env_creator
+import yaml
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, get_callback_list, get_class_by_name
+from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_callback_list, get_latest_run_id
 from sqlalchemy.exc import DBAPIError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback, LogEveryNTimesteps
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import LinearSchedule, configure_logger, safe_mean
+from stable_baselines3.common.utils import get_latest_run_id as latest_curve
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg import MADDPG
 from sb3_maddpg.callbacks import DashboardCallback
+from sb3_maddpg.cli.literals import format_literal, parse_literal
+from sb3_maddpg.cli.options import PROG, check_writable
+from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
+from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
 from sb3_maddpg.team import Team
-from sb3_maddpg.utils import arguments_of, describe_env, suggest
+from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
-# Keys of a recipe that rl_zoo3 uses up itself; every other key is an argument of the algorithm.
-ZOO_KEYS = {
-    "callback",
-    "env_kwargs",
-    "env_wrapper",
-    "eval_env_kwargs",
-    "frame_stack",
-    "monitor_kwargs",
-    "n_envs",
-    "n_timesteps",
-    "noise_std",
-    "noise_type",
-    "normalize",
-    "policy",
-    "vec_env",
-    "vec_env_wrapper",
-}
-# Arguments of the algorithm that the command line gives.
-COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
-# Arguments of the policy that the algorithm gives.
-OF_ALGORITHM = {"observation_space", "action_space", "lr_schedule"}
-
-# Off-policy algorithms log every so many episodes, unless --log-interval says otherwise; SB3's four fill the screen.
-LOG_EPISODES = 20
+# Tables in a training of an off-policy algorithm, unless --log-interval says otherwise: SB3's one every four episodes
+# fills the screen, and short trainings end before the first.
+TABLES = 100
+FEWEST_STEPS_PER_TABLE = 1000
 
 
 class TeamExperimentManager(ExperimentManager):
     """
     - ``--env-kwargs`` are merged over the recipe's ``env_kwargs``, and both reach the evaluation environment, there
       with ``eval_env_kwargs`` and ``--eval-env-kwargs`` merged over them;
-    - unknown keys are refused, with the nearest known one;
+    - options and recipes are checked before anything runs, see ``recipes``; no text of a recipe is evaluated;
+    - a run's folder is claimed: trainings that start together take different ones;
+    - an algorithm for single agents on a PettingZoo environment trains one policy for all agents, ``AgentsVecEnv``;
     - ``vec_env: gymnasium`` takes the environment's own Gymnasium vector environment, see ``GymnasiumVecEnv``;
     - ``replay_buffer_class`` can be a dotted path, as ``policy`` can;
+    - models load where rl_zoo3 is not installed: a linear schedule is Stable-Baselines3's;
     - every model, not only MADDPG's, carries the environment it was trained in as ``env_spec``;
     - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up; with a team of
       another size a ``PairPolicy`` goes on with its networks alone;
     - ``--trial-id`` takes any trial of a study, also the first, whose number is 0;
     - tuning (``-optimize``) keeps the recipe's other ``policy_kwargs``, leaves no run folder behind and draws other
       hyperparameters in each worker of a study. A trial is pruned if its networks diverged; any other error ends the
-      search, instead of being counted as a bad trial.
+      search, instead of being counted as a bad trial. The best trial is written as a recipe.
     """
+
+    study: optuna.Study | None = None  # that was searched
+
+    def __init__(self, args: Any, *rest: Any, uuid_str: str = "", **kwargs: Any):
+        check_options(args)
+        super().__init__(args, *rest, **{**kwargs, "uuid_str": uuid_str})
+        self.uuid_str = uuid_str
+        self.shares_parameters = shares_parameters(ALGOS[self.algo], self.env_name.gym_id)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         # rl_zoo3 would replace the recipe's arguments by these
         given, self.env_kwargs = self.env_kwargs, {}
         # and would take no trial for trial 0
         trial_id, self.trial_id = self.trial_id, None
+        read_recipe(self.config, self.algo, self.env_name.gym_id)
         hyperparams, _ = super().read_hyperparameters()
         if trial_id is not None:
             of_trial = self._read_trial(trial_id)
             print(f"Hyperparameters of trial {trial_id} of {self.study_name}: {of_trial}")
             hyperparams = {**update(hyperparams, of_trial), **(self.custom_hyperparams or {})}
-        check_keys(self.algo, hyperparams)
+        if self.n_timesteps > 0:
+            hyperparams.setdefault("n_timesteps", self.n_timesteps)
         if hyperparams.get("noise_type") is None:
             hyperparams.pop("noise_type", None)
             hyperparams.pop("noise_std", None)
+        as_written = dict(hyperparams)
+        hyperparams = check_recipe(self.algo, hyperparams, f"recipe for {self.algo} in {self.config}")
         self.own_vec_env = self._read_vec_env(hyperparams)
         env_kwargs = {**(hyperparams.get("env_kwargs") or {}), **given}
         eval_env_kwargs = {**(hyperparams.pop("eval_env_kwargs", None) or {}), **(self._eval_env_kwargs_args or {})}
         self.eval_env_kwargs = {**env_kwargs, **eval_env_kwargs}
         hyperparams["env_kwargs"] = env_kwargs
-        saved = {**hyperparams, "eval_env_kwargs": eval_env_kwargs}
-        if self.own_vec_env:
-            saved["vec_env"] = "gymnasium"
+        # As it was written, for classes have no plain form in YAML
+        self.recipe = {**as_written, "env_kwargs": env_kwargs, "eval_env_kwargs": eval_env_kwargs}
         check_env_kwargs(self.env_name.gym_id, self.eval_env_kwargs)
-        buffer = hyperparams.get("replay_buffer_class")
-        if isinstance(buffer, str) and "." in buffer:  # other names are for rl_zoo3
-            hyperparams["replay_buffer_class"] = _import_buffer(buffer)
-        return hyperparams, dict(sorted(saved.items()))
+        return hyperparams, dict(sorted(self.recipe.items()))
 
     def _read_vec_env(self, hyperparams: dict[str, Any]) -> bool:
         """Whether training steps the environment's own vector environment."""
@@ -117,6 +113,13 @@ class TeamExperimentManager(ExperimentManager):
         if vec_env and (wrappers := {"env_wrapper", "frame_stack", "monitor_kwargs"} & set(hyperparams)):
             raise ValueError(
                 f"vec_env: gymnasium in the recipe does not go with {', '.join(sorted(wrappers))}: leave one out."
+            )
+        others = ("env_wrapper", "frame_stack", "monitor_kwargs", "normalize", "vec_env_wrapper")
+        if self.shares_parameters and (refused := [key for key in others if hyperparams.get(key)]):
+            raise ValueError(
+                f"{', '.join(refused)} in the recipe: {self.algo} shares its policy among the agents of "
+                f"{self.env_name.gym_id}, whose wrappers are PettingZoo's. Name them in `wrappers` of env_kwargs, such "
+                "as supersuit.frame_stack_v2."
             )
         return vec_env is not None
 
@@ -141,11 +144,31 @@ class TeamExperimentManager(ExperimentManager):
 
     def create_log_folder(self) -> None:
         """Make the run's folder; a search has none, each trial's log goes to ``--optimization-log-path``."""
-        if not self.optimize_hyperparameters:
-            super().create_log_folder()
+        if self.optimize_hyperparameters:
+            return
+        first = get_latest_run_id(self.log_path, self.env_name) + 1
+        self.save_path = str(claim_folder(f"{self.log_path}{self.env_name}", first, self.uuid_str))
+        self.params_path = f"{self.save_path}/{self.env_name}"
+        super().create_log_folder()
+
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        found = ExperimentManager._preprocess_schedules(
+            {key: one for key, one in hyperparams.items() if one is not None}
+        )
+        for key, one in found.items():
+            if isinstance(one, SimpleLinearSchedule):  # to load a model with it takes rl_zoo3
+                found[key] = LinearSchedule(one.initial_value, 0.0, 1.0)
+        return found
 
     def create_callbacks(self) -> None:
         """rl_zoo3's, and what TensorBoard shows beside the curves."""
+        if self.shares_parameters:  # rl_zoo3 counts in steps of all copies and in episodes
+            env = self.create_envs(1, eval_env=True)
+            env.close()
+            self.eval_freq = max(self.eval_freq // env.num_envs, 1) if self.eval_freq > 0 else -1
+            self.save_freq = max(self.save_freq // env.num_envs, 1) if self.save_freq > 0 else -1
+            self.n_eval_episodes *= env.num_envs
         super().create_callbacks()
         if not self.tensorboard_log or self.optimize_hyperparameters:
             return
@@ -166,11 +189,15 @@ class TeamExperimentManager(ExperimentManager):
         :param eval_env: whether they are for evaluation
         :param no_log: write no monitor file
         """
-        no_log = no_log or self.optimize_hyperparameters
-        if eval_env or not self.own_vec_env:
+        no_log = no_log or eval_env or self.optimize_hyperparameters
+        if self.shares_parameters:
+            kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+            agents: VecEnv = AgentsVecEnv(self.env_name.gym_id, n_envs, kwargs)
+        elif self.own_vec_env and not eval_env:
+            agents = GymnasiumVecEnv(gymnasium.make_vec(self.env_name.gym_id, num_envs=n_envs, **self.env_kwargs))
+        else:
             return super().create_envs(n_envs, eval_env, no_log)
-        envs = gymnasium.make_vec(self.env_name.gym_id, num_envs=n_envs, **self.env_kwargs)
-        env = VecMonitor(GymnasiumVecEnv(envs), None if no_log else f"{self.save_path}/0")
+        env = VecMonitor(agents, None if no_log else f"{self.save_path}/0")
         env.seed(self.seed)
         return self._maybe_normalize(env, eval_env)
 
@@ -200,11 +227,13 @@ class TeamExperimentManager(ExperimentManager):
         """
         assert model.env is not None
         model.env_spec = describe_env(model.env)  # type: ignore[attr-defined]
+        model.set_logger(self._logger(type(model).__name__))
         kwargs: dict[str, Any] = {}
         if self.log_interval != -1:
             kwargs["log_interval"] = max(self.log_interval, 0) or None
         elif isinstance(model, OffPolicyAlgorithm):
-            kwargs["log_interval"] = LOG_EPISODES
+            kwargs["log_interval"] = None
+            self.callbacks.append(RegularTables(max(self.n_timesteps // TABLES, FEWEST_STEPS_PER_TABLE)))
         try:
             with warnings.catch_warnings():
                 # Evaluation goes episode by episode, whatever steps the training
@@ -223,6 +252,15 @@ class TeamExperimentManager(ExperimentManager):
             assert model.env is not None
             model.env.close()
 
+    def _logger(self, name: str) -> Logger:
+        """Tables on the screen, unless a progress bar is there, and curves for TensorBoard."""
+        prints = self.verbose > 0 and not self.show_progress
+        if not self.tensorboard_log or self.continue_training:
+            return configure_logger(int(prints), self.tensorboard_log, name, not self.continue_training)
+        first = latest_curve(self.tensorboard_log, name) + 1
+        folder = claim_folder(str(Path(self.tensorboard_log, name)), first)
+        return configure(str(folder), [*(["stdout"] if prints else []), "tensorboard"])
+
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         sampler: optuna.samplers.BaseSampler
         if sampler_method == "tpe":
@@ -239,16 +277,26 @@ class TeamExperimentManager(ExperimentManager):
         return sampler
 
     def hyperparameters_optimization(self) -> None:
-        """Search, alone or with other workers."""
+        """Search, alone or with other workers, and write the best trial as a recipe."""
+        best = Path(self.log_path, f"{self.env_name}_best.yml")
+        check_writable(best)  # as the report beside it
         if self.storage is not None and not self.storage.endswith(".log"):
             _make_tables(self.storage)
         super().hyperparameters_optimization()
+        if self.study is None:  # no trial was left to this worker
+            return
+        params = HYPERPARAMS_CONVERTER[self.algo](self.study.best_params)
+        with atomic_write(best, "yml") as file:
+            file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
+        print(f"The best trial as a recipe: {best}. To train by it:")
+        print(f"  {PROG} train --algo {self.algo} --env {self.env_name.gym_id} --conf-file {best}")
 
     def objective(self, trial: optuna.Trial) -> float:
         """
         :param trial: to choose hyperparameters for
         :return: last mean reward of the evaluation
         """
+        self.study = trial.study
         env = self.create_envs(self.n_envs, no_log=True)
         eval_env = self.create_envs(self.n_eval_envs, eval_env=True)
         try:
@@ -257,7 +305,7 @@ class TeamExperimentManager(ExperimentManager):
                 "her_kwargs": self._hyperparams.get("replay_buffer_kwargs", {}),
                 "env": env,
                 "hyperparams": self._hyperparams,
-                "policy_arguments": arguments_of(_policy(self.algo, self._hyperparams["policy"]) or BasePolicy),
+                "policy_arguments": arguments_of(policy_class(self.algo, self._hyperparams["policy"]) or BasePolicy),
             }
             sampled = HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments)
             model = ALGOS[self.algo](
@@ -267,7 +315,7 @@ class TeamExperimentManager(ExperimentManager):
                 device=self.device,
                 **update(self._hyperparams, sampled),
             )
-            evaluation = self._trial_evaluation(trial, eval_env)
+            evaluation = self._trial_evaluation(trial, eval_env, env.num_envs)
             callbacks = get_callback_list({"callback": self.specified_callbacks})
             try:
                 model.learn(self.n_timesteps, callback=[*callbacks, evaluation])
@@ -283,7 +331,7 @@ class TeamExperimentManager(ExperimentManager):
             raise optuna.TrialPruned
         return evaluation.last_mean_reward
 
-    def _trial_evaluation(self, trial: optuna.Trial, eval_env: VecEnv) -> TrialEvalCallback:
+    def _trial_evaluation(self, trial: optuna.Trial, eval_env: VecEnv, n_envs: int) -> TrialEvalCallback:
         path = None
         if self.optimization_log_path is not None:
             path = str(Path(self.optimization_log_path, f"trial_{trial.number}"))
@@ -293,7 +341,7 @@ class TeamExperimentManager(ExperimentManager):
             best_model_save_path=path,
             log_path=path,
             n_eval_episodes=self.n_eval_episodes,
-            eval_freq=max(self.n_timesteps // self.n_evaluations // self.n_envs, 1),
+            eval_freq=max(self.n_timesteps // self.n_evaluations // n_envs, 1),
             deterministic=self.deterministic_eval,
         )
 
@@ -302,10 +350,59 @@ class TeamExperimentManager(ExperimentManager):
         :param model: the trained model
         """
         super().save_trained_model(model)
+        if model.ep_info_buffer:
+            rewards = [episode["r"] for episode in model.ep_info_buffer]
+            print(f"Mean reward: {safe_mean(rewards):.4g} in the last {len(rewards)} episodes of the training")
         print(f"Model:       {self.save_path}/{self.env_name}.zip")
         print(f"Logs:        {self.save_path}")
         if self.tensorboard_log:
             print(f"TensorBoard: tensorboard --logdir {self.tensorboard_log}")
+
+
+class RegularTables(LogEveryNTimesteps):
+    """A table, and a point of each curve, every so many timesteps and at the end."""
+
+    def _on_training_start(self) -> None:
+        self.last_time_trigger = self.num_timesteps  # a continued training counts on
+
+    def _on_training_end(self) -> None:
+        self.num_timesteps = self.model.num_timesteps
+        if self.num_timesteps > self.last_time_trigger:
+            self._on_event()
+
+
+def claim_folder(prefix: str, first: int, suffix: str = "") -> Path:
+    """
+    Make a folder ``PREFIX_NUMBER`` that nobody else has, whoever starts at the same time.
+
+    :param prefix: path without the number
+    :param first: the lowest number
+    :param suffix: added to the number
+    """
+    Path(prefix).parent.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(first):
+        folder = Path(f"{prefix}_{number}{suffix}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise AssertionError  # there is always another number
+
+
+def as_yaml(recipe: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param recipe: that may hold classes of ``torch.nn``
+    :return: with text that ``parse_literal`` reads where YAML has no form for a value
+    """
+    plain = {}
+    for key, value in recipe.items():
+        try:
+            yaml.safe_dump(value)
+            plain[key] = value
+        except yaml.YAMLError:
+            plain[key] = format_literal(value)
+    return plain
 
 
 def _make_tables(url: str) -> None:
@@ -329,8 +426,8 @@ def update(hyperparams: dict[str, Any], changes: dict[str, Any]) -> dict[str, An
     """
     changed = {**hyperparams, **changes}
     policy_kwargs = hyperparams.get("policy_kwargs") or {}
-    if isinstance(policy_kwargs, str):  # as rl_zoo3 does it, which comes to it only later
-        policy_kwargs = eval(policy_kwargs, vars(rl_zoo3.exp_manager))
+    if isinstance(policy_kwargs, str):  # of a recipe as it is written
+        policy_kwargs = parse_literal(policy_kwargs)
     if "policy_kwargs" in changes:
         changed["policy_kwargs"] = {**policy_kwargs, **changes["policy_kwargs"]}
     return changed
@@ -342,66 +439,3 @@ def diverged(model: BaseAlgorithm) -> bool:
     :return: whether a network has a weight that is no number
     """
     return any(not weight.isfinite().all() for weight in model.policy.parameters())
-
-
-def _policy(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | None:
-    """The policy that a recipe names, or None for a dotted path, which rl_zoo3 imports later."""
-    return ALGOS[algo].policy_aliases.get(name) if isinstance(name, str) else name
-
-
-def _import_buffer(name: str) -> type[ReplayBuffer]:
-    """The replay buffer that a recipe names by a dotted path."""
-    try:
-        return get_class_by_name(name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Give the dotted path of a class, "
-            "such as sb3_maddpg.PrioritizedTeamReplayBuffer."
-        ) from error
-
-
-def check_keys(algo: str, hyperparams: dict[str, Any]) -> None:
-    """
-    Refuse a recipe with keys that nothing reads.
-
-    :param algo: name of the algorithm
-    :param hyperparams: the recipe
-    """
-    known = ZOO_KEYS | (arguments_of(ALGOS[algo]) - COMMAND_LINE)
-    for key in hyperparams:
-        if key not in known:
-            raise ValueError(suggest(f"key in the recipe for {algo}", key, known))
-    policy = _policy(algo, hyperparams.get("policy", ""))
-    policy_kwargs = hyperparams.get("policy_kwargs")
-    if policy is not None and isinstance(policy_kwargs, dict):
-        known = arguments_of(policy) - OF_ALGORITHM
-        for key in policy_kwargs:
-            if key not in known:
-                raise ValueError(suggest(f"key in policy_kwargs for {algo}", key, known))
-
-
-def check_env_kwargs(env_id: str, env_kwargs: dict[str, Any]) -> None:
-    """
-    Refuse arguments that the environment does not take.
-
-    :param env_id: Gymnasium id
-    :param env_kwargs: from the recipe and the command line
-    """
-    known = _env_arguments(env_id)
-    for key in env_kwargs:
-        if known is not None and key not in known:
-            raise ValueError(suggest(f"argument of {env_id}", key, known))
-
-
-def _env_arguments(env_id: str) -> set[str] | None:
-    """Names of the arguments an environment takes, or None if it takes any."""
-    spec = gymnasium.spec(env_id)
-    if spec.entry_point == parallel.ENTRY_POINT:
-        return parallel.arguments(spec.kwargs["entry"])
-    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
-    if creator is None:
-        return None
-    parameters = inspect.signature(creator).parameters.values()
-    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
-        return None
-    return {parameter.name for parameter in parameters}

@@ -1,6 +1,7 @@
-"""What all commands share: their name and the options that each of them looks at."""
+"""What all commands share: their name, the options that each of them looks at, and what is checked for each of them."""
 
 import argparse
+from pathlib import Path
 
 PROG = "sb3-maddpg"
 
@@ -12,3 +13,17 @@ def common_options() -> argparse.ArgumentParser:
     parser.add_argument("--env")
     parser.add_argument("--gym-packages", nargs="+", default=[])
     return parser
+
+
+def check_writable(path: Path) -> None:
+    """
+    Find out that a file cannot be written before the work whose result it shall hold; its folder is made.
+
+    :param path: of the file
+    :raises OSError: it cannot be written
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exists = path.exists()
+    path.open("ab").close()
+    if not exists:
+        path.unlink()

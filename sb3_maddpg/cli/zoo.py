@@ -1,7 +1,7 @@
 """``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3 and the installed environments."""
 
-import ast
-import builtins
+import argparse
+import difflib
 import importlib
 import os
 import runpy
@@ -24,11 +24,14 @@ except ImportError as error:
     raise ImportError(f"{error}. The zoo needs its own packages: pip install 'sb3-maddpg[zoo]'.") from error
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, StoreDict, get_latest_run_id, get_saved_hyperparams
+from rl_zoo3.utils import ALGOS, get_latest_run_id, get_saved_hyperparams
 
 from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.experiment import TeamExperimentManager
+from sb3_maddpg.cli.literals import StoreValues
 from sb3_maddpg.cli.options import PROG, common_options
+from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.utils import suggest
@@ -40,37 +43,11 @@ def register() -> None:
     HYPERPARAMS_SAMPLER.update({"maddpg": sample_maddpg_params, "matd3": sample_matd3_params})
     HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3"), convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
-    rl_zoo3.train.StoreDict = WordsAndPython  # type: ignore[misc]
+    for module in (rl_zoo3.train, rl_zoo3.enjoy, rl_zoo3.utils):  # record takes it from the last
+        module.StoreDict = StoreValues  # type: ignore[attr-defined]
     importlib.import_module("sb3_maddpg.team_tasks")
     for entry_point in entry_points(group="sb3_maddpg.environments"):
         entry_point.load()
-
-
-class WordsAndPython(StoreDict):
-    """
-    rl_zoo3's ``key:value``, where values are Python, and beside it plain words: ``preset:dense`` as well as
-    ``preset:"'dense'"``.
-    """
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        try:
-            super().__call__(parser, namespace, [_quoted(word) for word in values], option_string)
-        except Exception as error:
-            raise ValueError(f"{option_string} {' '.join(values)}: {error}. Write key:value.") from error
-
-
-def _quoted(word: str) -> str:
-    """:return: ``key:value`` with a value that Python can read"""
-    key, colon, value = word.partition(":")
-    if not colon or not value:
-        raise ValueError(f"'{word}' has no value")
-    try:
-        tree = ast.parse(value, mode="eval")
-    except SyntaxError:
-        return f"{key}:{value!r}"
-    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    known = names <= vars(builtins).keys() | vars(rl_zoo3.utils).keys()
-    return word if known and not isinstance(tree.body, ast.Name) else f"{key}:{value!r}"
 
 
 def _call(function: Callable[[], Any], command: str, argv: list[str]) -> None:
@@ -99,8 +76,8 @@ def train(argv: list[str]) -> int:
     parser = common_options()
     parser.add_argument("-conf", "--conf-file")
     known, rest = parser.parse_known_args(argv)
-    if known.env is not None and not {"-h", "--help"} & set(rest):
-        _find_env(known.env, known.gym_packages)
+    if not {"-h", "--help"} & set(rest):
+        _check(known)
     # One thread unless asked otherwise: small networks gain nothing by a second and lose badly where it is not free.
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
     if known.env is not None and known.conf_file is None:
@@ -115,10 +92,11 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     parser = common_options()
     parser.add_argument("-f", "--folder", default="logs")
     parser.add_argument("--exp-id", type=int, default=0)
-    parser.add_argument("--env-kwargs", nargs="+", action=WordsAndPython, default={})
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreValues, default={})
     known, rest = parser.parse_known_args(argv)
-    if known.env is not None and not {"-h", "--help"} & set(rest):
-        _find_env(known.env, known.gym_packages)
+    algorithm = None
+    if not {"-h", "--help"} & set(rest):
+        _check(known)
         name = EnvironmentName(known.env)
         exp_id = known.exp_id or get_latest_run_id(str(Path(known.folder, known.algo)), name)
         run = Path(known.folder, known.algo, f"{name}_{exp_id}" if exp_id > 0 else "")
@@ -132,7 +110,14 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
             if _is_headless() or not _has_window(known.env, env_kwargs):
                 print(f"Only the rewards are printed: {reason}. `record` makes a video.")
                 rest.append("--no-render")
-    _call(function, command, ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest])
+        if shares_parameters(ALGOS[known.algo], known.env):
+            algorithm = ALGOS[known.algo]
+            ALGOS[known.algo] = SharedPolicy.loader(algorithm.load)
+    try:
+        _call(function, command, ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest])
+    finally:
+        if algorithm is not None:
+            ALGOS[known.algo] = algorithm
     return 0
 
 
@@ -147,20 +132,31 @@ def record(argv: list[str]) -> int:
     return _show("record", lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), argv)
 
 
-def _find_env(env_id: str, packages: list[str]) -> None:
-    """Make the environment known to Gymnasium: one that is registered, or a PettingZoo module."""
-    for package in packages:
+def _check(known: argparse.Namespace) -> None:
+    """Whether the algorithm and the environment are there; a PettingZoo module is made known to Gymnasium."""
+    if known.algo not in ALGOS:
+        raise ValueError(suggest("algorithm", known.algo, ALGOS))
+    if known.env is None:
+        raise ValueError("--env is missing: give the id of a Gymnasium environment, or PACKAGE/MODULE of PettingZoo's.")
+    for package in known.gym_packages:
         importlib.import_module(package)
-    if parallel.register(env_id):
+    if pettingzoo_ids.register(known.env):
         return
-    package, slash, _ = env_id.rpartition("/")
-    known = parallel.siblings(env_id) or gymnasium.registry
-    if slash and not any(name.startswith(f"{package}/") for name in known):
+    package, slash, _ = known.env.rpartition("/")
+    ids = pettingzoo_ids.siblings(known.env) or list(gymnasium.registry)
+    if slash and not any(name.startswith(f"{package}/") for name in ids):
         raise ValueError(
-            f"Unknown environment '{env_id}': there is no module {env_id.replace('/', '.')} with a function "
+            f"Unknown environment '{known.env}': there is no module {known.env.replace('/', '.')} with a function "
             "parallel_env, as PettingZoo's have. Is its package installed, or in this folder?"
         )
-    raise ValueError(suggest("environment", env_id, known))
+    if difflib.get_close_matches(known.env, ids, n=1):
+        raise ValueError(suggest("environment", known.env, ids))
+    nearest = ", ".join(difflib.get_close_matches(known.env, ids, n=3, cutoff=0))
+    raise ValueError(
+        f"Unknown environment '{known.env}'. The nearest ids are {nearest}. A PettingZoo environment is "
+        "PACKAGE/MODULE, or MODULE for a file in this folder, with a function parallel_env; --gym-packages imports "
+        "what registers others."
+    )
 
 
 def _is_headless() -> bool:
@@ -186,3 +182,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "enjoy": enjoy,
     "record": record,
 }
+
+
+if __name__ == "__main__":
+    sys.exit(f"error: this module is no command: use `{PROG} train` or `python -m sb3_maddpg train`.")

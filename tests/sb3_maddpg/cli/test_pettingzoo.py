@@ -11,11 +11,11 @@ import yaml
 import quad_swarm
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.commands import latest_model, main
-from sb3_maddpg.cli.experiment import check_env_kwargs, check_keys
+from sb3_maddpg.cli.pettingzoo_ids import register
+from sb3_maddpg.cli.recipes import check_env_kwargs, check_keys
 from sb3_maddpg.cli.zoo import packaged_config
 from sb3_maddpg.cli.zoo import register as register_all
 from sb3_maddpg.matd3 import MATD3
-from sb3_maddpg.parallel import register
 
 SPREAD = ["--env", "mpe2/simple_spread_v3"]
 
@@ -115,6 +115,7 @@ def test_the_packaged_recipes_train_both_kinds_of_actions(in_logs, capsys, algor
         (["--env", "mpe2/simple_spred_v3"], "did you mean 'mpe2/simple_spread_v3'?"),
         (["--env", "mpe3/simple_spread_v3"], "no module mpe3.simple_spread_v3 with a function parallel_env"),
         (["--env", "QuadSwram-v0"], "did you mean 'QuadSwarm-v0'?"),
+        (["--env", "zzzz"], "A PettingZoo environment is PACKAGE/MODULE, or MODULE for a file in this folder"),
         ([*SPREAD, "--env-kwargs", "continous_actions:True"], "did you mean 'continuous_actions'?"),
         ([*SPREAD, "--eval-env-kwargs", "entry:'mpe2.simple_v3'"], "Unknown argument of mpe2/simple_spread_v3 'entry'"),
         ([*SPREAD, "--env-kwargs", "wrappers:['supersuit.dtype_v1']"], "supersuit.dtype_v1 cannot be imported"),
@@ -122,4 +123,13 @@ def test_the_packaged_recipes_train_both_kinds_of_actions(in_logs, capsys, algor
 )
 def test_what_is_no_pettingzoo_module_is_refused(in_logs, capsys, argv, message):
     assert main(["train", *argv, "--verbose", "0"]) == 2
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("-v") < 10  # the nearest few of all ids
+
+
+def test_false_turns_an_argument_off(in_logs):
+    argv = ["train", *SPREAD, "-n", "30", "--env-kwargs", "continuous_actions:false", "--verbose", "0"]
+    assert main([*argv, "--eval-freq", "-1"]) == 0
+    space = MADDPG.load(latest_model("latest:logs", "maddpg", SPREAD[1])).action_space
+    assert isinstance(space, gymnasium.spaces.MultiDiscrete)

@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.experiment import as_yaml
+from sb3_maddpg.cli.literals import parse_literal
 from sb3_maddpg.cli.zoo import register
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.team_tasks import OwnBit
@@ -163,7 +165,7 @@ def test_updates_are_counted_in_transitions_and_noise_is_left_to_action_noise():
 def test_the_first_trial_of_a_study_is_taken_up_again(algo, folder, capsys):
     stored = ["--storage", "s.log", "--study-name", "s"]
     assert train(*SEARCH, *stored, algo=algo) == 0
-    assert sorted(path.suffix for path in (folder / "logs" / algo).iterdir()) == [".csv", ".pkl"]  # no run
+    assert sorted(path.suffix for path in (folder / "logs" / algo).iterdir()) == [".csv", ".pkl", ".yml"]  # no run
     (trial,) = study().trials
     for trial_id in ("0", "1"):
         code = train(*stored, "--trial-id", trial_id, "--eval-freq", "-1", "-params", "n_steps:2", algo=algo)
@@ -177,6 +179,30 @@ def test_the_first_trial_of_a_study_is_taken_up_again(algo, folder, capsys):
     assert (model.tau, model.batch_size, model.estimator) == tuple(
         expected[key] for key in ("tau", "batch_size", "estimator")
     )
+
+
+def test_the_best_trial_is_written_as_a_recipe(folder, capsys):
+    assert train(*SEARCH, "--storage", "s.log", "--study-name", "s") == 0
+    command = capsys.readouterr().out.splitlines()[-1]
+    assert command == "  sb3-maddpg train --algo maddpg --env OwnBit-v0 --conf-file logs/maddpg/OwnBit-v0_best.yml"
+    (recipe,) = yaml.safe_load(Path("logs/maddpg/OwnBit-v0_best.yml").read_text()).values()
+    params = study().best_params
+    assert recipe["gamma"] == pytest.approx(1 - params["one_minus_gamma"])
+    assert recipe["tau"] == params["tau"]
+    assert not recipe.keys() & {"one_minus_gamma", "first_noise", "last_noise", "net_arch"}
+    assert recipe["policy_kwargs"]["threshold"] == 0.25  # of the recipe that was searched from
+    assert main([*command.split()[1:], "--eval-freq", "-1", "--verbose", "0"]) == 0
+    model = MADDPG.load("logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip")
+    assert (model.tau, model.gamma, model.num_timesteps) == (recipe["tau"], recipe["gamma"], 60)
+
+
+def test_classes_of_a_trial_have_a_form_in_a_recipe():
+    from torch import nn
+
+    params = {"policy_kwargs": {"activation_fn": nn.Tanh, "net_arch": {"pi": [64]}}, "gamma": 0.9}
+    written = yaml.safe_load(yaml.safe_dump(as_yaml(params)))
+    assert parse_literal(written["policy_kwargs"]) == params["policy_kwargs"]
+    assert written["gamma"] == 0.9
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import yaml
 
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
 from sb3_maddpg.cli.commands import main
-from sb3_maddpg.cli.zoo import WordsAndPython
+from sb3_maddpg.cli.literals import StoreValues
 
 PACKAGE = """
 import json, sys
@@ -119,7 +119,7 @@ def test_arguments_of_the_environment_reach_training_and_evaluation(arena, tmp_p
 )
 def test_arguments_are_words_or_python(words, meant):
     parser = argparse.ArgumentParser()
-    parser.add_argument("--env-kwargs", nargs="+", action=WordsAndPython)
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreValues)
     assert parser.parse_args(["--env-kwargs", *words]).env_kwargs == meant
 
 
@@ -215,6 +215,18 @@ def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
     assert json.loads(capsys.readouterr().out) == ["none", "--algo", "stable_baselines3.ppo.ppo:PPO"]
     assert main(["evaluate", "--env", "Arena-v0", "--algo", "matd3", "none"]) == 3
     assert json.loads(capsys.readouterr().out) == ["none", "--algo", "sb3_maddpg.matd3:MATD3"]
+
+
+def test_examples_of_a_command_are_those_of_what_is_installed(arena, monkeypatch, capsys):
+    for shown in ("  sb3-maddpg evaluate --env Arena-v0 --policy latest:logs\n", "  sb3-maddpg evaluate spicy\n"):
+        assert main(["evaluate", "--env", "Arena-v0", "--help"]) == 3
+        assert shown in capsys.readouterr().out
+        monkeypatch.setattr(arena, "EXAMPLES", "  sb3-maddpg evaluate spicy\n", raising=False)
+
+
+def test_an_environment_is_chosen_where_several_have_evaluators(arena, capsys):
+    assert main(["evaluate", "none"]) == 2
+    assert "--env is missing: choose one of Arena-v0, QuadSwarm-v0." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,153 @@
+"""Values on the command line and in recipes, read without running code."""
+
+import argparse
+import ast
+import math
+from typing import Any
+
+import torch
+import yaml
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+
+WORDS = {"true": True, "false": False, "null": None, "none": None}
+NOT_FINITE = ("nan", "inf", "infinity")
+SEQUENCES = {"list": list, "tuple": tuple}
+# What recipes of rl_zoo3 name: activation functions and optimizers
+CLASSES = {
+    **{name: (torch.nn, torch.nn.Module) for name in ("nn", "th.nn", "torch.nn")},
+    **{name: (torch.optim, torch.optim.Optimizer) for name in ("th.optim", "torch.optim")},
+}
+
+
+def parse_literal(text: str) -> Any:
+    """
+    Read a Python literal: numbers, text in quotes, lists, tuples and dicts, also written ``dict(a=1)``, with classes of
+    ``torch.nn`` and ``torch.optim``, such as ``nn.ReLU``. Nothing is evaluated.
+
+    :param text: e.g. "dict(net_arch=[64, 64], activation_fn=nn.ReLU)"
+    :raises ValueError: anything else, also a number that is not finite
+    """
+    try:
+        tree = ast.parse(text.strip(), mode="eval")
+    except SyntaxError as error:
+        raise ValueError(f"{text!r} is not valid Python: {error.msg}") from error
+    return _finite(_value(tree.body))
+
+
+def parse_value(text: str) -> Any:
+    """
+    Read a value of the command line: a literal of Python (``parse_literal``), ``true``, ``false`` or ``null``, a list
+    or dict as YAML has it, ``{preset: dense}``, or else a word, ``state+memory``.
+
+    :param text: without the key
+    :raises ValueError: an expression that would have to be evaluated, or a number that is not finite
+    """
+    if text.lower() in WORDS:
+        return WORDS[text.lower()]
+    try:
+        return parse_literal(_finite(text))
+    except ValueError as error:
+        if _is_word(text):
+            return _finite(text)
+        if text[0] not in "[{":
+            raise error
+    try:
+        return _finite(yaml.safe_load(text))
+    except yaml.YAMLError:
+        raise ValueError(f"{text} is neither a list nor a dict, in Python or in YAML") from None
+
+
+def _is_word(text: str) -> bool:
+    """Whether it is text that needs no quotes: neither brackets nor arithmetic."""
+    if set(text) & set("()[]{}"):
+        return False
+    try:
+        tree = ast.parse(text, mode="eval")
+    except SyntaxError:
+        return True
+    # An overflowing number is one constant, arithmetic has nothing but constants
+    return any(isinstance(node, ast.Name) for node in ast.walk(tree))
+
+
+def _value(node: ast.expr) -> Any:
+    match node:
+        case ast.Constant(value=bool() | int() | float() | str() | None as value):
+            return value
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=ast.Constant(value=int() | float() as value)):
+            return -value if isinstance(node.op, ast.USub) else value
+        case ast.List(elts=elements):
+            return [_value(element) for element in elements]
+        case ast.Tuple(elts=elements):
+            return tuple(_value(element) for element in elements)
+        case ast.Dict(keys=keys, values=values) if None not in keys:
+            return {_key(key): _value(value) for key, value in zip(keys, values, strict=True)}
+        case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(one.arg for one in keywords):
+            return {one.arg: _value(one.value) for one in keywords}
+        case ast.Call(func=ast.Name(id="list" | "tuple" as name), args=[argument], keywords=[]):
+            return SEQUENCES[name](_value(argument))
+        case ast.Name(id="RMSpropTFLike"):
+            return RMSpropTFLike
+        case ast.Attribute(value=module, attr=name) if ast.unparse(module) in CLASSES:
+            package, base = CLASSES[ast.unparse(module)]
+            found = getattr(package, name, None)
+            if isinstance(found, type) and issubclass(found, base):
+                return found
+            raise ValueError(f"there is no class {name} in {package.__name__}")
+    raise ValueError(
+        f"{ast.unparse(node)} is not evaluated: give numbers, text in quotes, lists, dicts or classes of torch.nn"
+    )
+
+
+def _key(node: ast.expr | None) -> Any:
+    key = _value(node)  # type: ignore[arg-type]
+    if isinstance(key, (list, dict)):
+        raise ValueError(f"{key} cannot be the key of a dict")
+    return key
+
+
+def _finite(value: Any) -> Any:
+    not_finite = isinstance(value, float) and not math.isfinite(value)
+    if not_finite or (isinstance(value, str) and value.lower().lstrip("+-.") in NOT_FINITE):
+        raise ValueError(f"{value} is not a finite number")
+    if isinstance(value, dict):
+        contents = [*value, *value.values()]
+    else:
+        contents = list(value) if isinstance(value, (list, tuple)) else []
+    for one in contents:
+        _finite(one)
+    return value
+
+
+def format_literal(value: Any) -> str:
+    """
+    The text that ``parse_literal`` reads as the value.
+
+    :param value: a literal, or one with classes of ``torch.nn``
+    """
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key!r}: {format_literal(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(format_literal, value)) + "]"
+    if isinstance(value, type):
+        module = "optim" if issubclass(value, torch.optim.Optimizer) else "nn"
+        return value.__name__ if value is RMSpropTFLike else f"th.{module}.{value.__name__}"
+    return repr(value)
+
+
+class StoreValues(argparse.Action):
+    """
+    ``key:value key:value`` as a dict, for rl_zoo3's options. Unlike rl_zoo3's own it evaluates nothing, see
+    ``parse_value``.
+    """
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        pairs = {}
+        try:
+            for word in values:
+                key, _, value = word.partition(":")
+                if not key or not value:
+                    raise ValueError(f"'{word}' has no value")
+                pairs[key] = parse_value(value)
+        except ValueError as error:
+            raise ValueError(f"{option_string} {' '.join(values)}: {error}. Write key:value.") from error
+        setattr(namespace, self.dest, pairs)

@@ -1,0 +1,58 @@
+"""Modules with a function ``parallel_env``, as PettingZoo's are, under ids of Gymnasium."""
+
+import inspect
+import pkgutil
+import re
+
+import gymnasium
+
+from sb3_maddpg.parallel import ENTRY_POINT, find_module, find_parallel_env
+
+
+def register(env_id: str) -> bool:
+    """
+    Make a module with a function ``parallel_env`` known to Gymnasium: "mpe2/simple_spread_v3" stands for
+    ``mpe2.simple_spread_v3``, and "quad_swarm" or "quad_swarm/parallel_env" for a module that lies in no package.
+
+    :param env_id: Gymnasium id
+    :return: whether Gymnasium knows the id now
+    :raises ValueError: a module that is there, but cannot be imported
+    """
+    if env_id in gymnasium.registry:
+        return True
+    entry = env_id.removesuffix("/parallel_env").replace("/", ".")
+    if not all(part.isidentifier() for part in entry.split(".")):
+        return False
+    if not callable(getattr(find_module(entry), "parallel_env", None)):
+        return False
+    # Gymnasium's checker would warn of padding, whose bounds are both zero
+    gymnasium.register(env_id, entry_point=ENTRY_POINT, kwargs={"entry": entry}, disable_env_checker=True)
+    return True
+
+
+def siblings(env_id: str) -> list[str]:
+    """
+    :param env_id: an id like those of ``register``, of a module that may not exist
+    :return: ids of the versioned modules beside it
+    """
+    package, _, _ = env_id.rpartition("/")
+    if not package.isidentifier():
+        return []
+    paths = getattr(find_module(package), "__path__", [])
+    return [f"{package}/{found.name}" for found in pkgutil.iter_modules(paths) if re.search(r"_v\d+$", found.name)]
+
+
+def arguments(entry: str) -> set[str] | None:
+    """
+    Names of the arguments of ``make`` for a module. PettingZoo's modules take any in ``parallel_env`` and hand them
+    on to ``raw_env``, which is asked instead.
+
+    :param entry: see ``make``
+    :return: the names, or None if any is taken
+    """
+    for function in (find_parallel_env(entry), getattr(find_module(entry), "raw_env", None)):
+        if callable(function):
+            parameters = inspect.signature(function).parameters.values()
+            if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
+                return {parameter.name for parameter in parameters} | {"state", "wrappers"}
+    return None

@@ -1,0 +1,325 @@
+"""What a training is asked for, checked before anything runs: options of the command line and keys of recipes."""
+
+import argparse
+import inspect
+import math
+import types
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import yaml
+from gymnasium.envs.registration import load_env_creator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, PositiveInt, ValidationError, create_model
+from rl_zoo3.utils import ALGOS, get_class_by_name
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_maddpg import parallel
+from sb3_maddpg.cli import pettingzoo_ids
+from sb3_maddpg.cli.literals import parse_literal
+from sb3_maddpg.utils import arguments_of, suggest
+
+# Arguments of the algorithm that the command line gives.
+COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
+# Arguments of the policy that the algorithm gives.
+OF_ALGORITHM = {"observation_space", "action_space", "lr_schedule"}
+# Arguments that rl_zoo3 turns into schedules
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
+SIMPLE = (int, float, bool, str, type(None))
+
+
+def at_least(low: int, otherwise: int | None = None) -> AfterValidator:
+    """
+    :param low: the lowest value
+    :param otherwise: a value below that means something of its own
+    """
+
+    def check(value: int) -> int:
+        if value < low and value != otherwise:
+            raise ValueError(f"give {low} or more" + ("" if otherwise is None else f", or {otherwise}"))
+        return value
+
+    return AfterValidator(check)
+
+
+One = Annotated[int, at_least(1)]
+OneOrDefault = Annotated[int, at_least(1, otherwise=-1)]
+
+
+class TrainingOptions(BaseModel):
+    """The numbers among rl_zoo3's options of ``train``; -1 is the default, or none at all."""
+
+    n_timesteps: OneOrDefault = -1
+    num_threads: OneOrDefault = -1
+    eval_freq: OneOrDefault = -1
+    save_freq: OneOrDefault = -1
+    log_interval: Annotated[int, at_least(-2)] = -1
+    eval_episodes: One = 1
+    n_eval_envs: One = 1
+    n_trials: One = 1
+    max_total_trials: One | None = None
+    n_startup_trials: Annotated[int, at_least(0)] = 0
+    n_evaluations: One | None = None
+    n_jobs: OneOrDefault = 1
+    trial_id: Annotated[int, at_least(0)] | None = None
+    verbose: Annotated[int, at_least(0)] = 0
+
+
+def check_options(args: argparse.Namespace) -> None:
+    """
+    Refuse numbers that no training can be asked for.
+
+    :param args: the options of the command line, by rl_zoo3's names
+    :raises ValueError: with the option, its value and what is allowed
+    """
+    try:
+        TrainingOptions.model_validate(vars(args))
+    except ValidationError as error:
+        raise ValueError(one_line(error, lambda name: f"--{name.replace('_', '-')}")) from None
+
+
+def one_line(error: ValidationError, describe: Callable[[str], str] = str) -> str:
+    """
+    :param error: of pydantic
+    :param describe: how the user wrote the argument of this name
+    :return: its first finding as one line: argument, value and what is allowed
+    """
+    findings = error.errors(include_url=False, include_context=False)
+    name = str(findings[0]["loc"][0])
+    same = [finding for finding in findings if finding["loc"][0] == findings[0]["loc"][0]]
+    allowed = dict.fromkeys(_lower(finding["msg"].removeprefix("Value error, ")) for finding in same)
+    if findings[0]["type"] == "missing":
+        return f"{describe(name)} is missing"
+    return f"{describe(name)} {findings[0]['input']!r}: {', or '.join(allowed)}"
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]
+
+
+def _number(value: Any) -> Any:
+    """YAML reads 1e-3 as text, and so may the user's editor write it."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        raise ValueError("give a number") from None
+
+
+def _schedule(value: Any) -> Any:
+    if value is None:
+        return None
+    text = value.removeprefix("lin_") if isinstance(value, str) else value
+    try:
+        number = math.nan if isinstance(value, bool) else float(text)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError("give a finite number, or lin_NUMBER for one that falls linearly to zero")
+    return number if text == value else value
+
+
+def _literal(value: Any) -> Any:
+    return parse_literal(value) if isinstance(value, str) else value
+
+
+Schedule = Annotated[Any, BeforeValidator(_schedule)]
+Count = Annotated[PositiveInt, BeforeValidator(_number)]
+Arguments = Annotated[dict[str, Any], BeforeValidator(_literal)]
+
+
+class ZooKeys(BaseModel):
+    """Keys of a recipe that rl_zoo3 uses up itself; every other key is an argument of the algorithm."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False, arbitrary_types_allowed=True, protected_namespaces=())
+
+    n_timesteps: Count
+    policy: str | type[BasePolicy]
+    n_envs: Count = 1
+    callback: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
+    env_kwargs: Arguments | None = None
+    env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
+    eval_env_kwargs: Arguments | None = None
+    frame_stack: Count | None = None
+    monitor_kwargs: Arguments | None = None
+    noise_std: Annotated[float, BeforeValidator(_number)] | None = None
+    noise_type: str | None = None
+    normalize: bool | Arguments = False
+    vec_env: str | None = None
+    vec_env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
+
+
+def read_recipe(path: str, algo: str, env_id: str) -> None:
+    """
+    Refuse a YAML file that holds no recipe for the environment.
+
+    :param path: of the file
+    :param algo: name of the algorithm
+    :param env_id: Gymnasium id
+    :raises FileNotFoundError: there is no such file
+    :raises ValueError: it holds something else
+    """
+    if not path.endswith((".yml", ".yaml")):  # a module, which Python reads
+        return
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"There is no recipe {path}: --conf-file names a YAML file.")
+    try:
+        recipes = yaml.safe_load(Path(path).read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise ValueError(
+            f"{path}{where}: this is not valid YAML ({getattr(error, 'problem', None) or error})."
+        ) from None
+    form = f"Write `{env_id}:` and the keys of its recipe, indented, below it."
+    if not isinstance(recipes, dict):
+        raise ValueError(f"{path} holds {_kind(recipes)} instead of recipes by environment. {form}")
+    name = env_id if env_id in recipes else "default"
+    if name not in recipes:
+        raise ValueError(f"{path} has no recipe for {env_id} and no `default`. {form}")
+    if not isinstance(recipes[name], dict):
+        raise ValueError(f"{path}: the recipe {name} is {_kind(recipes[name])}. {form}")
+    for key in recipes[name]:
+        if not isinstance(key, str):
+            raise ValueError(suggest(f"key in the recipe for {algo}", str(key), set(ZooKeys.model_fields)))
+
+
+def _kind(value: Any) -> str:
+    return "nothing" if value is None else f"{type(value).__name__} {value!r}"[:60]
+
+
+def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """
+    Refuse a recipe with keys that nothing reads, or values of another type than their keys take.
+
+    :param algo: name of the algorithm
+    :param hyperparams: the recipe, with the changes of the command line
+    :param source: where it comes from, for messages
+    :return: the recipe with numbers for their text and dicts for Python's ``dict(...)``
+    :raises ValueError: with key, value and what is allowed
+    """
+    check_keys(algo, hyperparams)
+    fields = {key: hint for key, hint in _hints(ALGOS[algo]).items() if key in hyperparams}
+    fields |= {key: Schedule for key in SCHEDULES if key in hyperparams}
+    fields |= {key: Arguments | None for key in ("policy_kwargs", "replay_buffer_kwargs") if key in hyperparams}
+    definitions: Any = {key: (hint, ...) for key, hint in fields.items()}
+    model = create_model("Recipe", __base__=ZooKeys, **definitions)
+    try:
+        checked = model.model_validate(dict(hyperparams))
+    except ValidationError as error:
+        raise ValueError(one_line(error, lambda name: f"{source}: {name}")) from None
+    found = {key: getattr(checked, key) for key in hyperparams}
+    check_policy_kwargs(algo, found)
+    if isinstance(name := found.get("replay_buffer_class"), str):
+        found["replay_buffer_class"] = _replay_buffer(name)
+    return found
+
+
+def _hints(algorithm: type) -> dict[str, Any]:
+    """The arguments of an algorithm whose values a recipe can hold, with their types."""
+    hints: dict[str, Any] = {}
+    for base in algorithm.__mro__:
+        if "__init__" in vars(base) and base is not object:
+            # Stable-Baselines3 names VecEnv in text that only its own module can resolve
+            hints = {**typing.get_type_hints(vars(base)["__init__"], localns={"VecEnv": VecEnv}), **hints}
+    names = arguments_of(algorithm) - COMMAND_LINE
+    return {name: _lenient(hint) for name, hint in hints.items() if name in names and _is_simple(hint)}
+
+
+def _is_simple(hint: Any) -> bool:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType, tuple, list):
+        return all(one is ... or _is_simple(one) for one in typing.get_args(hint))
+    return hint in SIMPLE or hint is None
+
+
+def _lenient(hint: Any) -> Any:
+    return Annotated[hint, BeforeValidator(_number)] if hint in (int, float) else hint
+
+
+def check_keys(algo: str, hyperparams: Mapping[str, Any]) -> None:
+    """
+    Refuse a recipe with keys that nothing reads.
+
+    :param algo: name of the algorithm
+    :param hyperparams: the recipe
+    :raises ValueError: with the nearest known key
+    """
+    known = set(ZooKeys.model_fields) | (arguments_of(ALGOS[algo]) - COMMAND_LINE)
+    for key in hyperparams:
+        if key not in known:
+            raise ValueError(suggest(f"key in the recipe for {algo}", str(key), known))
+    check_policy_kwargs(algo, hyperparams)
+
+
+def check_policy_kwargs(algo: str, hyperparams: Mapping[str, Any]) -> None:
+    """
+    Refuse arguments that the policy does not take.
+
+    :param algo: name of the algorithm
+    :param hyperparams: the recipe
+    :raises ValueError: with the nearest known argument
+    """
+    policy = policy_class(algo, hyperparams.get("policy", ""))
+    policy_kwargs = hyperparams.get("policy_kwargs")
+    if policy is not None and isinstance(policy_kwargs, dict):
+        known = arguments_of(policy) - OF_ALGORITHM
+        for key in policy_kwargs:
+            if key not in known:
+                raise ValueError(suggest(f"key in policy_kwargs for {algo}", str(key), known))
+
+
+def policy_class(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | None:
+    """
+    :param algo: name of the algorithm
+    :param name: what the recipe calls the policy
+    :return: the policy, or None for a dotted path, which rl_zoo3 imports later
+    """
+    return ALGOS[algo].policy_aliases.get(name) if isinstance(name, str) else name
+
+
+def _replay_buffer(name: str) -> type[ReplayBuffer]:
+    """The replay buffer that a recipe names by a dotted path, or as rl_zoo3's recipes do."""
+    if name == "HerReplayBuffer":
+        return HerReplayBuffer
+    try:
+        return get_class_by_name(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Give the dotted path of a class, "
+            "such as sb3_maddpg.PrioritizedTeamReplayBuffer."
+        ) from error
+
+
+def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+    """
+    Refuse arguments that the environment does not take.
+
+    :param env_id: Gymnasium id
+    :param env_kwargs: from the recipe and the command line
+    :raises ValueError: with the nearest known argument
+    """
+    known = _env_arguments(env_id)
+    for key in env_kwargs:
+        if known is not None and key not in known:
+            raise ValueError(suggest(f"argument of {env_id}", key, known))
+
+
+def _env_arguments(env_id: str) -> set[str] | None:
+    """Names of the arguments an environment takes, or None if it takes any."""
+    spec = gymnasium.spec(env_id)
+    if spec.entry_point == parallel.ENTRY_POINT:
+        return pettingzoo_ids.arguments(spec.kwargs["entry"])
+    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    if creator is None:
+        return None
+    parameters = inspect.signature(creator).parameters.values()
+    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
+        return None
+    return {parameter.name for parameter in parameters}

@@ -1,0 +1,105 @@
+"""Trainings from the command line: folders, logs, schedules."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_maddpg import MADDPG
+from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.experiment import claim_folder
+
+RECIPE = {
+    "n_timesteps": 400,
+    "policy": "MlpPolicy",
+    "policy_kwargs": {"net_arch": [8]},
+    "learning_starts": 50,
+    "train_freq": 10,
+    "batch_size": 16,
+    "buffer_size": 1000,
+    "learning_rate": "lin_0.01",
+}
+WITHOUT_RL_ZOO3 = """
+import sys
+sys.modules["rl_zoo3"] = None
+from sb3_maddpg import MADDPG
+model = MADDPG.load(sys.argv[1])
+print(model.learning_rate(0.5), model.lr_schedule(0.25))
+"""
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def train(*argv: str, env: str = "OwnBit-v0", **changes) -> int:
+    Path("recipe.yml").write_text(yaml.safe_dump({env: {**RECIPE, **changes}}))
+    return main(["train", "--env", env, "--conf-file", "recipe.yml", "--eval-freq", "-1", "--seed", "1", *argv])
+
+
+def test_a_folder_has_one_owner(tmp_path):
+    with ThreadPoolExecutor(4) as pool:
+        claimed = list(pool.map(lambda _: claim_folder(str(tmp_path / "logs" / "run"), 1), range(100)))
+    assert len(set(claimed)) == 100
+    assert sorted(os.listdir(tmp_path / "logs")) == sorted(f"run_{number}" for number in range(1, 101))
+    assert claim_folder(str(tmp_path / "logs" / "run"), 5, "_unique").name == "run_5_unique"
+
+
+def test_trainings_that_start_together_keep_their_own_files(monkeypatch):
+    # Both have looked for the newest run before either made its folder
+    for module in ("rl_zoo3.exp_manager", "sb3_maddpg.cli.experiment"):
+        monkeypatch.setattr(f"{module}.get_latest_run_id", lambda path, name: 0)
+    monkeypatch.setattr("sb3_maddpg.cli.experiment.latest_curve", lambda path, name: 0)
+    for _ in range(2):
+        assert train("-tb", "tb", "-n", "60", "--verbose", "0") == 0
+    assert sorted(os.listdir("logs/maddpg")) == ["OwnBit-v0_1", "OwnBit-v0_2"]
+    assert sorted(os.listdir("tb/OwnBit-v0")) == ["MADDPG_1", "MADDPG_2"]
+    assert all((run / "OwnBit-v0.zip").is_file() for run in Path("logs/maddpg").iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(capsys):
+    Path("logs").write_text("a file")
+    assert train("--verbose", "0") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: logs")
+    assert error.count("\n") == 1
+
+
+def test_tables_come_at_a_readable_rate_and_short_trainings_log_their_rewards(capsys):
+    assert train() == 0  # 400 steps
+    assert capsys.readouterr().out.count("ep_rew_mean") == 1
+    assert train("-n", "3500") == 0
+    assert capsys.readouterr().out.count("ep_rew_mean") == 4  # after each thousand, and at the end
+    assert train("-n", "400", "--log-interval", "1") == 0
+    assert capsys.readouterr().out.count("ep_rew_mean") > 4  # by episodes
+
+
+def test_a_progress_bar_stands_alone(capsys):
+    assert train("--progress", "-tb", "tb") == 0
+    out = capsys.readouterr().out
+    assert "ep_rew_mean" not in out
+    assert "Mean reward: " in out
+    assert list(Path("tb").rglob("events*"))
+
+
+def test_a_model_loads_where_rl_zoo3_is_not_installed():
+    assert train("--verbose", "0") == 0
+    path = "logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip"
+    command = [sys.executable, "-c", WITHOUT_RL_ZOO3, path]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert list(map(float, shown.split())) == pytest.approx([0.005, 0.0025])
+    # Up to rounding what rl_zoo3's schedule says
+    schedule = MADDPG.load(path).learning_rate
+    assert all(schedule(k / 997) == pytest.approx(k / 997 * 0.01, rel=1e-12, abs=1e-15) for k in range(998))
+
+
+@pytest.mark.parametrize("module", ["zoo", "bench"])
+def test_a_module_of_the_command_line_is_no_command(module):
+    done = subprocess.run([sys.executable, "-m", f"sb3_maddpg.cli.{module}", "train"], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "python -m sb3_maddpg" in done.stderr

@@ -1,0 +1,57 @@
+"""Modules of PettingZoo under ids of Gymnasium."""
+
+import gymnasium
+import pytest
+from gymnasium import spaces
+
+from sb3_maddpg import parallel
+from sb3_maddpg.cli import pettingzoo_ids
+
+
+@pytest.fixture
+def registry():
+    known = dict(gymnasium.registry)
+    yield
+    gymnasium.registry.clear()
+    gymnasium.registry.update(known)
+
+
+@pytest.mark.usefixtures("registry")
+def test_a_module_is_an_environment_id():
+    assert pettingzoo_ids.register("mpe2/simple_tag_v3")
+    assert pettingzoo_ids.register("mpe2/simple_tag_v3")
+    wrappers = ["supersuit.pad_observations_v0", {"supersuit.frame_stack_v2": {"stack_size": 2}}]
+    env = gymnasium.make("mpe2/simple_tag_v3", num_good=2, state=True, wrappers=wrappers, render_mode="rgb_array")
+    team = env.observation_space
+    assert team.names == (*(f"adversary_{i}" for i in range(3)), "agent_0", "agent_1")
+    assert (team.obs_dims, team.state_dim) == ((2 * 20,) * 5, 3 * 20 + 2 * 18)
+    env.reset(seed=0)
+    assert env.render().shape[2] == 3
+    assert pettingzoo_ids.register("quad_swarm/parallel_env")
+    assert gymnasium.make("quad_swarm/parallel_env").action_space == spaces.MultiBinary(12)
+    for unknown in ("mpe2/simple_tig_v3", "mpe2/_mpe_utils", "no_such/module", "phys-2d/CartPole-v7", "simple_tag_v3"):
+        assert not pettingzoo_ids.register(unknown)
+
+
+def test_a_module_that_fails_is_no_unknown_id(tmp_path, monkeypatch):
+    (tmp_path / "lacking_v1.py").write_text("import no_such_library")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match="lacking_v1 cannot be imported: No module named 'no_such_library'"):
+        pettingzoo_ids.register("lacking_v1/parallel_env")
+    with pytest.raises(ValueError, match="no function parallel_env in mpe2"):
+        parallel.make("mpe2.simple_sprad_v3")
+
+
+def test_arguments_are_those_of_the_module():
+    assert pettingzoo_ids.arguments("mpe2.simple_tag_v3") >= {"num_good", "continuous_actions", "state", "wrappers"}
+    assert "entry" not in pettingzoo_ids.arguments("mpe2.simple_tag_v3")
+    assert pettingzoo_ids.arguments("quad_swarm") is None  # takes whatever QuadSwarmEnv does
+    assert "mpe2/simple_tag_v3" in pettingzoo_ids.siblings("mpe2/simple_tig_v3")
+
+
+@pytest.mark.usefixtures("registry")
+def test_a_file_in_the_present_folder_is_an_environment_id(tmp_path, monkeypatch):
+    (tmp_path / "flat_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert pettingzoo_ids.register("flat_team")
+    assert gymnasium.make("flat_team").observation_space.names == ("agent_0", "agent_1", "agent_2")

@@ -1,0 +1,131 @@
+"""What a training is asked for, checked before anything runs."""
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.recipes import check_options, check_recipe
+from sb3_maddpg.cli.zoo import packaged_config, register
+
+RECIPE = {"n_timesteps": 100, "policy": "MlpPolicy", "learning_starts": 1000}
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def refused(capsys, *argv: str) -> str:
+    assert main(["train", "--env", "OwnBit-v0", "--verbose", "0", "--eval-freq", "-1", *argv]) == 2
+    assert not Path("logs").exists()
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- 1\n- 2\n", "holds list [1, 2] instead of recipes by environment. Write `OwnBit-v0:`"),
+        ("5", "holds int 5 instead"),
+        ("", "holds nothing instead"),
+        ("OwnBit-v0: [1\n", "r.yml, line 2: this is not valid YAML"),
+        ("OwnBit-v0: 3", "the recipe OwnBit-v0 is int 3"),
+        ("Other-v0: {n_timesteps: 3}", "has no recipe for OwnBit-v0 and no `default`"),
+        (None, "There is no recipe r.yml"),
+    ],
+)
+def test_a_file_without_a_recipe_is_refused(capsys, text, message):
+    if text is not None:
+        Path("r.yml").write_text(text)
+    assert message in refused(capsys, "--conf-file", "r.yml")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"learning_rate": float("nan")}, "learning_rate nan: give a finite number, or lin_NUMBER"),
+        ({"learning_rate": "nan"}, "learning_rate 'nan': give a finite number, or lin_NUMBER"),
+        ({"learning_rate": "lin_x"}, "learning_rate 'lin_x': give a finite number, or lin_NUMBER"),
+        ({"n_timesteps": 0}, "n_timesteps 0: input should be greater than 0"),
+        ({"n_timesteps": "many"}, "n_timesteps 'many': give a number"),
+        ({"n_timesteps": None}, "n_timesteps None: input should be a valid integer"),
+        ({"n_envs": 1.5}, "n_envs 1.5: input should be a valid integer"),
+        ({"env_kwargs": 3}, "env_kwargs 3: input should be a valid dictionary"),
+        ({"policy_kwargs": "dict(net_arch=print(1))"}, "print(1) is not evaluated"),
+        ({"policy_kwargs": "dict(net_arc=[8])"}, "did you mean 'net_arch'?"),
+        ({"policy_kwargs": [1]}, "policy_kwargs [1]: input should be a valid dictionary"),
+        ({"batch_size": "big"}, "batch_size 'big': give a number"),
+        ({"tau": float("nan")}, "tau nan: input should be a finite number"),
+        ({"normalize": "dict(a=exit())"}, "exit() is not evaluated"),
+        ({1: 2}, "Unknown key in the recipe for maddpg '1'"),
+    ],
+)
+def test_a_value_of_another_type_is_refused(capsys, changes, message):
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, **changes}}))
+    assert message in refused(capsys, "--conf-file", "r.yml")
+
+
+def test_a_key_that_is_missing_is_named(capsys):
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {"n_timesteps": 10}}))
+    assert "recipe for maddpg in r.yml: policy is missing" in refused(capsys, "--conf-file", "r.yml")
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {"policy": "MlpPolicy"}}))
+    assert "n_timesteps is missing" in refused(capsys, "--conf-file", "r.yml")
+    assert main(["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "-n", "20", "--verbose", "0"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["-n", "0"], "--n-timesteps 0: give 1 or more, or -1"),
+        (["-n", "-5"], "--n-timesteps -5: "),
+        (["--n-eval-envs", "0"], "--n-eval-envs 0: give 1 or more"),
+        (["--eval-freq", "0"], "--eval-freq 0: "),
+        (["--save-freq", "-7"], "--save-freq -7: "),
+        (["--eval-episodes", "0"], "--eval-episodes 0: "),
+        (["--num-threads", "0"], "--num-threads 0: "),
+        (["--seed", "4294967296"], "Seed must be between"),
+        (["-params", "learning_rate:nan"], "nan is not a finite number"),
+        (["-params", "learning_rate:1e999"], "inf is not a finite number"),
+    ],
+)
+def test_a_number_that_no_training_can_be_asked_for_is_refused(capsys, argv, message):
+    assert message in refused(capsys, *argv)
+
+
+def test_without_an_environment_the_option_is_named(capsys):
+    for command in ("train", "tune", "bench", "enjoy", "record"):
+        assert main([command]) == 2
+        assert "--env is missing" in capsys.readouterr().err
+
+
+def test_text_stands_for_its_number_and_a_call_of_dict_for_the_dict():
+    register()
+    given = {
+        **RECIPE,
+        "n_timesteps": "1e5",
+        "learning_rate": "1e-3",
+        "tau": "1e-2",
+        "policy_kwargs": "dict(net_arch=[8])",
+    }
+    checked = check_recipe("maddpg", given, "recipe")
+    assert (checked["n_timesteps"], checked["learning_rate"], checked["tau"]) == (100_000, 0.001, 0.01)
+    assert checked["policy_kwargs"] == {"net_arch": [8]}
+    given = {"n_timesteps": 10, "policy": "MlpPolicy", "clip_range": "lin_0.2", "clip_range_vf": None}
+    assert check_recipe("ppo", given, "recipe") == given
+
+
+@pytest.mark.parametrize("algo", ["maddpg", "matd3", "ppo"])
+def test_packaged_recipes_pass_unchanged(algo):
+    register()
+    for recipe in yaml.safe_load(Path(packaged_config(algo, "mpe2/simple_spread_v3")).read_text()).values():
+        checked = check_recipe(algo, recipe, "recipe")
+        assert json.loads(json.dumps(checked)) == recipe  # but for tuples
+
+
+def test_the_defaults_of_rl_zoo3_are_allowed():
+    check_options(argparse.Namespace(n_timesteps=-1, num_threads=-1, save_freq=-1, eval_freq=25000, log_interval=-2))
