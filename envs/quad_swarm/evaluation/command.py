@@ -22,6 +22,9 @@ from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
+# Shown by `sb3-maddpg --help`
+EXAMPLES = "  sb3-maddpg evaluate --policy none full cpa:0.7:1.5 pretrained:quad-swarm-paper --scenario all --jobs 2"
+
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows as a table to print; models by their short names where these tell them apart."""
@@ -162,7 +165,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-maddpg evaluate",
         description="Fly the same held-out episodes with several policies and compare them.",
-        epilog="Example: sb3-maddpg evaluate --policy none full cpa:0.7:1.5 --episodes 200 --jobs 2",
+        epilog=f"example:\n{EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_policy_arguments(parser)
     parser.add_argument(

@@ -30,6 +30,9 @@ _LINGER = 10
 # Digits behind the point of a metre: finer than a pixel
 _DIGITS = 3
 
+# Shown by `sb3-maddpg --help`
+EXAMPLES = "  sb3-maddpg replay --policy full pretrained:quad-swarm-paper --scenario symmetric_swap --out replay.html"
+
 
 def replay_page(conditions: Sequence[Condition], seed: int = 0, episode: int = 0, preset: str = "") -> str:
     """Fly an episode with some policies and make its page.
@@ -79,7 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="sb3-maddpg replay",
         description="Fly one held-out episode with some policies and write a page that replays it.",
-        epilog="Example: sb3-maddpg replay --policy full cpa:0.7:1.5 --scenario symmetric_swap --out a.html",
+        epilog=f"example:\n{EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_policy_arguments(parser)
     parser.add_argument("--scenario", default="symmetric_swap", help=f"one of {', '.join(SCENARIOS)} (%(default)s)")
