@@ -14,6 +14,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from quad_swarm.validation import checked
 
 N_STATES = 9
 N_INPUTS = 4
@@ -22,6 +25,7 @@ VELOCITY = slice(3, 6)
 ATTITUDE = slice(6, 9)
 
 
+@checked
 @dataclass(frozen=True)
 class QuadrotorParams:
     """Physical parameters; source of every value but gravity: Parrot Bebop 2, identified by tud-amr/mrca-mav.
@@ -35,17 +39,24 @@ class QuadrotorParams:
     :param pitch_time_constant: time constant of the pitch response (s)
     :param climb_gain: steady-state gain of the climb-rate command (-)
     :param climb_time_constant: time constant of the climb-rate response (s)
+    :raises ValueError: a drag is negative, or another value not positive
     """
 
-    gravity: float = 9.81
-    drag_x: float = 0.25
-    drag_y: float = 0.33
-    roll_gain: float = 1.1260
-    roll_time_constant: float = 0.2368
-    pitch_gain: float = 1.1075
-    pitch_time_constant: float = 0.2318
-    climb_gain: float = 1.2270
-    climb_time_constant: float = 0.3367
+    gravity: PositiveFloat = 9.81
+    drag_x: NonNegativeFloat = 0.25
+    drag_y: NonNegativeFloat = 0.33
+    roll_gain: PositiveFloat = 1.1260
+    roll_time_constant: PositiveFloat = 0.2368
+    pitch_gain: PositiveFloat = 1.1075
+    pitch_time_constant: PositiveFloat = 0.2318
+    climb_gain: PositiveFloat = 1.2270
+    climb_time_constant: PositiveFloat = 0.3367
+
+    @property
+    def longest_step(self) -> float:
+        """The longest step (s) in which `rk4_step` is stable: its stability interval over the fastest decay."""
+        lags = (1 / self.roll_time_constant, 1 / self.pitch_time_constant, 1 / self.climb_time_constant)
+        return 2.785 / max(self.drag_x, self.drag_y, *lags)
 
 
 def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -> ca.SX:

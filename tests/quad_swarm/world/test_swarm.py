@@ -139,11 +139,11 @@ def test_presets_take_replacements_and_name_what_they_do_not_know():
     for values, message in [
         ({"planner": {"seperation": 1}}, "planner parameter 'seperation'.*Did you mean 'separation'"),
         ({"speed": 1}, "world parameter 'speed'"),
-        ({"planner": {"dt": "fast"}}, "'dt' takes a number, not 'fast'"),
-        ({"planner": {"horizon": 9.5}}, "'horizon' takes an integer, not 9.5"),
-        ({"planner": {"workspace_low": [0, 0]}}, r"'workspace_low' takes 3 numbers"),
-        ({"radius": float("nan")}, "'radius' takes a finite number"),
-        ({"memory": {"far": 1}}, "takes a plain value"),
+        ({"planner": {"dt": "fast"}}, "planner.dt='fast': it must be a valid number"),
+        ({"planner": {"horizon": 9.5}}, "planner.horizon=9.5: it must be a valid integer"),
+        ({"planner": {"workspace_low": [0, 0]}}, r"planner.workspace_low=\[0, 0\]: it has too few entries"),
+        ({"radius": float("nan")}, "radius=nan: it must be a finite number"),
+        ({"memory": {"far": 1}}, "memory={'far': 1}: it must be a valid number"),
     ]:
         with pytest.raises(ValueError, match=message):
             make_config("paper", **values)
