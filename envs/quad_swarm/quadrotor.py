@@ -10,6 +10,7 @@ commands with first-order lags, and yaw does not couple into the translation.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import casadi as ca
@@ -99,7 +100,7 @@ def step_function(params: QuadrotorParams, dt: float) -> ca.Function:
 
 
 class QuadrotorModel:
-    """The discrete dynamics of many quadrotors at once, on NumPy arrays.
+    """The discrete dynamics of many quadrotors at once, on NumPy arrays; threads may share it.
 
     :param params: physical parameters
     :param dt: length of a step (s)
@@ -108,7 +109,7 @@ class QuadrotorModel:
     def __init__(self, params: QuadrotorParams, dt: float):
         self.params = params
         self.dt = dt
-        self._calls: dict[int, _BufferedCall] = {}
+        self._local = threading.local()  # calls write into buffers, so every thread has its own
 
     def step(self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None) -> np.ndarray:
         """Next states.
@@ -122,9 +123,10 @@ class QuadrotorModel:
         if count == 0:
             return x.copy()
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
-        if capacity not in self._calls:
-            self._calls[capacity] = _BufferedCall(step_function(self.params, self.dt), capacity)
-        return self._calls[capacity](x, u, wind).reshape(x.shape)
+        calls: dict[int, _BufferedCall] = self._local.__dict__
+        if capacity not in calls:
+            calls[capacity] = _BufferedCall(step_function(self.params, self.dt), capacity)
+        return calls[capacity](x, u, wind).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """States that follow from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
@@ -134,8 +136,8 @@ class QuadrotorModel:
             states[:, k + 1] = self.step(states[:, k], u[:, k])
         return states
 
-    def __getstate__(self) -> dict:
-        return {"params": self.params, "dt": self.dt, "_calls": {}}  # call buffers hold raw memory: rebuilt on demand
+    def __reduce__(self) -> tuple:
+        return QuadrotorModel, (self.params, self.dt)  # call buffers hold raw memory: rebuilt on demand
 
 
 class _BufferedCall:

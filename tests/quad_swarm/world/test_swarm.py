@@ -138,7 +138,7 @@ def test_presets_take_replacements_and_name_what_they_do_not_know():
     assert make_config("dense", n_robots=None) == PRESETS["dense"]
     for values, message in [
         ({"planner": {"seperation": 1}}, "planner parameter 'seperation'.*Did you mean 'separation'"),
-        ({"speed": 1}, "world parameter 'speed'"),
+        ({"speed": 1}, "SwarmConfig parameter 'speed'"),
         ({"planner": {"dt": "fast"}}, "planner.dt='fast': it must be a valid number"),
         ({"planner": {"horizon": 9.5}}, "planner.horizon=9.5: it must be a valid integer"),
         ({"planner": {"workspace_low": [0, 0]}}, r"planner.workspace_low=\[0, 0\]: it has too few entries"),
