@@ -52,7 +52,9 @@ def checked(cls: type[T]) -> type[T]:
 
 def checked_arguments(function: F) -> F:
     """Decorator: arguments are converted to their annotated types and checked, as the fields of `checked` are."""
-    call = pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True))(function)
+    call = pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True))(
+        function
+    )
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:

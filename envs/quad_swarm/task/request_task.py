@@ -96,8 +96,8 @@ class RequestTask:
         last = swarm.config.planner.horizon - 1
         if reward.near_miss_ahead > last:
             raise ValueError(
-                f"reward.near_miss_ahead={reward.near_miss_ahead}: plans reach planner.horizon - 1 = {last} steps beyond "
-                "the present one."
+                f"reward.near_miss_ahead={reward.near_miss_ahead}: plans reach planner.horizon - 1 = {last} steps "
+                "beyond the present one."
             )
         self.swarm = swarm
         self.sampler = sampler

@@ -13,7 +13,6 @@ from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, advance, other_indices
 from quad_swarm.world.presets import SwarmConfig
 
-
 _FARTHEST = 1e4  # m, of starts and goals; far beyond any room, and well before squares lose their meaning
 
 

@@ -130,27 +130,6 @@ def test_refuses_senseless_starts(bad):
         swarm.reset(0, bad, np.zeros((4, 3)))
 
 
-def test_presets_take_replacements_and_name_what_they_do_not_know():
-    config = make_config("dense", n_robots=5, planner={"separation": 0.7, "workspace_low": [-3, -3, 0.5]})
-    assert (config.n_robots, config.planner.separation, config.planner.max_speed) == (5, 0.7, 4.0)
-    assert config.planner.workspace_low == (-3, -3, 0.5)
-    assert make_config("paper", planner={"violation_weight": "1e5"}).planner.violation_weight == 1e5
-    assert make_config("dense", n_robots=None) == PRESETS["dense"]
-    for values, message in [
-        ({"planner": {"seperation": 1}}, "planner parameter 'seperation'.*Did you mean 'separation'"),
-        ({"speed": 1}, "SwarmConfig parameter 'speed'"),
-        ({"planner": {"dt": "fast"}}, "planner.dt='fast': it must be a valid number"),
-        ({"planner": {"horizon": 9.5}}, "planner.horizon=9.5: it must be a valid integer"),
-        ({"planner": {"workspace_low": [0, 0]}}, r"planner.workspace_low=\[0, 0\]: it has too few entries"),
-        ({"radius": float("nan")}, "radius=nan: it must be a finite number"),
-        ({"memory": {"far": 1}}, "memory={'far': 1}: it must be a valid number"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            make_config("paper", **values)
-    with pytest.raises(ValueError, match="Did you mean 'dense'"):
-        make_config("dens")
-
-
 def test_lost_answers_count_as_not_received_and_repeat_with_the_seed():
     sources = []
     for _ in range(2):
@@ -201,11 +180,6 @@ def test_late_answers_are_older_plans():
     np.testing.assert_allclose(remembered, expected[:, late.beliefs.others])
     assert (late.beliefs._age == 3).all()
     assert not np.allclose(fly(swarm, 20)[-1], fly(late, 14)[-1])
-
-
-def test_wrong_radios_are_refused():
-    with pytest.raises(ValueError, match=r"radio\.loss=2"):
-        make_config("paper", radio={"loss": 2.0})
 
 
 def test_planned_separation_is_the_distance_between_plans():

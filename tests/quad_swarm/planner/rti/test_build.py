@@ -174,7 +174,11 @@ def stub_compiler(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     "damage",
-    [lambda path: (path.unlink(), path.write_bytes(b"no library")), flip_a_bit, lambda path: build_module._checksum_file(path).unlink()],
+    [
+        lambda path: (path.unlink(), path.write_bytes(b"no library")),
+        flip_a_bit,
+        lambda path: build_module._checksum_file(path).unlink(),
+    ],
     ids=["no library", "a bit", "no checksum"],
 )
 def test_a_damaged_library_is_compiled_again(damage, stub_compiler):
