@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -123,7 +124,7 @@ class QuadrotorModel:
         if count == 0:
             return x.copy()
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
-        calls: dict[int, _BufferedCall] = self._local.__dict__
+        calls: dict[Any, _BufferedCall] = self._local.__dict__
         if capacity not in calls:
             calls[capacity] = _BufferedCall(step_function(self.params, self.dt), capacity)
         return calls[capacity](x, u, wind).reshape(x.shape)

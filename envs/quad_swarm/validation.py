@@ -101,7 +101,7 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
     if errors[0]["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
         *parents, name = map(str, place)
         where = ".".join((*path, *parents))
-        kind = f"{where or owner.__name__} parameter" if dataclasses.is_dataclass(owner) else "argument"
+        kind = f"{where or owner.__name__} parameter" if isinstance(owner, type) else "argument"
         return unknown_name(kind, name, _names(owner, parents))
     if place and isinstance(place[0], int):  # by position
         place = (_names(owner)[place[0]], *place[1:])

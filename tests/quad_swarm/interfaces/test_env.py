@@ -332,5 +332,5 @@ def test_every_field_of_the_world_can_be_set():
 
 
 def test_unknown_arguments_are_named():
-    with pytest.raises(ValueError, match="Unknown argument 'sceanrio'.*Did you mean 'scenario'"):
+    with pytest.raises(ValueError, match=r"Unknown argument 'sceanrio'.*Did you mean 'scenario'"):
         QuadSwarmEnv(sceanrio="random")

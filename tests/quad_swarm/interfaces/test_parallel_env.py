@@ -5,7 +5,10 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+import supersuit
 from pettingzoo.test import parallel_api_test
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 import quad_swarm
 from quad_swarm.interfaces.env import QuadSwarmEnv
@@ -87,3 +90,26 @@ def test_every_field_of_the_world_can_be_set():
     assert (env.config.planner.separation, env.config.planner.horizon) == (0.24, 5)
     with pytest.raises(ValueError, match="Did you mean 'world'"):
         quad_swarm.parallel_env(wrld={})
+
+
+class BitActions(VecEnvWrapper):
+    """SB3 samples bits as floats, and SuperSuit stacks actions without a conversion."""
+
+    def step_async(self, actions):
+        self.venv.step_async(actions.astype(self.action_space.dtype))
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+@pytest.mark.slow
+def test_ppo_learns_through_supersuit():
+    env = supersuit.pettingzoo_env_to_vec_env_v1(quad_swarm.parallel_env(n_robots=3, max_steps=20))
+    env = supersuit.concat_vec_envs_v1(env, 2, num_cpus=0, base_class="stable_baselines3")
+    model = PPO("MlpPolicy", BitActions(env), n_steps=32, batch_size=64, seed=0)
+    before = model.policy.action_net.weight.detach().clone()
+    assert model.learn(400).num_timesteps >= 400
+    assert not before.equal(model.policy.action_net.weight)

@@ -1,4 +1,4 @@
-"""The reference solver: its optimum against an independent transcription, and every level of the fallback chain with it."""
+"""The reference solver's optimum against an independent transcription, and every level of the fallback chain."""
 
 import math
 import pickle

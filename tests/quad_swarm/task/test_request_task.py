@@ -58,5 +58,5 @@ def test_a_world_reaches_every_field():
 
 
 def test_rewards_are_checked_wherever_they_are_made():
-    with pytest.raises(ValueError, match="^near_miss_width=0: it must be greater than 0"):
+    with pytest.raises(ValueError, match=r"^near_miss_width=0: it must be greater than 0"):
         RewardConfig(near_miss_width=0)
