@@ -109,7 +109,7 @@ class BitActions(VecEnvWrapper):
 def test_ppo_learns_through_supersuit():
     env = supersuit.pettingzoo_env_to_vec_env_v1(quad_swarm.parallel_env(n_robots=3, max_steps=20))
     env = supersuit.concat_vec_envs_v1(env, 2, num_cpus=0, base_class="stable_baselines3")
-    model = PPO("MlpPolicy", BitActions(env), n_steps=32, batch_size=64, seed=0)
+    model = PPO("MlpPolicy", BitActions(env), n_steps=32, batch_size=64)
     before = model.policy.action_net.weight.detach().clone()
     assert model.learn(400).num_timesteps >= 400
     assert not before.equal(model.policy.action_net.weight)

@@ -146,7 +146,7 @@ def test_a_robot_knows_what_the_others_believe_of_it():
     swarm, rng = make_swarm(2), np.random.default_rng(0)
     for _ in range(8):
         swarm.step(rng.random((2, 4, 3)) < 0.3)
-    told, outlook = View(swarm).told(range(swarm.config.planner.horizon)), swarm.beliefs.outlook(swarm.pos, swarm.vel)
+    told, outlook = View(swarm).told(range(swarm.config.planner.horizon)), swarm.beliefs.predict(swarm.pos, swarm.vel)
     assert 0 < told.remembers.mean() < 1
     for i, m in np.ndindex(4, 3):
         j = swarm.beliefs.others[i, m]
