@@ -103,13 +103,13 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         where = ".".join((*path, *parents))
         kind = f"{where or owner.__name__} parameter" if isinstance(owner, type) else "argument"
         return unknown_name(kind, name, _names(owner, parents))
-    if place and isinstance(place[0], int):  # by position
-        place = (_names(owner)[place[0]], *place[1:])
     if "str" in place:  # of a union: each of its members has a complaint, under the name of its type
         place = place[: place.index("str")]
         errors = [each for each in errors if each["loc"][: len(place)] == place]
     else:
         errors = errors[:1]
+    if place and isinstance(place[0], int):  # by position
+        place = (_names(owner)[place[0]], *place[1:])
     told = " or ".join(dict.fromkeys(_told(each["msg"]) for each in errors))
     name = ".".join((*path, *(str(part) for part in place)))
     if errors[0]["type"] == "value_error" and not isinstance(value, (tuple, list)):

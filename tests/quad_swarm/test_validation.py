@@ -1,5 +1,6 @@
 """How a wrong value is told: in one line, with its name, also where it was given by position."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -50,9 +51,8 @@ def function(number: PositiveInt, text: str | Mapping[str, float] = "", **others
     ],
 )
 def test_one_line_says_where_and_what(call, message):
-    with pytest.raises(ValueError, match="") as caught:
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         call()
-    assert str(caught.value) == message
 
 
 def test_values_come_in_their_types():

@@ -59,7 +59,7 @@ class View:
 
     @cached_property
     def outlook(self) -> Prediction:
-        """What the robot believes of those it does not ask, `Prediction`; positions along the world's axes, absolute."""
+        """What the robot predicts of those it does not ask, `Prediction`; absolute positions."""
         return self._swarm.beliefs.predict(self._swarm.pos, self._swarm.vel)
 
     @cached_property

@@ -85,7 +85,7 @@ class Beliefs:
         # Remembered positions of now and of the next N steps; age in steps since they were planned, N or more: none.
         self._remembered = np.zeros((*shape, horizon + 1, 3))
         self._age = np.full(shape, horizon, dtype=np.int64)
-        # Positions, velocities and what `_predict` made of them: who decides predicts first, and the step does so again.
+        # The last positions, velocities and prediction: who decides predicts first, and the step does so again.
         self._known: tuple[np.ndarray, np.ndarray, tuple[Prediction, np.ndarray]] | None = None
 
     def forget(self, swarms: np.ndarray) -> None:
