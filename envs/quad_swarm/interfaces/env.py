@@ -162,7 +162,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         """
         if not self._is_reset:
             raise need_reset()
-        self._requests = request_matrices(action, self.action_space.shape, self.n_agents)
+        self._requests = request_matrices(action, (self._requests.size,), self.n_agents)
         outcome = self.task.step(self._requests[None])
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = info_of(self.task.info(outcome), 0)

@@ -39,7 +39,8 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         self.task = make_task(num_envs, **kwargs)
         n = self.n_agents
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
-        self.single_action_space = spaces.MultiBinary(n * (n - 1))
+        self._n_bits = n * (n - 1)
+        self.single_action_space = spaces.MultiBinary(self._n_bits)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rngs: list[np.random.Generator] = []
@@ -55,7 +56,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """
         if options:
             raise ValueError(f"Unknown reset options {sorted(options)}: the vector environment has none.")
-        if isinstance(seed, (list, tuple, np.ndarray)) and np.ndim(seed):
+        if isinstance(seed, (list, tuple, np.ndarray)):
             seeds = [checked_seed(value) for value in seed]
         else:
             first = checked_seed(seed)
@@ -79,7 +80,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """
         if not self._rngs:
             raise need_reset()
-        outcome = self.task.step(request_matrices(actions, self.action_space.shape, self.n_agents))
+        outcome = self.task.step(request_matrices(actions, (self.num_envs, self._n_bits), self.n_agents))
         info = self.task.info(outcome)
         infos = self._with_masks(info)
         done = outcome.terminated | outcome.truncated
