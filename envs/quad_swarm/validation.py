@@ -52,14 +52,15 @@ def checked(cls: type[T]) -> type[T]:
 
 def checked_arguments(function: F) -> F:
     """Decorator: arguments are converted to their annotated types and checked, as the fields of `checked` are."""
-    call = pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True))(
-        function
-    )
+
+    @functools.cache  # made at the first call, to keep the import fast
+    def call() -> Callable[..., Any]:
+        return pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False))(function)
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
-            return call(*args, **kwargs)
+            return call()(*args, **kwargs)
         except pydantic.ValidationError as error:
             raise explained(error, function) from None
 
