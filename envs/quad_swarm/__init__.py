@@ -1,6 +1,6 @@
 """A quadrotor swarm with NMPC planners whose robots may ask each other for their plans (Serra-Gomez et al., IROS 2020).
 
-Importing registers ``QuadSwarm-v0`` with Gymnasium; `parallel_env` makes the PettingZoo face.
+Importing registers ``QuadSwarm-v0`` with Gymnasium; `parallel_env` makes the PettingZoo interface.
 """
 
 import gymnasium

@@ -10,10 +10,15 @@ commands with first-order lags, and yaw does not couple into the translation.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from quad_swarm.validation import checked
 
 N_STATES = 9
 N_INPUTS = 4
@@ -22,6 +27,7 @@ VELOCITY = slice(3, 6)
 ATTITUDE = slice(6, 9)
 
 
+@checked
 @dataclass(frozen=True)
 class QuadrotorParams:
     """Physical parameters; source of every value but gravity: Parrot Bebop 2, identified by tud-amr/mrca-mav.
@@ -35,17 +41,24 @@ class QuadrotorParams:
     :param pitch_time_constant: time constant of the pitch response (s)
     :param climb_gain: steady-state gain of the climb-rate command (-)
     :param climb_time_constant: time constant of the climb-rate response (s)
+    :raises ValueError: a drag is negative, or another value not positive
     """
 
-    gravity: float = 9.81
-    drag_x: float = 0.25
-    drag_y: float = 0.33
-    roll_gain: float = 1.1260
-    roll_time_constant: float = 0.2368
-    pitch_gain: float = 1.1075
-    pitch_time_constant: float = 0.2318
-    climb_gain: float = 1.2270
-    climb_time_constant: float = 0.3367
+    gravity: PositiveFloat = 9.81
+    drag_x: NonNegativeFloat = 0.25
+    drag_y: NonNegativeFloat = 0.33
+    roll_gain: PositiveFloat = 1.1260
+    roll_time_constant: PositiveFloat = 0.2368
+    pitch_gain: PositiveFloat = 1.1075
+    pitch_time_constant: PositiveFloat = 0.2318
+    climb_gain: PositiveFloat = 1.2270
+    climb_time_constant: PositiveFloat = 0.3367
+
+    @property
+    def longest_step(self) -> float:
+        """The longest step (s) in which `rk4_step` is stable: its stability interval over the fastest decay."""
+        lags = (1 / self.roll_time_constant, 1 / self.pitch_time_constant, 1 / self.climb_time_constant)
+        return 2.785 / max(self.drag_x, self.drag_y, *lags)
 
 
 def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -> ca.SX:
@@ -88,7 +101,7 @@ def step_function(params: QuadrotorParams, dt: float) -> ca.Function:
 
 
 class QuadrotorModel:
-    """The discrete dynamics of many quadrotors at once, on NumPy arrays.
+    """The discrete dynamics of many quadrotors at once, on NumPy arrays; threads may share it.
 
     :param params: physical parameters
     :param dt: length of a step (s)
@@ -97,7 +110,7 @@ class QuadrotorModel:
     def __init__(self, params: QuadrotorParams, dt: float):
         self.params = params
         self.dt = dt
-        self._calls: dict[int, _BufferedCall] = {}
+        self._local = threading.local()  # calls write into buffers, so every thread has its own
 
     def step(self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None) -> np.ndarray:
         """Next states.
@@ -111,9 +124,10 @@ class QuadrotorModel:
         if count == 0:
             return x.copy()
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
-        if capacity not in self._calls:
-            self._calls[capacity] = _BufferedCall(step_function(self.params, self.dt), capacity)
-        return self._calls[capacity](x, u, wind).reshape(x.shape)
+        calls: dict[Any, _BufferedCall] = self._local.__dict__
+        if capacity not in calls:
+            calls[capacity] = _BufferedCall(step_function(self.params, self.dt), capacity)
+        return calls[capacity](x, u, wind).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """States that follow from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
@@ -123,8 +137,8 @@ class QuadrotorModel:
             states[:, k + 1] = self.step(states[:, k], u[:, k])
         return states
 
-    def __getstate__(self) -> dict:
-        return {"params": self.params, "dt": self.dt, "_calls": {}}  # call buffers hold raw memory: rebuilt on demand
+    def __reduce__(self) -> tuple:
+        return QuadrotorModel, (self.params, self.dt)  # call buffers hold raw memory: rebuilt on demand
 
 
 class _BufferedCall:

@@ -1,6 +1,7 @@
 """The dynamics: against an independent integrator, their steady states, and batches against single calls."""
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import casadi as ca
 import numpy as np
@@ -87,3 +88,20 @@ def test_survives_pickling():
     x, u = random_states(2, np.random.default_rng(3))
     expected = model.step(x, u)
     assert np.array_equal(pickle.loads(pickle.dumps(model)).step(x, u), expected)
+
+
+def test_threads_may_share_a_model():
+    model = QuadrotorModel(PARAMS, dt=0.1)
+    batches = [random_states(50, np.random.default_rng(k)) for k in range(4)]
+    expected = [model.step(x, u) for x, u in batches]
+
+    def often(k: int) -> bool:
+        return all(np.array_equal(model.step(*batches[k]), expected[k]) for _ in range(300))
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(often, range(4)))
+
+
+def test_refuses_senseless_parameters():
+    with pytest.raises(ValueError, match="drag_x=-1: it must be greater than or equal to 0"):
+        QuadrotorParams(drag_x=-1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from quad_swarm.evaluation.policies import is_model, load_model, short_name, tra
 from quad_swarm.evaluation.rows import check_writable, write_rows
 from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.task.rules import RULES
-from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
+from quad_swarm.world.presets import PRESET_VERSION, PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
@@ -75,9 +74,6 @@ def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
         if leaf in place:
             raise ValueError(f"--world {assignment!r}: {name!r} is given twice.")
         place[leaf] = yaml.safe_load(value)
-    for name in world:
-        if name not in (known := [field.name for field in dataclasses.fields(SwarmConfig)]):
-            raise unknown_name("--world parameter", name, known)
     return world
 
 
@@ -126,7 +122,7 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
             raise unknown_name("scenario", name, SCENARIOS)
     models = {policy: trained_in(load_model(policy, args.algo)) for policy in args.policy if is_model(policy)}
     args.preset = args.preset or _preset_of(models)
-    config = make_config(args.preset, **({"n_robots": args.n_robots} | _parse_world(args.world)))
+    config = make_config(args.preset, _parse_world(args.world), n_robots=args.n_robots)
     for policy, trained in models.items():
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, this is {args.preset!r}", file=sys.stderr)

@@ -35,6 +35,7 @@ class Condition:
     :param algo: ``module:Class`` that loads models
     :param solver: see `make_planner`
     :param linger: steps that are flown on after all robots have reached their goals; None: until the time limit
+    :raises ValueError: no step, or a negative number
     """
 
     policy: str
@@ -44,6 +45,12 @@ class Condition:
     algo: str = "sb3_maddpg:MADDPG"
     solver: str = "auto"
     linger: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
+        if self.linger is not None and self.linger < 0:
+            raise ValueError(f"linger={self.linger} is a number of steps, or None to fly until the time limit.")
 
 
 def first_episode(seed: int) -> int:

@@ -37,7 +37,7 @@ LAYOUT: dict[str, dict[str, list[Any]]] = {
 }
 # Episodes behind the heat map, a set of their own
 EPISODES, SET = 32, 9
-_OF_THE_WORLD = ("preset", "n_robots", "memory", "planner", "noise", "radio", "space")
+_OF_THE_WORLD = ("preset", "world", "n_robots", "memory", "planner", "noise", "radio", "space")
 
 
 def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]:

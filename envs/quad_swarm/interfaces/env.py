@@ -1,4 +1,4 @@
-"""The Gymnasium face: one swarm as a team environment."""
+"""The Gymnasium interface: one swarm as a team environment."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from pydantic import PositiveInt
 
 from quad_swarm.errors import unknown_name
+from quad_swarm.interfaces.shared import TaskAttributes, checked_seed, need_reset, request_matrices
 from quad_swarm.task.request_task import make_task
+from quad_swarm.validation import checked_arguments
 
 
-class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
+class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     """Quadrotors that fly to their goals and may ask each other for their plans.
 
     ## Description
@@ -62,6 +65,8 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     :param noise: values of `ProcessNoise` to replace
     :param radio: values of `Radio` to replace
     :param space: values of `ScenarioSpace` to replace
+    :param world: any fields of `SwarmConfig` to replace, nested ones by mappings, for example ``{"radius": 0.12,
+        "quadrotor": {"drag_x": 0.3}}``; what has an argument of its own may be given here or there
     :param solver: "auto" or a name of `planner.SOLVERS`
     :param render_mode: None, "rgb_array", or "human" for a window that shows every step in real time
     :raises ValueError: a wrong value; the message names it and the remedy
@@ -73,22 +78,24 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
     reset_options = ("starts", "goals")
 
+    @checked_arguments
     def __init__(
         self,
         preset: str = "paper",
         scenario: str | Mapping[str, float] = "mixed",
         n_robots: int | None = None,
-        max_steps: int = 100,
+        max_steps: PositiveInt = 100,
         observation: str = "paper",
         scale_observation: bool = False,
         continuous_collisions: bool = False,
         end_at_arrival: bool = False,
         memory: float | None = None,
-        reward: Mapping[str, float] | None = None,
+        reward: Mapping[str, Any] | None = None,
         planner: Mapping[str, Any] | None = None,
-        noise: Mapping[str, float] | None = None,
-        radio: Mapping[str, float] | None = None,
+        noise: Mapping[str, Any] | None = None,
+        radio: Mapping[str, Any] | None = None,
         space: Mapping[str, Any] | None = None,
+        world: Mapping[str, Any] | None = None,
         solver: str = "auto",
         render_mode: str | None = None,
     ):
@@ -108,13 +115,10 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
             noise=noise,
             radio=radio,
             space=space,
+            world=world,
             solver=solver,
         )
-        self.config = self.task.swarm.config
-        self.agent_names = self.task.agent_names
-        self.observation_layout = self.task.observation_layout
-        self.action_cost = self.task.action_cost
-        self.n_agents = n = self.config.n_robots
+        n = self.n_agents
         self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
         self.action_space = spaces.MultiBinary(n * (n - 1))
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -122,41 +126,27 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self._renderer: Any = None
         self._requests = np.zeros((n, n - 1), dtype=bool)
-
-    # The curriculum: a training callback sets the level, the environment itself never does.
-    @property
-    def n_curriculum_levels(self) -> int:
-        """Number of curriculum levels; 1 where the scenario has none."""
-        return self.task.sampler.n_levels
-
-    @property
-    def curriculum_level(self) -> int:
-        """The present level, from 0."""
-        return self.task.sampler.level
-
-    def set_curriculum_level(self, level: int) -> None:
-        """Draw later episodes from the first ``level + 1`` scenarios.
-
-        :raises ValueError: no such level
-        """
-        self.task.sampler.set_level(level)
+        self._is_reset = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; see the class for ``options``."""
-        super().reset(seed=seed)
+        """Begin an episode; see the class for ``options``.
+
+        :raises ValueError: a wrong seed or option
+        """
+        super().reset(seed=checked_seed(seed))
         options = options or {}
         if unknown := set(options).difference(self.reset_options):
             raise unknown_name("reset option", unknown.pop(), self.reset_options)
         if len(options) == 1:
             raise ValueError(f"reset options name only {next(iter(options))!r}; give both 'starts' and 'goals'.")
         if options:
-            starts, goals = (np.asarray(options[name], dtype=float) for name in self.reset_options)
-            self.task.place(0, "custom", starts, goals, self.np_random)
+            self.task.place(0, "custom", options["starts"], options["goals"], self.np_random)
         else:
             self.task.reset(0, self.np_random)
         self._requests = np.zeros_like(self._requests)
+        self._is_reset = True
         if self._renderer is not None:
             self._renderer.reset()
         if self.render_mode == "human":
@@ -166,9 +156,13 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Let every robot ask, plan and fly for one step.
 
-        :raises ValueError: the action is not n(n - 1) bits; a solver's failure never raises
+        :param action: bits, (n(n - 1),)
+        :raises ValueError: the action has another shape or other entries; a solver's failure never raises
+        :raises gymnasium.error.ResetNeeded: before the first reset
         """
-        self._requests = request_matrices(action, 1, self.n_agents)[0]
+        if not self._is_reset:
+            raise need_reset()
+        self._requests = request_matrices(action, (self._requests.size,), self.n_agents)
         outcome = self.task.step(self._requests[None])
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = info_of(self.task.info(outcome), 0)
@@ -211,26 +205,6 @@ class QuadSwarmEnv(gym.Env[np.ndarray, np.ndarray]):
         if self._renderer is not None:
             self._renderer.close()
         self._renderer = None
-
-
-def request_matrices(actions: Any, n_swarms: int, n_robots: int) -> np.ndarray:
-    """Joint actions as whom each robot asks, (E, n, n - 1) bool.
-
-    :param actions: E times n(n - 1) bits, in any shape
-    :raises ValueError: wrong size, or anything but zeros and ones
-    """
-    bits = np.asarray(actions)
-    size = n_robots * (n_robots - 1)
-    if bits.size != n_swarms * size:
-        raise ValueError(
-            f"The action has {bits.size} entries; {n_robots} robots need {size} bits, {n_robots - 1} each"
-            + (f", in each of {n_swarms} swarms." if n_swarms > 1 else ".")
-        )
-    asked = bits == 1
-    if not (asked | (bits == 0)).all():
-        wrong = bits[~(asked | (bits == 0))].ravel()[0]
-        raise ValueError(f"The action contains {wrong!r}; every entry must be 0 or 1. Threshold scores before acting.")
-    return asked.reshape(n_swarms, n_robots, n_robots - 1)
 
 
 def info_of(batch: dict[str, Any], swarm: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The PettingZoo face: the same swarm with one agent a robot."""
+"""The PettingZoo interface: the same swarm with one agent for each robot."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from quad_swarm.interfaces.env import QuadSwarmEnv
+from quad_swarm.interfaces.shared import TaskAttributes, need_reset, request_matrices
 
 
-class QuadSwarmParallelEnv(ParallelEnv):
+class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
     """`QuadSwarmEnv` as a PettingZoo environment: same seed and same bits give the same episode.
 
     Agents are called "robot_0", "robot_1", ...; each observes its row, acts with `MultiBinary(n - 1)` and gets the
@@ -19,6 +20,7 @@ class QuadSwarmParallelEnv(ParallelEnv):
 
     :param render_mode: None, "rgb_array" or "human"
     :param kwargs: arguments of `QuadSwarmEnv`
+    :raises ValueError: a wrong value; the message names it and the remedy
     """
 
     metadata = {"name": "quad_swarm_v0", "render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
@@ -26,13 +28,14 @@ class QuadSwarmParallelEnv(ParallelEnv):
     def __init__(self, render_mode: str | None = None, **kwargs: Any):
         self.team = QuadSwarmEnv(render_mode=render_mode, **kwargs)
         self.render_mode = render_mode
-        self.observation_layout = self.team.observation_layout
-        self.action_cost = self.team.action_cost
-        n, size = self.team.observation_space.shape  # type: ignore[misc]
+        self.task = self.team.task
+        n, size = self.n_agents, self.task.observation_size
         self.possible_agents = list(self.team.agent_names)
         self.agents: list[str] = []
         self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, (size,), np.float32) for a in self.possible_agents}
         self.action_spaces = {a: spaces.MultiBinary(n - 1) for a in self.possible_agents}
+        self.state_space = spaces.Box(-np.inf, np.inf, (n * size,), np.float32)
+        self._is_reset = False
 
     def observation_space(self, agent: str) -> spaces.Space:
         """Observation space of one robot, (6n,)."""
@@ -48,18 +51,28 @@ class QuadSwarmParallelEnv(ParallelEnv):
         """See `QuadSwarmEnv.reset`; unknown options are ignored, as PettingZoo's API test demands."""
         known = {name: value for name, value in (options or {}).items() if name in QuadSwarmEnv.reset_options}
         observation, info = self.team.reset(seed=seed, options=known)
+        self._is_reset = True
         self.agents = list(self.possible_agents)
         return self._rows(observation), {agent: dict(info) for agent in self.agents}
 
     def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
-        """See `QuadSwarmEnv.step`.
+        """See `QuadSwarmEnv.step`; once the episode is over there are no agents left, and all five are empty.
 
-        :raises ValueError: an agent's action is missing
+        :param actions: bits of each agent, (n - 1,)
+        :raises ValueError: an agent's action is missing or has another shape or other entries
+        :raises gymnasium.error.ResetNeeded: before the first reset
         """
+        if not self._is_reset:
+            raise need_reset()
+        if not self.agents:
+            return {}, {}, {}, {}, {}
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise ValueError(f"No action for {', '.join(missing)}; every robot must act in every step.")
-        joint = np.concatenate([np.asarray(actions[agent]).ravel() for agent in self.possible_agents])
-        observation, reward, terminated, truncated, info = self.team.step(joint)
+        width = (self.n_agents - 1,)
+        requests = [
+            request_matrices(actions[agent], width, self.n_agents, f"The action of {agent}") for agent in self.agents
+        ]
+        observation, reward, terminated, truncated, info = self.team.step(np.concatenate(requests).ravel())
         agents = self.agents
         if terminated or truncated:
             self.agents = []
@@ -72,7 +85,7 @@ class QuadSwarmParallelEnv(ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """All observations, (n * 6n,)."""
+        """All observations, one robot after the other, (n * size,); in `state_space`."""
         return self.team.task.observe()[0].ravel()
 
     def render(self) -> Any:

@@ -10,12 +10,14 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from pydantic import PositiveInt
 
-from quad_swarm.interfaces.env import request_matrices
+from quad_swarm.interfaces.shared import TaskAttributes, checked_seed, need_reset, request_matrices
 from quad_swarm.task.request_task import make_task
+from quad_swarm.validation import checked_arguments
 
 
-class QuadSwarmVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """`QuadSwarmEnv`, E times: ``gymnasium.make_vec("QuadSwarm-v0", num_envs=256)``.
 
     Each swarm flies step for step as it would alone. Episodes that end begin anew in the same step
@@ -24,35 +26,24 @@ class QuadSwarmVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     :param num_envs: number of swarms E
     :param kwargs: arguments of `QuadSwarmEnv`
+    :raises ValueError: a wrong value; the message names it and the remedy
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's convention
 
-    def __init__(self, num_envs: int = 1, render_mode: None = None, **kwargs: Any):
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs}: at least one swarm is needed.")
+    @checked_arguments
+    def __init__(self, num_envs: PositiveInt = 1, render_mode: Any = None, **kwargs: Any):
         if render_mode is not None:
             raise ValueError(f"render_mode={render_mode!r}: the vector environment draws nothing; use QuadSwarmEnv.")
         self.num_envs = num_envs
         self.task = make_task(num_envs, **kwargs)
-        self.agent_names = self.task.agent_names
-        self.observation_layout = self.task.observation_layout
-        self.action_cost = self.task.action_cost
-        self.n_agents = n = self.task.swarm.config.n_robots
+        n = self.n_agents
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
-        self.single_action_space = spaces.MultiBinary(n * (n - 1))
+        self._n_bits = n * (n - 1)
+        self.single_action_space = spaces.MultiBinary(self._n_bits)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rngs: list[np.random.Generator] = []
-
-    @property
-    def n_curriculum_levels(self) -> int:
-        """See `QuadSwarmEnv`."""
-        return self.task.sampler.n_levels
-
-    def set_curriculum_level(self, level: int) -> None:
-        """See `QuadSwarmEnv`."""
-        self.task.sampler.set_level(level)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -61,17 +52,18 @@ class QuadSwarmVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         :param seed: of swarm 0, the others count on from it; or one of each swarm
         :param options: none are known
+        :raises ValueError: a wrong seed or option
         """
         if options:
             raise ValueError(f"Unknown reset options {sorted(options)}: the vector environment has none.")
-        if isinstance(seed, int):
-            seeds: list[int | None] = [seed + k for k in range(self.num_envs)]
+        if isinstance(seed, (list, tuple, np.ndarray)):
+            seeds = [checked_seed(value) for value in seed]
         else:
-            seeds = list(seed) if seed is not None else [None] * self.num_envs
+            first = checked_seed(seed)
+            seeds = [None if first is None else first + k for k in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ValueError(f"{len(seeds)} seeds for {self.num_envs} swarms.")
-        fresh = not self._rngs
-        if fresh:
+        if not self._rngs:
             self._rngs = [np.random.default_rng() for _ in seeds]
         for k, value in enumerate(seeds):
             if value is not None:
@@ -82,9 +74,13 @@ class QuadSwarmVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of every swarm; see `QuadSwarmEnv.step`.
 
-        :param actions: (E, n(n - 1)) bits
+        :param actions: bits, (E, n(n - 1))
+        :raises ValueError: the actions have another shape or other entries
+        :raises gymnasium.error.ResetNeeded: before the first reset
         """
-        outcome = self.task.step(request_matrices(actions, self.num_envs, self.n_agents))
+        if not self._rngs:
+            raise need_reset()
+        outcome = self.task.step(request_matrices(actions, (self.num_envs, self._n_bits), self.n_agents))
         info = self.task.info(outcome)
         infos = self._with_masks(info)
         done = outcome.terminated | outcome.truncated

@@ -1,4 +1,4 @@
-"""Planning: the optimal control problem of one robot, solvers for batches of it, and the ladder below them."""
+"""Planning: the optimal control problem of one robot, solvers for batches of it, and the fallback chain below them."""
 
 from __future__ import annotations
 

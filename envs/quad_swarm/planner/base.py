@@ -1,7 +1,8 @@
-"""What every solver is given and gives back, and the ladder that always ends in a plan that can be flown."""
+"""What every solver is given and gives back, and the fallback chain that always ends in a plan that can be flown."""
 
 from __future__ import annotations
 
+import warnings
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
@@ -40,7 +41,7 @@ class Solution(NamedTuple):
 
 
 class Solver(Protocol):
-    """Solves batches of problems; it reports failure, it never raises for it."""
+    """Solves batches of problems; it reports failure as data. Should it raise all the same, all its problems failed."""
 
     name: str
 
@@ -55,7 +56,11 @@ class Solver(Protocol):
 
 
 class PlanStatus(IntEnum):
-    """How a plan came about: the rung of the ladder that held."""
+    """How a plan came about: the level of the fallback chain that gave it.
+
+    SOLVED: by the solver, from the last plan as a guess. RETRIED: by the solver, from a guess that forgets the last
+    plan. SHIFTED: the last plan, flown on. BRAKING: braking to hover.
+    """
 
     SOLVED = 0
     RETRIED = 1
@@ -93,12 +98,12 @@ class Plans(NamedTuple):
 
 
 class Planner:
-    """Warm-started solves with a ladder below them: solve, retry cold, fly the last plan on, brake (Sec. III-B).
+    """Warm-started solves with a fallback chain: solve, retry cold, fly the last plan on, brake (Sec. III-B).
 
-    Every rung is decided per robot; a failure of one never touches another's plan.
+    The level is chosen for each robot by itself; a failure of one never touches another's plan.
 
     :param solver: the solver
-    :param model: discrete dynamics, for the rungs that need no solver
+    :param model: discrete dynamics, for the levels that need no solver
     :param config: horizon and limits
     """
 
@@ -108,14 +113,14 @@ class Planner:
         self.config = config
 
     def plan(self, problems: Problems, previous: Plans) -> Plans:
-        """Plans for a batch of B problems.
+        """Plans for a batch of B problems; a solver's failure never raises.
 
         :param problems: the batch
         :param previous: the plans of the same robots one step ago
         """
         x_guess, u_guess = shift(previous.x), shift(previous.u)
         problems = self._nearest_others(problems, x_guess)
-        x, u, success, iterations = self.solver.solve(problems, x_guess, u_guess)
+        x, u, success, iterations = self._solve(problems, x_guess, u_guess)
         status = np.where(success, PlanStatus.SOLVED, PlanStatus.BRAKING)
         age = np.zeros(len(status), dtype=np.int64)
 
@@ -123,7 +128,7 @@ class Planner:
         if failed.size:
             # Cold: the present state held, no input.
             cold = Plans.hover(problems.x[failed], self.config.horizon)
-            retry = self.solver.solve(Problems(*(field[failed] for field in problems)), cold.x, cold.u)
+            retry = self._solve(Problems(*(field[failed] for field in problems)), cold.x, cold.u)
             iterations[failed] += retry.iterations
             x[failed], u[failed] = retry.x, retry.u
             status[failed[retry.success]] = PlanStatus.RETRIED
@@ -136,6 +141,20 @@ class Planner:
             u[failed[~lasts]] = self.braking_inputs(problems.x[failed[~lasts]])
             x[failed] = self.model.rollout(problems.x[failed], u[failed])
         return Plans(x, u, age, status, iterations)
+
+    def _solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
+        """What the solver finds. Plans that are not finite failed, and all of a solver that raises did."""
+        try:
+            solution = self.solver.solve(problems, x_guess, u_guess)
+        except Exception as error:
+            message = f"the solver {self.solver.name!r} raised {error!r}: its problems count as failed"
+            warnings.warn(message, RuntimeWarning, stacklevel=3)
+            hover, none = Plans.hover(problems.x, self.config.horizon), np.zeros(len(problems.x), dtype=np.int64)
+            return Solution(hover.x, hover.u, none.astype(bool), none)
+        if np.isfinite(solution.x).all() and np.isfinite(solution.u).all():
+            return solution
+        finite = np.isfinite(solution.x).all(axis=(1, 2)) & np.isfinite(solution.u).all(axis=(1, 2))
+        return solution._replace(success=solution.success & finite)
 
     def _nearest_others(self, problems: Problems, x_guess: np.ndarray) -> Problems:
         """The same problems with only the ``max_neighbours`` others that come nearest over the horizon."""

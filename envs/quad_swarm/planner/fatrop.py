@@ -11,6 +11,10 @@ from quad_swarm.planner.base import Problems, Solution
 from quad_swarm.planner.problem import OptimalControlProblem
 from quad_swarm.quadrotor import N_INPUTS, N_STATES
 
+_LARGEST_EXPONENT = 300.0  # of the repulsion: its square is still far from the overflow of a double
+
+_LARGEST_NUMBER = 1e5  # m, m/s or rad: what is given beyond that fails without a solve
+
 
 class FatropSolver:
     """Reference solver: every problem of a batch to convergence, one after the other.
@@ -54,11 +58,11 @@ class FatropSolver:
             parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], problems.others[b].ravel()])
             variables[program.x_index] = x_guess[b, 1:, :nx]
             variables[program.u_index] = u_guess[b, :, :nu]
-            if not (np.isfinite(parameters).all() and np.isfinite(variables).all()):
+            if not (_is_sane(parameters) and _is_sane(variables)):
                 continue
             try:
                 solution = solver(x0=variables, p=parameters, **program.bounds)
-            except RuntimeError:  # fatrop gave up on the numbers; the ladder takes over
+            except RuntimeError:  # fatrop gave up on the numbers; the fallback chain takes over
                 continue
             stats = solver.stats()
             success[b], iterations[b] = stats["success"], stats["iter_count"]
@@ -70,6 +74,11 @@ class FatropSolver:
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"_program": None, "_solver": None}  # rebuilt in the process that needs it
+
+
+def _is_sane(numbers: np.ndarray) -> bool:
+    """Whether the numbers are finite and small enough for fatrop, which may loop for ever on what overflows."""
+    return bool((np.abs(numbers) <= _LARGEST_NUMBER).all())
 
 
 class Program(NamedTuple):
@@ -103,6 +112,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
     variables, lower, x_index, u_index = [], [], [], []
     constraints, constraint_lower, equality, n_slacks = [], [], [], []
     max_input = problem.max_input.full().ravel()
+    farthest = config.separation * (_LARGEST_EXPONENT / config.repulsion_steepness + config.repulsion_buffer)
     offset = 0
     for k in range(horizon + 1):
         slack = ca.SX.sym(f"slack{k}", n_others if k > 0 else 0)
@@ -113,7 +123,9 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             x_index.append(np.arange(offset, offset + nx))
             offset += nx
             distances = problem.distances(states[k], others[:, [j * horizon + k - 1 for j in range(n_others)]])
-            cost += sum((problem.repulsion_cost(d) for d in distances), start=ca.SX(0))
+            # Far away the repulsion is zero long before its exponential overflows, whose derivatives would be NaN:
+            # given one, fatrop regularises its Hessian for ever.
+            cost += sum((problem.repulsion_cost(ca.fmin(d, farthest)) for d in distances), start=ca.SX(0))
             cost += config.violation_weight * (
                 ca.sumsqr(slack) + ca.sumsqr(ca.fmax(problem.box_violations(states[k]), 0))
             )

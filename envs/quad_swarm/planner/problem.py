@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
+from quad_swarm.validation import checked
 
 
+@checked
 @dataclass(frozen=True)
 class PlannerConfig:
     """Horizon, limits and weights of the problem. Form of the cost and most weights: tud-amr/mrca-mav (docs/method.md).
 
     :param horizon: number of stages N (-)
     :param dt: length of a stage and of a simulation step (s)
-    :param separation: distance to keep between the centres of two robots (m); the paper's constraint is 2r
+    :param separation: distance to keep between the centres of two robots (m); the paper's constraint is 2r, which
+        `make_config` keeps to when the radius changes
     :param max_tilt: limit of the commanded roll and pitch (rad)
     :param max_climb_rate: limit of the commanded climb rate (m/s)
     :param max_yaw_rate: limit of the commanded yaw rate (rad/s); 0 holds the yaw and takes it out of the problem
@@ -32,36 +37,33 @@ class PlannerConfig:
     :param violation_weight: weight of the squared violation of a soft constraint (1/m^2)
     :param max_neighbours: consider only so many others, those whose believed trajectories come nearest to the robot's
         last plan; None considers all
+    :raises ValueError: a value that is not finite or out of its range, or an empty workspace
     """
 
-    horizon: int = 10
-    dt: float = 0.1
-    separation: float = 0.6
-    max_tilt: float = math.radians(12.0)
-    max_climb_rate: float = 1.0
-    max_yaw_rate: float = 0.0
-    max_speed: float = 4.0
-    max_vertical_speed: float = 1.5
+    horizon: Annotated[int, Field(ge=2)] = 10
+    dt: PositiveFloat = 0.1
+    separation: PositiveFloat = 0.6
+    max_tilt: Annotated[float, Field(gt=0, lt=math.pi / 2)] = math.radians(12.0)
+    max_climb_rate: PositiveFloat = 1.0
+    max_yaw_rate: NonNegativeFloat = 0.0
+    max_speed: PositiveFloat = 4.0
+    max_vertical_speed: PositiveFloat = 1.5
     workspace_low: tuple[float, float, float] = (-4.8, -4.8, 0.48)
     workspace_high: tuple[float, float, float] = (4.8, 4.8, 2.4)
-    goal_weight: float = 8.0
-    input_weight: float = 0.1
-    repulsion_weight: float = 0.1
-    repulsion_buffer: float = 1.2
-    repulsion_steepness: float = 10.0
-    violation_weight: float = 1e4
-    max_neighbours: int | None = None
+    goal_weight: NonNegativeFloat = 8.0
+    input_weight: PositiveFloat = 0.1
+    repulsion_weight: NonNegativeFloat = 0.1
+    repulsion_buffer: PositiveFloat = 1.2
+    repulsion_steepness: PositiveFloat = 10.0
+    violation_weight: PositiveFloat = 1e4
+    max_neighbours: PositiveInt | None = None
 
     def __post_init__(self) -> None:
-        if self.horizon < 2:
-            raise ValueError(f"horizon={self.horizon}: the planner needs at least 2 stages.")
-        for name in ("dt", "separation", "max_tilt", "max_climb_rate", "max_speed", "max_vertical_speed"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}={getattr(self, name)}: it must be positive.")
-        if self.max_neighbours is not None and self.max_neighbours < 1:
-            raise ValueError(f"max_neighbours={self.max_neighbours}: it must be at least 1, or None for all.")
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
-            raise ValueError(f"Empty workspace: low corner {self.workspace_low}, high corner {self.workspace_high}.")
+            raise ValueError(
+                f"Empty workspace: planner.workspace_low={self.workspace_low} must be below "
+                f"planner.workspace_high={self.workspace_high} along every axis"
+            )
 
 
 class OptimalControlProblem:

@@ -209,16 +209,16 @@ def _critic(pair: PairView) -> np.ndarray:
     plans = advance(pair.swarm.plans[..., :3])[:, :, 1:]
     theirs = plans[:, others] - pair.swarm.pos[:, :, None, None]
     surprise = theirs - view.expected
-    back = pair.swarm.beliefs.back  # the other's view of this robot: the same numbers with the two exchanged
+    reverse = pair.swarm.beliefs.reverse  # the other's view of this robot: the same numbers with the two exchanged
     size = length(surprise)[..., stages]
     separation = length(view.plan[:, :, None] - theirs)
     parts = (
         np.clip(2 * _flat(pair.turn(surprise.take(stages, axis=-2)), 3), -2, 2),
         np.tanh(size / 0.1),
-        np.tanh(size[:, others, back] / 0.1),
+        np.tanh(size[:, others, reverse] / 0.1),
         pair.closeness(separation.min(axis=-1)),
         pair.closeness(view.plan_separation.min(axis=-1)),
-        view.outlook.remembers[:, others, back, None],
+        view.outlook.remembers[:, others, reverse, None],
     )
     return np.concatenate(parts, axis=-1)
 
@@ -285,4 +285,8 @@ def make_observation(
     """
     if observation == "paper":
         return PaperObservation(config.n_robots, scale_observation)
+    if scale_observation:
+        raise ValueError(
+            f"scale_observation=True is for observation='paper' alone; observation={observation!r} is scaled already."
+        )
     return PairObservation(config, observation.split("+"), critics)

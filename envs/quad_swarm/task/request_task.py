@@ -8,14 +8,17 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
-from quad_swarm.world.presets import make_config, replace_fields
+from quad_swarm.validation import checked, checked_arguments, replaced
+from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm
 
 
+@checked
 @dataclass(frozen=True)
 class RewardConfig:
     """R = w_g R_g + w_coll R_coll + w_c R_c with the paper's values (Sec. V-A).
@@ -30,16 +33,17 @@ class RewardConfig:
     :param near_miss_ahead: count also how close the two come by their plans within so many further steps
     :param near_miss_narrowing: by how much ``near_miss_distance`` is less for the last of those steps, in proportion
         for those before: plans that are far ahead still change (m)
+    :raises ValueError: a value is negative or not finite; the near misses' distance or width is zero
     """
 
-    goal: float = 1.3
-    collision: float = 150.0
-    request: float = 0.1
-    near_miss: float = 0.0
-    near_miss_distance: float = 0.6
-    near_miss_width: float = 0.01
-    near_miss_ahead: int = 0
-    near_miss_narrowing: float = 0.0
+    goal: NonNegativeFloat = 1.3
+    collision: NonNegativeFloat = 150.0
+    request: NonNegativeFloat = 0.1
+    near_miss: NonNegativeFloat = 0.0
+    near_miss_distance: PositiveFloat = 0.6
+    near_miss_width: PositiveFloat = 0.01
+    near_miss_ahead: NonNegativeInt = 0
+    near_miss_narrowing: NonNegativeFloat = 0.0
 
 
 class Outcome(NamedTuple):
@@ -78,6 +82,7 @@ class RequestTask:
     :param continuous_collisions: end episodes at collisions between steps too; the paper looks at the steps alone
     :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
     :param end_at_collision: end episodes at collisions; otherwise they fly on, to see how deep a collision gets
+    :raises ValueError: near misses are looked for beyond the plans' end
     """
 
     def __init__(
@@ -91,8 +96,12 @@ class RequestTask:
         end_at_arrival: bool = False,
         end_at_collision: bool = True,
     ):
-        if max_steps < 1:
-            raise ValueError(f"max_steps={max_steps}: an episode needs at least one step.")
+        last = swarm.config.planner.horizon - 1
+        if reward.near_miss_ahead > last:
+            raise ValueError(
+                f"reward.near_miss_ahead={reward.near_miss_ahead}: plans reach planner.horizon - 1 = {last} steps "
+                "beyond the present one."
+            )
         self.swarm = swarm
         self.sampler = sampler
         self.reward = reward
@@ -219,22 +228,24 @@ class RequestTask:
         return {"is_success": self.statistics.success, "metrics": self.statistics.metrics()}
 
 
+@checked_arguments
 def make_task(
-    n_swarms: int = 1,
+    n_swarms: PositiveInt = 1,
     preset: str = "paper",
     scenario: str | Mapping[str, float] = "mixed",
     n_robots: int | None = None,
-    max_steps: int = 100,
+    max_steps: PositiveInt = 100,
     observation: str = "paper",
     scale_observation: bool = False,
     continuous_collisions: bool = False,
     end_at_arrival: bool = False,
     memory: float | None = None,
-    reward: Mapping[str, float] | None = None,
+    reward: Mapping[str, Any] | None = None,
     planner: Mapping[str, Any] | None = None,
-    noise: Mapping[str, float] | None = None,
-    radio: Mapping[str, float] | None = None,
+    noise: Mapping[str, Any] | None = None,
+    radio: Mapping[str, Any] | None = None,
     space: Mapping[str, Any] | None = None,
+    world: Mapping[str, Any] | None = None,
     solver: str = "auto",
 ) -> RequestTask:
     """The task of an environment; arguments as in `QuadSwarmEnv`.
@@ -243,10 +254,10 @@ def make_task(
     :raises ValueError: a wrong value; the message names it and the remedy
     """
     config = make_config(
-        preset, n_robots=n_robots, memory=memory, planner=planner, noise=noise, radio=radio, space=space
+        preset, world, n_robots=n_robots, memory=memory, planner=planner, noise=noise, radio=radio, space=space
     )
     sampler = ScenarioSampler(scenario, config.n_robots, config.space)
-    weights = replace_fields(RewardConfig(), reward or {}, "reward")
+    weights = replaced(RewardConfig(), reward or {}, "reward")
     swarm = Swarm(config, n_swarms, solver)
     seen = make_observation(config, observation, scale_observation)
     return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from quad_swarm.geometry import length
-from quad_swarm.world.beliefs import Outlook, advance
+from quad_swarm.world.beliefs import Prediction, advance
 from quad_swarm.world.swarm import Swarm
 
 
@@ -58,9 +58,9 @@ class View:
         return advance(self._swarm.plans[..., :3]) - self._swarm.pos[:, :, None]
 
     @cached_property
-    def outlook(self) -> Outlook:
-        """What the robot believes of those it does not ask, `Outlook`; positions along the world's axes, absolute."""
-        return self._swarm.beliefs.outlook(self._swarm.pos, self._swarm.vel)
+    def outlook(self) -> Prediction:
+        """What the robot predicts of those it does not ask, `Prediction`; absolute positions."""
+        return self._swarm.beliefs.predict(self._swarm.pos, self._swarm.vel)
 
     @cached_property
     def expected(self) -> np.ndarray:
@@ -71,16 +71,16 @@ class View:
         relative = believed.reshape(*believed.shape[:3], -1) - np.tile(pos, self.horizon)[:, :, None]
         return relative.reshape(believed.shape)
 
-    def told(self, stages: Sequence[int]) -> Outlook:
+    def told(self, stages: Sequence[int]) -> Prediction:
         """What each of the others believes of this robot unless it asks, as far as this robot can tell: it knows what
         it answered, and takes every answer to have arrived.
 
-        :param stages: which of the next N steps, from 0 on; `Outlook.believed` holds no others
+        :param stages: which of the next N steps, from 0 on; `Prediction.believed` holds no others
         """
         beliefs = self._swarm.told
-        outlook = beliefs.outlook(self._swarm.pos, self._swarm.vel)
+        outlook = beliefs.predict(self._swarm.pos, self._swarm.vel)
         outlook = outlook._replace(believed=outlook.believed.take(stages, axis=-2))
-        return Outlook(*(field[:, beliefs.others, beliefs.back] for field in outlook))
+        return Prediction(*(field[:, beliefs.others, beliefs.reverse] for field in outlook))
 
     @property
     def age(self) -> np.ndarray:

@@ -30,7 +30,7 @@ def other_indices(n_robots: int) -> np.ndarray:
     return np.array([[j for j in range(n_robots) if j != i] for i in range(n_robots)], dtype=np.int64)
 
 
-def back_indices(n_robots: int) -> np.ndarray:
+def reverse_indices(n_robots: int) -> np.ndarray:
     """For each robot its own place among the others of each of its others, see `other_indices`: (n, n - 1)."""
     others = other_indices(n_robots)
     return np.array([[row.tolist().index(i) for row in others[others[i]]] for i in range(n_robots)], dtype=np.int64)
@@ -48,8 +48,8 @@ def advance(trajectory: np.ndarray) -> np.ndarray:
     return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
 
 
-class Outlook(NamedTuple):
-    """What robots believe of those they do not ask.
+class Prediction(NamedTuple):
+    """What robots predict of the others as long as they do not request their plans.
 
     :param believed: positions at the next N steps, (E, n, n - 1, N, 3), world frame (m)
     :param remembers: whether an earlier plan is believed, else a constant velocity, (E, n, n - 1) bool
@@ -77,7 +77,7 @@ class Beliefs:
     def __init__(self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float):
         if not memory >= 0:
             raise ValueError(f"memory={memory}: it is a distance in metres, or 0 to switch it off.")
-        self.others, self.back = other_indices(n_robots), back_indices(n_robots)
+        self.others, self.reverse = other_indices(n_robots), reverse_indices(n_robots)
         self.horizon = horizon
         self.dt = dt
         self.memory = memory
@@ -85,8 +85,8 @@ class Beliefs:
         # Remembered positions of now and of the next N steps; age in steps since they were planned, N or more: none.
         self._remembered = np.zeros((*shape, horizon + 1, 3))
         self._age = np.full(shape, horizon, dtype=np.int64)
-        # Positions, velocities and what `_look` made of them: who decides looks first, and the step looks again.
-        self._known: tuple[np.ndarray, np.ndarray, tuple[Outlook, np.ndarray]] | None = None
+        # The last positions, velocities and prediction: who decides predicts first, and the step does so again.
+        self._known: tuple[np.ndarray, np.ndarray, tuple[Prediction, np.ndarray]] | None = None
 
     def forget(self, swarms: np.ndarray) -> None:
         """Forget every received plan in the given swarms (indices or mask)."""
@@ -98,31 +98,31 @@ class Beliefs:
         self._remembered, self._age = self._remembered[swarms], self._age[swarms]
         self._known = None
 
-    def outlook(self, pos: np.ndarray, vel: np.ndarray) -> Outlook:
-        """What the robots would believe in this step if they did not ask; `update` has not been called for it.
+    def predict(self, pos: np.ndarray, vel: np.ndarray) -> Prediction:
+        """What the robots believe in this step without a request; `update` has not been called for it.
 
         :param pos: present positions, (E, n, 3), world frame (m)
         :param vel: present velocities, (E, n, 3), world frame (m/s)
         """
-        return self._look_once(pos, vel)[0]
+        return self._predict_once(pos, vel)[0]
 
-    def _look_once(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Outlook, np.ndarray]:
+    def _predict_once(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Prediction, np.ndarray]:
         known = self._known
         if known is None or not (np.array_equal(known[0], pos) and np.array_equal(known[1], vel)):
-            known = self._known = (pos.copy(), vel.copy(), self._look(pos, vel))
+            known = self._known = (pos.copy(), vel.copy(), self._predict(pos, vel))
         return known[2]
 
-    def _look(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Outlook, np.ndarray]:
+    def _predict(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Prediction, np.ndarray]:
         """:return: what is believed, and what is remembered, from now on; nothing else holds these arrays"""
         believed = constant_velocity(pos, vel, self.horizon, self.dt)[:, self.others]
         if not self.memory:
             never = np.full(self._age.shape, self.horizon)
-            return Outlook(believed, np.zeros(never.shape, bool), never, np.zeros(never.shape)), self._remembered
+            return Prediction(believed, np.zeros(never.shape, bool), never, np.zeros(never.shape)), self._remembered
         remembered, age = advance(self._remembered), self._age + 1
         error = length(remembered[..., 0, :] - pos[:, self.others])
         remembers = (age < self.horizon) & (error <= self.memory)
         believed[remembers] = remembered[remembers, 1:]
-        return Outlook(believed, remembers, age, error), remembered
+        return Prediction(believed, remembers, age, error), remembered
 
     def update(
         self, requests: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray, age: int = 1
@@ -137,16 +137,16 @@ class Beliefs:
         :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
             1)
         """
-        outlook, remembered = self._look_once(pos, vel)
+        prediction, remembered = self._predict_once(pos, vel)
         swarms, robots, places = np.nonzero(requests)
         received = advance(plans)[swarms, self.others[robots, places]]  # now, and the next N steps
-        believed = outlook.believed.copy()
+        believed = prediction.believed.copy()
         believed[requests] = received[:, 1:]
-        unasked = np.where(outlook.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
+        unasked = np.where(prediction.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
         source = np.where(requests, BeliefSource.REQUESTED, unasked)
         if self.memory:
             remembered[requests] = received
             self._remembered = remembered
-            self._age = np.where(requests, age, outlook.age)
+            self._age = np.where(requests, age, prediction.age)
         self._known = None
         return believed, source

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from quad_swarm.errors import unknown_name
 from quad_swarm.planner import PlannerConfig
 from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.validation import checked, replaced
 from quad_swarm.world.scenarios import ScenarioSpace
 
 PRESET_VERSION = 1
 
+# Beyond these nothing flies, and numbers lose their meaning before they overflow.
+Disturbance = Annotated[float, Field(ge=0, le=1e3)]
 
+
+@checked
 @dataclass(frozen=True)
 class ProcessNoise:
     """Disturbances of the simulated flight; the planner knows nothing of them. All off by default.
@@ -24,38 +31,38 @@ class ProcessNoise:
     :param vel: standard deviation added to each velocity component in each step (m/s)
     :param attitude: standard deviation added to roll and pitch in each step (rad)
     :param wind: speed of a steady horizontal wind whose direction is drawn for each episode (m/s)
+    :raises ValueError: a value is negative, not finite, or beyond 1000 (pi for the attitude)
     """
 
-    pos: float = 0.0
-    vel: float = 0.0
-    attitude: float = 0.0
-    wind: float = 0.0
+    pos: Disturbance = 0.0
+    vel: Disturbance = 0.0
+    attitude: Annotated[float, Field(ge=0, le=math.pi)] = 0.0
+    wind: Disturbance = 0.0
 
     def __bool__(self) -> bool:
         return any((self.pos, self.vel, self.attitude, self.wind))
 
 
+@checked
 @dataclass(frozen=True)
 class Radio:
     """How plans travel. A request counts whether or not its answer arrives. Perfect by default.
 
     :param loss: share of the answers that get lost, each for itself
     :param delay: steps by which answers are late: with 0 a robot receives the plan that was made one step ago
+    :raises ValueError: the loss lies outside [0, 1], or the delay is negative
     """
 
-    loss: float = 0.0
-    delay: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.loss <= 1 or self.delay < 0:
-            raise ValueError(f"radio.loss={self.loss} lies in [0, 1], and radio.delay={self.delay} is not negative.")
+    loss: Annotated[float, Field(ge=0, le=1)] = 0.0
+    delay: NonNegativeInt = 0
 
 
+@checked
 @dataclass(frozen=True)
 class SwarmConfig:
     """Everything that defines a world but the scenario.
 
-    :param n_robots: number of robots n
+    :param n_robots: number of robots n, at least 2
     :param radius: radius r of the sphere around a robot (m)
     :param collision_tolerance: two robots collide when their centres are closer than 2r by more than this (m); the
         planner's soft constraint sits exactly at 2r in the paper's world
@@ -66,18 +73,39 @@ class SwarmConfig:
     :param space: room of the scenarios
     :param noise: disturbances
     :param radio: how plans travel
+    :raises ValueError: a value out of its range, a planner that keeps less than 2r, a tolerance that hides every
+        collision, or a step too long for the vehicle's dynamics
     """
 
-    n_robots: int = 4
-    radius: float = 0.3
-    collision_tolerance: float = 1e-3
-    goal_radius: float = 0.3
-    memory: float = 0.03
+    n_robots: Annotated[int, Field(ge=2)] = 4
+    radius: PositiveFloat = 0.3
+    collision_tolerance: NonNegativeFloat = 1e-3
+    goal_radius: PositiveFloat = 0.3
+    memory: NonNegativeFloat = 0.03
     quadrotor: QuadrotorParams = field(default_factory=QuadrotorParams)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     space: ScenarioSpace = field(default_factory=ScenarioSpace)
     noise: ProcessNoise = field(default_factory=ProcessNoise)
     radio: Radio = field(default_factory=Radio)
+
+    def __post_init__(self) -> None:
+        contact, planner = 2 * self.radius, self.planner
+        if planner.separation < contact:
+            raise ValueError(
+                f"planner.separation={planner.separation}: it must be at least 2 radius = {contact}, "
+                "or left out of `make_config` to follow the radius"
+            )
+        if not self.collision_tolerance < contact:
+            raise ValueError(
+                f"collision_tolerance={self.collision_tolerance}: it must be less than 2 radius = {contact}, "
+                "else nothing is a collision"
+            )
+        longest = self.quadrotor.longest_step
+        if planner.dt > longest:
+            raise ValueError(
+                f"planner.dt={planner.dt}: steps must not exceed {longest:.2g} s, "
+                "the stability limit of the integration of the quadrotor's fastest response"
+            )
 
     @property
     def is_random(self) -> bool:
@@ -98,56 +126,42 @@ PRESETS: dict[str, SwarmConfig] = {
 }
 
 
-def make_config(preset: str, **overrides: Any) -> SwarmConfig:
+def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, **overrides: Any) -> SwarmConfig:
     """A preset with some of its fields replaced.
 
+    The planner's separation follows the radius: where only the radius is given, the planner keeps as much beyond twice
+    the radius as the preset does.
+
     :param preset: a name of `PRESETS`
-    :param overrides: fields of `SwarmConfig`; None keeps the preset's value; nested fields take a mapping of what to
-        replace
-    :raises ValueError: unknown preset or field
+    :param world: fields of `SwarmConfig`; nested ones take a mapping of what to replace in them
+    :param overrides: the same by name; None keeps the preset's value
+    :raises ValueError: unknown preset or field, a value out of its range, or a field that is given twice
     """
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         raise unknown_name("preset", preset, PRESETS)
-    return replace_fields(
-        PRESETS[preset], {name: value for name, value in overrides.items() if value is not None}, "world"
-    )
+    changes = _joined(world or {}, {name: value for name, value in overrides.items() if value is not None})
+    base = PRESETS[preset]
+    planner = changes.get("planner", {})
+    if "radius" in changes and isinstance(planner, Mapping) and "separation" not in planner:
+        with contextlib.suppress(TypeError, ValueError):  # no number: the check of the fields says so
+            separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
+            changes = {**changes, "planner": {**planner, "separation": separation}}
+    return replaced(base, changes)
 
 
-def replace_fields(config: Any, changes: Mapping[str, Any], where: str) -> Any:
-    """A frozen dataclass with some fields replaced, nested ones by mappings.
+def _joined(first: Mapping[str, Any], second: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Two nested mappings as one.
 
-    :param config: the dataclass
-    :param changes: field name -> new value
-    :param where: what the fields belong to, for messages
-    :raises ValueError: unknown field
+    :raises ValueError: both name the same field
     """
-    known = {f.name for f in dataclasses.fields(config)}
-    values = {}
-    for name, value in changes.items():
-        if name not in known:
-            raise unknown_name(f"{where} parameter", name, known)
-        present = getattr(config, name)
-        if isinstance(value, Mapping):
-            if not dataclasses.is_dataclass(present):
-                raise ValueError(f"{where} parameter {name!r} takes a plain value, not the mapping {dict(value)}.")
-            value = replace_fields(present, value, name)
+    joined = dict(first)
+    for name, value in second.items():
+        if name not in joined:
+            joined[name] = value
+        elif isinstance(joined[name], Mapping) and isinstance(value, Mapping):
+            joined[name] = _joined(joined[name], value, f"{path}{name}.")
         else:
-            value = _like(present, value, f"{where} parameter {name!r}")
-        values[name] = value
-    return dataclasses.replace(config, **values)
-
-
-def _like(present: Any, value: Any, what: str) -> Any:
-    """``value`` in the type of the present one; YAML, for one, reads 1e4 as a text."""
-    if isinstance(present, tuple):
-        if not isinstance(value, Sequence) or len(value) != len(present):
-            raise ValueError(f"{what} takes {len(present)} numbers, not {value!r}.")
-        return tuple(_like(p, v, what) for p, v in zip(present, value, strict=True))
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} takes a number, not {value!r}.") from None
-    if not math.isfinite(number) or (isinstance(present, int) and number != int(number)):
-        kind = "an integer" if isinstance(present, int) else "a finite number"
-        raise ValueError(f"{what} takes {kind}, not {value!r}.")
-    return type(present)(number)
+            raise ValueError(
+                f"{path}{name} is given twice, {joined[name]!r} in `world` and {value!r} beside it: leave one out."
+            )
+    return joined

@@ -10,8 +10,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
 
 from quad_swarm.errors import unknown_name
+from quad_swarm.validation import Range, checked
 
 Rng = np.random.Generator
 Scenario = Callable[[int, "ScenarioSpace", Rng], tuple[np.ndarray, np.ndarray]]
@@ -20,6 +22,7 @@ _DRAWS_PER_POINT = 100  # then the set is begun anew
 _MAX_DRAWS = 20_000
 
 
+@checked
 @dataclass(frozen=True)
 class ScenarioSpace:
     """The room that scenarios draw from.
@@ -34,12 +37,12 @@ class ScenarioSpace:
         sectors begin at the x axis and are used in full; otherwise they are centred on it and used to 80 %
     """
 
-    half_width: float = 4.0
-    heights: tuple[float, float] = (0.7, 2.1)
-    spacing: float = 1.0
-    circle_radius: tuple[float, float] = (2.0, 3.0)
-    circle_jitter: float = 0.15
-    sector_radius: tuple[float, float] = (2.0, 4.5)
+    half_width: PositiveFloat = 4.0
+    heights: Range = (0.7, 2.1)
+    spacing: NonNegativeFloat = 1.0
+    circle_radius: Range = (2.0, 3.0)
+    circle_jitter: NonNegativeFloat = 0.15
+    sector_radius: Range = (2.0, 4.5)
     whole_sectors: bool = False
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from copy import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, advance, other_indices
 from quad_swarm.world.presets import SwarmConfig
+
+_FARTHEST = 1e4  # m, of starts and goals; far beyond any room, and well before squares lose their meaning
 
 
 class StepReport(NamedTuple):
@@ -108,13 +110,10 @@ class Swarm:
         """Put one swarm's robots at rest at ``starts`` and give them ``goals``, both (n, 3), world frame (m).
 
         :param noise_seed: seed of the disturbances; without any, it does not matter
+        :raises ValueError: starts or goals are not n finite points
         """
         n = self.config.n_robots
-        for name, points in (("starts", starts), ("goals", goals)):
-            if np.shape(points) != (n, 3) or not np.isfinite(points).all():
-                raise ValueError(
-                    f"{name} must be {n} finite points, shape ({n}, 3); got {np.asarray(points).tolist()}."
-                )
+        starts, goals = _points("starts", starts, n), _points("goals", goals, n)
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
@@ -216,6 +215,23 @@ class Swarm:
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
         )
+
+
+def _points(name: str, points: Any, count: int) -> np.ndarray:
+    """Points as an array, (count, 3) (m).
+
+    :raises ValueError: another shape, no numbers, or farther away than `_FARTHEST`
+    """
+    try:
+        array = np.asarray(points, dtype=float)
+        valid = array.shape == (count, 3) and bool((np.abs(array) <= _FARTHEST).all())
+    except (TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise ValueError(
+            f"{name} must be {count} finite points, shape ({count}, 3), within {_FARTHEST:.0f} m; got {points!r}."
+        )
+    return array
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Both faces of the swarm: upstream's checkers, exact repetition, and bad input."""
+"""The Gymnasium interface: upstream's checkers, exact repetition, rewards, ends, pictures, and bad input."""
 
 import pickle
 import time
@@ -10,10 +10,8 @@ import pygame
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.wrappers import RecordVideo
-from pettingzoo.test import parallel_api_test
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-import quad_swarm
 from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -59,12 +57,6 @@ def test_upstream_checkers(kwargs):
         sb3_check_env(env.unwrapped)
 
 
-def test_parallel_api():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        parallel_api_test(quad_swarm.parallel_env(max_steps=20), num_cycles=60)
-
-
 @pytest.mark.parametrize("kwargs", [{}, {"noise": {"vel": 0.05, "wind": 1.0}, "memory": 0.3, "n_robots": 3}])
 def test_a_hundred_steps_repeat_exactly(kwargs):
     first = without_times(run(gymnasium.make("QuadSwarm-v0", **kwargs), 7, 100))
@@ -72,24 +64,6 @@ def test_a_hundred_steps_repeat_exactly(kwargs):
     assert_same(first, second)
     other = run(gymnasium.make("QuadSwarm-v0", **kwargs), 8, 1)
     assert not np.array_equal(first[0][0], other[0][0])
-
-
-def test_both_faces_fly_the_same_episode():
-    team, parallel = QuadSwarmEnv(), quad_swarm.parallel_env()
-    observation, _ = team.reset(seed=3)
-    rows, _ = parallel.reset(seed=3)
-    rng = np.random.default_rng(0)
-    while parallel.agents:
-        bits = rng.integers(0, 2, (4, 3), dtype=np.int8)
-        assert np.array_equal(observation, np.stack([rows[f"robot_{i}"] for i in range(4)]))
-        assert np.array_equal(parallel.state(), observation.ravel())
-        observation, reward, terminated, truncated, _ = team.step(bits.ravel())
-        rows, rewards, terminations, truncations, infos = parallel.step({f"robot_{i}": bits[i] for i in range(4)})
-        assert set(rewards.values()) == {reward}
-        assert set(terminations.values()) == {terminated}
-        assert set(truncations.values()) == {truncated}
-    assert terminated or truncated
-    assert "is_success" in infos["robot_0"]
 
 
 def test_observation_is_the_paper_s():
@@ -172,7 +146,7 @@ def test_a_hopeless_planner_never_raises():
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.ones(11), "11 entries; 4 robots need 12 bits, 3 each"),
+        (np.ones(11), r"shape \(11,\); the action space has \(12,\): 3 bits for each"),
         (np.full(12, 0.5), r"contains .*0\.5.*Threshold"),
         (np.full(12, np.nan), "contains .*nan"),
         (np.full(12, 2), "must be 0 or 1"),
@@ -215,13 +189,6 @@ def test_refuses_senseless_arguments(kwargs, message):
 def test_refuses_senseless_reset_options(options, message):
     with pytest.raises(ValueError, match=message):
         QuadSwarmEnv().reset(options=options)
-
-
-def test_missing_agents_are_named():
-    env = quad_swarm.parallel_env()
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="No action for robot_3"):
-        env.step({f"robot_{i}": np.zeros(3) for i in range(3)})
 
 
 def test_pictures_show_the_swarm():
@@ -328,3 +295,42 @@ def test_episodes_may_end_at_arrival():
     env.reset(options={"starts": line, "goals": line})
     *_, terminated, truncated, info = env.step(np.array([0, 0]))
     assert (terminated, truncated, info["is_success"]) == (True, False, True)
+
+
+@pytest.mark.parametrize("seed", [3, np.int64(3)])
+def test_seeds_may_be_numpy_s(seed):
+    env = QuadSwarmEnv(n_robots=2)
+    assert np.array_equal(env.reset(seed=seed)[0], env.reset(seed=3)[0])
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "x", [1]])
+def test_refuses_senseless_seeds(seed):
+    with pytest.raises(ValueError, match="a seed is an integer of at least 0"):
+        QuadSwarmEnv(n_robots=2).reset(seed=seed)
+
+
+def test_a_step_before_the_reset_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before reset\(\)"):
+        QuadSwarmEnv(n_robots=2).step(np.zeros(2))
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (1, 12), (12, 1), ()])
+def test_an_action_has_the_shape_of_its_space(shape):
+    env = QuadSwarmEnv()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"has shape \(.*\); the action space has \(12,\)"):
+        env.step(np.zeros(shape))
+
+
+def test_every_field_of_the_world_can_be_set():
+    world = {"radius": 0.12, "goal_radius": 0.2, "quadrotor": {"drag_x": 0.1}, "noise": {"wind": 1.0}}
+    env = gymnasium.make("QuadSwarm-v0", n_robots=2, world=world)
+    env.reset(seed=0)
+    config = env.unwrapped.config
+    assert (config.radius, config.planner.separation, config.noise.wind) == (0.12, 0.24, 1.0)
+    env.step(np.zeros(2, dtype=np.int8))
+
+
+def test_unknown_arguments_are_named():
+    with pytest.raises(ValueError, match=r"Unknown argument 'sceanrio'.*Did you mean 'scenario'"):
+        QuadSwarmEnv(sceanrio="random")

@@ -110,5 +110,35 @@ def test_refuses_senseless_arguments(call, message):
 def test_refuses_senseless_actions():
     env = quad_swarm.QuadSwarmVectorEnv(2)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"23 entries.*in each of 2 swarms"):
+    with pytest.raises(ValueError, match=r"shape \(23,\); the action space has \(2, 12\)"):
         env.step(np.zeros(23))
+
+
+@pytest.mark.parametrize("shape", [(12, 3), (36,), (1, 36), (3, 4, 3)])
+def test_actions_have_the_shape_of_their_space(shape):
+    env = quad_swarm.QuadSwarmVectorEnv(3)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"has shape \(.*\); the action space has \(3, 12\)"):
+        env.step(np.zeros(shape))
+
+
+@pytest.mark.parametrize("seed", [np.int64(3), np.array([3, 4]), (3, np.int32(4))])
+def test_seeds_may_be_numpy_s(seed):
+    env = quad_swarm.QuadSwarmVectorEnv(2, n_robots=2)
+    assert np.array_equal(env.reset(seed=seed)[0], env.reset(seed=3)[0])
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "x", [0, "x"]])
+def test_refuses_senseless_seeds(seed):
+    with pytest.raises(ValueError, match="a seed is an integer of at least 0"):
+        quad_swarm.QuadSwarmVectorEnv(2, n_robots=2).reset(seed=seed)
+
+
+def test_a_step_before_the_reset_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before reset\(\)"):
+        quad_swarm.QuadSwarmVectorEnv(2, n_robots=2).step(np.zeros((2, 2)))
+
+
+def test_every_field_of_the_world_can_be_set():
+    env = gymnasium.make_vec("QuadSwarm-v0", num_envs="2", n_robots=2, world={"radius": 0.12})
+    assert env.unwrapped.config.planner.separation == 0.24

@@ -1,4 +1,4 @@
-"""The reference solver: its optimum against an independent transcription, and every rung of the ladder with it."""
+"""The reference solver's optimum against an independent transcription, and every level of the fallback chain."""
 
 import math
 import pickle
@@ -15,6 +15,7 @@ from quad_swarm.planner import (
     Plans,
     PlanStatus,
     Problems,
+    Solution,
     make_planner,
 )
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
@@ -181,6 +182,44 @@ def test_flies_the_last_plan_on_while_it_lasts_and_then_brakes():
     assert statuses == [PlanStatus.SHIFTED] * 4 + [PlanStatus.BRAKING] * 2
 
 
+class Faulty:
+    """A solver that breaks its contract."""
+
+    name = "faulty"
+
+    def __init__(self, fault: str):
+        self.fault = fault
+
+    def solve(self, problems, x_guess, u_guess):
+        if self.fault == "raises":
+            raise ZeroDivisionError("in the solver")
+        x, u = x_guess.copy(), u_guess.copy()
+        (x if self.fault == "x" else u)[0, 1] = np.nan
+        count = len(x)
+        return Solution(x, u, np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64))
+
+
+@pytest.mark.filterwarnings("ignore:the solver 'faulty' raised")
+@pytest.mark.parametrize("fault", ["x", "u", "raises"])
+def test_a_solver_that_breaks_its_contract_has_failed(fault):
+    config = PlannerConfig()
+    problems = crossing(3, config)
+    planner = Planner(Faulty(fault), QuadrotorModel(QUADROTOR, config.dt), config)
+    plans = planner.plan(problems, hover(problems, config))
+    assert np.isfinite(plans.x).all()
+    assert np.isfinite(plans.u).all()
+    failed = plans.status >= PlanStatus.SHIFTED
+    assert failed.tolist() == ([True] * 3 if fault == "raises" else [True, False, False])
+
+
+def test_a_solver_that_raises_is_told_of():
+    config = PlannerConfig()
+    problems = crossing(1, config)
+    planner = Planner(Faulty("raises"), QuadrotorModel(QUADROTOR, config.dt), config)
+    with pytest.warns(RuntimeWarning, match="'faulty' raised ZeroDivisionError"):
+        planner.plan(problems, hover(problems, config))
+
+
 def test_a_cold_retry_rescues_a_hopeless_guess():
     config = PlannerConfig()
     problems = crossing(2, config)
@@ -211,8 +250,10 @@ def test_survives_pickling():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"horizon": 1}, "horizon=1"),
+        ({"horizon": 1}, "horizon=1: it must be greater than or equal to 2"),
         ({"dt": 0.0}, r"dt=0\.0"),
+        ({"max_tilt": 1.6}, r"max_tilt=1\.6: it must be less than 1\.57"),
+        ({"input_weight": float("nan")}, "input_weight=nan: it must be a finite number"),
         ({"separation": -1.0}, r"separation=-1\.0"),
         ({"workspace_low": (5.0, -4.8, 0.48)}, "Empty workspace"),
     ],

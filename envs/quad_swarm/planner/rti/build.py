@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 _SOURCES = Path(__file__).parent
@@ -44,8 +45,11 @@ def compiler() -> list[str]:
     :raises BuildError: there is none
     """
     if chosen := os.environ.get("CXX"):
-        command = shlex.split(chosen)
-        if shutil.which(command[0]) is None:
+        try:
+            command = shlex.split(chosen)
+        except ValueError:  # an unclosed quotation
+            command = []
+        if not command or shutil.which(command[0]) is None:
             raise BuildError(f"no C++ compiler: CXX={chosen!r} is no command; unset CXX or name one")
         return command
     for name in ("c++", "g++", "clang++"):
@@ -55,33 +59,45 @@ def compiler() -> list[str]:
 
 
 def build(model: str, precision: str) -> Path:
-    """The shared library of a problem, compiled unless the cache has it.
+    """The shared library of a problem, compiled unless the cache has it whole.
+
+    Beside each library stands its checksum: a damaged one is compiled again. Without a compiler that works, a library
+    that any compiler made of the same sources on such a machine will do.
 
     :param model: the header that `generate_model` wrote
     :param precision: "float32" or "float64"
     :raises BuildError: no compiler, or it fails, or the cache cannot be written
     """
-    command = [*compiler(), *_FLAGS, _native_flag(), f"-DREAL={'float' if precision == 'float32' else 'double'}"]
+    options = [*_FLAGS, _native_flag(), f"-DREAL={'float' if precision == 'float32' else 'double'}"]
     sources = {name: (_SOURCES / name).read_text(encoding="utf-8") for name in ("lanes.hpp", "kernel.cpp")}
     sources["model.hpp"] = model
-    digest = hashlib.sha256()
-    for part in (*command, _target(tuple(command)), *sources.values()):
-        digest.update(part.encode() + b"\0")
     directory = cache_directory()
-    library = directory / f"rti-{digest.hexdigest()[:32]}{_SUFFIX}"
-    if library.exists():
+    name = f"rti-{_digest(*options, _machine(), *sources.values())}"
+    try:
+        command = [*compiler(), *options]
+        library = directory / f"{name}-{_digest(*command, _target(tuple(command)))}{_SUFFIX}"
+    except BuildError:
+        for library in sorted(directory.glob(f"{name}-*{_SUFFIX}")):
+            if _is_whole(library):
+                return library
+        raise
+    if _is_whole(library):
         return library
     try:
         directory.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(directory)
         # In the cache's own file system, so that the finished library appears there in one step.
         with tempfile.TemporaryDirectory(dir=directory, prefix="building-", ignore_cleanup_errors=True) as folder:
-            for name, text in sources.items():
-                Path(folder, name).write_text(text, encoding="utf-8")
+            for file, text in sources.items():
+                Path(folder, file).write_text(text, encoding="utf-8")
             result = Path(folder, library.name)
             _run([*command, *_SHARED, str(Path(folder, "kernel.cpp")), "-o", str(result)])
+            checksum = Path(folder, _checksum_file(library).name)
+            checksum.write_text(hashlib.sha256(result.read_bytes()).hexdigest(), encoding="utf-8")
             # On Windows a library in use cannot be replaced: then another process was faster, and made the same.
             with contextlib.suppress(PermissionError):
                 os.replace(result, library)
+                os.replace(checksum, _checksum_file(library))
     except OSError as error:
         raise BuildError(
             f"cannot write to the cache {directory} ({error.strerror or error}); "
@@ -94,13 +110,16 @@ def build(model: str, precision: str) -> Path:
 def load(path: str) -> ctypes.CDLL:
     """A compiled kernel with its types declared; see `kernel.cpp` for what it is given.
 
-    :raises BuildError: the file is damaged or was made for another system
+    :raises BuildError: the system does not load it
     """
     try:
         library = ctypes.CDLL(path)
         function = library.quad_swarm_rti
     except (OSError, AttributeError) as error:
-        raise BuildError(f"cannot load {path} ({error}); delete that file to have it compiled again") from error
+        raise BuildError(
+            f"cannot load {path} ({error}); delete that file to have it compiled again, or name a directory from which "
+            "libraries may be loaded in QUAD_SWARM_CACHE"
+        ) from error
     function.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 8, *[ctypes.c_int64] * 3, ctypes.c_double]
     function.restype = None
     return library
@@ -108,6 +127,46 @@ def load(path: str) -> ctypes.CDLL:
 
 def _native_flag() -> str:
     return "-mcpu=native" if platform.machine().lower() in ("arm64", "aarch64") else "-march=native"
+
+
+def _digest(*parts: str) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()[:24]
+
+
+def _checksum_file(library: Path) -> Path:
+    return library.with_name(f"{library.name}.sha256")
+
+
+def _is_whole(library: Path) -> bool:
+    """Whether the library is there and has the checksum with which it was made."""
+    try:
+        expected = _checksum_file(library).read_text(encoding="utf-8")
+        return hashlib.sha256(library.read_bytes()).hexdigest() == expected.strip()
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _remove_leftovers(directory: Path) -> None:
+    """Remove the folders of builds that were killed: those older than any compiler may run."""
+    for folder in directory.glob("building-*"):
+        with contextlib.suppress(OSError):
+            if time.time() - folder.stat().st_mtime > 2 * _TIMEOUT:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@functools.cache
+def _machine() -> str:
+    """What a compiled kernel is tied to, as far as can be told without a compiler: the system and the processor."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+            lines = [line for line in file if line.startswith(("flags", "Features", "CPU part"))]
+        processor = "".join(sorted(set(lines)))
+    except OSError:  # no Linux: libraries serve this very machine alone
+        processor = f"{platform.processor()} {platform.node()}"
+    return f"{sys.platform} {platform.machine()} {' '.join(platform.libc_ver())} {processor}"
 
 
 @functools.lru_cache(maxsize=8)

@@ -115,7 +115,7 @@ def _riccati(
     feedforward = -_backward_substitute(lower, inverse_d * _forward_substitute(lower, total))
     costate_previous = a.T @ costate + gain_symbols.T @ total
     dx = ca.SX.sym("dx", nx)
-    du = feedforward_symbols = ca.SX.sym("feedforward", nu)
+    feedforward_symbols = ca.SX.sym("feedforward", nu)
     du = feedforward_symbols + gain_symbols @ dx
 
     factor_inputs = {"p": p_symbols, "a": a_symbols, "b": b_symbols, "weight": weight}

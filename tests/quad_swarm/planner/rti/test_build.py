@@ -39,7 +39,8 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 
 def libraries(cache: Path) -> list[str]:
-    return sorted(os.listdir(cache))
+    """The names in the cache but those of the checksums: one for each library."""
+    return sorted(name for name in os.listdir(cache) if not name.endswith(".sha256"))
 
 
 def solve(precision: str = "float32", solver: RtiSolver | None = None):
@@ -152,13 +153,79 @@ def test_with_a_compiler_the_fast_solver_is_the_default():
         assert make_planner(CONFIG, QUADROTOR, 2).solver.name == "rti"
 
 
-def test_names_a_damaged_library(cache):
-    model = generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2))
-    library = build_module.build(model, "float32")
-    library.unlink()
-    library.write_bytes(b"no library")
-    with pytest.raises(BuildError, match=f"{library.name}.*delete that file"):
+def flip_a_bit(library: Path) -> None:
+    content = bytearray(library.read_bytes())
+    content[len(content) // 2] ^= 1
+    library.unlink()  # never write into a file that a process has loaded
+    library.write_bytes(content)
+
+
+@pytest.fixture
+def stub_compiler(monkeypatch) -> None:
+    """Writes something for a library, at once."""
+
+    def run(command: list[str]) -> str:
+        if "-o" in command:
+            Path(command[-1]).write_bytes(b"library" * 99)
+        return ""
+
+    monkeypatch.setattr(build_module, "_run", run)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: (path.unlink(), path.write_bytes(b"no library")),
+        flip_a_bit,
+        lambda path: build_module._checksum_file(path).unlink(),
+    ],
+    ids=["no library", "a bit", "no checksum"],
+)
+def test_a_damaged_library_is_compiled_again(damage, stub_compiler):
+    library = build_module.build("model", "float32")
+    content = library.read_bytes()
+    damage(library)
+    assert build_module.build("model", "float32") == library
+    assert library.read_bytes() == content
+    assert build_module._is_whole(library)
+
+
+@pytest.mark.parametrize("kind", ["absent", "misnamed", "failing"])
+def test_without_a_compiler_the_cache_will_do(kind, tmp_path, monkeypatch):
+    expected = solve()
+    break_compiler(kind, tmp_path, monkeypatch)
+    build_module.load.cache_clear()
+    assert_same(solve(), expected)
+    for library in build_module.cache_directory().glob("*.so"):
+        flip_a_bit(library)
+    with pytest.raises(BuildError, match=r"C\+\+ compiler"):
         solve()
+
+
+def test_a_library_of_another_machine_is_not_used(tmp_path, monkeypatch, stub_compiler):
+    library = build_module.build("model", "float32")
+    break_compiler("absent", tmp_path, monkeypatch)
+    assert build_module.build("model", "float32") == library
+    monkeypatch.setattr(build_module, "_machine", lambda: "a processor without vectors")
+    with pytest.raises(BuildError, match="no C\\+\\+ compiler"):
+        build_module.build("model", "float32")
+
+
+@pytest.mark.parametrize("value", [" ", "'x"])
+def test_nonsense_in_cxx_is_named(value, monkeypatch):
+    monkeypatch.setenv("CXX", value)
+    with pytest.raises(BuildError, match=f"CXX={value!r} is no command"):
+        build_module.compiler()
+
+
+def test_folders_of_killed_builds_are_removed(cache, stub_compiler):
+    old, young = cache / "building-old", cache / "building-young"
+    for folder in (old, young):
+        folder.mkdir(parents=True)
+    os.utime(old, (0, 0))
+    build_module.build("model", "float32")
+    assert not old.exists()
+    assert young.exists(), "another process may be at work in it"
 
 
 def run_harness(folder: Path, main: str, *flags: str) -> str:

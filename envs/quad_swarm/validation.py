@@ -1,0 +1,134 @@
+"""Settings and arguments are checked once, where they enter: pydantic checks, and one line says what is wrong.
+
+Texts are read as what they stand for ("false", "1e-3", "10"), as they come from YAML and from command lines.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, TypeVar
+
+import pydantic
+import pydantic.dataclasses
+
+from quad_swarm.errors import unknown_name
+
+T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
+
+_STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError("it must be lowest first, highest second")
+    return pair
+
+
+Range = Annotated[tuple[float, float], pydantic.AfterValidator(_ascending)]
+
+
+def checked(cls: type[T]) -> type[T]:
+    """Decorator of a frozen dataclass: its fields are converted to their types and checked against their bounds.
+
+    A nested dataclass may be given as a mapping. What does not fit raises a `ValueError` of one line.
+    """
+    strict = pydantic.dataclasses.dataclass(frozen=True, config=_STRICT)(cls)
+    construct = strict.__init__
+
+    @functools.wraps(construct)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            construct(self, *args, **kwargs)
+        except pydantic.ValidationError as error:
+            raise explained(error, cls) from None
+
+    strict.__init__ = init  # type: ignore[method-assign]
+    return strict  # type: ignore[return-value]
+
+
+def checked_arguments(function: F) -> F:
+    """Decorator: arguments are converted to their annotated types and checked, as the fields of `checked` are."""
+
+    @functools.cache  # made at the first call, to keep the import fast
+    def call() -> Callable[..., Any]:
+        return pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False))(function)
+
+    @functools.wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return call()(*args, **kwargs)
+        except pydantic.ValidationError as error:
+            raise explained(error, function) from None
+
+    return wrapper  # type: ignore[return-value]
+
+
+def replaced(config: T, changes: Mapping[str, Any], *path: str) -> T:
+    """A `checked` dataclass with some of its fields replaced, nested ones by mappings of what to replace in them.
+
+    :param config: the dataclass
+    :param changes: field name -> new value
+    :param path: where the dataclass stands among the user's arguments, for messages
+    :raises ValueError: unknown field or wrong value; the message names its path
+    """
+    validator = type(config).__pydantic_validator__  # type: ignore[attr-defined]
+    try:
+        return validator.validate_python(_values(config, changes))
+    except pydantic.ValidationError as error:
+        raise explained(error, type(config), *path) from None
+
+
+def _values(config: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    for name, value in changes.items():
+        nested = isinstance(value, Mapping) and dataclasses.is_dataclass(values.get(name))
+        values[name] = _values(values[name], value) if nested else value
+    return values
+
+
+def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueError:
+    """A validation error as one line: where, which value, what is allowed.
+
+    :param error: what pydantic found
+    :param owner: the dataclass or function that was called
+    :param path: where it stands among the user's arguments
+    """
+    errors = error.errors(include_url=False)
+    place, value = errors[0]["loc"], errors[0]["input"]
+    if errors[0]["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
+        *parents, name = map(str, place)
+        where = ".".join((*path, *parents))
+        kind = f"{where or owner.__name__} parameter" if isinstance(owner, type) else "argument"
+        return unknown_name(kind, name, _names(owner, parents))
+    if "str" in place:  # of a union: each of its members has a complaint, under the name of its type
+        place = place[: place.index("str")]
+        errors = [each for each in errors if each["loc"][: len(place)] == place]
+    else:
+        errors = errors[:1]
+    if place and isinstance(place[0], int):  # by position
+        place = (_names(owner)[place[0]], *place[1:])
+    told = " or ".join(dict.fromkeys(_told(each["msg"]) for each in errors))
+    name = ".".join((*path, *(str(part) for part in place)))
+    if errors[0]["type"] == "value_error" and not isinstance(value, (tuple, list)):
+        return ValueError(f"{told}.")  # from `__post_init__`, which names the fields that do not go together
+    if errors[0]["type"] == "missing":  # of a tuple
+        name, told = name.rpartition(".")[0], "it has too few entries"
+    return ValueError(f"{name}={value!r}: {told}.")
+
+
+def _told(message: str) -> str:
+    message = message.removeprefix("Value error, ").replace("Input should", "it must", 1)
+    return message.replace("dictionary", "mapping").replace(" or an instance of", ", not a plain value, or a")
+
+
+def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
+    """Names of the parameters of a function, or of the fields of the dataclass at ``path`` inside a dataclass."""
+    if not dataclasses.is_dataclass(owner):
+        return list(inspect.signature(owner).parameters)
+    for name in path:
+        owner = next(field.default_factory for field in dataclasses.fields(owner) if field.name == name)
+    return [field.name for field in dataclasses.fields(owner)]

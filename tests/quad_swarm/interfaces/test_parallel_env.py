@@ -1,0 +1,115 @@
+"""The PettingZoo interface: upstream's checks, the same episodes as the team's, and what learners read of it."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import supersuit
+from pettingzoo.test import parallel_api_test
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+import quad_swarm
+from quad_swarm.interfaces.env import QuadSwarmEnv
+
+
+def test_parallel_api():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        parallel_api_test(quad_swarm.parallel_env(max_steps=20), num_cycles=60)
+
+
+def test_both_interfaces_fly_the_same_episode():
+    team, parallel = QuadSwarmEnv(), quad_swarm.parallel_env()
+    observation, _ = team.reset(seed=3)
+    rows, _ = parallel.reset(seed=3)
+    rng = np.random.default_rng(0)
+    while parallel.agents:
+        bits = rng.integers(0, 2, (4, 3), dtype=np.int8)
+        assert np.array_equal(observation, np.stack([rows[f"robot_{i}"] for i in range(4)]))
+        assert np.array_equal(parallel.state(), observation.ravel())
+        observation, reward, terminated, truncated, _ = team.step(bits.ravel())
+        rows, rewards, terminations, truncations, infos = parallel.step({f"robot_{i}": bits[i] for i in range(4)})
+        assert set(rewards.values()) == {reward}
+        assert set(terminations.values()) == {terminated}
+        assert set(truncations.values()) == {truncated}
+    assert terminated or truncated
+    assert "is_success" in infos["robot_0"]
+
+
+def test_missing_agents_are_named():
+    env = quad_swarm.parallel_env()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="No action for robot_3"):
+        env.step({f"robot_{i}": np.zeros(3) for i in range(3)})
+
+
+def test_the_state_is_in_its_space():
+    env = quad_swarm.parallel_env(n_robots=3, observation="state+plan")
+    env.reset(seed=0)
+    assert env.state() in env.state_space
+
+
+def test_what_learners_read_is_the_team_s():
+    team, parallel = QuadSwarmEnv(scenario="curriculum"), quad_swarm.parallel_env(scenario="curriculum")
+    vector = quad_swarm.QuadSwarmVectorEnv(2, scenario="curriculum")
+    names = ("agent_names", "n_agents", "observation_layout", "action_cost", "n_curriculum_levels", "config")
+    for name in names:
+        assert getattr(team, name) == getattr(parallel, name) == getattr(vector, name)
+    for env in (parallel, vector):
+        env.set_curriculum_level(2)
+        assert env.curriculum_level == env.task.sampler.level == 2
+        with pytest.raises(ValueError, match="Level 4 does not exist"):
+            env.set_curriculum_level(4)
+
+
+def test_after_the_end_nobody_is_left():
+    env = quad_swarm.parallel_env(n_robots=2, max_steps=1)
+    env.reset(seed=0)
+    env.step({agent: np.zeros(1) for agent in env.agents})
+    assert env.agents == []
+    assert env.step({}) == ({}, {}, {}, {}, {})
+
+
+def test_a_step_before_the_reset_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before reset\(\)"):
+        quad_swarm.parallel_env(n_robots=2).step({})
+
+
+def test_every_action_has_the_shape_of_its_space():
+    env = quad_swarm.parallel_env()
+    env.reset(seed=0)
+    widths = {"robot_0": 2, "robot_1": 4, "robot_2": 3, "robot_3": 3}  # as many as all need
+    with pytest.raises(ValueError, match=r"action of robot_0 has shape \(2,\); the action space has \(3,\)"):
+        env.step({agent: np.zeros(width) for agent, width in widths.items()})
+
+
+def test_every_field_of_the_world_can_be_set():
+    env = quad_swarm.parallel_env(n_robots=2, world={"radius": 0.12, "planner": {"horizon": 5}})
+    assert (env.config.planner.separation, env.config.planner.horizon) == (0.24, 5)
+    with pytest.raises(ValueError, match="Did you mean 'world'"):
+        quad_swarm.parallel_env(wrld={})
+
+
+class BitActions(VecEnvWrapper):
+    """SB3 samples bits as floats, and SuperSuit stacks actions without a conversion."""
+
+    def step_async(self, actions):
+        self.venv.step_async(actions.astype(self.action_space.dtype))
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+@pytest.mark.slow
+def test_ppo_learns_through_supersuit():
+    env = supersuit.pettingzoo_env_to_vec_env_v1(quad_swarm.parallel_env(n_robots=3, max_steps=20))
+    env = supersuit.concat_vec_envs_v1(env, 2, num_cpus=0, base_class="stable_baselines3")
+    model = PPO("MlpPolicy", BitActions(env), n_steps=32, batch_size=64)
+    before = model.policy.action_net.weight.detach().clone()
+    assert model.learn(400).num_timesteps >= 400
+    assert not before.equal(model.policy.action_net.weight)

@@ -1,0 +1,110 @@
+"""The settings of a world: what is accepted, and what is refused with its path, its value and what is allowed."""
+
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+
+from quad_swarm.planner import PlannerConfig
+from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+
+
+def test_presets_keep_their_numbers():
+    paper, dense = PRESETS["paper"], PRESETS["dense"]
+    assert (paper.radius, paper.planner.separation, dense.radius, dense.planner.separation) == (0.3, 0.6, 0.3, 0.64)
+    assert make_config("dense", n_robots=None) == dense
+    assert make_config("dense", radius=0.3) == dense
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_settings_survive_pickling_and_can_be_hashed_and_replaced(preset):
+    config = PRESETS[preset]
+    assert pickle.loads(pickle.dumps(config)) == config
+    assert hash(make_config(preset)) == hash(config)
+    assert dataclasses.replace(config, n_robots=3).n_robots == 3
+    with pytest.raises(ValueError, match="n_robots=0: it must be greater than or equal to 2"):
+        dataclasses.replace(config, n_robots=0)
+
+
+def test_fields_are_replaced_one_by_one():
+    config = make_config("dense", n_robots=5, planner={"separation": 0.7, "workspace_low": [-3, -3, 0.5]})
+    assert (config.n_robots, config.planner.separation, config.planner.max_speed) == (5, 0.7, 4.0)
+    assert config.planner.max_tilt == PRESETS["dense"].planner.max_tilt
+    assert config.planner.workspace_low == (-3, -3, 0.5)
+    world = {"quadrotor": {"drag_x": 0.1}, "goal_radius": 0.2}
+    assert make_config("dense", world, n_robots=5).quadrotor.drag_x == 0.1
+
+
+@pytest.mark.parametrize("number", [2, "2", 2.0, np.int64(2)])
+def test_the_nearest_neighbours_can_be_set(number):
+    assert make_config("paper", planner={"max_neighbours": number}).planner.max_neighbours == 2
+    assert make_config("paper", planner={"max_neighbours": None}).planner.max_neighbours is None
+
+
+def test_texts_are_read_as_what_they_stand_for():
+    config = make_config("paper", radius="0.2", planner={"violation_weight": "1e5", "horizon": "8"})
+    assert (config.radius, config.planner.violation_weight, config.planner.horizon) == (0.2, 1e5, 8)
+
+
+def test_the_separation_follows_the_radius_unless_it_is_given():
+    for preset, margin in (("paper", 0.0), ("dense", 0.04)):
+        for radius in (0.12, 0.5):
+            assert make_config(preset, radius=radius).planner.separation == pytest.approx(2 * radius + margin)
+            assert make_config(preset, {"radius": radius}).planner.separation == pytest.approx(2 * radius + margin)
+    assert make_config("paper", radius=0.5, planner={"separation": 1.2}).planner.separation == 1.2
+    for make in (
+        lambda: make_config("paper", radius=0.5, planner={"separation": 0.9}),
+        lambda: make_config("paper", planner={"separation": 0.59}),
+        lambda: SwarmConfig(radius=0.5, planner=PlannerConfig()),
+    ):
+        with pytest.raises(ValueError, match=r"^planner\.separation=0\.[569]+: it must be at least 2 radius"):
+            make()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"planner": {"seperation": 1}}, "planner parameter 'seperation'.*Did you mean 'separation'"),
+        ({"speed": 1}, "SwarmConfig parameter 'speed'"),
+        ({"planner": {"dt": "fast"}}, r"planner\.dt='fast': it must be a valid number"),
+        ({"planner": {"dt": 2}}, r"planner\.dt=2\.0: steps must not exceed 0\.65 s"),
+        ({"planner": {"horizon": 9.5}}, r"planner\.horizon=9\.5: it must be a valid integer"),
+        ({"planner": {"violation_weight": -1}}, r"planner\.violation_weight=-1: it must be greater than 0"),
+        ({"planner": {"max_neighbours": 0}}, r"planner\.max_neighbours=0: it must be greater than 0"),
+        ({"planner": {"workspace_low": [0, 0]}}, r"planner\.workspace_low=\[0, 0\]: it has too few entries"),
+        ({"planner": 5}, "planner=5: it must be a mapping"),
+        ({"radius": float("nan")}, "radius=nan: it must be a finite number"),
+        ({"radius": -1}, "radius=-1: it must be greater than 0"),
+        ({"collision_tolerance": 5}, r"collision_tolerance=5\.0: it must be less than 2 radius = 0\.6"),
+        ({"memory": {"far": 1}}, "memory={'far': 1}: it must be a valid number"),
+        ({"noise": -1}, "noise=-1: it must be a mapping"),
+        ({"noise": {"pos": -1}}, r"noise\.pos=-1: it must be greater than or equal to 0"),
+        ({"noise": {"vel": 1e300}}, r"noise\.vel=1e\+300: it must be less than or equal to 1000"),
+        ({"radio": {"loss": 2.0}}, r"radio\.loss=2\.0: it must be less than or equal to 1"),
+        ({"radio": {"delay": -1}}, r"radio\.delay=-1"),
+        ({"space": {"spacing": -1}}, r"space\.spacing=-1"),
+        ({"space": {"heights": [2, 1]}}, r"space\.heights=\[2, 1\]: it must be lowest first"),
+        ({"quadrotor": {"gravity": 0}}, r"quadrotor\.gravity=0: it must be greater than 0"),
+    ],
+)
+def test_nonsense_is_refused_in_one_line(values, message):
+    for make in (lambda: make_config("paper", **values), lambda: make_config("paper", values)):
+        with pytest.raises(ValueError, match=message) as caught:
+            make()
+        assert "\n" not in str(caught.value)
+        assert type(caught.value) is ValueError
+
+
+def test_what_is_given_twice_is_refused():
+    with pytest.raises(ValueError, match=r"radius is given twice, 0\.5 in `world` and 0\.4 beside it"):
+        make_config("paper", {"radius": 0.5}, radius=0.4)
+    with pytest.raises(ValueError, match=r"planner\.dt is given twice"):
+        make_config("paper", {"planner": {"dt": 0.1}}, planner={"dt": 0.05})
+    assert make_config("paper", {"planner": {"dt": 0.05}}, planner={"horizon": 20}).planner.dt == 0.05
+
+
+@pytest.mark.parametrize("preset", ["papr", [], None])
+def test_an_unknown_preset_is_refused(preset):
+    with pytest.raises(ValueError, match="Unknown preset"):
+        make_config(preset)
