@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch as th
@@ -250,8 +251,8 @@ class TeamActions(nn.Module):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
-        self.kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
-        self._modules_of_kinds = nn.ModuleList(self.kinds)  # so that their tables move with the module
+        kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
+        self.kinds = cast("Sequence[ActionKind]", nn.ModuleList(kinds))
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()
         boxes = [

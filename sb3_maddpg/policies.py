@@ -288,16 +288,19 @@ class TeamCritic(Critic):
             inputs.append(actions.new_ones(len(actions), 1))
         return th.cat(inputs, dim=1).T
 
-    def _first(self, inputs: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
-        """:return: what the first layer gives, (n_networks, width, batch)"""
-        weight, bias = self.net.layer(0, networks)
+    def _first(
+        self, inputs: th.Tensor, layer: tuple[th.Tensor, th.Tensor], networks: th.Tensor | None = None
+    ) -> th.Tensor:
+        """:return: the first layer's outputs, (n_networks, width, batch)"""
+        weight, bias = (self.net.of_networks(parameter, networks) for parameter in layer)
         if self.shared:  # reordering the few weights does what reordering the whole batch would
             columns = self.columns if networks is None else self.columns[networks]
             weight = weight.gather(2, columns.unsqueeze(1).expand(-1, weight.shape[1], -1))
         return th.baddbmm(bias, weight, inputs.expand(len(weight), -1, -1))
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        values = self.net.after_first(self._first(self._inputs(obs, actions)))
+        layers = self.net.layers()
+        values = self.net.after_first(self._first(self._inputs(obs, actions), layers[0]), layers)
         return values.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
 
     def clip_grad_norm_(self, max_norm: float) -> None:
@@ -309,14 +312,15 @@ class TeamCritic(Critic):
         # The first layer is linear: it reads the wide joint input once, and every alternative adds its few columns
         agents = th.arange(self.team.n_agents, device=own.device) if units is None else units
         networks = None if units is None and self.n_critics == 1 else agents
-        first = self._first(self._inputs(obs, actions), networks)
-        weight = self.net.of_networks(self.net.weights[0], networks)
+        layers = self.net.layers()
+        first = self._first(self._inputs(obs, actions), layers[0], networks)
+        weight = self.net.of_networks(layers[0][0], networks)
         own_weight = weight.gather(2, self.own_columns[agents].unsqueeze(1).expand(-1, weight.shape[1], -1))
         # The batch comes last: what is added to every alternative then runs along memory
         change = (own - actions[:, agents].unsqueeze(2)).permute(1, 3, 2, 0)
         shape = change.shape[2:]
         change = th.bmm(own_weight, change.flatten(2)).unflatten(2, shape)
-        values = self.net.after_first(change.add_(first.unsqueeze(2)).flatten(2), networks)
+        values = self.net.after_first(change.add_(first.unsqueeze(2)).flatten(2), layers, networks)
         return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
 
 

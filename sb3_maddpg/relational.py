@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from itertools import chain, pairwise
-from typing import Any, ClassVar, TypedDict
+from typing import Any, ClassVar, TypedDict, cast
 
 import torch as th
 from gymnasium import spaces
@@ -308,8 +308,9 @@ class PairCritic(Critic):
         self.views = views
         self.on_neighbours = on_neighbours
         features = 2 * views.own_dim + views.neighbour_dim
-        self.nets = [PairNet(features, [units.width] * 2, 1, net_arch, activation_fn) for _ in range(n_critics)]
-        self.modules_of_nets = nn.ModuleList(self.nets)
+        nets = (PairNet(features, [units.width] * 2, 1, net_arch, activation_fn) for _ in range(n_critics))
+        # Saved models know the networks by this name
+        self.modules_of_nets = cast("Sequence[PairNet]", nn.ModuleList(nets))
 
     def _pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -333,7 +334,7 @@ class PairCritic(Critic):
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         mine, theirs = self._pairs(actions)
         values = []
-        for net in self.nets:
+        for net in self.modules_of_nets:
             hidden, present = self._hidden(net, obs, theirs)
             values.append((net.decode(hidden.add_(net.extra(0, mine))) * present).flatten(1))
         return th.stack(values)
@@ -342,7 +343,7 @@ class PairCritic(Critic):
         self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, units: th.Tensor | None = None
     ) -> th.Tensor:
         assert units is None, "equal agents have one kind of action"
-        net = self.nets[0]
+        net = self.modules_of_nets[0]
         hidden, present = self._hidden(net, obs, self._pairs(actions)[1])
         own = own.unflatten(1, hidden.shape[1:3]) if self.on_neighbours else own.unsqueeze(2)
         mine = net.extra(0, own)
@@ -350,7 +351,7 @@ class PairCritic(Critic):
         return values.flatten(1, 2) if self.on_neighbours else values.sum(dim=2)
 
     def clip_grad_norm_(self, max_norm: float) -> None:
-        for net in self.nets:
+        for net in self.modules_of_nets:
             nn.utils.clip_grad_norm_(net.parameters(), max_norm)
 
 

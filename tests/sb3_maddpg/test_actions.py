@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.actions import ActionKind, TeamActions
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.team import MixedActions, heads_of, joint_action_space
 from toys import AGENT_SPACES, SMALL, Toy
@@ -247,3 +247,10 @@ def test_warm_up_is_uniform():
             assert frequencies == pytest.approx(np.full(size, 1 / size), abs=0.05)
         else:
             assert np.quantile(column, [0, 0.25, 0.5, 0.75, 1]) == pytest.approx([-1, -0.5, 0, 0.5, 1], abs=0.08)
+
+
+def test_kinds_of_actions_are_submodules():
+    """So that one can be replaced, and no other list keeps the old one."""
+    actions = TeamActions(AGENT_SPACES["mixed"])
+    assert [child for _, child in actions.named_children()] == [actions.kinds]
+    assert list(actions.kinds) == [module for module in actions.modules() if isinstance(module, ActionKind)]

@@ -1,6 +1,7 @@
 """Twin critics, delayed policies and smoothed targets."""
 
 import copy
+import inspect
 
 import numpy as np
 import pytest
@@ -115,6 +116,14 @@ def test_with_one_critic_no_delay_and_no_noise_it_is_maddpg():
         model = algorithm("MlpPolicy", TeamEnv(Toy("numbers")), **kwargs, **further).learn(100)
         vectors.append(model.policy.parameters_to_vector())
     assert np.array_equal(*vectors)
+
+
+def test_takes_the_arguments_of_maddpg_in_the_same_order():
+    of_maddpg, of_matd3 = (list(inspect.signature(algorithm).parameters) for algorithm in (MADDPG, MATD3))
+    assert of_matd3[: len(of_maddpg)] == of_maddpg
+    assert of_matd3[len(of_maddpg) :] == ["target_policy_noise", "target_noise_clip"]
+    model = MATD3("MlpPolicy", TeamEnv(Toy("numbers")), 1e-3, 50_000)
+    assert (model.learning_rate, model.buffer_size, model.policy_delay) == (1e-3, 50_000, 2)
 
 
 def test_defaults_are_those_of_td3():

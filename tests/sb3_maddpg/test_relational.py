@@ -1,5 +1,7 @@
 """Relational networks: symmetry, who sees whom, values of pairs, and layouts that do not fit."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch as th
@@ -179,3 +181,14 @@ def test_spaces_that_do_not_fit_are_refused():
         policy(net_arch=[])
     with pytest.raises(ValueError, match="these have unlike spaces: use MlpPolicy"):
         policy(spaces.MultiDiscrete([3] * 4 * (N - 1) + [2] * 4))
+
+
+def test_parameters_that_are_put_in_place_are_used():
+    critic = policy(n_critics=2).critic
+    obs, actions = batch(policy())
+    zeros = {name: th.zeros_like(parameter) for name, parameter in critic.named_parameters()}
+    assert not th.func.functional_call(critic, zeros, (obs, actions)).any()
+    for index in range(2):  # a network in another's place
+        critic.modules_of_nets[index] = deepcopy(critic.modules_of_nets[0])
+    first, second = critic(obs, actions)
+    assert th.equal(first, second)
