@@ -11,9 +11,9 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.estimators import Estimator
-from sb3_maddpg.team import AgentActionSpace, heads_of
+from sb3_maddpg.team import AgentActionSpace, Team, heads_of
 
-Critic = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
+QOfAlternatives = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
 
 class ActionKind(nn.Module):
@@ -192,6 +192,22 @@ class Categories(ActionKind):
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
         return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
+
+
+def check_bounds(team: Team) -> None:
+    """
+    :param team: whose continuous actions are scaled by their bounds
+    :raises ValueError: bounds whose range is not finite in single precision, or negative
+    """
+    for name, space in zip(team.names, team.action_spaces, strict=True):
+        if isinstance(space, spaces.Box):
+            with np.errstate(over="ignore", invalid="ignore"):
+                span = space.high.astype(np.float32) - space.low.astype(np.float32)
+            if not (np.isfinite(span) & (span >= 0)).all():
+                raise ValueError(
+                    f"The actions of {name} lie between {space.low.tolist()} and {space.high.tolist()}: actions are "
+                    "scaled to [-1, 1], so the range must be finite in single precision. Give the Box narrower bounds."
+                )
 
 
 def make_kinds(
@@ -374,7 +390,7 @@ class TeamActions(nn.Module):
         """
         return self._by_kind(logits, lambda kind, part: kind.act(part, deterministic))
 
-    def objective(self, estimator: Estimator, logits: th.Tensor, q: Critic, temperature: float) -> th.Tensor:
+    def objective(self, estimator: Estimator, logits: th.Tensor, q: QOfAlternatives, temperature: float) -> th.Tensor:
         """
         :param estimator: of the gradient through bits and categories
         :param logits: (batch, n_agents, width)
@@ -413,7 +429,9 @@ class TeamActions(nn.Module):
         :param actions: of the environment, (batch, length)
         :return: the same with continuous numbers in [-1, 1], as the replay buffer keeps them
         """
-        scaled = 2.0 * (actions - self.low) / (self.high - self.low) - 1.0
+        # A bound that is both the lowest and the highest value has no range to divide by
+        span = np.where(self.high > self.low, self.high - self.low, 1.0)
+        scaled = 2.0 * (actions - self.low) / span - 1.0
         return np.where(self.is_continuous, scaled, actions)
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:

@@ -67,8 +67,10 @@ class AgentPolicy(nn.Module):
         """
         :param policy: of the team
         :param agent: name or number
-        :raises ValueError: no such agent
+        :raises ValueError: no such agent, or parameters that are not finite
         """
+        if problem := policy.not_finite(policy.state_dict()):
+            raise ValueError(f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file.")
         team, index = policy.team, policy.team.index(agent)
         network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
         columns, space = policy.actions.columns_of(index), team.action_spaces[index]
@@ -113,7 +115,11 @@ class AgentPolicy(nn.Module):
         a function from (batch, obs_dim) float32 to actions as ``forward`` gives them.
 
         :param path: of the file
+        :raises ValueError: a parameter is not finite
         """
+        for name, parameter in self.named_parameters():
+            if not parameter.isfinite().all():
+                raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
         example, other = th.zeros(2, self.obs_dim), th.linspace(-2.0, 2.0, 5 * self.obs_dim).view(5, -1)
         with warnings.catch_warnings():
             # What torch offers instead, torch.export, needs a compiler to run without Python

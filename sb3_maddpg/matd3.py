@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.policies import MADDPGPolicy
+from sb3_maddpg.validation import SmoothedTrainingArguments
 
 SelfMATD3 = TypeVar("SelfMATD3", bound="MATD3")
 
@@ -52,8 +53,8 @@ class MATD3(MADDPG):
     :param policy_delay: the policy and the target networks are updated every ``policy_delay`` critic updates
     :param max_grad_norm: largest gradient norm of each agent's network, ``None`` for no limit
     :param policy_regularization: weight of the mean squared actor output before squashing (1e-3 in the original code)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``MADDPGPolicy``; ``n_critics``
-        is 2 unless given
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``MADDPGPolicy``;
+        ``n_critics`` is 2 unless given
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
         the reported success rate, mean episode length, and mean reward over
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -65,6 +66,9 @@ class MATD3(MADDPG):
     :param target_policy_noise: standard deviation of the Gaussian noise on continuous target actions
     :param target_noise_clip: limit for absolute value of that noise
     """
+
+    algorithm_name = "MATD3"
+    arguments = SmoothedTrainingArguments
 
     def __init__(
         self,
@@ -137,14 +141,6 @@ class MATD3(MADDPG):
         self.target_noise_clip = target_noise_clip
         if _init_setup_model:
             self._setup_model()
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        if self.target_policy_noise < 0 or self.target_noise_clip < 0:
-            raise ValueError(
-                f"target_policy_noise={self.target_policy_noise} and target_noise_clip={self.target_noise_clip} "
-                "must not be negative."
-            )
 
     def _target_actions(self, next_obs: th.Tensor) -> th.Tensor:
         actions = self.actor_target.act(next_obs, deterministic=False)

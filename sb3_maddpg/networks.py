@@ -49,7 +49,7 @@ class StackedMLP(nn.Module):
         """:return: weights (n_groups, out, in) and biases (n_groups, out, 1) of each layer"""
         # Where nn.Module itself looks them up: indexing a ParameterList is so slow that acting shows it
         weights, biases = (self._modules[name]._parameters for name in ("weights", "biases"))  # type: ignore[union-attr]
-        return list(zip(weights.values(), biases.values(), strict=True))  # type: ignore[arg-type]
+        return list(zip(weights.values(), biases.values(), strict=True))
 
     def of_networks(self, parameter: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
         """
