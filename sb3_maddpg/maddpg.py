@@ -587,14 +587,19 @@ class MADDPG(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         self._check_normalization(env)
-        n_envs = env.num_envs if isinstance(env, VecEnv) else 1
+        before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
         if self.replay_buffer.size() and self.replay_buffer.n_envs != n_envs:
             raise ValueError(
                 f"The replay buffer holds transitions of {self.replay_buffer.n_envs} environment(s) side by side and "
                 f"cannot take those of {n_envs}: give as many, or empty it by `model.replay_buffer.reset()`."
             )
-        with _remedy_for_other_team():
-            super().set_env(env, force_reset)
+        self.n_envs = n_envs  # SB3 would refuse another number, whether or not there are transitions to keep
+        try:
+            with _remedy_for_other_team():
+                super().set_env(env, force_reset)
+        except BaseException:
+            self.n_envs = before
+            raise
         assert self.env is not None
         assert self.replay_buffer_class is not None
         assert issubclass(self.replay_buffer_class, TeamReplayBuffer)
@@ -628,7 +633,7 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> SelfMADDPG:
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
         check_file(path, cls.__name__, {base.__name__ for base in algorithms})
-        with _remedy_for_other_team():
+        with _remedy_for_other_team(), _as_value_error():
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def save(
@@ -642,7 +647,8 @@ class MADDPG(OffPolicyAlgorithm):
 
         :raises ValueError: a parameter is not finite, which nothing could be done with
         """
-        self._check_finite_parameters(self.get_parameters(), "This model cannot be saved")
+        if problem := self._not_finite(self.get_parameters()):
+            raise ValueError(f"This model cannot be saved: {problem}")
         if not isinstance(path, (str, os.PathLike)):
             return super().save(path, exclude, include)
         with atomic_write(path, suffix="zip") as file:
@@ -654,23 +660,24 @@ class MADDPG(OffPolicyAlgorithm):
         """
         SB3's ``set_parameters``, which ``load`` calls too.
 
-        :raises ValueError: a parameter is not finite; nothing has changed then
+        :raises RuntimeError: a parameter is not finite; nothing has changed then
         """
         if not isinstance(load_path_or_dict, dict):
             load_path_or_dict = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
-        self._check_finite_parameters(load_path_or_dict, "These parameters cannot be used")
+        if problem := self._not_finite(load_path_or_dict):
+            raise _NotFiniteError(f"These parameters cannot be used: {problem}")
         super().set_parameters(load_path_or_dict, exact_match, device)
 
-    def _check_finite_parameters(self, parameters: dict[str, Any], refusal: str) -> None:
+    def _not_finite(self, parameters: dict[str, Any]) -> str | None:
+        """:return: which of the parameters (see ``get_parameters``) are not finite, and what to do, None if all are"""
         for name, state in parameters.items():
-            problem = self.policy.not_finite(state) if name == "policy" else None
-            if name != "policy" and optimizer_not_finite(state):
-                problem = f"the state of {name} holds NaN or infinity"
+            if name == "policy":
+                problem = self.policy.not_finite(state)
+            else:
+                problem = f"the state of {name} holds NaN or infinity" if optimizer_not_finite(state) else None
             if problem:
-                raise ValueError(
-                    f"{refusal}: {problem}. Its training diverged: go back to an earlier file, and train with a lower "
-                    "learning_rate."
-                )
+                return f"{problem}. The training diverged: go back to an earlier file, and train with a lower learning_rate."
+        return None
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
@@ -776,6 +783,18 @@ def _normalizer_of_observations(env: GymEnv | None) -> VecNormalize | None:
     """:return: the wrapper that normalises this environment's observations, if there is one"""
     normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
     return normalizer if normalizer is not None and normalizer.norm_obs else None
+
+
+class _NotFiniteError(RuntimeError):
+    """Not a ValueError, by which SB3's ``load`` recognises models of its older versions."""
+
+
+@contextmanager
+def _as_value_error() -> Iterator[None]:
+    try:
+        yield
+    except _NotFiniteError as error:
+        raise ValueError(str(error)) from None
 
 
 @contextmanager
