@@ -52,7 +52,8 @@ NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensor
 
 class MADDPG(OffPolicyAlgorithm):
     """
-    Multi-Agent Deep Deterministic Policy Gradient (MADDPG): decentralised actors, centralised critics.
+    Multi-Agent Deep Deterministic Policy Gradient (MADDPG): centralised training of critics that read all observations
+    and actions, decentralised execution by actors that read their own observation.
 
     Paper: https://arxiv.org/abs/1706.02275 (Lowe et al., 2017), original code https://github.com/openai/maddpg.
     Threshold actions: Serra-Gomez et al., IROS 2020. Code based on SB3's TD3.
@@ -63,7 +64,7 @@ class MADDPG(OffPolicyAlgorithm):
     ``info["agent_terminated"]`` and ``info["agent_active"]``, all (n_agents,). Numbers in ``info["metrics"]`` are
     logged as means. Of the environment's attributes it reads ``agent_names``, ``observation_layout`` (see
     ``PairPolicy``) and, with ``use_action_cost``, ``action_cost``: what an action costs as long as the reward holds
-    that as a plain sum over bits, numbers or categories, a float or (n_agents, width).
+    that as a plain sum over the encoded action, a float or (n_agents, width).
 
     :param policy: The policy model to use (MlpPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -84,13 +85,15 @@ class MADDPG(OffPolicyAlgorithm):
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
     :param n_steps: number of rewards in a return before the critic's estimate takes over
     :param use_action_cost: take the environment's ``action_cost`` as known; critics then learn the rest of the return
-    :param threshold_price: for bits: a price of every set bit that no reward holds and no critic sees. It rises
-        geometrically with the threshold, from the first number at 0 to the second at 1. A score then says up to which
-        price its bit is worth setting, and the policy's ``threshold`` chooses the price after the training.
+    :param threshold_price: for binary actions: a cost of every 1 that no reward holds and no critic sees. It rises
+        geometrically with the threshold, from the first number at 0 to the second at 1. A probability then
+        says up to which price its action is worth it, and the policy's ``threshold`` chooses the price after the
+        training.
     :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
-        [-1, 1]; two numbers go from the first to the second over the training. Bits explore by a random threshold,
-        categories by their probabilities.
-    :param estimator: gradient through bits and categories, see ``sb3_maddpg.estimators``; unused for continuous actions
+        [-1, 1]; two numbers go from the first to the second over the training. Binary actions
+        explore by a random threshold, categorical ones by their probabilities.
+    :param estimator: gradient through binary and categorical actions, see ``sb3_maddpg.estimators``; unused for
+        continuous actions
     :param temperature: of the estimators that relax, can be a function of the current progress remaining
     :param policy_delay: the policy and the target networks are updated every ``policy_delay`` critic updates
     :param max_grad_norm: largest gradient norm of each agent's network, ``None`` for no limit
@@ -223,7 +226,7 @@ class MADDPG(OffPolicyAlgorithm):
         if self.action_noise is not None and not actions.has_continuous:
             raise ValueError(
                 f"action_noise={self.action_noise} is for continuous actions, the action space is {self.action_space}. "
-                "Leave it out: bits explore by a random threshold, categories by their probabilities."
+                "Leave it out: binary actions explore by a random threshold, categorical ones by their probabilities."
             )
         self._spread_action_cost()
 
@@ -256,8 +259,8 @@ class MADDPG(OffPolicyAlgorithm):
             self.action_cost = env.get_attr("action_cost", indices=0)[0]
 
     def _spread_action_cost(self) -> None:
-        """The price of every number that critics read, (n_agents, width)."""
-        self._action_cost: th.Tensor | None = None
+        """The cost of every number of the encoded action, (n_agents, width)."""
+        self._cost_of_encoded: th.Tensor | None = None
         if self.action_cost is None:
             return
         shape = (self.policy.team.n_agents, self.policy.actions.width)
@@ -267,14 +270,14 @@ class MADDPG(OffPolicyAlgorithm):
             raise ValueError(
                 f"action_cost of shape {np.shape(self.action_cost)} does not fit (n_agents, width) = {shape}."
             ) from error
-        self._action_cost = th.as_tensor(cost.copy(), device=self.device)
+        self._cost_of_encoded = th.as_tensor(cost.copy(), device=self.device)
 
     def _scaled_action_cost(self) -> th.Tensor | None:
         """:return: the price on the scale of the rewards that critics are fitted to, (n_agents, width)"""
         env = self._vec_normalize_env
-        if self._action_cost is None or env is None or not env.norm_reward:
-            return self._action_cost
-        return self._action_cost / float(np.sqrt(env.ret_rms.var + env.epsilon))
+        if self._cost_of_encoded is None or env is None or not env.norm_reward:
+            return self._cost_of_encoded
+        return self._cost_of_encoded / float(np.sqrt(env.ret_rms.var + env.epsilon))
 
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
@@ -482,16 +485,12 @@ class MADDPG(OffPolicyAlgorithm):
         network.optimizer.step()
         return value
 
+    @th.no_grad()
     def _check_diverged(self) -> None:
-        """Once for many updates, which is cheap: not finite parameters stay so."""
-        parameters = [
-            parameter
-            for network in (self.actor, self.critic)
-            for group in network.optimizer.param_groups
-            for parameter in group["params"]
-        ]
-        if not math.isfinite(th.nn.utils.get_total_norm(parameters, math.inf).item()):
-            raise self._diverged(self.policy.not_finite(self.policy.state_dict()) or "parameters are not finite")
+        """Once for all updates of a call, which is cheap: parameters that are not finite stay so."""
+        groups = [*self.actor.optimizer.param_groups, *self.critic.optimizer.param_groups]
+        if not all(math.isfinite(parameter.sum().item()) for group in groups for parameter in group["params"]):
+            raise self._diverged(self.policy.not_finite(self.policy.state_dict()) or "parameters grew without limit")
 
     def _diverged(self, what: str) -> ValueError:
         return ValueError(
@@ -517,7 +516,7 @@ class MADDPG(OffPolicyAlgorithm):
 
     def set_threshold(self, threshold: float) -> None:
         """
-        Set the threshold delta over which bits are set, in this model and in what it saves.
+        Set the threshold delta over which binary actions are 1, in this model and in what it saves.
 
         :param threshold: in [0, 1)
         """
@@ -676,7 +675,7 @@ class MADDPG(OffPolicyAlgorithm):
             else:
                 problem = f"the state of {name} holds NaN or infinity" if optimizer_not_finite(state) else None
             if problem:
-                return f"{problem}. The training diverged: go back to an earlier file, and train with a lower learning_rate."
+                return f"{problem}. The training diverged: go back to an earlier file and lower the learning_rate."
         return None
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
@@ -721,7 +720,7 @@ class MADDPG(OffPolicyAlgorithm):
         # The last observations of many environments are larger than the networks, and loading begins new episodes
         last = ["_last_obs", "_last_original_obs"]
         networks = ["actor", "critic", "actor_target", "critic_target"]
-        return [*super()._excluded_save_params(), *last, *networks, "_action_cost"]
+        return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

@@ -21,7 +21,8 @@ class MATD3(MADDPG):
     Multi-Agent Twin Delayed DDPG (MATD3): MADDPG with twin critics, delayed policy updates and target policy smoothing.
 
     Paper: https://arxiv.org/abs/1910.01465 (Ackermann et al., 2019). Based on TD3, https://arxiv.org/abs/1802.09477.
-    Bits and categories are smoothed by drawing the target action as in exploration, instead of taking the best one.
+    Binary and categorical actions are smoothed by drawing the target action as in exploration, instead of taking the
+    best one.
 
     :param policy: The policy model to use (MlpPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -42,13 +43,15 @@ class MATD3(MADDPG):
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
     :param n_steps: number of rewards in a return before the critic's estimate takes over
     :param use_action_cost: take the environment's ``action_cost`` as known; critics then learn the rest of the return
-    :param threshold_price: for bits: a price of every set bit that no reward holds and no critic sees. It rises
-        geometrically with the threshold, from the first number at 0 to the second at 1. A score then says up to which
-        price its bit is worth setting, and the policy's ``threshold`` chooses the price after the training.
+    :param threshold_price: for binary actions: a cost of every 1 that no reward holds and no critic sees. It rises
+        geometrically with the threshold, from the first number at 0 to the second at 1. A probability then
+        says up to which price its action is worth it, and the policy's ``threshold`` chooses the price after the
+        training.
     :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
-        [-1, 1]; two numbers go from the first to the second over the training. Bits explore by a random threshold,
-        categories by their probabilities.
-    :param estimator: gradient through bits and categories, see ``sb3_maddpg.estimators``; unused for continuous actions
+        [-1, 1]; two numbers go from the first to the second over the training. Binary actions
+        explore by a random threshold, categorical ones by their probabilities.
+    :param estimator: gradient through binary and categorical actions, see ``sb3_maddpg.estimators``; unused for
+        continuous actions
     :param temperature: of the estimators that relax, can be a function of the current progress remaining
     :param policy_delay: the policy and the target networks are updated every ``policy_delay`` critic updates
     :param max_grad_norm: largest gradient norm of each agent's network, ``None`` for no limit

@@ -24,11 +24,12 @@ Sharing = bool | Sequence[Sequence[str | int]]
 
 def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
     """
-    :param share: True: all agents share one network, False: each has its own, or lists of agents that share one
+    :param share: True: all agents share one network (parameter sharing), False: each has its own, or lists of agents
+        that share one
     :param team: whose agents
     :param argument: name of the argument, for the error's message
     :return: for each agent the number of its network
-    :raises ValueError: an agent in two lists, or unlike agents in one
+    :raises ValueError: an agent in two lists, or heterogeneous agents in one
     """
     if isinstance(share, bool):
         lists = [list(range(team.n_agents))] if share else []
@@ -41,8 +42,8 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
         for other in others:
             if not team.homogeneous(first, other):
                 raise ValueError(
-                    f"{argument}={share}: {team.names[first]} and {team.names[other]} have unlike spaces and cannot "
-                    "share a network. Give lists of agents that are alike, or False."
+                    f"{argument}={share}: {team.names[first]} and {team.names[other]} have different spaces and "
+                    "cannot share a network. Give lists of homogeneous agents, or False."
                 )
     lists += [[agent] for agent in range(team.n_agents) if agent not in named]
     groups = [0] * team.n_agents
@@ -88,7 +89,7 @@ class Actor(nn.Module):
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
         :param obs: (batch, n_agents, obs_dim or more)
-        :return: scores, continuous actions or probabilities, (batch, n_agents, width)
+        :return: probabilities or continuous actions, (batch, n_agents, width)
         """
         return self.actions.squash(self.logits(obs))
 
@@ -96,7 +97,7 @@ class Actor(nn.Module):
         """
         :param obs: (batch, n_agents, obs_dim or more)
         :param deterministic: without exploration, see ``TeamActions``
-        :return: actions as critics read them, (batch, n_agents, width)
+        :return: encoded actions, (batch, n_agents, width)
         """
         return self.actions.act(self.logits(obs), deterministic)
 
@@ -336,10 +337,10 @@ class MADDPGPolicy(BasePolicy):
     :param lr_schedule: learning rate schedule (could be constant)
     :param net_arch: widths of the hidden layers, as a list or as ``dict(pi=[...], qf=[...])``
     :param activation_fn: between the layers
-    :param share_actor: True: one actor network for all agents, False: one for each; or lists of agents (names or
-        numbers) that share one
+    :param share_actor: parameter sharing; True: one actor network for all agents, False: one for each; or lists of
+        agents (names or numbers) that share one
     :param share_critic: the same for critics
-    :param threshold: delta in [0, 1): a bit is set where its score exceeds it. For ``MultiBinary`` alone.
+    :param threshold: delta in [0, 1): a binary action is 1 where its probability exceeds it. For ``MultiBinary`` alone.
     :param random_thresholds: share of the thresholds that are drawn to explore, the others are delta
     :param n_critics: number of critics of each agent
     :param agent_names: by default those of the observation space, or agent_0, agent_1, ...
@@ -457,7 +458,7 @@ class MADDPGPolicy(BasePolicy):
 
     def set_threshold(self, threshold: float) -> None:
         """
-        :param threshold: delta in [0, 1), for the bits of all agents from now on
+        :param threshold: delta in [0, 1), for the binary actions of all agents from now on
         """
         threshold = validated(ThresholdArgument, threshold=threshold)["threshold"]
         self.threshold = threshold
@@ -488,7 +489,7 @@ class MADDPGPolicy(BasePolicy):
         """
         :param obs: (batch, n_agents, obs_dim or more)
         :param deterministic: without exploration
-        :return: joint actions as the replay buffer keeps them, (batch, length)
+        :return: buffer actions, (batch, length)
         """
         return self.actions.decode(self.actor.act(obs.float(), deterministic))
 

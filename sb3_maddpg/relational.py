@@ -74,18 +74,18 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
     return who
 
 
-class Views(nn.Module):
+class NeighbourViews(nn.Module):
     """
     An observation as an agent's own part and its views of its neighbours.
 
     :param layout: see ``ObservationLayout``
-    :param team: a team of equal agents
+    :param team: a team of homogeneous agents
     :param of_critic: with the columns that only critics read
     :raises ValueError: a layout that does not fit the team
     """
 
-    who: th.Tensor
-    back: th.Tensor
+    neighbour_indices: th.Tensor
+    reverse_indices: th.Tensor
     n_neighbours: int
     own_dim: int
     neighbour_dim: int
@@ -108,7 +108,7 @@ class Views(nn.Module):
         self.own = _Columns([list(layout["own"])])
         self.neighbours = _Columns(neighbours)
         back = [[who[j].index(i) if i in who[j] else -1 for j in row] for i, row in enumerate(who)]
-        for name, table in (("who", who), ("back", back)):
+        for name, table in (("neighbour_indices", who), ("reverse_indices", back)):
             self.register_buffer(name, th.tensor(table, dtype=th.long), persistent=False)
 
     def forward(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
@@ -243,7 +243,7 @@ class PairActor(Actor):
 
     def __init__(
         self,
-        views: Views,
+        views: NeighbourViews,
         actions: TeamActions,
         on_neighbours: bool,
         net_arch: Sequence[int],
@@ -300,7 +300,7 @@ class PairCritic(Critic):
 
     def __init__(
         self,
-        views: Views,
+        views: NeighbourViews,
         factors: TeamActions,
         on_neighbours: bool,
         net_arch: Sequence[int],
@@ -308,7 +308,7 @@ class PairCritic(Critic):
         pair_credit: bool = False,
         n_critics: int = 1,
     ):
-        super().__init__(factors, len(views.who), views.n_neighbours if pair_credit else 1, n_critics)
+        super().__init__(factors, len(views.neighbour_indices), views.n_neighbours if pair_credit else 1, n_critics)
         self.pair_credit = pair_credit
         self.views = views
         self.on_neighbours = on_neighbours
@@ -322,18 +322,20 @@ class PairCritic(Critic):
         :param actions: (batch, n_agents, width)
         :return: i's action towards j and j's towards i, both (batch, n_agents, n_neighbours, the factors' width)
         """
-        who = self.views.who
+        who = self.views.neighbour_indices
         if not self.on_neighbours:
             return actions.unsqueeze(2).expand(-1, -1, self.views.n_neighbours, -1), actions[:, who]
         parts = actions.unflatten(-1, (self.views.n_neighbours, -1))
         # Where j does not see i it does nothing to it
-        return parts, parts[:, who, self.views.back.clamp(min=0)] * (self.views.back >= 0).unsqueeze(-1)
+        return parts, parts[:, who, self.views.reverse_indices.clamp(min=0)] * (
+            self.views.reverse_indices >= 0
+        ).unsqueeze(-1)
 
     def _hidden(self, net: PairNet, obs: th.Tensor, theirs: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
         """:return: the second network's first layer without i's own action, and which neighbours are present"""
         own, neighbours, present = self.views(obs)
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
-        hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.who]], dim=-1), present)
+        hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.neighbour_indices]], dim=-1), present)
         return hidden.add_(net.extra(1, theirs)), 1.0 if present is None else present
 
     def of_pairs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -371,8 +373,8 @@ class PairCritic(Critic):
 
 class PairPolicy(MADDPGPolicy):
     """
-    Policy for teams of equal agents that see each other: one relational actor and one relational critic for all. The
-    same parameters fit a team of any size: ``MADDPG("PairPolicy", larger_env).set_parameters("small_team.zip")``.
+    Policy for teams of homogeneous agents that see each other: one relational actor and one relational critic for all.
+    The same parameters fit a team of any size: ``MADDPG("PairPolicy", larger_env).set_parameters("small_team.zip")``.
 
     :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
     :param action_space: flat joint action, see ``Team.from_spaces``
@@ -436,7 +438,7 @@ class PairPolicy(MADDPGPolicy):
         layout = self.observation_layout
         on_neighbours = layout.get("acts_on_neighbours", False)
         action_spaces = self.team.action_spaces
-        views, of_critic = Views(layout, self.team), Views(layout, self.team, of_critic=True)
+        views, of_critic = NeighbourViews(layout, self.team), NeighbourViews(layout, self.team, of_critic=True)
         apart = on_neighbours and not self.shared_threshold
         n_thresholds = views.n_neighbours if apart else 1
         actions = TeamActions(action_spaces, self.threshold, n_thresholds, self.random_thresholds)

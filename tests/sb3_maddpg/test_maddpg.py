@@ -174,7 +174,7 @@ def test_tasks_are_proper_environments():
     ("kwargs", "message"),
     [
         ({"estimator": "expectd"}, "Unknown estimator 'expectd': did you mean 'expected'"),
-        ({"action_noise": NormalActionNoise(np.zeros(9), np.ones(9))}, "Leave it out: bits explore"),
+        ({"action_noise": NormalActionNoise(np.zeros(9), np.ones(9))}, "Leave it out: binary actions explore"),
         ({"max_grad_norm": 0.0}, "max_grad_norm=0.0 must be positive"),
         ({"policy_kwargs": {"threshold": 1.5}}, "threshold=1.5"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),

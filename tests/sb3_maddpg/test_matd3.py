@@ -33,7 +33,7 @@ def test_one_update_is_that_of_separate_agents_with_twin_critics(kind, priced, n
     )
     n_agents, width = model.policy.team.n_agents, model.policy.actions.width
     cost = np.full((n_agents, width), 0.7, np.float32) if priced else None
-    model._action_cost = None if cost is None else th.as_tensor(cost)
+    model._cost_of_encoded = None if cost is None else th.as_tensor(cost)
     model.learn(60)
     old, data = copy.deepcopy(model.policy), drawn(model, 32)
     th.manual_seed(5)

@@ -152,8 +152,8 @@ def test_groups_by_name_and_number():
         ([[0, 6]], "There is no agent 6.*0 to 5"),
         ([["mixed_0", 1], [0]], "share_actor.* names an agent twice"),
         ([[2, 2]], "names an agent twice"),
-        (True, "mixed_0 and mixed_1 have unlike spaces.*Give lists of agents that are alike, or False"),
-        ([["mixed_0", "mixed_4"]], "mixed_0 and mixed_4 have unlike spaces"),
+        (True, "mixed_0 and mixed_1 have different spaces.*Give lists of homogeneous agents, or False"),
+        ([["mixed_0", "mixed_4"]], "mixed_0 and mixed_4 have different spaces"),
     ],
 )
 def test_sharing_that_cannot_be_is_refused(share, message):
@@ -165,7 +165,7 @@ def test_sharing_that_cannot_be_is_refused(share, message):
 def test_agents_with_equal_observations_but_unlike_actions_do_not_share():
     unlike = spaces.MultiDiscrete([3] * 2 + [4] * 2)
     for argument in ("share_actor", "share_critic"):
-        with pytest.raises(ValueError, match=rf"{argument}=True: agent_0 and agent_2 have unlike spaces"):
+        with pytest.raises(ValueError, match=rf"{argument}=True: agent_0 and agent_2 have different spaces"):
             policy(unlike, **{argument: True})
         assert policy(unlike, **{argument: [[0, 1], [2, 3]]}).predict(batch()[0].numpy())[0].max() <= 3
 

@@ -115,7 +115,10 @@ def test_what_a_neighbour_does_counts_only_where_it_sees_the_agent():
     layout = {"own": [0, 1], "neighbours": [[2, 6], [3, 7]], "acts_on_neighbours": True}
     ring = {**layout, "who": [[(i + 1) % N, (i + 2) % N] for i in range(N)]}  # nobody is seen back but ...
     ring["who"][1] = [0, 2]  # ... agent 0 by agent 1
-    assert policy(layout={**LAYOUT, "who": who}).critic.views.back.tolist() == policy().critic.views.back.tolist()
+    assert (
+        policy(layout={**LAYOUT, "who": who}).critic.views.reverse_indices.tolist()
+        == policy().critic.views.reverse_indices.tolist()
+    )
     built = policy(space, ring)
     obs, actions = batch(built)
     actions.requires_grad_()
