@@ -1,8 +1,23 @@
-"""The joint action of a team inside the networks: bits, continuous numbers and categories side by side."""
+"""
+The joint action of a team inside the networks: binary, continuous and categorical actions side by side.
+
+An action has four forms, which all code here calls by these names:
+
+- *environment actions*, (batch, length): as the environment takes them, flat, agent after agent; continuous ones in its
+  units, a category as its index from 0;
+- *buffer actions*, (batch, length): the same with continuous ones scaled to [-1, 1], as the replay buffer keeps them;
+- *encoded actions*, (batch, n_agents, width): as critics read them and actors give them; binary ones 0 or 1, continuous
+  ones in [-1, 1], categories one-hot, padded with zeros to the widest agent;
+- *logits*, (batch, n_agents, width): outputs of actors before they are squashed to probabilities or continuous actions.
+
+``TeamActions`` goes between them: ``act`` from logits to encoded actions, ``decode`` and ``encode`` from these to
+buffer actions and back, ``unscale`` and ``scale`` from these to environment actions and back.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch as th
@@ -10,16 +25,16 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.estimators import Estimator
-from sb3_maddpg.team import AgentActionSpace, heads_of
+from sb3_maddpg.team import AgentActionSpace, Team, heads_of
 
-Critic = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
+QOfAlternatives = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
 
 class ActionKind(nn.Module):
     """
     Those agents of a team that act in the same way.
 
-    Networks see an agent's action as ``width`` numbers: bits as 0 or 1, continuous ones in [-1, 1], categories one-hot.
+    Their encoded actions are ``width`` numbers wide, see the module's docstring.
 
     :param agents: their numbers
     :param action_spaces: their action spaces, all of one kind
@@ -48,7 +63,7 @@ class ActionKind(nn.Module):
     def squash(self, logits: th.Tensor) -> th.Tensor:
         """
         :param logits: the networks' outputs, (batch, n_agents, width)
-        :return: what the outputs mean: scores in [0, 1], actions in [-1, 1], probabilities; the same shape
+        :return: probabilities of binary and categorical actions, continuous actions in [-1, 1]; the same shape
         """
         raise NotImplementedError
 
@@ -56,7 +71,7 @@ class ActionKind(nn.Module):
         """
         :param logits: (batch, n_agents, width)
         :param deterministic: the best action, otherwise one to explore with
-        :return: actions, (batch, n_agents, width)
+        :return: encoded actions, (batch, n_agents, width)
         """
         raise NotImplementedError
 
@@ -80,7 +95,7 @@ class ActionKind(nn.Module):
 
 
 class Continuous(ActionKind):
-    """Numbers of a ``Box``, scaled to [-1, 1]. Exploration noise is the algorithm's."""
+    """Continuous actions (``Box``), scaled to [-1, 1]. Exploration noise is the algorithm's."""
 
     def squash(self, logits: th.Tensor) -> th.Tensor:
         # The same slope for an action's whole range as the sigmoid of a bit; steeper, simple_spread learns worse
@@ -95,10 +110,10 @@ class Continuous(ActionKind):
         return q(self.squash(logits).unsqueeze(2)).squeeze(2)
 
 
-class Bits(ActionKind):
+class Binary(ActionKind):
     """
-    Threshold actions 1[f > delta] of scores f. To explore, delta' ~ U(0, 1) is drawn per agent and shared by its bits
-    (Serra-Gomez et al., IROS 2020, Sec. IV-C).
+    Binary actions (``MultiBinary``) by a threshold, 1[f > delta] of probabilities f. To explore, delta' ~ U(0, 1) is
+    drawn per agent and shared by its bits (Serra-Gomez et al., IROS 2020, Sec. IV-C).
 
     :param threshold: delta
     :param n_thresholds: how many delta' an agent draws, each for an equal part of its bits
@@ -137,7 +152,7 @@ class Bits(ActionKind):
         return estimator.binary(self.squash(logits), q, temperature)
 
 
-class Categories(ActionKind):
+class Categorical(ActionKind):
     """
     ``Discrete`` and ``MultiDiscrete``: H sub-actions of K categories each, one-hot, padded to the largest. To explore,
     categories are drawn with their probabilities.
@@ -193,6 +208,22 @@ class Categories(ActionKind):
         return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
 
 
+def check_bounds(team: Team) -> None:
+    """
+    :param team: whose continuous actions are scaled by their bounds
+    :raises ValueError: bounds whose range is not finite in single precision, or negative
+    """
+    for name, space in zip(team.names, team.action_spaces, strict=True):
+        if isinstance(space, spaces.Box):
+            with np.errstate(over="ignore", invalid="ignore"):
+                span = space.high.astype(np.float32) - space.low.astype(np.float32)
+            if not (np.isfinite(span) & (span >= 0)).all():
+                raise ValueError(
+                    f"The actions of {name} lie between {space.low.tolist()} and {space.high.tolist()}: actions are "
+                    "scaled to [-1, 1], so the range must be finite in single precision. Give the Box narrower bounds."
+                )
+
+
 def make_kinds(
     action_spaces: Sequence[AgentActionSpace], threshold: float, n_thresholds: int = 1, random_thresholds: float = 1.0
 ) -> list[ActionKind]:
@@ -200,35 +231,34 @@ def make_kinds(
     Group the agents of a team by how they act.
 
     :param action_spaces: of all agents
-    :param threshold: for bits, see ``Bits``
-    :param n_thresholds: for bits, see ``Bits``
-    :param random_thresholds: for bits, see ``Bits``
+    :param threshold: for binary actions, see ``Binary``
+    :param n_thresholds: for binary actions, see ``Binary``
+    :param random_thresholds: for binary actions, see ``Binary``
     """
     groups: dict[str, list[int]] = {}
     for agent, space in enumerate(action_spaces):
-        name = "numbers" if isinstance(space, spaces.Box) else "categories"
-        groups.setdefault("bits" if isinstance(space, spaces.MultiBinary) else name, []).append(agent)
+        name = "continuous" if isinstance(space, spaces.Box) else "categorical"
+        groups.setdefault("binary" if isinstance(space, spaces.MultiBinary) else name, []).append(agent)
     kinds: list[ActionKind] = []
     for name, agents in groups.items():
         members = [action_spaces[agent] for agent in agents]
-        if name == "numbers":
+        if name == "continuous":
             kinds.append(Continuous(agents, members))
-        elif name == "bits":
-            kinds.append(Bits(agents, members, threshold, n_thresholds, random_thresholds))
+        elif name == "binary":
+            kinds.append(Binary(agents, members, threshold, n_thresholds, random_thresholds))
         else:
-            kinds.append(Categories(agents, members))
+            kinds.append(Categorical(agents, members))
     return kinds
 
 
 class TeamActions(nn.Module):
     """
-    How a team acts: from the networks' outputs to actions, and from actions as the replay buffer keeps them (flat,
-    agent after agent, continuous ones in [-1, 1], a category as its index) to what critics read.
+    How a team acts: from each form of the joint action to the next, see the module's docstring.
 
     :param action_spaces: each agent's action space, categories counting from 0
-    :param threshold: for bits, see ``Bits``
-    :param n_thresholds: for bits, see ``Bits``
-    :param random_thresholds: for bits, see ``Bits``
+    :param threshold: for binary actions, see ``Binary``
+    :param n_thresholds: for binary actions, see ``Binary``
+    :param random_thresholds: for binary actions, see ``Binary``
     """
 
     source: th.Tensor
@@ -250,8 +280,8 @@ class TeamActions(nn.Module):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
-        self.kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
-        self._modules_of_kinds = nn.ModuleList(self.kinds)  # so that their tables move with the module
+        kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
+        self.kinds = cast("Sequence[ActionKind]", nn.ModuleList(kinds))
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()
         boxes = [
@@ -265,21 +295,21 @@ class TeamActions(nn.Module):
         self.has_continuous = bool(self.is_continuous.any())
 
     def _make_tables(self) -> None:
-        """Where each number that a critic reads stands in the flat action, and the other way round."""
+        """Where each number of the encoded action stands in the buffer action, and the other way round."""
         starts = np.cumsum([0, *(len(heads_of(space)) for space in self.action_spaces)])
         source = np.zeros((self.n_agents, self.width), int)
         value = np.full((self.n_agents, self.width), -1)  # the category of a one-hot column, -1 for a plain number
         real = np.zeros((self.n_agents, self.width), bool)
         target = np.zeros(starts[-1], int)
         for kind in self.kinds:
-            if isinstance(kind, Categories):
+            if isinstance(kind, Categorical):
                 columns = [np.arange(starts[agent], starts[agent + 1]) for agent in kind.agents]
                 kind.register_buffer("flat_columns", th.as_tensor(np.concatenate(columns)), persistent=False)
             for row, agent in enumerate(kind.agents):
                 real[agent, : kind.width] = kind.real[row]
                 for head in range(len(kind.sizes[row])):
                     column = head
-                    if isinstance(kind, Categories):
+                    if isinstance(kind, Categorical):
                         column = head * kind.shape[1]
                         value[agent, column : column + kind.shape[1]] = np.arange(kind.shape[1])
                         source[agent, column : column + kind.shape[1]] = starts[agent] + head
@@ -303,15 +333,15 @@ class TeamActions(nn.Module):
 
     def set_threshold(self, threshold: float) -> None:
         """
-        :param threshold: delta, of all bits
+        :param threshold: delta, of all binary actions
         """
         for kind in self.kinds:
-            if isinstance(kind, Bits):
+            if isinstance(kind, Binary):
                 kind.threshold = threshold
 
     @property
     def discrete(self) -> bool:
-        """Whether any agent has bits or categories."""
+        """Whether any agent has binary or categorical actions."""
         return any(not isinstance(kind, Continuous) for kind in self.kinds)
 
     def columns_of(self, agent: int) -> list[int]:
@@ -321,14 +351,14 @@ class TeamActions(nn.Module):
         """
         sizes = heads_of(self.action_spaces[agent])
         (kind,) = (kind for kind in self.kinds if agent in kind.agents)
-        if not isinstance(kind, Categories):
+        if not isinstance(kind, Categorical):
             return list(range(len(sizes)))
         return [head * kind.shape[1] + category for head in range(len(sizes)) for category in range(max(sizes))]
 
     def encode(self, flat: th.Tensor) -> th.Tensor:
         """
-        :param flat: as in the replay buffer, (batch, length)
-        :return: as critics read it, (batch, n_agents, width) float
+        :param flat: buffer actions, (batch, length)
+        :return: encoded actions, (batch, n_agents, width) float
         """
         if self.plain:
             return flat.float().view(len(flat), self.n_agents, self.width)
@@ -337,14 +367,14 @@ class TeamActions(nn.Module):
 
     def decode(self, actions: th.Tensor) -> th.Tensor:
         """
-        :param actions: (batch, n_agents, width)
-        :return: as in the replay buffer, (batch, length) float
+        :param actions: encoded, (batch, n_agents, width)
+        :return: buffer actions, (batch, length) float
         """
         if self.plain:
             return actions.flatten(1)
         flat = actions.flatten(1)[:, self.target]
         for kind in self.kinds:
-            if isinstance(kind, Categories):
+            if isinstance(kind, Categorical):
                 part = actions if len(self.kinds) == 1 else actions[:, kind.agents, : kind.width]
                 flat[:, kind.flat_columns] = kind.chosen(part).to(flat.dtype)
         return flat
@@ -361,7 +391,7 @@ class TeamActions(nn.Module):
     def squash(self, logits: th.Tensor) -> th.Tensor:
         """
         :param logits: the networks' outputs, (batch, n_agents, width)
-        :return: scores, continuous actions or probabilities, the same shape
+        :return: probabilities or continuous actions, the same shape
         """
         return self._by_kind(logits, lambda kind, part: kind.squash(part))
 
@@ -369,13 +399,13 @@ class TeamActions(nn.Module):
         """
         :param logits: (batch, n_agents, width)
         :param deterministic: without exploration
-        :return: actions as critics read them, (batch, n_agents, width)
+        :return: encoded actions, (batch, n_agents, width)
         """
         return self._by_kind(logits, lambda kind, part: kind.act(part, deterministic))
 
-    def objective(self, estimator: Estimator, logits: th.Tensor, q: Critic, temperature: float) -> th.Tensor:
+    def objective(self, estimator: Estimator, logits: th.Tensor, q: QOfAlternatives, temperature: float) -> th.Tensor:
         """
-        :param estimator: of the gradient through bits and categories
+        :param estimator: of the gradient through binary and categorical actions
         :param logits: (batch, n_agents, width)
         :param q: ``q(own, agents)``: values of alternatives for the own action, (batch, len(agents), M, width) ->
             (batch, len(agents), M); ``agents`` is None for all
@@ -409,16 +439,18 @@ class TeamActions(nn.Module):
 
     def scale(self, actions: np.ndarray) -> np.ndarray:
         """
-        :param actions: of the environment, (batch, length)
-        :return: the same with continuous numbers in [-1, 1], as the replay buffer keeps them
+        :param actions: environment actions, (batch, length)
+        :return: buffer actions, (batch, length)
         """
-        scaled = 2.0 * (actions - self.low) / (self.high - self.low) - 1.0
+        # A bound that is both the lowest and the highest value has no range to divide by
+        span = np.where(self.high > self.low, self.high - self.low, 1.0)
+        scaled = 2.0 * (actions - self.low) / span - 1.0
         return np.where(self.is_continuous, scaled, actions)
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:
         """
-        :param actions: as the replay buffer keeps them, (batch, length)
-        :return: the same in the environment's units
+        :param actions: buffer actions, (batch, length)
+        :return: environment actions, (batch, length)
         """
         unscaled = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
         return np.where(self.is_continuous, unscaled, actions)

@@ -13,7 +13,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_maddpg.actions import ActionKind, Categories, Continuous, make_kinds
+from sb3_maddpg.actions import ActionKind, Categorical, Continuous, make_kinds
 from sb3_maddpg.team import AgentActionSpace
 from sb3_maddpg.utils import atomic_write
 
@@ -31,7 +31,7 @@ class AgentPolicy(nn.Module):
     :param columns: which of the outputs are the agent's, see ``TeamActions.columns_of``
     :param action_space: the agent's
     :param obs_dim: length of its observation
-    :param threshold: for bits, see ``Bits``
+    :param threshold: for binary actions, see ``Binary``
     """
 
     columns: th.Tensor
@@ -55,7 +55,7 @@ class AgentPolicy(nn.Module):
         self.obs_dim = obs_dim
         self.kind: ActionKind = make_kinds([action_space], threshold)[0]
         self.register_buffer("columns", th.tensor(columns))
-        if isinstance(self.kind, Categories):
+        if isinstance(self.kind, Categorical):
             start = th.as_tensor(np.ravel(getattr(action_space, "start", 0)), dtype=th.int64)
             self.register_buffer("start", start)
         if isinstance(action_space, spaces.Box):
@@ -67,8 +67,10 @@ class AgentPolicy(nn.Module):
         """
         :param policy: of the team
         :param agent: name or number
-        :raises ValueError: no such agent
+        :raises ValueError: no such agent, or parameters that are not finite
         """
+        if problem := policy.not_finite(policy.state_dict()):
+            raise ValueError(f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file.")
         team, index = policy.team, policy.team.index(agent)
         network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
         columns, space = policy.actions.columns_of(index), team.action_spaces[index]
@@ -77,14 +79,14 @@ class AgentPolicy(nn.Module):
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
         :param obs: (batch, obs_dim)
-        :return: actions in the environment's units, (batch, length of the action): bits as int8, numbers as float32,
-            categories as int64
+        :return: actions in the environment's units, (batch, length of the action): binary ones as int8, continuous ones
+            as float32, categorical ones as int64
         """
         logits = self.network(obs)[:, self.columns].unsqueeze(1)
         actions = self.kind.act(logits, deterministic=True).squeeze(1)
         if isinstance(self.kind, Continuous):
             return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
-        if isinstance(self.kind, Categories):
+        if isinstance(self.kind, Categorical):
             return actions.unflatten(-1, self.kind.shape).argmax(dim=-1) + self.start
         return actions.to(th.int8)
 
@@ -113,7 +115,11 @@ class AgentPolicy(nn.Module):
         a function from (batch, obs_dim) float32 to actions as ``forward`` gives them.
 
         :param path: of the file
+        :raises ValueError: a parameter is not finite
         """
+        for name, parameter in self.named_parameters():
+            if not parameter.isfinite().all():
+                raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
         example, other = th.zeros(2, self.obs_dim), th.linspace(-2.0, 2.0, 5 * self.obs_dim).view(5, -1)
         with warnings.catch_warnings():
             # What torch offers instead, torch.export, needs a compiler to run without Python

@@ -148,7 +148,7 @@ LAYOUT: dict[str, dict[str, list[Any]]] = {
         "return": ["Multiline", ["rollout/ep_rew_mean", "eval/mean_reward"]],
         "critics": ["Multiline", ["train/critic_loss"]],
         "actors": ["Multiline", ["train/actor_loss"]],
-        "scores": ["Multiline", ["train/score_mean", "train/score_std"]],
+        "probabilities": ["Multiline", ["train/probability_mean", "train/probability_std"]],
         "steps per second": ["Multiline", ["time/fps"]],
     },
 }

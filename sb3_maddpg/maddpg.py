@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 import os
 import pathlib
-import zipfile
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar, cast
@@ -20,30 +19,41 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import open_path
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecNormalize,
+    is_vecenv_wrapped,
+    unwrap_vec_normalize,
+)
 
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import record_metrics
 from sb3_maddpg.estimators import ESTIMATORS
+from sb3_maddpg.model_files import FILE_FORMAT, check_file, optimizer_not_finite
 from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
-from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, by_agent
-from sb3_maddpg.relational import ObservationLayout, PairPolicy
+from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
+from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
-from sb3_maddpg.utils import atomic_write, describe_env, suggest
+from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
+from sb3_maddpg.validation import Arguments, TrainingArguments, validated
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 
-# Raised whenever an older model's networks would be read wrongly
-FILE_FORMAT = 2
+# Arguments of policies that the algorithm gives itself
+NOT_POLICY_KWARGS = {"observation_space", "action_space", "lr_schedule"}
+# Arguments that a model for a team of another size does not take over
+NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
 
 
 class MADDPG(OffPolicyAlgorithm):
     """
-    Multi-Agent Deep Deterministic Policy Gradient (MADDPG): decentralised actors, centralised critics.
+    Multi-Agent Deep Deterministic Policy Gradient (MADDPG): centralised training of critics that read all observations
+    and actions, decentralised execution by actors that read their own observation.
 
     Paper: https://arxiv.org/abs/1706.02275 (Lowe et al., 2017), original code https://github.com/openai/maddpg.
     Threshold actions: Serra-Gomez et al., IROS 2020. Code based on SB3's TD3.
@@ -54,7 +64,7 @@ class MADDPG(OffPolicyAlgorithm):
     ``info["agent_terminated"]`` and ``info["agent_active"]``, all (n_agents,). Numbers in ``info["metrics"]`` are
     logged as means. Of the environment's attributes it reads ``agent_names``, ``observation_layout`` (see
     ``PairPolicy``) and, with ``use_action_cost``, ``action_cost``: what an action costs as long as the reward holds
-    that as a plain sum over bits, numbers or categories, a float or (n_agents, width).
+    that as a plain sum over the encoded action, a float or (n_agents, width).
 
     :param policy: The policy model to use (MlpPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -75,13 +85,15 @@ class MADDPG(OffPolicyAlgorithm):
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
     :param n_steps: number of rewards in a return before the critic's estimate takes over
     :param use_action_cost: take the environment's ``action_cost`` as known; critics then learn the rest of the return
-    :param threshold_price: for bits: a price of every set bit that no reward holds and no critic sees. It rises
-        geometrically with the threshold, from the first number at 0 to the second at 1. A score then says up to which
-        price its bit is worth setting, and the policy's ``threshold`` chooses the price after the training.
+    :param threshold_price: for binary actions: a cost of every 1 that no reward holds and no critic sees. It rises
+        geometrically with the threshold, from the first number at 0 to the second at 1. A probability then
+        says up to which price its action is worth it, and the policy's ``threshold`` chooses the price after the
+        training.
     :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
-        [-1, 1]; two numbers go from the first to the second over the training. Bits explore by a random threshold,
-        categories by their probabilities.
-    :param estimator: gradient through bits and categories, see ``sb3_maddpg.estimators``; unused for continuous actions
+        [-1, 1]; two numbers go from the first to the second over the training. Binary actions
+        explore by a random threshold, categorical ones by their probabilities.
+    :param estimator: gradient through binary and categorical actions, see ``sb3_maddpg.estimators``; unused for
+        continuous actions
     :param temperature: of the estimators that relax, can be a function of the current progress remaining
     :param policy_delay: the policy and the target networks are updated every ``policy_delay`` critic updates
     :param max_grad_norm: largest gradient norm of each agent's network, ``None`` for no limit
@@ -98,6 +110,9 @@ class MADDPG(OffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MADDPGPolicy, "PairPolicy": PairPolicy}
+    # A class reads the files of its bases of the same name, see ``load``
+    algorithm_name: ClassVar[str] = "MADDPG"
+    arguments: ClassVar[type[Arguments]] = TrainingArguments
     policy_class: type[MADDPGPolicy]
     policy: MADDPGPolicy
     replay_buffer: TeamReplayBuffer
@@ -184,11 +199,7 @@ class MADDPG(OffPolicyAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        if isinstance(env, (ParallelEnv, AECEnv)):
-            env = TeamEnv(env)
-        vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        Team.from_spaces(vec_env.observation_space, vec_env.action_space)  # SB3 would advise policies that are not here
-        return vec_env
+        return as_vec_env(env, verbose, monitor_wrapper)
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -199,6 +210,7 @@ class MADDPG(OffPolicyAlgorithm):
                     "supersuit.frame_stack_v2 on the PettingZoo environment, or in the environment itself."
                 )
             self._read_env(self.env)
+            self._check_normalization(self.env)
         # SB3 knows n_steps of its own buffer only, and would make the buffer of a model that is loaded without an
         # environment, only to predict, at full size
         n_steps, buffer_size = self.n_steps, self.buffer_size
@@ -214,7 +226,7 @@ class MADDPG(OffPolicyAlgorithm):
         if self.action_noise is not None and not actions.has_continuous:
             raise ValueError(
                 f"action_noise={self.action_noise} is for continuous actions, the action space is {self.action_space}. "
-                "Leave it out: bits explore by a random threshold, categories by their probabilities."
+                "Leave it out: binary actions explore by a random threshold, categorical ones by their probabilities."
             )
         self._spread_action_cost()
 
@@ -229,6 +241,15 @@ class MADDPG(OffPolicyAlgorithm):
             n_pairs = len(self.policy_kwargs["observation_layout"]["neighbours"])
             self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_pairs": n_pairs}
 
+    def _check_normalization(self, env: GymEnv) -> None:
+        layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
+        if layout is not None and normalizer is not None and not layout.get("complete", False):
+            raise ValueError(
+                "VecNormalize(norm_obs=True) moves the zeros by which PairPolicy knows absent neighbours: they would "
+                "all look present. Set norm_obs=False and scale observations in the environment; or, if every "
+                "neighbour is always there, let the environment's observation_layout say `complete: True`."
+            )
+
     def _read_task(self, env: VecEnv) -> None:
         self.env_spec = describe_env(env)
         self.action_cost = None
@@ -238,8 +259,8 @@ class MADDPG(OffPolicyAlgorithm):
             self.action_cost = env.get_attr("action_cost", indices=0)[0]
 
     def _spread_action_cost(self) -> None:
-        """The price of every number that critics read, (n_agents, width)."""
-        self._action_cost: th.Tensor | None = None
+        """The cost of every number of the encoded action, (n_agents, width)."""
+        self._cost_of_encoded: th.Tensor | None = None
         if self.action_cost is None:
             return
         shape = (self.policy.team.n_agents, self.policy.actions.width)
@@ -249,26 +270,39 @@ class MADDPG(OffPolicyAlgorithm):
             raise ValueError(
                 f"action_cost of shape {np.shape(self.action_cost)} does not fit (n_agents, width) = {shape}."
             ) from error
-        self._action_cost = th.as_tensor(cost.copy(), device=self.device)
+        self._cost_of_encoded = th.as_tensor(cost.copy(), device=self.device)
 
-    def _present_action_cost(self) -> th.Tensor | None:
+    def _scaled_action_cost(self) -> th.Tensor | None:
         """:return: the price on the scale of the rewards that critics are fitted to, (n_agents, width)"""
         env = self._vec_normalize_env
-        if self._action_cost is None or env is None or not env.norm_reward:
-            return self._action_cost
-        return self._action_cost / float(np.sqrt(env.ret_rms.var + env.epsilon))
+        if self._cost_of_encoded is None or env is None or not env.norm_reward:
+            return self._cost_of_encoded
+        return self._cost_of_encoded / float(np.sqrt(env.ret_rms.var + env.epsilon))
 
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
             raise ValueError(f"{self.policy_class.__name__} is no policy of a team: use MlpPolicy or PairPolicy.")
         if self.estimator not in ESTIMATORS:
             raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
-        if self.threshold_price is not None:
-            first, last = self.threshold_price
-            if not 0 < first < last:
-                raise ValueError(f"threshold_price={self.threshold_price} is a positive price and a higher one.")
-            if not isinstance(self.action_space, spaces.MultiBinary):
-                raise ValueError(f"threshold_price is for bits, the action space is {self.action_space}.")
+        names = self.arguments.model_fields
+        self.__dict__.update(validated(self.arguments, **{name: getattr(self, name) for name in names}))
+        if self.batch_size > self.buffer_size:
+            raise ValueError(
+                f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}: a batch is drawn from "
+                "the replay buffer. Lower the one or raise the other."
+            )
+        if self.n_steps > self.buffer_size // self.n_envs:
+            raise ValueError(
+                f"n_steps={self.n_steps} is more than buffer_size={self.buffer_size} keeps of each of the "
+                f"{self.n_envs} environment(s): lower the one or raise the other."
+            )
+        if self.threshold_price is not None and not isinstance(self.action_space, spaces.MultiBinary):
+            raise ValueError(
+                f"threshold_price is for binary actions (MultiBinary), the action space is {self.action_space}."
+            )
+        for name in self.policy_kwargs:
+            if name not in (known := arguments_of(self.policy_class)):
+                raise ValueError(suggest("argument in policy_kwargs", name, known - NOT_POLICY_KWARGS))
         buffer = self.replay_buffer_class
         if isinstance(buffer, str):
             raise ValueError(f"replay_buffer_class={buffer!r} is a name, which only recipes know: give the class.")
@@ -278,24 +312,6 @@ class MADDPG(OffPolicyAlgorithm):
                 "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
                 "observations, which a team does not have."
             )
-        self._check_numbers()
-
-    def _check_numbers(self) -> None:
-        for name in ("tau", "gamma"):
-            value = getattr(self, name)
-            if not isinstance(value, (int, float, np.floating)) or not 0 <= value <= 1:
-                raise ValueError(f"{name}={value!r} must be a number between 0 and 1.")
-        if self.max_grad_norm is not None and not self.max_grad_norm > 0:
-            raise ValueError(f"max_grad_norm={self.max_grad_norm} must be positive, or None for no limit.")
-        if self.n_steps < 1 or self.policy_delay < 1:
-            raise ValueError(f"n_steps={self.n_steps} and policy_delay={self.policy_delay} must be at least 1.")
-        noise = np.asarray(self.exploration_noise)
-        if noise.shape not in ((), (2,)) or not (noise >= 0).all():
-            raise ValueError(
-                f"exploration_noise={self.exploration_noise} is a standard deviation, or two of them, of at least 0."
-            )
-        if not callable(self.temperature) and not self.temperature > 0:
-            raise ValueError(f"temperature={self.temperature} must be positive.")
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -325,8 +341,8 @@ class MADDPG(OffPolicyAlgorithm):
     @property
     def noise_std(self) -> float:
         """Present standard deviation of the exploration noise."""
-        if isinstance(self.exploration_noise, (int, float)):
-            return float(self.exploration_noise)
+        if not isinstance(self.exploration_noise, tuple):
+            return self.exploration_noise
         first, last = self.exploration_noise
         return last + self._current_progress_remaining * (first - last)
 
@@ -346,111 +362,161 @@ class MADDPG(OffPolicyAlgorithm):
         actor_losses, critic_losses, q_values, outputs = [], [], [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
-            data = cast(TeamReplayBufferSamples, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env))
-            obs = data.observations.float()
-            actions = self.policy.actions.encode(data.actions)
-            if data.active is not None:
-                actions = actions * data.active.unsqueeze(2)
+            # Sample replay buffer
+            replay_data = cast(
+                TeamReplayBufferSamples, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            )
+            obs = replay_data.observations.float()
+            actions = self.policy.actions.encode(replay_data.actions)
+            if replay_data.active is not None:
+                actions = actions * replay_data.active.unsqueeze(2)
 
-            critic_loss, values = self._critic_loss(data, obs, actions)
-            self._descend(self.critic, critic_loss)
-            critic_losses.append(critic_loss.item() / self.policy.team.n_agents)
-            q_values.append(values)
+            # Optimize the centralised critics
+            losses, q_value = self._critic_loss(replay_data, obs, actions)
+            critic_losses.append(self._descend(self.critic, losses, self.critic.agent_of_value))
+            q_values.append(q_value)
 
+            # Delayed policy updates
             if self._n_updates % self.policy_delay == 0:
-                actor_loss, output = self._actor_loss(data, obs, actions)
-                self._descend(self.actor, actor_loss)
-                actor_losses.append(actor_loss.item() / self.policy.team.n_agents)
+                # Optimize the decentralised actors
+                losses, output = self._actor_loss(replay_data, obs, actions)
+                actor_losses.append(self._descend(self.actor, losses))
                 outputs.append(output)
+
+                # Update the target networks
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
                 polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+        self._check_diverged()
 
+        n_agents = self.policy.team.n_agents
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/critic_loss", np.mean(critic_losses))
-        for agent, q_value in enumerate(th.stack(q_values).mean(dim=0).tolist()):
-            self.logger.record(f"train/q_value_{agent}", q_value)
+        self.logger.record("train/critic_loss", np.mean(critic_losses) / n_agents)
+        for name, mean in zip(self.policy.team.names, th.stack(q_values).mean(dim=0).tolist(), strict=True):
+            self.logger.record(f"train/q_value/{name}", mean)
         if outputs:
-            self.logger.record("train/actor_loss", np.mean(actor_losses))
+            self.logger.record("train/actor_loss", np.mean(actor_losses) / n_agents)
             if self.policy.actions.discrete:
-                self.logger.record("train/score_mean", th.stack(outputs).mean().item())
-                self.logger.record("train/score_std", th.stack(outputs).std().item())
+                self.logger.record("train/probability_mean", th.stack(outputs).mean().item())
+                self.logger.record("train/probability_std", th.stack(outputs).std().item())
         if self.policy.actions.has_continuous and self.action_noise is None:
             self.logger.record("train/exploration_noise", self.noise_std)
 
     def _critic_loss(
-        self, data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
+        self, replay_data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """:return: the loss, summed over agents, and each agent's mean value, (n_agents,)"""
-        critic, action_cost = self.critic, self._present_action_cost()
-        rewards = data.rewards
-        if critic.part_credit and data.pair_rewards is not None:
-            rewards = data.pair_rewards.flatten(1)
+        """:return: the loss of each value head, (n_values,), and each agent's mean Q-value, (n_agents,)"""
+        critic, action_cost = self.critic, self._scaled_action_cost()
+        rewards = replay_data.rewards
+        if len(critic.agent_of_value) > critic.n_agents and replay_data.pair_rewards is not None:
+            rewards = replay_data.pair_rewards.flatten(1)
         with th.no_grad():
-            next_obs = data.next_observations.float()
+            # Select actions by the target actors
+            next_obs = replay_data.next_observations.float()
             next_actions = self._target_actions(next_obs)
-            if data.next_active is not None:
-                next_actions = next_actions * data.next_active.unsqueeze(2)
-            next_values = critic.credited(self.critic_target(next_obs, next_actions)).amin(dim=0)
+            if replay_data.next_active is not None:
+                next_actions = next_actions * replay_data.next_active.unsqueeze(2)
+            # Compute the next Q-values: min over all critics targets
+            next_q_values = self.critic_target(next_obs, next_actions).amin(dim=0)
             if action_cost is not None:
-                next_values = next_values - critic.cost(next_actions, action_cost)
-                rewards = rewards + critic.cost(actions, action_cost)
-            targets = rewards + critic.spread((1 - data.dones) * data.discounts) * next_values
+                next_q_values = next_q_values - critic.known_cost(next_actions, action_cost)
+                rewards = rewards + critic.known_cost(actions, action_cost)
+            discounts = critic.per_value((1 - replay_data.dones) * replay_data.discounts)
+            target_q_values = rewards + discounts * next_q_values
 
-        # A sum over agents: each gradient is that of the agent's own mean squared error
-        values = critic.credited(critic(obs, actions))
-        errors = (values - targets).square().sum(dim=0)
-        active = None if data.active is None else critic.spread(data.active)
-        if isinstance(self.replay_buffer, PrioritizedTeamReplayBuffer) and data.indices is not None:
-            counted = errors.detach() if active is None else errors.detach() * active
-            self.replay_buffer.update_priorities(data.indices, counted.sum(dim=1).sqrt().cpu().numpy())
-        loss = _mean_over_batch(errors, active, data.weights).sum()
-        parts_left = critic.parts_per_agent if critic.part_credit else 1
-        return loss, by_agent(values[0].detach(), parts_left).mean(dim=0)
+        # Get current Q-values estimates for each critic network
+        current_q_values = critic(obs, actions)
+
+        # Losses of agents are summed: each gradient is that of the agent's own mean squared error
+        errors = (current_q_values - target_q_values).square().sum(dim=0)
+        active = None if replay_data.active is None else critic.per_value(replay_data.active)
+        if isinstance(self.replay_buffer, PrioritizedTeamReplayBuffer) and replay_data.indices is not None:
+            td_errors = errors.detach() if active is None else errors.detach() * active
+            self.replay_buffer.update_priorities(replay_data.indices, td_errors.sum(dim=1).sqrt().cpu().numpy())
+        losses = _mean_over_batch(errors, active, replay_data.weights)
+        return losses, critic.sum_by_agent(current_q_values[0].detach()).mean(dim=0)
 
     def _actor_loss(
-        self, data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
+        self, replay_data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """:return: the loss, summed over agents, and all scores and probabilities, (batch, any number)"""
-        critic, team, action_cost = self.critic, self.policy.actions, self._present_action_cost()
+        """:return: the loss of each agent, (n_agents,), and all probabilities, (batch, any number)"""
+        critic, action_cost = self.critic, self._scaled_action_cost()
         # The other agents' actions are those of the replay buffer, as in the original code
 
-        def q(own: th.Tensor, units: th.Tensor | None) -> th.Tensor:
-            values = critic.forward_alternatives(obs, actions, own, units)
+        def q(own: th.Tensor, factors: th.Tensor | None) -> th.Tensor:
+            q_values = critic.forward_alternatives(obs, actions, own, factors)
             if action_cost is None:
-                return values
-            cost = critic.to_units(action_cost.unsqueeze(0))[0]
-            return values - (own * (cost if units is None else cost[units]).unsqueeze(1)).sum(dim=-1)
+                return q_values
+            cost = critic.factored(action_cost.unsqueeze(0))[0]
+            return q_values - (own * (cost if factors is None else cost[factors]).unsqueeze(1)).sum(dim=-1)
 
         logits = self.actor.logits(obs)
         temperature = self.temperature
         if callable(temperature):
             temperature = temperature(self._current_progress_remaining)
         with _no_gradients(critic):
-            objective = critic.units.objective(ESTIMATORS[self.estimator], critic.to_units(logits), q, temperature)
-        losses = self.policy_regularization * team.regularization(logits) - by_agent(objective, critic.units_per_agent)
+            objective = critic.factors.objective(ESTIMATORS[self.estimator], critic.factored(logits), q, temperature)
+        joint = self.policy.actions
+        losses = self.policy_regularization * joint.regularization(logits) - critic.sum_by_agent(objective)
         if self.threshold_price is not None:
-            losses = losses + _price_up_to(team.squash(logits), self.threshold_price).sum(dim=-1)
-        loss = _mean_over_batch(losses, data.active, data.weights).sum()
-        return loss, team.squash(logits.detach())[:, team.discrete_columns]
+            losses = losses + _price_up_to(joint.squash(logits), self.threshold_price).sum(dim=-1)
+        losses = _mean_over_batch(losses, replay_data.active, replay_data.weights)
+        return losses, joint.squash(logits.detach())[:, joint.discrete_columns]
 
-    def _descend(self, network: Actor | Critic, loss: th.Tensor) -> None:
+    def _descend(self, network: Actor | Critic, losses: th.Tensor, agents: th.Tensor | None = None) -> float:
+        """
+        A step of gradient descent.
+
+        :param losses: (n,)
+        :param agents: whose they are, (n,); each agent's own one by default
+        :return: their sum
+        :raises ValueError: it is not finite
+        """
+        loss = losses.sum()
+        value = loss.item()
+        if not math.isfinite(value):
+            diverged = (~losses.isfinite()).nonzero().squeeze(1)
+            owners = diverged if agents is None else agents[diverged]
+            names = [self.policy.team.names[agent] for agent in sorted(set(owners.tolist()))]
+            raise self._diverged(f"the loss of the {_role(network)} of {', '.join(names) or 'the team'} is {value}")
         network.optimizer.zero_grad()
         loss.backward()
         if self.max_grad_norm is not None:
             network.clip_grad_norm_(self.max_grad_norm)
         network.optimizer.step()
+        return value
+
+    @th.no_grad()
+    def _check_diverged(self) -> None:
+        """Once for all updates of a call, which is cheap: parameters that are not finite stay so."""
+        groups = [*self.actor.optimizer.param_groups, *self.critic.optimizer.param_groups]
+        if not all(math.isfinite(parameter.sum().item()) for group in groups for parameter in group["params"]):
+            raise self._diverged(self.policy.not_finite(self.policy.state_dict()) or "parameters grew without limit")
+
+    def _diverged(self, what: str) -> ValueError:
+        return ValueError(
+            f"The training diverged at step {self.num_timesteps} (update {self._n_updates}): {what}. Lower "
+            f"learning_rate={self.learning_rate}, scale the rewards down (VecNormalize(norm_obs=False) divides them "
+            "by their spread), or limit gradients by max_grad_norm."
+        )
 
     def agent_policy(self, agent: str | int) -> AgentPolicy:
         """
         What one agent needs to act by itself, without the team and without the critics.
 
         :param agent: its name or its number
+        :raises ValueError: no such agent, or parameters that are not finite
         """
+        if _normalizer_of_observations(self.env) is not None:
+            warnings.warn(
+                "The environment's observations are normalised by VecNormalize(norm_obs=True), whose statistics are no "
+                "part of the agent's policy: give it observations normalised in the same way.",
+                stacklevel=2,
+            )
         return AgentPolicy.of(self.policy, agent)
 
     def set_threshold(self, threshold: float) -> None:
         """
-        Set the threshold delta over which bits are set, in this model and in what it saves.
+        Set the threshold delta over which binary actions are 1, in this model and in what it saves.
 
         :param threshold: in [0, 1)
         """
@@ -468,17 +534,33 @@ class MADDPG(OffPolicyAlgorithm):
         :param observation_layout: of that team, see ``ObservationLayout``
         :raises ValueError: the policy is no ``PairPolicy``, or observations hold something else
         """
+        return self._resizable_policy().resized(observation_space, action_space, observation_layout)
+
+    def resized(self: SelfMADDPG, env: GymEnv, **kwargs: Any) -> SelfMADDPG:
+        """
+        A model for a team of another size: the same networks, optimizers and arguments. Its counters start at 0 and its
+        replay buffer empty.
+
+        :param env: of that team
+        :param kwargs: arguments of the algorithm, over those that this model was made with
+        :raises ValueError: the policy is no ``PairPolicy``, or agents observe something else
+        """
+        policy = self._resizable_policy()
+        vec_env = as_vec_env(env)
+        arguments = {
+            name: getattr(self, name) for name in arguments_of(type(self)) - NOT_RESIZED if hasattr(self, name)
+        }
+        own = {key: value for key, value in self.policy_kwargs.items() if key not in PairPolicy.env_attributes}
+        arguments |= {"policy_kwargs": own, "device": self.device, **kwargs}
+        resized = type(self)(arguments.pop("policy", type(policy)), vec_env, **arguments)
+        with remedy_for_other_observations():
+            resized.set_parameters(self.get_parameters())  # type: ignore[arg-type]
+        return resized
+
+    def _resizable_policy(self) -> PairPolicy:
         if not isinstance(self.policy, PairPolicy):
             raise ValueError(f"{type(self.policy).__name__} fits one size of team; train with PairPolicy.")
-        kwargs = {**self.policy_kwargs, "observation_layout": observation_layout}
-        kwargs.pop("agent_names", None)
-        policy = type(self.policy)(observation_space, action_space, self.lr_schedule, **kwargs).to(self.device)
-        try:
-            policy.load_state_dict(self.policy.state_dict())
-        except RuntimeError as error:
-            raise ValueError(f"The team observes something else than this model was trained with: {error}") from error
-        policy.set_training_mode(False)
-        return policy
+        return self.policy
 
     def learn(
         self: SelfMADDPG,
@@ -503,15 +585,30 @@ class MADDPG(OffPolicyAlgorithm):
         record_metrics(self.logger, infos)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        with _remedy_for_other_team():
-            super().set_env(env, force_reset)
+        self._check_normalization(env)
+        before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
+        if self.replay_buffer.size() and self.replay_buffer.n_envs != n_envs:
+            raise ValueError(
+                f"The replay buffer holds transitions of {self.replay_buffer.n_envs} environment(s) side by side and "
+                f"cannot take those of {n_envs}: give as many, or empty it by `model.replay_buffer.reset()`."
+            )
+        self.n_envs = n_envs  # SB3 would refuse another number, whether or not there are transitions to keep
+        try:
+            with _remedy_for_other_team():
+                super().set_env(env, force_reset)
+        except BaseException:
+            self.n_envs = before
+            raise
         assert self.env is not None
         assert self.replay_buffer_class is not None
         assert issubclass(self.replay_buffer_class, TeamReplayBuffer)
         self._read_task(self.env)
         self._spread_action_cost()
-        if self.replay_buffer.size() == 0 and self.replay_buffer.buffer_size < self.buffer_size // self.n_envs:
-            # Loaded without an environment, see _setup_model()
+        rows = max(self.buffer_size // self.n_envs, 1)
+        if self.replay_buffer.size() == 0 and (self.replay_buffer.buffer_size, self.replay_buffer.n_envs) != (
+            rows,
+            self.n_envs,
+        ):  # loaded without an environment, see _setup_model(), or made for another number of environments
             self.replay_buffer = self.replay_buffer_class(
                 self.buffer_size,
                 self.observation_space,
@@ -533,32 +630,10 @@ class MADDPG(OffPolicyAlgorithm):
         force_reset: bool = True,
         **kwargs,
     ) -> SelfMADDPG:
-        cls._check_file(path)
-        with _remedy_for_other_team():
+        algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
+        check_file(path, cls.__name__, {base.__name__ for base in algorithms})
+        with _remedy_for_other_team(), _as_value_error():
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-
-    @classmethod
-    def _check_file(cls, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """Refuse a model of another algorithm or of another format, before anything in it is unpickled."""
-        file = open_path(path, "r", verbose=0, suffix="zip")
-        if not zipfile.is_zipfile(file):
-            return  # SB3 says what is wrong
-        with zipfile.ZipFile(file) as archive:
-            data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
-        if isinstance(path, (str, os.PathLike)):
-            file.close()
-        else:
-            file.seek(0)
-        algorithm = data.get("algorithm")
-        if algorithm not in (None, cls.__name__):
-            raise ValueError(f"{path} holds a model of {algorithm}: load it with `{algorithm}.load`.")
-        if algorithm is None and "policy_regularization" not in data:
-            raise ValueError(f"{path} holds a model of another algorithm than {cls.__name__}.")
-        if data.get("file_format", 1) != FILE_FORMAT:
-            raise ValueError(
-                f"{path} has format {data.get('file_format', 1)}, this version of sb3-maddpg reads format "
-                f"{FILE_FORMAT}: install the version that wrote it, or train again."
-            )
 
     def save(
         self,
@@ -566,10 +641,74 @@ class MADDPG(OffPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
+        """
+        SB3's ``save``, whole or not at all: a file that was there stays until the new one is complete.
+
+        :raises ValueError: a parameter is not finite, which nothing could be done with
+        """
+        if problem := self._not_finite(self.get_parameters()):
+            raise ValueError(f"This model cannot be saved: {problem}")
         if not isinstance(path, (str, os.PathLike)):
             return super().save(path, exclude, include)
         with atomic_write(path, suffix="zip") as file:
             super().save(file, exclude, include)  # type: ignore[arg-type]
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        SB3's ``set_parameters``, which ``load`` calls too.
+
+        :raises RuntimeError: a parameter is not finite; nothing has changed then
+        """
+        if not isinstance(load_path_or_dict, dict):
+            load_path_or_dict = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+        if problem := self._not_finite(load_path_or_dict):
+            raise _NotFiniteError(f"These parameters cannot be used: {problem}")
+        super().set_parameters(load_path_or_dict, exact_match, device)
+
+    def _not_finite(self, parameters: dict[str, Any]) -> str | None:
+        """:return: which of the parameters (see ``get_parameters``) are not finite, and what to do, None if all are"""
+        for name, state in parameters.items():
+            if name == "policy":
+                problem = self.policy.not_finite(state)
+            else:
+                problem = f"the state of {name} holds NaN or infinity" if optimizer_not_finite(state) else None
+            if problem:
+                return f"{problem}. The training diverged: go back to an earlier file and lower the learning_rate."
+        return None
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        SB3's ``load_replay_buffer``.
+
+        :raises ValueError: a buffer of another kind, team or number of environments; the present one stays then
+        """
+        present = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            self._check_replay_buffer(self.replay_buffer, path)
+        except BaseException:
+            self.replay_buffer = present
+            raise
+
+    def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
+        if not isinstance(buffer, TeamReplayBuffer):
+            raise ValueError(
+                f"{path} holds a {type(buffer).__name__}, which knows no agents; the model needs a TeamReplayBuffer."
+            )
+        n_pairs = self.replay_buffer_kwargs.get("n_pairs", 0)
+        for what, loaded, needed in (
+            ("transitions of {} environment(s) side by side", buffer.n_envs, self.n_envs),
+            ("observations of {}", buffer.observation_space, self.observation_space),
+            ("actions of {}", buffer.action_space, self.action_space),
+            ("rewards of {} neighbours of each agent", buffer.n_pairs, n_pairs),
+        ):
+            if loaded != needed:
+                raise ValueError(
+                    f"{path} holds {what.format(loaded)}, the model needs {what.format(needed)}: resume with the "
+                    "environment and arguments of the training that saved it, or without its replay buffer."
+                )
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         if not isinstance(path, (str, os.PathLike)):
@@ -581,10 +720,25 @@ class MADDPG(OffPolicyAlgorithm):
         # The last observations of many environments are larger than the networks, and loading begins new episodes
         last = ["_last_obs", "_last_original_obs"]
         networks = ["actor", "critic", "actor_target", "critic_target"]
-        return [*super()._excluded_save_params(), *last, *networks, "_action_cost"]
+        return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+    """
+    :param env: a PettingZoo environment, a team environment, or a vector of team environments
+    :param verbose: see SB3's ``BaseAlgorithm``
+    :param monitor_wrapper: see SB3's ``BaseAlgorithm``
+    :return: the environment as algorithms train on it
+    :raises ValueError: spaces that describe no team
+    """
+    if isinstance(env, (ParallelEnv, AECEnv)):
+        env = TeamEnv(env)
+    vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+    Team.from_spaces(vec_env.observation_space, vec_env.action_space)  # SB3 would advise policies that are not here
+    return vec_env
 
 
 def _price_up_to(scores: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
@@ -610,6 +764,10 @@ def _mean_over_batch(values: th.Tensor, active: th.Tensor | None, weights: th.Te
     return values.mean(dim=0) if active is None else (values * active).sum(dim=0) / active.sum(dim=0).clamp(min=1.0)
 
 
+def _role(network: Actor | Critic) -> str:
+    return "critic" if isinstance(network, Critic) else "actor"
+
+
 @contextmanager
 def _no_gradients(network: th.nn.Module) -> Iterator[None]:
     """Leave the network's parameters out of the backward pass, where only its inputs' gradients are wanted."""
@@ -618,6 +776,24 @@ def _no_gradients(network: th.nn.Module) -> Iterator[None]:
         yield
     finally:
         network.requires_grad_(True)
+
+
+def _normalizer_of_observations(env: GymEnv | None) -> VecNormalize | None:
+    """:return: the wrapper that normalises this environment's observations, if there is one"""
+    normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
+    return normalizer if normalizer is not None and normalizer.norm_obs else None
+
+
+class _NotFiniteError(RuntimeError):
+    """Not a ValueError, by which SB3's ``load`` recognises models of its older versions."""
+
+
+@contextmanager
+def _as_value_error() -> Iterator[None]:
+    try:
+        yield
+    except _NotFiniteError as error:
+        raise ValueError(str(error)) from None
 
 
 @contextmanager

@@ -44,8 +44,12 @@ class StackedMLP(nn.Module):
             bound = width**-0.5
             self.weights.append(nn.init.uniform_(th.empty(self.n_groups, next_width, width), -bound, bound))
             self.biases.append(nn.init.uniform_(th.empty(self.n_groups, next_width, 1), -bound, bound))
-        # A ParameterList is slow to index, which shows where an environment asks for one action at a time
-        self.layers = list(zip(self.weights, self.biases, strict=True))
+
+    def layers(self) -> list[tuple[th.Tensor, th.Tensor]]:
+        """:return: weights (n_groups, out, in) and biases (n_groups, out, 1) of each layer"""
+        # Where nn.Module itself looks them up: indexing a ParameterList is so slow that acting shows it
+        weights, biases = (self._modules[name]._parameters for name in ("weights", "biases"))  # type: ignore[union-attr]
+        return list(zip(weights.values(), biases.values(), strict=True))
 
     def of_networks(self, parameter: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
         """
@@ -59,24 +63,17 @@ class StackedMLP(nn.Module):
             return parameter
         return parameter.expand(self.n_networks, -1, -1) if self.n_groups == 1 else parameter[self.groups]
 
-    def layer(self, index: int, networks: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+    def after_first(
+        self, x: th.Tensor, layers: Sequence[tuple[th.Tensor, th.Tensor]], networks: th.Tensor | None = None
+    ) -> th.Tensor:
         """
-        :param index: which layer
+        :param x: the first layer's outputs before its activation, (n_networks, width, batch); not valid afterwards
+        :param layers: all layers, see ``layers``
         :param networks: which networks, None for all
-        :return: weights (n_networks, out, in) and biases (n_networks, out, 1)
+        :return: outputs, (n_networks, out_features, batch)
         """
-        weight, bias = self.layers[index]
-        return self.of_networks(weight, networks), self.of_networks(bias, networks)
-
-    def after_first(self, x: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
-        """
-        :param x: what the first layer gives before its activation, (n_networks, width, batch); not valid afterwards
-        :param networks: which networks, None for all
-        :return: what the networks give, (n_networks, out_features, batch)
-        """
-        for index in range(1, len(self.layers)):
-            weight, bias = self.layer(index, networks)
-            x = th.baddbmm(bias, weight, self.activation(x))
+        for weight, bias in layers[1:]:
+            x = th.baddbmm(self.of_networks(bias, networks), self.of_networks(weight, networks), self.activation(x))
         return x
 
     def forward(self, x: th.Tensor) -> th.Tensor:
@@ -84,8 +81,9 @@ class StackedMLP(nn.Module):
         :param x: (n_networks, in_features, batch)
         :return: (n_networks, out_features, batch)
         """
-        weight, bias = self.layer(0)
-        return self.after_first(th.baddbmm(bias, weight, x))
+        layers = self.layers()
+        weight, bias = layers[0]
+        return self.after_first(th.baddbmm(self.of_networks(bias), self.of_networks(weight), x), layers)
 
     def single(self, network: int, n_inputs: int) -> nn.Sequential:
         """
@@ -96,7 +94,7 @@ class StackedMLP(nn.Module):
         """
         modules: list[nn.Module] = []
         group = int(self.groups[network])
-        for index, (weights, biases) in enumerate(self.layers):
+        for index, (weights, biases) in enumerate(self.layers()):
             weight = weights[group] if index else weights[group, :, :n_inputs]
             linear = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0], device=weight.device)
             with th.no_grad():
@@ -114,16 +112,18 @@ class StackedMLP(nn.Module):
         gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
         norm = th.stack([gradient.square().sum(dim=(1, 2)) for gradient in gradients]).sum(dim=0).sqrt()
         scale = (max_norm / (norm + 1e-6)).clamp(max=1.0).view(-1, 1, 1)
-        th._foreach_mul_(gradients, [scale] * len(gradients))
+        for gradient in gradients:
+            gradient.mul_(scale)
 
 
 @th.no_grad()
 def polyak_update(parameters: Iterable[th.Tensor], targets: Iterable[th.Tensor], tau: float) -> None:
     """
-    SB3's ``polyak_update`` in one call for all parameters.
+    SB3's ``polyak_update`` with one operation, not two, for each parameter.
 
     :param parameters: of the network
-    :param targets: of its target, which move
-    :param tau: how far
+    :param targets: of its target network, updated in place
+    :param tau: the soft update coefficient, 1 copies the parameters
     """
-    th._foreach_lerp_(list(targets), list(parameters), tau)
+    for parameter, target in zip(parameters, targets, strict=True):
+        target.lerp_(parameter, tau)

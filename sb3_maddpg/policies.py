@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, ClassVar
 
@@ -14,20 +14,22 @@ from stable_baselines3.common.torch_layers import get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.actions import TeamActions, check_bounds
 from sb3_maddpg.networks import StackedMLP
 from sb3_maddpg.team import MixedActions, Team
+from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
 
 Sharing = bool | Sequence[Sequence[str | int]]
 
 
 def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
     """
-    :param share: True: all agents share one network, False: each has its own, or lists of agents that share one
+    :param share: True: all agents share one network (parameter sharing), False: each has its own, or lists of agents
+        that share one
     :param team: whose agents
     :param argument: name of the argument, for the error's message
     :return: for each agent the number of its network
-    :raises ValueError: an agent in two lists, or unlike agents in one
+    :raises ValueError: an agent in two lists, or heterogeneous agents in one
     """
     if isinstance(share, bool):
         lists = [list(range(team.n_agents))] if share else []
@@ -38,11 +40,10 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
         raise ValueError(f"{argument}={share} names an agent twice: an agent has one network.")
     for first, *others in filter(None, lists):
         for other in others:
-            same_obs = team.obs_dims[first] == team.obs_dims[other]
-            if not same_obs or team.action_spaces[first] != team.action_spaces[other]:
+            if not team.homogeneous(first, other):
                 raise ValueError(
-                    f"{argument}={share}: {team.names[first]} and {team.names[other]} have unlike spaces and cannot "
-                    "share a network. Give lists of agents that are alike, or False."
+                    f"{argument}={share}: {team.names[first]} and {team.names[other]} have different spaces and "
+                    "cannot share a network. Give lists of homogeneous agents, or False."
                 )
     lists += [[agent] for agent in range(team.n_agents) if agent not in named]
     groups = [0] * team.n_agents
@@ -88,7 +89,7 @@ class Actor(nn.Module):
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
         :param obs: (batch, n_agents, obs_dim or more)
-        :return: scores, continuous actions or probabilities, (batch, n_agents, width)
+        :return: probabilities or continuous actions, (batch, n_agents, width)
         """
         return self.actions.squash(self.logits(obs))
 
@@ -96,12 +97,12 @@ class Actor(nn.Module):
         """
         :param obs: (batch, n_agents, obs_dim or more)
         :param deterministic: without exploration, see ``TeamActions``
-        :return: actions as critics read them, (batch, n_agents, width)
+        :return: encoded actions, (batch, n_agents, width)
         """
         return self.actions.act(self.logits(obs), deterministic)
 
 
-class TeamActor(Actor):
+class MLPActor(Actor):
     """
     One multi-layer perceptron per agent.
 
@@ -136,52 +137,49 @@ class TeamActor(Actor):
 
 class Critic(nn.Module):
     """
-    Centralised critics, which read all observations and all actions. An agent's value may be a sum of parts, and its
-    action may be made of units whose gradient is estimated unit by unit; in the plain case each agent is one of both.
+    Centralised critics (centralised training, decentralised execution): they read all observations and all actions.
 
-    :param units: how units act
-    :param units_per_agent: number of units of an agent's action
-    :param parts_per_agent: number of parts of an agent's value
-    :param part_credit: each part is fitted to rewards of its own, otherwise their sum to the agent's reward
+    Credit assignment: an agent may have several value heads, each fitted to rewards of its own, and its action may be
+    made of several factors, whose policy gradients are estimated independently. Heads and factors lie agent after
+    agent, the same number for each; in the plain case each agent has one of both.
+
+    :param factors: how the factors of the joint action act
+    :param n_agents: number of agents
+    :param values_per_agent: number of value heads of an agent
     :param n_critics: number of critics (two for MATD3)
     """
 
     optimizer: th.optim.Optimizer
+    agent_of_value: th.Tensor
 
-    def __init__(
-        self,
-        units: TeamActions,
-        units_per_agent: int = 1,
-        parts_per_agent: int = 1,
-        part_credit: bool = False,
-        n_critics: int = 1,
-    ):
+    def __init__(self, factors: TeamActions, n_agents: int, values_per_agent: int = 1, n_critics: int = 1):
         super().__init__()
-        self.units = units
-        self.units_per_agent = units_per_agent
-        self.parts_per_agent = parts_per_agent
-        self.part_credit = part_credit
+        self.factors = factors
+        self.n_agents = n_agents
         self.n_critics = n_critics
+        self.register_buffer(
+            "agent_of_value", th.arange(n_agents).repeat_interleave(values_per_agent), persistent=False
+        )
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         :param obs: (batch, n_agents, obs_dim or more)
         :param actions: (batch, n_agents, width)
-        :return: the parts of the values, agent after agent, (n_critics, batch, n_agents * parts_per_agent)
+        :return: Q-values, (n_critics, batch, n_values)
         """
         raise NotImplementedError
 
     def forward_alternatives(
-        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, units: th.Tensor | None = None
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
     ) -> th.Tensor:
         """
-        The first critic's value with a unit's action replaced and everything else kept.
+        The first critic's Q-value with one factor's action replaced and everything else kept.
 
         :param obs: (batch, n_agents, obs_dim or more)
-        :param actions: (batch, n_agents, width); the unit's own part is not read
-        :param own: alternatives for the unit's action, (batch, len(units), M, the units' width)
-        :param units: which units, None for all
-        :return: (batch, len(units), M)
+        :param actions: (batch, n_agents, width); the factor's own part is not read
+        :param own: alternatives for the factor's action, (batch, len(factors), M, the factors' width)
+        :param factors: which factors, None for all
+        :return: (batch, len(factors), M)
         """
         raise NotImplementedError
 
@@ -191,49 +189,44 @@ class Critic(nn.Module):
         """
         raise NotImplementedError
 
-    def to_units(self, actions: th.Tensor) -> th.Tensor:
+    def factored(self, actions: th.Tensor) -> th.Tensor:
         """
-        :param actions: actions or outputs of agents, (batch, n_agents, width)
-        :return: those of units, (batch, n_units, the units' width)
+        :param actions: actions or logits of agents, (batch, n_agents, width)
+        :return: those of factors, (batch, n_factors, the factors' width)
         """
-        return actions if self.units_per_agent == 1 else actions.reshape(len(actions), -1, self.units.width)
+        return actions.reshape(len(actions), -1, self.factors.width)
 
-    def credited(self, parts: th.Tensor) -> th.Tensor:
+    def per_value(self, of_agents: th.Tensor) -> th.Tensor:
         """
-        :param parts: (..., n_agents * parts_per_agent)
-        :return: what has rewards of its own: the parts, or their sums, (..., n_credited)
+        :param of_agents: (batch, n_agents)
+        :return: broadcast to the agents' value heads, (batch, n_values)
         """
-        return parts if self.part_credit else by_agent(parts, self.parts_per_agent)
+        one_each = len(self.agent_of_value) == self.n_agents
+        return of_agents if one_each else of_agents[..., self.agent_of_value]
 
-    def spread(self, of_agents: th.Tensor) -> th.Tensor:
+    def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
         """
-        :param of_agents: something every agent has, (batch, n_agents)
-        :return: the same for what has rewards of its own, (batch, n_credited)
+        :param values: of value heads or of factors, (..., n)
+        :return: their sums over each agent's, (..., n_agents)
         """
-        return of_agents.repeat_interleave(self.parts_per_agent, dim=-1) if self.part_credit else of_agents
+        # The same number for each agent: a reshape does what index_add would
+        one_each = values.shape[-1] == self.n_agents
+        return values if one_each else values.unflatten(-1, (self.n_agents, -1)).sum(dim=-1)
 
-    def cost(self, actions: th.Tensor, action_cost: th.Tensor) -> th.Tensor:
+    def known_cost(self, actions: th.Tensor, action_cost: th.Tensor) -> th.Tensor:
         """
         :param actions: (batch, n_agents, width)
         :param action_cost: (n_agents, width)
-        :return: what the actions cost those who have rewards of their own, (batch, n_credited)
+        :return: what the actions cost, as each value head's rewards hold it, (batch, n_values)
         """
-        of_units = self.to_units(actions * action_cost).sum(dim=-1)
-        if not self.part_credit:
-            return by_agent(of_units, self.units_per_agent)
-        return of_units if self.units_per_agent > 1 else self.spread(of_units) / self.parts_per_agent
+        cost = self.factored(actions * action_cost).sum(dim=-1)
+        if cost.shape[-1] == len(self.agent_of_value):
+            return cost
+        values_per_agent = len(self.agent_of_value) // self.n_agents
+        return self.per_value(self.sum_by_agent(cost)) / values_per_agent
 
 
-def by_agent(parts: th.Tensor, per_agent: int) -> th.Tensor:
-    """
-    :param parts: agent after agent, (..., n_agents * per_agent)
-    :param per_agent: how many each agent has
-    :return: their sums, (..., n_agents)
-    """
-    return parts if per_agent == 1 else parts.unflatten(-1, (-1, per_agent)).sum(dim=-1)
-
-
-class TeamCritic(Critic):
+class MLPCritic(Critic):
     """
     One multi-layer perceptron per agent, Q_i(z_1..z_n, a_1..a_n), or Q_i(s, a_1..a_n) with a global state s. Critics
     that share parameters read the agents in another order each: the own agent first, then those it shares with, then
@@ -259,7 +252,7 @@ class TeamCritic(Critic):
         groups: Sequence[int] | None = None,
         n_critics: int = 1,
     ):
-        super().__init__(actions, n_critics=n_critics)
+        super().__init__(actions, team.n_agents, n_critics=n_critics)
         self.team = team
         n = team.n_agents
         groups = list(groups or range(n))
@@ -288,35 +281,39 @@ class TeamCritic(Critic):
             inputs.append(actions.new_ones(len(actions), 1))
         return th.cat(inputs, dim=1).T
 
-    def _first(self, inputs: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
-        """:return: what the first layer gives, (n_networks, width, batch)"""
-        weight, bias = self.net.layer(0, networks)
+    def _first(
+        self, inputs: th.Tensor, layer: tuple[th.Tensor, th.Tensor], networks: th.Tensor | None = None
+    ) -> th.Tensor:
+        """:return: the first layer's outputs, (n_networks, width, batch)"""
+        weight, bias = (self.net.of_networks(parameter, networks) for parameter in layer)
         if self.shared:  # reordering the few weights does what reordering the whole batch would
             columns = self.columns if networks is None else self.columns[networks]
             weight = weight.gather(2, columns.unsqueeze(1).expand(-1, weight.shape[1], -1))
         return th.baddbmm(bias, weight, inputs.expand(len(weight), -1, -1))
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        values = self.net.after_first(self._first(self._inputs(obs, actions)))
+        layers = self.net.layers()
+        values = self.net.after_first(self._first(self._inputs(obs, actions), layers[0]), layers)
         return values.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
 
     def clip_grad_norm_(self, max_norm: float) -> None:
         self.net.clip_grad_norm_(max_norm)
 
     def forward_alternatives(
-        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, units: th.Tensor | None = None
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
     ) -> th.Tensor:
         # The first layer is linear: it reads the wide joint input once, and every alternative adds its few columns
-        agents = th.arange(self.team.n_agents, device=own.device) if units is None else units
-        networks = None if units is None and self.n_critics == 1 else agents
-        first = self._first(self._inputs(obs, actions), networks)
-        weight = self.net.of_networks(self.net.weights[0], networks)
+        agents = th.arange(self.team.n_agents, device=own.device) if factors is None else factors
+        networks = None if factors is None and self.n_critics == 1 else agents
+        layers = self.net.layers()
+        first = self._first(self._inputs(obs, actions), layers[0], networks)
+        weight = self.net.of_networks(layers[0][0], networks)
         own_weight = weight.gather(2, self.own_columns[agents].unsqueeze(1).expand(-1, weight.shape[1], -1))
         # The batch comes last: what is added to every alternative then runs along memory
         change = (own - actions[:, agents].unsqueeze(2)).permute(1, 3, 2, 0)
         shape = change.shape[2:]
         change = th.bmm(own_weight, change.flatten(2)).unflatten(2, shape)
-        values = self.net.after_first(change.add_(first.unsqueeze(2)).flatten(2), networks)
+        values = self.net.after_first(change.add_(first.unsqueeze(2)).flatten(2), layers, networks)
         return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
 
 
@@ -340,10 +337,10 @@ class MADDPGPolicy(BasePolicy):
     :param lr_schedule: learning rate schedule (could be constant)
     :param net_arch: widths of the hidden layers, as a list or as ``dict(pi=[...], qf=[...])``
     :param activation_fn: between the layers
-    :param share_actor: True: one actor network for all agents, False: one for each; or lists of agents (names or
-        numbers) that share one
+    :param share_actor: parameter sharing; True: one actor network for all agents, False: one for each; or lists of
+        agents (names or numbers) that share one
     :param share_critic: the same for critics
-    :param threshold: delta in [0, 1): a bit is set where its score exceeds it. For ``MultiBinary`` alone.
+    :param threshold: delta in [0, 1): a binary action is 1 where its probability exceeds it. For ``MultiBinary`` alone.
     :param random_thresholds: share of the thresholds that are drawn to explore, the others are delta
     :param n_critics: number of critics of each agent
     :param agent_names: by default those of the observation space, or agent_0, agent_1, ...
@@ -387,19 +384,22 @@ class MADDPGPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             squash_output=isinstance(action_space, spaces.Box) and not isinstance(action_space, MixedActions),
         )
-        _check_threshold(threshold)
-        if not 0.0 < random_thresholds <= 1.0:
-            raise ValueError(f"random_thresholds={random_thresholds} is a share above 0: without it nothing is tried.")
-        if n_critics < 1:
-            raise ValueError(f"n_critics={n_critics}: an agent needs at least one.")
+        arguments = validated(
+            PolicyArguments,
+            net_arch=[64, 64] if net_arch is None else net_arch,
+            threshold=threshold,
+            random_thresholds=random_thresholds,
+            n_critics=n_critics,
+        )
         self.team = Team.from_spaces(observation_space, action_space, agent_names)
-        self.net_arch = [64, 64] if net_arch is None else net_arch
+        check_bounds(self.team)
+        self.net_arch = arguments["net_arch"]
         self.activation_fn = activation_fn
         self.share_actor = share_actor
         self.share_critic = share_critic
-        self.threshold = threshold
-        self.random_thresholds = random_thresholds
-        self.n_critics = n_critics
+        self.threshold = arguments["threshold"]
+        self.random_thresholds = arguments["random_thresholds"]
+        self.n_critics = arguments["n_critics"]
         self._build(lr_schedule)
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -419,8 +419,8 @@ class MADDPGPolicy(BasePolicy):
         actor_groups = sharing_groups(self.share_actor, self.team, "share_actor")
         critic_groups = sharing_groups(self.share_critic, self.team, "share_critic")
         return (
-            TeamActor(self.team, actions, actor_arch, self.activation_fn, actor_groups),
-            TeamCritic(self.team, actions, critic_arch, self.activation_fn, critic_groups, self.n_critics),
+            MLPActor(self.team, actions, actor_arch, self.activation_fn, actor_groups),
+            MLPCritic(self.team, actions, critic_arch, self.activation_fn, critic_groups, self.n_critics),
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -439,11 +439,28 @@ class MADDPGPolicy(BasePolicy):
             "optimizer_kwargs": self.optimizer_kwargs,
         }
 
+    def not_finite(self, parameters: Mapping[str, th.Tensor]) -> str | None:
+        """
+        :param parameters: of this policy by their names, see ``state_dict``
+        :return: which of them hold NaN or infinity, and of which agents, None if none does
+        """
+        for name, parameter in parameters.items():
+            finite = parameter.isfinite()
+            if not finite.all():
+                network = getattr(getattr(self, name.split(".")[0], None), "net", None)
+                agents: Iterable[int] = range(self.team.n_agents)
+                if isinstance(network, StackedMLP):
+                    groups = finite.flatten(1).all(dim=1)[network.groups.to(finite.device)].tolist()
+                    agents = sorted({index % self.team.n_agents for index, good in enumerate(groups) if not good})
+                names = ", ".join(self.team.names[agent] for agent in agents)
+                return f"parameter {name}, of agent(s) {names}, holds NaN or infinity"
+        return None
+
     def set_threshold(self, threshold: float) -> None:
         """
-        :param threshold: delta in [0, 1), for the bits of all agents from now on
+        :param threshold: delta in [0, 1), for the binary actions of all agents from now on
         """
-        _check_threshold(threshold)
+        threshold = validated(ThresholdArgument, threshold=threshold)["threshold"]
         self.threshold = threshold
         for actions in {self.actor.actions, self.actor_target.actions, self.actions}:
             actions.set_threshold(threshold)
@@ -472,7 +489,7 @@ class MADDPGPolicy(BasePolicy):
         """
         :param obs: (batch, n_agents, obs_dim or more)
         :param deterministic: without exploration
-        :return: joint actions as the replay buffer keeps them, (batch, length)
+        :return: buffer actions, (batch, length)
         """
         return self.actions.decode(self.actor.act(obs.float(), deterministic))
 
@@ -484,8 +501,3 @@ class MADDPGPolicy(BasePolicy):
         if isinstance(self.action_space, MixedActions):
             return th.as_tensor(self.actions.unscale(flat.cpu().numpy()))
         return flat.to(th.int8 if isinstance(self.action_space, spaces.MultiBinary) else th.int64)
-
-
-def _check_threshold(threshold: float) -> None:
-    if not 0.0 <= threshold < 1.0:
-        raise ValueError(f"threshold={threshold}: scores lie in [0, 1], choose 0 <= threshold < 1.")

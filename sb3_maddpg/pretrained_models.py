@@ -8,12 +8,9 @@ from pathlib import Path
 
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.maddpg import MADDPG, as_vec_env
 from sb3_maddpg.relational import PairPolicy
-from sb3_maddpg.utils import arguments_of, suggest
-
-# What a team of another size does not take over from the model
-OF_TEAM = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
+from sb3_maddpg.utils import suggest
 
 
 def pretrained_models() -> dict[str, Path]:
@@ -37,22 +34,15 @@ def pretrained(name: str, env: GymEnv | None = None, **kwargs) -> MADDPG:
         model was trained with
     :raises ValueError: no such model, or an environment that it does not fit
     """
-    path = pretrained_folder(name) / "model.zip"
-    model = MADDPG.load(path, device=kwargs.get("device", "auto"))
+    model = MADDPG.load(pretrained_folder(name) / "model.zip", **kwargs)
     if env is None:
-        return model if not kwargs else MADDPG.load(path, **kwargs)
-    wrapped = MADDPG._wrap_env(env)
-    same = (wrapped.observation_space, wrapped.action_space) == (model.observation_space, model.action_space)
-    if same or not isinstance(model.policy, PairPolicy):
-        return MADDPG.load(path, env=wrapped, **kwargs)
-    trained = {name: getattr(model, name) for name in arguments_of(MADDPG) - OF_TEAM if hasattr(model, name)}
-    own = {key: value for key, value in model.policy_kwargs.items() if key not in PairPolicy.env_attributes}
-    resized = MADDPG("PairPolicy", wrapped, policy_kwargs=own, **{**trained, **kwargs})
-    try:
-        resized.set_parameters(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{name} was trained with other observations than this environment gives: {error}") from error
-    return resized
+        return model
+    vec_env = as_vec_env(env)
+    same = (vec_env.observation_space, vec_env.action_space) == (model.observation_space, model.action_space)
+    if not same and isinstance(model.policy, PairPolicy):
+        return model.resized(vec_env, **kwargs)
+    model.set_env(vec_env)
+    return model
 
 
 def pretrained_folder(name: str) -> Path:

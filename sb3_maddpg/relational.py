@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from copy import copy
 from itertools import chain, pairwise
-from typing import Any, ClassVar, TypedDict
+from typing import Any, ClassVar, TypedDict, cast
 
 import torch as th
 from gymnasium import spaces
@@ -15,6 +16,7 @@ from torch.nn import functional as F
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.team import AgentActionSpace, Team
+from sb3_maddpg.validation import PairPolicyArguments, validated
 
 
 class ObservationLayout(TypedDict, total=False):
@@ -72,26 +74,30 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
     return who
 
 
-class Views(nn.Module):
+class NeighbourViews(nn.Module):
     """
     An observation as an agent's own part and its views of its neighbours.
 
     :param layout: see ``ObservationLayout``
-    :param team: a team of equal agents
+    :param team: a team of homogeneous agents
     :param of_critic: with the columns that only critics read
     :raises ValueError: a layout that does not fit the team
     """
 
-    who: th.Tensor
-    back: th.Tensor
+    neighbour_indices: th.Tensor
+    reverse_indices: th.Tensor
     n_neighbours: int
     own_dim: int
     neighbour_dim: int
 
     def __init__(self, layout: ObservationLayout, team: Team, of_critic: bool = False):
         super().__init__()
-        if len(set(team.obs_dims)) > 1 or len(set(map(str, team.action_spaces))) > 1:
-            raise ValueError("PairPolicy is for teams of equal agents, and these have unlike spaces: use MlpPolicy.")
+        for agent in range(1, team.n_agents):
+            if not team.homogeneous(0, agent):
+                raise ValueError(
+                    f"PairPolicy is for teams of homogeneous agents, and {team.names[0]} and {team.names[agent]} have "
+                    "different spaces: use MlpPolicy."
+                )
         who = _check_layout(layout, team)
         self.n_neighbours = len(layout["neighbours"])
         neighbours = [list(columns) for columns in layout["neighbours"]]
@@ -102,7 +108,7 @@ class Views(nn.Module):
         self.own = _Columns([list(layout["own"])])
         self.neighbours = _Columns(neighbours)
         back = [[who[j].index(i) if i in who[j] else -1 for j in row] for i, row in enumerate(who)]
-        for name, table in (("who", who), ("back", back)):
+        for name, table in (("neighbour_indices", who), ("reverse_indices", back)):
             self.register_buffer(name, th.tensor(table, dtype=th.long), persistent=False)
 
     def forward(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
@@ -212,7 +218,7 @@ class PairNet(nn.Module):
         """
         return self.of_extras[index](x)
 
-    def decode(self, hidden: th.Tensor) -> th.Tensor:
+    def head(self, hidden: th.Tensor) -> th.Tensor:
         """
         :param hidden: before the activation, (..., width)
         :return: (..., out_features)
@@ -237,7 +243,7 @@ class PairActor(Actor):
 
     def __init__(
         self,
-        views: Views,
+        views: NeighbourViews,
         actions: TeamActions,
         on_neighbours: bool,
         net_arch: Sequence[int],
@@ -254,8 +260,8 @@ class PairActor(Actor):
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
         hidden, pool = self.net.encode(th.cat([each, neighbours], dim=-1), present)
         if self.on_neighbours:
-            return self.net.decode(hidden.add_(self.net.extra(0, own).unsqueeze(-2))).flatten(-2)
-        return self.net.decode(self.net.of_pool(pool) + self.net.extra(0, own) + self.net.of_pair.bias)
+            return self.net.head(hidden.add_(self.net.extra(0, own).unsqueeze(-2))).flatten(-2)
+        return self.net.head(self.net.of_pool(pool) + self.net.extra(0, own) + self.net.of_pair.bias)
 
     def single(self, agent: int) -> nn.Module:
         alone = copy(self)
@@ -281,83 +287,94 @@ class PairCritic(Critic):
     """
     An agent's value as a sum over its pairs, Q_i = sum_j Q_ij. Q_ij reads i's own part, i's view of j, j's own part,
     the pool of i's neighbourhood, and the two agents' actions towards each other (or their whole actions). With
-    ``part_credit`` each Q_ij is fitted to the rewards that belong to the pair, ``info["pair_rewards"]``.
+    ``pair_credit`` each Q_ij is a value head, fitted to the rewards of the pair, ``info["pair_rewards"]``.
 
     :param views: the layout of observations
-    :param units: how units act: pairs, or agents where they do not act on neighbours
-    :param width: numbers in an agent's action
+    :param factors: how the factors of the joint action act: pairs, or agents where they do not act on neighbours
     :param on_neighbours: the action falls into parts, one for each neighbour
     :param net_arch: widths of the hidden layers
     :param activation_fn: between the layers
-    :param part_credit: pairs have rewards of their own
+    :param pair_credit: pairs have rewards of their own
     :param n_critics: number of critics
     """
 
     def __init__(
         self,
-        views: Views,
-        units: TeamActions,
+        views: NeighbourViews,
+        factors: TeamActions,
         on_neighbours: bool,
         net_arch: Sequence[int],
         activation_fn: type[nn.Module],
-        part_credit: bool = False,
+        pair_credit: bool = False,
         n_critics: int = 1,
     ):
-        m = views.n_neighbours
-        super().__init__(units, m if on_neighbours else 1, m, part_credit, n_critics)
+        super().__init__(factors, len(views.neighbour_indices), views.n_neighbours if pair_credit else 1, n_critics)
+        self.pair_credit = pair_credit
         self.views = views
         self.on_neighbours = on_neighbours
         features = 2 * views.own_dim + views.neighbour_dim
-        self.nets = [PairNet(features, [units.width] * 2, 1, net_arch, activation_fn) for _ in range(n_critics)]
-        self.modules_of_nets = nn.ModuleList(self.nets)
+        nets = (PairNet(features, [factors.width] * 2, 1, net_arch, activation_fn) for _ in range(n_critics))
+        # Saved models know the networks by this name
+        self.modules_of_nets = cast("Sequence[PairNet]", nn.ModuleList(nets))
 
     def _pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param actions: (batch, n_agents, width)
-        :return: i's action towards j and j's towards i, both (batch, n_agents, n_neighbours, the units' width)
+        :return: i's action towards j and j's towards i, both (batch, n_agents, n_neighbours, the factors' width)
         """
-        who = self.views.who
+        who = self.views.neighbour_indices
         if not self.on_neighbours:
             return actions.unsqueeze(2).expand(-1, -1, self.views.n_neighbours, -1), actions[:, who]
         parts = actions.unflatten(-1, (self.views.n_neighbours, -1))
         # Where j does not see i it does nothing to it
-        return parts, parts[:, who, self.views.back.clamp(min=0)] * (self.views.back >= 0).unsqueeze(-1)
+        return parts, parts[:, who, self.views.reverse_indices.clamp(min=0)] * (
+            self.views.reverse_indices >= 0
+        ).unsqueeze(-1)
 
     def _hidden(self, net: PairNet, obs: th.Tensor, theirs: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
         """:return: the second network's first layer without i's own action, and which neighbours are present"""
         own, neighbours, present = self.views(obs)
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
-        hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.who]], dim=-1), present)
+        hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.neighbour_indices]], dim=-1), present)
         return hidden.add_(net.extra(1, theirs)), 1.0 if present is None else present
 
-    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def of_pairs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (batch, n_agents, obs_dim or more)
+        :param actions: (batch, n_agents, width)
+        :return: Q_ij, (n_critics, batch, n_agents * n_neighbours)
+        """
         mine, theirs = self._pairs(actions)
-        values = []
-        for net in self.nets:
+        q_values = []
+        for net in self.modules_of_nets:
             hidden, present = self._hidden(net, obs, theirs)
-            values.append((net.decode(hidden.add_(net.extra(0, mine))) * present).flatten(1))
-        return th.stack(values)
+            q_values.append((net.head(hidden.add_(net.extra(0, mine))) * present).flatten(1))
+        return th.stack(q_values)
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        of_pairs = self.of_pairs(obs, actions)
+        return of_pairs if self.pair_credit else self.sum_by_agent(of_pairs)
 
     def forward_alternatives(
-        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, units: th.Tensor | None = None
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
     ) -> th.Tensor:
-        assert units is None, "equal agents have one kind of action"
-        net = self.nets[0]
+        assert factors is None, "homogeneous agents have one kind of action"
+        net = self.modules_of_nets[0]
         hidden, present = self._hidden(net, obs, self._pairs(actions)[1])
         own = own.unflatten(1, hidden.shape[1:3]) if self.on_neighbours else own.unsqueeze(2)
         mine = net.extra(0, own)
-        values = net.decode(hidden.unsqueeze(3) + mine).squeeze(-1) * present
+        values = net.head(hidden.unsqueeze(3) + mine).squeeze(-1) * present
         return values.flatten(1, 2) if self.on_neighbours else values.sum(dim=2)
 
     def clip_grad_norm_(self, max_norm: float) -> None:
-        for net in self.nets:
+        for net in self.modules_of_nets:
             nn.utils.clip_grad_norm_(net.parameters(), max_norm)
 
 
 class PairPolicy(MADDPGPolicy):
     """
-    Policy for teams of equal agents that see each other: one relational actor and one relational critic for all. The
-    same parameters fit a team of any size: ``MADDPG("PairPolicy", larger_env).set_parameters("small_team.zip")``.
+    Policy for teams of homogeneous agents that see each other: one relational actor and one relational critic for all.
+    The same parameters fit a team of any size: ``MADDPG("PairPolicy", larger_env).set_parameters("small_team.zip")``.
 
     :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
     :param action_space: flat joint action, see ``Team.from_spaces``
@@ -396,9 +413,10 @@ class PairPolicy(MADDPGPolicy):
                 "`observation_layout` (see sb3_maddpg.relational.ObservationLayout), or policy_kwargs one; or use "
                 "MlpPolicy."
             )
+        own = validated(PairPolicyArguments, pair_credit=pair_credit, shared_threshold=shared_threshold)
         self.observation_layout = observation_layout
-        self.pair_credit = pair_credit
-        self.shared_threshold = shared_threshold
+        self.pair_credit = own["pair_credit"]
+        self.shared_threshold = own["shared_threshold"]
         super().__init__(
             observation_space,
             action_space,
@@ -420,20 +438,44 @@ class PairPolicy(MADDPGPolicy):
         layout = self.observation_layout
         on_neighbours = layout.get("acts_on_neighbours", False)
         action_spaces = self.team.action_spaces
-        views, of_critic = Views(layout, self.team), Views(layout, self.team, of_critic=True)
+        views, of_critic = NeighbourViews(layout, self.team), NeighbourViews(layout, self.team, of_critic=True)
         apart = on_neighbours and not self.shared_threshold
         n_thresholds = views.n_neighbours if apart else 1
         actions = TeamActions(action_spaces, self.threshold, n_thresholds, self.random_thresholds)
-        units = actions
+        factors = actions
         if on_neighbours:
             parts = [part for space in action_spaces for part in _split(space, views.n_neighbours)]
-            units = TeamActions(parts, self.threshold)
+            factors = TeamActions(parts, self.threshold)
         return (
             PairActor(views, actions, on_neighbours, actor_arch, self.activation_fn),
             PairCritic(
-                of_critic, units, on_neighbours, critic_arch, self.activation_fn, self.pair_credit, self.n_critics
+                of_critic, factors, on_neighbours, critic_arch, self.activation_fn, self.pair_credit, self.n_critics
             ),
         )
+
+    def resized(
+        self, observation_space: spaces.Space, action_space: spaces.Space, observation_layout: ObservationLayout
+    ) -> PairPolicy:
+        """
+        The same policy for a team of another size, which can act at once.
+
+        :param observation_space: of that team
+        :param action_space: of that team
+        :param observation_layout: of that team
+        :raises ValueError: agents observe something else
+        """
+        arguments = self._get_constructor_parameters()
+        del arguments["agent_names"]
+        arguments |= {
+            "observation_space": observation_space,
+            "action_space": action_space,
+            "observation_layout": observation_layout,
+        }
+        resized = type(self)(**arguments).to(self.device)
+        with remedy_for_other_observations():
+            resized.load_state_dict(self.state_dict())
+        resized.set_training_mode(False)
+        return resized
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         parameters = super()._get_constructor_parameters()
@@ -445,6 +487,18 @@ class PairPolicy(MADDPGPolicy):
             "pair_credit": self.pair_credit,
             "shared_threshold": self.shared_threshold,
         }
+
+
+@contextmanager
+def remedy_for_other_observations() -> Iterator[None]:
+    """Say what is wrong where PyTorch says that the shapes of parameters differ."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise ValueError(
+            "The model was trained with other observations or networks than this team has: make the environment with "
+            f"the arguments in the model's `env_spec`, but for the number of agents. {error}"
+        ) from error
 
 
 def _split(space: AgentActionSpace, n_parts: int) -> list[AgentActionSpace]:

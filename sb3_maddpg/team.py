@@ -251,6 +251,15 @@ class Team:
             f"There is no agent {agent!r}: the agents are {', '.join(self.names)}, or 0 to {self.n_agents - 1}."
         )
 
+    def homogeneous(self, agent: int, other: int) -> bool:
+        """
+        :param agent: number of an agent
+        :param other: number of another
+        :return: whether they observe and act in the same spaces, so that they could share a network
+        """
+        same_obs = self.obs_dims[agent] == self.obs_dims[other]
+        return same_obs and self.action_spaces[agent] == self.action_spaces[other]
+
     @classmethod
     def from_spaces(
         cls, observation_space: spaces.Space, action_space: spaces.Space, names: Sequence[str] | None = None

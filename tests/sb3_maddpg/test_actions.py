@@ -1,5 +1,6 @@
 """The joint action: encoding, what outputs mean, and whether exploration reaches the environment."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch as th
@@ -9,8 +10,9 @@ from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.actions import ActionKind, TeamActions
 from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.team import MixedActions, heads_of, joint_action_space
 from toys import AGENT_SPACES, SMALL, Toy
 
@@ -247,3 +249,42 @@ def test_warm_up_is_uniform():
             assert frequencies == pytest.approx(np.full(size, 1 / size), abs=0.05)
         else:
             assert np.quantile(column, [0, 0.25, 0.5, 0.75, 1]) == pytest.approx([-1, -0.5, 0, 0.5, 1], abs=0.08)
+
+
+def test_kinds_of_actions_are_submodules():
+    """So that one can be replaced, and no other list keeps the old one."""
+    actions = TeamActions(AGENT_SPACES["mixed"])
+    assert [child for _, child in actions.named_children()] == [actions.kinds]
+    assert list(actions.kinds) == [module for module in actions.modules() if isinstance(module, ActionKind)]
+
+
+@pytest.mark.parametrize("kind", [spaces.Box, MixedActions])
+def test_a_number_without_a_range_is_left_as_it_is(kind):
+    low, high = np.float32([0, 2, -1, 2]), np.float32([1, 2, 1, 2])
+    space = spaces.Box(low, high)
+    if kind is MixedActions:
+        space = MixedActions([spaces.Box(low[:2], high[:2]), spaces.Box(low[2:], high[2:])])
+
+    class Fixed(gymnasium.Env):
+        observation_space, action_space = spaces.Box(-1, 1, (2, 3)), space
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            assert (action[[1, 3]] == 2).all()
+            return self.observation_space.sample(), float(action[0]), False, False, {}
+
+    model = MADDPG("MlpPolicy", Fixed(), **SMALL).learn(60)
+    assert np.isfinite(model.policy.parameters_to_vector()).all()
+    obs = Fixed.observation_space.sample()
+    action, _ = model.predict(obs, deterministic=True)
+    assert (action[[1, 3]] == 2).all()
+    assert model.agent_policy(0).predict(obs[0])[1] == 2
+
+
+def test_a_range_that_is_not_finite_is_refused():
+    team = MixedActions([spaces.Box(-1, 1, (1,)), spaces.Box(np.float32([-3e38]), np.float32([3e38]))])
+    with pytest.raises(ValueError, match=r"actions of agent_1 lie between \[-3.*narrower bounds"):
+        MADDPGPolicy(spaces.Box(-1, 1, (2, 3)), team, lambda _: 1e-3)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from sb3_maddpg import MADDPG
@@ -161,3 +162,22 @@ def test_an_observation_that_does_not_fit_is_refused(observation, message):
     policy = MODELS["bits"]().agent_policy("bits_2")
     with pytest.raises(ValueError, match=message):
         policy.predict(observation)
+
+
+def test_a_policy_that_is_not_finite_is_not_exported(tmp_path):
+    model = MODELS["bits"]()
+    agent = model.agent_policy("bits_1")
+    exports = {agent.network: lambda: agent.export(tmp_path / "a.pt"), model.actor: lambda: model.agent_policy(0)}
+    for policy, export in exports.items():
+        with th.no_grad():
+            next(policy.parameters()).fill_(float("nan"))
+        with pytest.raises(ValueError, match=r"holds NaN or infinity"):
+            export()
+    assert not list(tmp_path.iterdir())
+
+
+def test_warns_where_an_agent_would_miss_the_statistics_of_observations():
+    env = VecNormalize(DummyVecEnv([lambda: TeamEnv(Toy("bits"))]))
+    model = MADDPG("MlpPolicy", env, **SMALL)
+    with pytest.warns(UserWarning, match="normalised by VecNormalize.*no part of the agent's policy"):
+        model.agent_policy(0)

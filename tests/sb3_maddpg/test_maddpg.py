@@ -1,6 +1,7 @@
 """The algorithm: one update against a plain reference, who learns from what, logs, repeatability, bad input."""
 
 import copy
+import re
 
 import gymnasium
 import numpy as np
@@ -124,14 +125,14 @@ def logged(env, steps: int) -> list[dict]:
 
 def test_logs_what_a_user_wants_to_see():
     last = logged("OwnBit-v0", 60)[-1]
-    train = {"actor_loss", "critic_loss", "n_updates", "learning_rate", "score_mean", "score_std"}
-    train |= {f"q_value_{agent}" for agent in range(3)}
+    train = {"actor_loss", "critic_loss", "n_updates", "learning_rate", "probability_mean", "probability_std"}
+    train |= {f"q_value/agent_{agent}" for agent in range(3)}
     assert {f"train/{name}" for name in train} | {"rollout/ep_rew_mean", "task/mean_action"} <= last.keys()
-    assert 0.0 <= last["train/score_mean"] <= 1.0
+    assert 0.0 <= last["train/probability_mean"] <= 1.0
     assert last["train/learning_rate"] == 1e-2
     assert "train/exploration_noise" not in last
     last = logged("FollowTarget-v0", 60)[-1]
-    assert "train/score_mean" not in last
+    assert "train/probability_mean" not in last
     assert last["train/exploration_noise"] == 0.1
 
 
@@ -173,15 +174,15 @@ def test_tasks_are_proper_environments():
     ("kwargs", "message"),
     [
         ({"estimator": "expectd"}, "Unknown estimator 'expectd': did you mean 'expected'"),
-        ({"action_noise": NormalActionNoise(np.zeros(9), np.ones(9))}, "Leave it out: bits explore"),
+        ({"action_noise": NormalActionNoise(np.zeros(9), np.ones(9))}, "Leave it out: binary actions explore"),
         ({"max_grad_norm": 0.0}, "max_grad_norm=0.0 must be positive"),
         ({"policy_kwargs": {"threshold": 1.5}}, "threshold=1.5"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),
         ({"policy_kwargs": {"agent_names": ["a", "b"]}}, "2 names, a, b, for 3 agents"),
-        ({"exploration_noise": -0.1}, r"exploration_noise=-0\.1 is a standard deviation"),
+        ({"exploration_noise": -0.1}, r"exploration_noise=-0\.1 must be a standard deviation"),
         ({"exploration_noise": (0.1, 0.2, 0.3)}, "or two of them"),
         ({"temperature": 0.0}, r"temperature=0\.0 must be positive"),
-        ({"n_steps": 0}, "n_steps=0 .* must be at least 1"),
+        ({"n_steps": 0}, "n_steps=0 must be a number of steps of at least 1"),
         ({"tau": "fast"}, "tau='fast' must be a number between 0 and 1"),
         ({"gamma": 1.5}, "gamma=1.5 must be a number between 0 and 1"),
         ({"policy_delay": 0}, "policy_delay=0 must be at least 1"),
@@ -231,3 +232,102 @@ def test_stacked_frames_are_refused():
     env = VecFrameStack(DummyVecEnv([OwnBit]), 2)
     with pytest.raises(ValueError, match=r"supersuit\.frame_stack_v2"):
         MADDPG("MlpPolicy", env)
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("learning_rate", INF), ("learning_rate", 0), ("buffer_size", -5), ("batch_size", 0), ("gradient_steps", -5),
+        ("policy_delay", 1.5), ("n_steps", 2.5), ("tau", 0), ("gamma", NAN), ("policy_regularization", NAN),
+        ("max_grad_norm", NAN), ("temperature", NAN), ("exploration_noise", (0.1, NAN)), ("train_freq", 0),
+        ("threshold_price", (1e-300, 1.0)), ("threshold_price", (1.0, INF)), ("threshold_price", (1.0, 1.0)),
+        ("action_noise", 0.1), ("learning_starts", -1),
+    ],
+)  # fmt: skip
+def test_a_value_out_of_range_is_refused_in_one_line(name, value):
+    with pytest.raises(ValueError, match=rf"^{name}={re.escape(repr(value))} must be .*\.$") as refused:
+        MADDPG("MlpPolicy", "OwnBit-v0", **{name: value})
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"buffer_size": 100, "batch_size": 101}, r"batch_size=101 is larger than buffer_size=100.*Lower the one"),
+        ({"buffer_size": 100, "batch_size": 10, "n_steps": 101}, "n_steps=101 is more than buffer_size=100 keeps"),
+        ({"policy_kwargs": {"net_arhc": [8]}}, "Unknown argument in policy_kwargs 'net_arhc': did you mean 'net_arch'"),
+        ({"policy_kwargs": {"net_arch": [0]}}, r"net_arch=\[0\] must be a list of widths"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8]}}}, r"net_arch=.* must be a list of widths"),
+        ({"policy_kwargs": {"random_thresholds": NAN}}, "random_thresholds=nan must be a share above 0"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        MADDPG("MlpPolicy", "OwnBit-v0", **kwargs)
+
+
+def test_numbers_of_numpy_are_numbers():
+    numbers = {"exploration_noise": np.float32(0.25), "batch_size": np.int64(16), "gamma": np.float32(0.5)}
+    model = learned(TeamEnv(Toy("numbers")), 60, **numbers)
+    assert (model.noise_std, model.batch_size, model.gamma) == (0.25, 16, 0.5)
+    assert learned(TeamEnv(Toy("numbers")), 60, exploration_noise=np.array([0.5, 0.5])).noise_std == 0.5
+
+
+@pytest.mark.parametrize("price", [(1e-12, 1e12), (1e-12, 1e-11), (1.0, 1.00001)])
+def test_extreme_prices_stay_finite(price):
+    assert np.isfinite(parameters(learned(steps=60, threshold_price=price))).all()
+
+
+@pytest.mark.parametrize("clip", [None, 0.5])
+def test_a_training_that_diverges_stops_and_says_whose(clip):
+    class Exploding(OwnBit):
+        def step(self, action):
+            *rest, info = super().step(action)
+            return *rest, {**info, "agent_rewards": np.float32([1e25 if self._steps == 5 else 0, 0, 0])}
+
+    message = (
+        r"diverged at step \d+ \(update \d+\): the loss of the critic of agent_0 is inf\. Lower learning_rate=0.01"
+    )
+    with pytest.raises(ValueError, match=message):
+        learned(Exploding(), max_grad_norm=clip)
+
+
+def test_parameters_that_are_not_finite_stop_the_training():
+    model = learned(steps=60)
+    with th.no_grad():
+        model.actor.net.biases[0][1] = NAN
+    model.policy_delay = 10**9  # so that no loss shows it
+    model._target_actions = lambda next_obs: th.zeros(len(next_obs), 3, 3)
+    message = r"diverged at step 60 .*: parameter actor\.net\.biases\.0, of agent\(s\) agent_1, holds NaN"
+    with pytest.raises(ValueError, match=message):
+        model.train(1, batch_size=16)
+
+
+def test_absent_neighbours_and_normalised_observations_exclude_each_other():
+    env = VecNormalize(DummyVecEnv([Neighbours]))
+    with pytest.raises(ValueError, match=r"VecNormalize\(norm_obs=True\) moves the zeros .* Set norm_obs=False"):
+        MADDPG("PairPolicy", env, **SMALL)
+    model = MADDPG("PairPolicy", VecNormalize(DummyVecEnv([Neighbours]), norm_obs=False), **SMALL)
+    before = model.get_env()
+    with pytest.raises(ValueError, match="moves the zeros"):
+        model.set_env(env)
+    assert model.get_env() is before
+    env = Neighbours()
+    env.observation_layout["complete"] = True
+    MADDPG("PairPolicy", VecNormalize(DummyVecEnv([lambda: env])), **SMALL).learn(30)
+
+
+def test_a_model_for_a_team_of_another_size_has_its_networks_and_arguments():
+    small = MADDPG("PairPolicy", Neighbours(3), **{**SMALL, "n_steps": 3, "gamma": 0.7}).learn(60)
+    large = small.resized(Neighbours(5), batch_size=8)
+    assert large.policy.team.n_agents == 5
+    assert (large.n_steps, large.gamma, large.batch_size, large.num_timesteps) == (3, 0.7, 8, 0)
+    assert large.replay_buffer.size() == 0
+    assert np.array_equal(parameters(large), parameters(small))
+    assert large.critic.optimizer.state_dict()["state"][0]["step"] == small._n_updates
+    large.learn(40)
+    with pytest.raises(ValueError, match="fits one size of team"):
+        learned().resized(OwnBit())

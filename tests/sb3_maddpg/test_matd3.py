@@ -1,6 +1,7 @@
 """Twin critics, delayed policies and smoothed targets."""
 
 import copy
+import inspect
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_one_update_is_that_of_separate_agents_with_twin_critics(kind, priced, n
     )
     n_agents, width = model.policy.team.n_agents, model.policy.actions.width
     cost = np.full((n_agents, width), 0.7, np.float32) if priced else None
-    model._action_cost = None if cost is None else th.as_tensor(cost)
+    model._cost_of_encoded = None if cost is None else th.as_tensor(cost)
     model.learn(60)
     old, data = copy.deepcopy(model.policy), drawn(model, 32)
     th.manual_seed(5)
@@ -115,6 +116,14 @@ def test_with_one_critic_no_delay_and_no_noise_it_is_maddpg():
         model = algorithm("MlpPolicy", TeamEnv(Toy("numbers")), **kwargs, **further).learn(100)
         vectors.append(model.policy.parameters_to_vector())
     assert np.array_equal(*vectors)
+
+
+def test_takes_the_arguments_of_maddpg_in_the_same_order():
+    of_maddpg, of_matd3 = (list(inspect.signature(algorithm).parameters) for algorithm in (MADDPG, MATD3))
+    assert of_matd3[: len(of_maddpg)] == of_maddpg
+    assert of_matd3[len(of_maddpg) :] == ["target_policy_noise", "target_noise_clip"]
+    model = MATD3("MlpPolicy", TeamEnv(Toy("numbers")), 1e-3, 50_000)
+    assert (model.learning_rate, model.buffer_size, model.policy_delay) == (1e-3, 50_000, 2)
 
 
 def test_defaults_are_those_of_td3():

@@ -67,3 +67,14 @@ def test_targets_move_as_in_sb3():
     polyak_update(net.parameters(), mine.parameters(), 0.3)
     sb3_polyak_update(net.parameters(), other.parameters(), 0.3)
     assert all(th.allclose(a, b, atol=1e-7) for a, b in zip(mine.parameters(), other.parameters(), strict=True))
+
+
+def test_what_is_put_in_the_place_of_parameters_is_used():
+    net, x = StackedMLP(GROUPS["grouped"], D, 2, [8]), th.randn(N, D, B)
+    zeros = {name: th.zeros_like(parameter) for name, parameter in net.named_parameters()}
+    assert net(x).any()
+    assert not th.func.functional_call(net, zeros, x).any()
+    assert net(x).any()
+    net.load_state_dict(zeros, assign=True)
+    assert not net(x).any()
+    assert not net.single(0, D)(x[0].T).any()

@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.parallel import TeamEnv
-from sb3_maddpg.policies import MADDPGPolicy, TeamActor, TeamCritic, sharing_groups
+from sb3_maddpg.policies import MADDPGPolicy, MLPActor, MLPCritic, sharing_groups
 from sb3_maddpg.team import Team, TeamObservation
 from toys import Toy
 
@@ -29,13 +29,13 @@ def team(state_dim: int = 0) -> Team:
     return Team.from_spaces(observation, spaces.MultiBinary(N * K))
 
 
-def actor(groups=None) -> TeamActor:
-    return TeamActor(team(), TeamActions(team().action_spaces), [16], groups=groups)
+def actor(groups=None) -> MLPActor:
+    return MLPActor(team(), TeamActions(team().action_spaces), [16], groups=groups)
 
 
-def critic(groups=None, state_dim: int = 0, net_arch=(16,), n_critics: int = 1) -> TeamCritic:
+def critic(groups=None, state_dim: int = 0, net_arch=(16,), n_critics: int = 1) -> MLPCritic:
     built = team(state_dim)
-    return TeamCritic(built, TeamActions(built.action_spaces), list(net_arch), nn.ReLU, groups, n_critics)
+    return MLPCritic(built, TeamActions(built.action_spaces), list(net_arch), nn.ReLU, groups, n_critics)
 
 
 def policy(action_space: spaces.Space | None = None, **kwargs) -> MADDPGPolicy:
@@ -43,17 +43,17 @@ def policy(action_space: spaces.Space | None = None, **kwargs) -> MADDPGPolicy:
     return MADDPGPolicy(observation_space, action_space or spaces.MultiBinary(N * K), lambda _: 1e-3, **kwargs)
 
 
-@pytest.mark.parametrize("units", [None, [2], [3, 0]])
+@pytest.mark.parametrize("factors", [None, [2], [3, 0]])
 @pytest.mark.parametrize("net_arch", [[], [16, 16]])
 @pytest.mark.parametrize("n_critics", [1, 2])
 @pytest.mark.parametrize("state_dim", [0, 6])
 @each_sharing
-def test_alternatives_equal_substituted_actions(groups, net_arch, n_critics, state_dim, units):
+def test_alternatives_equal_substituted_actions(groups, net_arch, n_critics, state_dim, factors):
     built = critic(groups, state_dim, net_arch, n_critics)
     obs, actions = batch(columns=D + 2 * (state_dim > 0))
-    agents = range(N) if units is None else units
+    agents = range(N) if factors is None else factors
     own = th.rand(B, len(agents), 5, K)
-    values = built.forward_alternatives(obs, actions, own, None if units is None else th.tensor(units))
+    values = built.forward_alternatives(obs, actions, own, None if factors is None else th.tensor(factors))
     assert values.shape == (B, len(agents), 5)
     for row, agent in enumerate(agents):
         for alternative in range(5):
@@ -152,8 +152,8 @@ def test_groups_by_name_and_number():
         ([[0, 6]], "There is no agent 6.*0 to 5"),
         ([["mixed_0", 1], [0]], "share_actor.* names an agent twice"),
         ([[2, 2]], "names an agent twice"),
-        (True, "mixed_0 and mixed_1 have unlike spaces.*Give lists of agents that are alike, or False"),
-        ([["mixed_0", "mixed_4"]], "mixed_0 and mixed_4 have unlike spaces"),
+        (True, "mixed_0 and mixed_1 have different spaces.*Give lists of homogeneous agents, or False"),
+        ([["mixed_0", "mixed_4"]], "mixed_0 and mixed_4 have different spaces"),
     ],
 )
 def test_sharing_that_cannot_be_is_refused(share, message):
@@ -165,7 +165,7 @@ def test_sharing_that_cannot_be_is_refused(share, message):
 def test_agents_with_equal_observations_but_unlike_actions_do_not_share():
     unlike = spaces.MultiDiscrete([3] * 2 + [4] * 2)
     for argument in ("share_actor", "share_critic"):
-        with pytest.raises(ValueError, match=rf"{argument}=True: agent_0 and agent_2 have unlike spaces"):
+        with pytest.raises(ValueError, match=rf"{argument}=True: agent_0 and agent_2 have different spaces"):
             policy(unlike, **{argument: True})
         assert policy(unlike, **{argument: [[0, 1], [2, 3]]}).predict(batch()[0].numpy())[0].max() <= 3
 

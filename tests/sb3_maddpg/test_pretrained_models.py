@@ -1,12 +1,15 @@
 """Models that come with the package: they load, and fly as well as when they were shipped."""
 
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
 
 from quad_swarm.evaluation import Condition, run_episodes, summarise
 from quad_swarm.world.presets import make_config
-from sb3_maddpg import pretrained
+from sb3_maddpg import MADDPG, pretrained
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 
 # Model -> world, and for numbers of robots the largest share of requests in the symmetric swap: 1.3 times its own.
@@ -65,3 +68,30 @@ def test_belongs_to_a_recipe_a_command_and_results():
         assert {"model.zip", "config.yml", "command.txt", "metrics.json"} <= {
             p.name for p in pretrained_folder(name).iterdir()
         }
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_loads_without_the_zoo(name):
+    code = f"""
+import sys
+sys.modules["rl_zoo3"] = None
+from sb3_maddpg import MADDPG, pretrained
+model = pretrained({name!r})
+assert model.lr_schedule(1.0) == 1e-3 and model.lr_schedule(0.0) == 0.0
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_model_is_read_once(monkeypatch):
+    paths, load = [], MADDPG.load.__func__
+
+    def counted(cls, path, **kwargs):
+        paths.append(path)
+        return load(cls, path, **kwargs)
+
+    monkeypatch.setattr(MADDPG, "load", classmethod(counted))
+    model = pretrained("quad-swarm-paper")
+    for n_robots in (4, 5):
+        env = gymnasium.make("QuadSwarm-v0", **{**model.env_spec["kwargs"], "n_robots": n_robots})
+        assert pretrained("quad-swarm-paper", env=env, batch_size=77).batch_size == 77
+    assert len(paths) == 3

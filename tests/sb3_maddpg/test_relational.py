@@ -1,5 +1,7 @@
 """Relational networks: symmetry, who sees whom, values of pairs, and layouts that do not fit."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch as th
@@ -66,14 +68,14 @@ def test_the_order_of_agents_does_not_matter(layout, space):
     moved_obs = th.zeros_like(obs)
     moved_obs[..., :2], moved_obs[..., LAYOUT["neighbours"]] = obs[:, names, :2], neighbours
     moved_actions = parts.flatten(2) if layout is LAYOUT else actions[:, names]
-    scores, values = built.actor(obs), built.critic(obs, actions).unflatten(-1, (N, M))
+    scores, values = built.actor(obs), built.critic.of_pairs(obs, actions).unflatten(-1, (N, M))
     if layout is LAYOUT:
         _, (scores,) = renamed(names, obs, [scores.unflatten(-1, (M, -1))])
         scores = scores.flatten(2)
     else:
         scores = scores[:, names]
     assert th.allclose(built.actor(moved_obs), scores, atol=1e-6)
-    moved_values = built.critic(moved_obs, moved_actions).unflatten(-1, (N, M))
+    moved_values = built.critic.of_pairs(moved_obs, moved_actions).unflatten(-1, (N, M))
     for mine, theirs in zip(moved_values, values, strict=True):
         assert th.allclose(mine, renamed(names, obs, [theirs])[1][0], atol=1e-6)
 
@@ -98,7 +100,7 @@ def test_a_critic_reads_the_agents_view_and_of_others_what_they_are_and_do_to_it
     obs, actions = batch(built)
     obs, actions = obs.requires_grad_(), actions.requires_grad_()
     for agent in range(N):
-        value = built.critic.credited(built.critic(obs, actions))[0, :, agent].sum()
+        value = built.critic(obs, actions)[0, :, agent].sum()
         of_obs, of_actions = (g.abs().sum(dim=0) > 0 for g in th.autograd.grad(value, (obs, actions)))
         for other in range(N):
             assert of_obs[other].tolist() == [True, True] + [other == agent] * 8
@@ -113,11 +115,14 @@ def test_what_a_neighbour_does_counts_only_where_it_sees_the_agent():
     layout = {"own": [0, 1], "neighbours": [[2, 6], [3, 7]], "acts_on_neighbours": True}
     ring = {**layout, "who": [[(i + 1) % N, (i + 2) % N] for i in range(N)]}  # nobody is seen back but ...
     ring["who"][1] = [0, 2]  # ... agent 0 by agent 1
-    assert policy(layout={**LAYOUT, "who": who}).critic.views.back.tolist() == policy().critic.views.back.tolist()
+    assert (
+        policy(layout={**LAYOUT, "who": who}).critic.views.reverse_indices.tolist()
+        == policy().critic.views.reverse_indices.tolist()
+    )
     built = policy(space, ring)
     obs, actions = batch(built)
     actions.requires_grad_()
-    (gradient,) = th.autograd.grad(built.critic(obs, actions)[0, :, :2].sum(), actions)
+    (gradient,) = th.autograd.grad(built.critic.of_pairs(obs, actions)[0, :, :2].sum(), actions)
     assert (gradient.abs().sum(dim=0) > 0).tolist() == [[True, True], [True, False]] + [[False, False]] * 3
 
 
@@ -128,20 +133,20 @@ def test_alternatives_equal_substituted_actions_and_pairs_sum_to_the_agents_valu
     obs, actions = batch(built)
     obs[:, 1, LAYOUT["neighbours"][2]] = 0.0
     critic = built.critic
-    parts = critic(obs, actions)
+    parts = critic.of_pairs(obs, actions)
     assert parts.shape == (2, B, N * M)
     assert not parts[:, :, M + 2].any()  # nobody is there
-    assert th.allclose(critic.credited(parts), parts.unflatten(-1, (N, M)).sum(dim=-1))
-    units = critic.to_units(actions)
-    own = th.rand(B, units.shape[1], 3, units.shape[2])
+    assert th.allclose(critic(obs, actions), parts.unflatten(-1, (N, M)).sum(dim=-1))
+    factors = critic.factored(actions)
+    own = th.rand(B, factors.shape[1], 3, factors.shape[2])
     values = critic.forward_alternatives(obs, actions, own)
-    for unit in range(units.shape[1]):
+    for factor in range(factors.shape[1]):
         for alternative in range(3):
-            substituted = units.clone()
-            substituted[:, unit] = own[:, unit, alternative]
-            joint = critic(obs, substituted.reshape(actions.shape))[0]
-            expected = joint[:, unit] if layout is LAYOUT else joint.unflatten(-1, (N, M)).sum(dim=-1)[:, unit]
-            assert th.allclose(values[:, unit, alternative], expected, atol=1e-5)
+            substituted = factors.clone()
+            substituted[:, factor] = own[:, factor, alternative]
+            joint = critic.of_pairs(obs, substituted.reshape(actions.shape))[0]
+            expected = joint[:, factor] if layout is LAYOUT else joint.unflatten(-1, (N, M)).sum(dim=-1)[:, factor]
+            assert th.allclose(values[:, factor, alternative], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -177,5 +182,16 @@ def test_spaces_that_do_not_fit_are_refused():
             policy(space)
     with pytest.raises(ValueError, match=r"net_arch=\[\]: PairPolicy needs a hidden layer"):
         policy(net_arch=[])
-    with pytest.raises(ValueError, match="these have unlike spaces: use MlpPolicy"):
+    with pytest.raises(ValueError, match="agent_0 and agent_4 have different spaces: use MlpPolicy"):
         policy(spaces.MultiDiscrete([3] * 4 * (N - 1) + [2] * 4))
+
+
+def test_parameters_that_are_put_in_place_are_used():
+    critic = policy(n_critics=2).critic
+    obs, actions = batch(policy())
+    zeros = {name: th.zeros_like(parameter) for name, parameter in critic.named_parameters()}
+    assert not th.func.functional_call(critic, zeros, (obs, actions)).any()
+    for index in range(2):  # a network in another's place
+        critic.modules_of_nets[index] = deepcopy(critic.modules_of_nets[0])
+    first, second = critic(obs, actions)
+    assert th.equal(first, second)

@@ -37,10 +37,10 @@ def test_one_update_is_that_of_plain_sums_over_pairs(pair_credit, priced):
     next_bits = old.actor_target.act(data.next_observations)
     rewards = data.pair_rewards.flatten(1) if pair_credit else data.rewards
     per = (lambda pairs: pairs) if pair_credit else (lambda pairs: pairs.unflatten(-1, (4, 3)).sum(dim=-1))
-    rest = per(old.critic_target(data.next_observations, next_bits)[0] - cost * next_bits.flatten(1))
+    rest = per(old.critic_target.of_pairs(data.next_observations, next_bits)[0] - cost * next_bits.flatten(1))
     dones = data.dones.repeat_interleave(3, dim=1) if pair_credit else data.dones
     targets = rewards + per(cost * bits.flatten(1)) + 0.9 * (1 - dones) * rest
-    errors = per(old.critic(data.observations, bits)[0]) - targets.detach()
+    errors = per(old.critic.of_pairs(data.observations, bits)[0]) - targets.detach()
     critic, actor = copy.deepcopy(old.critic), copy.deepcopy(old.actor)
     for network, source, loss in ((critic, old.critic, errors.square().mean(dim=0).sum()), (actor, old.actor, None)):
         if loss is None:
@@ -50,7 +50,7 @@ def test_one_update_is_that_of_plain_sums_over_pairs(pair_credit, priced):
                 for bit, sign in ((1.0, 1.0), (0.0, -1.0)):
                     joint = bits.flatten(1).clone()
                     joint[:, pair] = bit
-                    value = critic(data.observations, joint.view_as(bits))[0, :, pair] - cost * bit
+                    value = critic.of_pairs(data.observations, joint.view_as(bits))[0, :, pair] - cost * bit
                     gain[:, pair] += sign * value.detach()
             loss = -(scores * gain).mean(dim=0).sum()
         gradients = th.autograd.grad(loss, list(source.parameters()))

@@ -181,12 +181,12 @@ def test_the_price_of_actions_is_that_of_the_environment(tmp_path):
     model = learned(env, use_action_cost=True)
     model.save(tmp_path / "model")
     loaded = MADDPG.load(tmp_path / "model")
-    assert th.equal(loaded._action_cost, model._action_cost)
-    assert model._action_cost.tolist() == env.action_cost.tolist()
+    assert th.equal(loaded._cost_of_encoded, model._cost_of_encoded)
+    assert model._cost_of_encoded.tolist() == env.action_cost.tolist()
     for env.action_cost in (0.5, 2.0):
         loaded.set_env(env)
-        assert (loaded._action_cost == env.action_cost).all()
-        assert (MADDPG.load(tmp_path / "model", env=env)._action_cost == env.action_cost).all()
+        assert (loaded._cost_of_encoded == env.action_cost).all()
+        assert (MADDPG.load(tmp_path / "model", env=env)._cost_of_encoded == env.action_cost).all()
     with pytest.raises(ValueError, match="no attribute `action_cost`"):
         loaded.set_env(OwnBit())
 
@@ -197,3 +197,82 @@ def test_another_team_is_refused_with_both_spaces_and_a_remedy(tmp_path):
     for refused in (lambda: MADDPG.load(tmp_path / "model", env=OtherBit()), lambda: model.set_env(OtherBit())):
         with pytest.raises(ValueError, match=r"\(3, 3\).*\(2, 2\).*env_spec"):
             refused()
+
+
+def broken(model: MADDPG) -> MADDPG:
+    with th.no_grad():
+        model.critic.net.weights[1][2, 0, 0] = float("nan")
+    return model
+
+
+def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
+    learned().save(tmp_path / "model")
+    before = (tmp_path / "model.zip").read_bytes()
+    message = r"cannot be saved: parameter critic\.net\.weights\.1, of agent\(s\) agent_2, holds NaN .* earlier file"
+    for target in (tmp_path / "model", io.BytesIO()):
+        with pytest.raises(ValueError, match=message):
+            broken(learned()).save(target)
+    assert (tmp_path / "model.zip").read_bytes() == before
+    model = learned()
+    model.actor.optimizer.state_dict()["state"][0]["exp_avg"][0] = float("inf")
+    with pytest.raises(ValueError, match=r"the state of actor\.optimizer holds NaN or infinity"):
+        model.save(tmp_path / "model")
+    assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
+
+
+def test_parameters_that_are_not_finite_are_not_loaded(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(MADDPG, "_not_finite", lambda *_: None)
+        broken(learned()).save(tmp_path / "model")
+    message = r"These parameters cannot be used: parameter critic\.net\.weights\.1, of agent\(s\) agent_2"
+    with pytest.raises(ValueError, match=message):
+        MADDPG.load(tmp_path / "model")
+    model, before = learned(), learned().get_parameters()
+    for parameters in (tmp_path / "model.zip", broken(learned()).get_parameters()):
+        with pytest.raises(RuntimeError, match=message):
+            model.set_parameters(parameters)
+    assert_equal_state(model.get_parameters(), before)
+
+
+class MyMADDPG(MADDPG):
+    """An algorithm of a user."""
+
+
+def test_a_subclass_reads_the_files_of_its_base(tmp_path):
+    model = learned()
+    model.save(tmp_path / "model")
+    loaded = MyMADDPG.load(tmp_path / "model")
+    assert_equal_state(loaded.get_parameters(), model.get_parameters())
+    MyMADDPG("MlpPolicy", OwnBit()).save(tmp_path / "mine")
+    assert type(MyMADDPG.load(tmp_path / "mine")) is MyMADDPG
+    with pytest.raises(ValueError, match=r"holds a model of MyMADDPG: load it with `MyMADDPG\.load`"):
+        MADDPG.load(tmp_path / "mine")
+
+
+def test_a_replay_buffer_that_does_not_fit_is_refused_where_it_is_loaded(tmp_path):
+    two = learned(make_vec_env("OwnBit-v0", 2))
+    two.save_replay_buffer(tmp_path / "two")
+    learned(OtherBit()).save_replay_buffer(tmp_path / "other")
+    td3 = TD3("MlpPolicy", "Pendulum-v1", buffer_size=10)
+    td3.save_replay_buffer(tmp_path / "td3")
+    model = learned()
+    present = model.replay_buffer
+    for name, message in (
+        ("two", r"transitions of 2 environment\(s\) side by side, the model needs transitions of 1 .*: resume with"),
+        ("other", r"observations of .*\(2, 2\).*, the model needs observations of .*\(3, 3\)"),
+        ("td3", "holds a ReplayBuffer, which knows no agents; the model needs a TeamReplayBuffer"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model.load_replay_buffer(tmp_path / f"{name}.pkl")
+        assert model.replay_buffer is present
+
+
+def test_other_numbers_of_environments_need_an_empty_replay_buffer():
+    model = learned()
+    before = model.get_env()
+    with pytest.raises(ValueError, match=r"holds transitions of 1 environment\(s\) .* those of 2: .*reset"):
+        model.set_env(make_vec_env("OwnBit-v0", 2))
+    assert model.get_env() is before
+    model.replay_buffer.reset()
+    model.set_env(make_vec_env("OwnBit-v0", 2))
+    assert model.learn(40, reset_num_timesteps=False).replay_buffer.n_envs == 2

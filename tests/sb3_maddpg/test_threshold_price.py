@@ -92,7 +92,7 @@ def test_the_policy_fits_a_team_of_another_size():
     [
         ({"threshold_price": (0.5, 0.1)}, "a positive price and a higher one"),
         ({"threshold_price": (0.0, 0.1)}, "a positive price and a higher one"),
-        ({"policy_kwargs": {"random_thresholds": 0.0}}, "without it nothing is tried"),
+        ({"policy_kwargs": {"random_thresholds": 0.0}}, "at 0 nothing is explored"),
     ],
 )
 def test_senseless_arguments_are_refused(kwargs, message):
@@ -103,5 +103,5 @@ def test_senseless_arguments_are_refused(kwargs, message):
 def test_prices_are_for_bits():
     env = Gains()
     env.action_space = spaces.Box(-1, 1, (4,))
-    with pytest.raises(ValueError, match="threshold_price is for bits"):
+    with pytest.raises(ValueError, match="threshold_price is for binary actions"):
         MADDPG("MlpPolicy", env, threshold_price=PRICES, **SMALL)

@@ -26,7 +26,7 @@ LAYOUT: dict[str, dict[str, list[Any]]] = {
     "Communication": {
         "requests, of all possible": ["Multiline", ["comm/request_share", "symmetric_swap/request_share"]],
         "reward for requests": ["Multiline", ["reward/requests"]],
-        "scores": ["Multiline", ["train/score_mean", "train/score_std"]],
+        "probabilities": ["Multiline", ["train/probability_mean", "train/probability_std"]],
     },
     "Learning": {
         "return": ["Multiline", ["rollout/ep_rew_mean", "eval/mean_reward"]],

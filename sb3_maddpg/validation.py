@@ -1,0 +1,120 @@
+"""Arguments are checked once, where they enter, by pydantic, whose errors become plain ones of one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError, field_validator
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import TrainFreq
+
+AtLeastZero = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+# Beyond these a price is 0, or infinite, in single precision
+Price = Annotated[float, Field(ge=1e-12, le=1e12)]
+Widths = list[Annotated[int, Field(ge=1)]]
+Schedule = Callable[[float], float]
+
+
+class Arguments(BaseModel):
+    """Arguments whose descriptions say what is allowed: messages quote them."""
+
+    model_config = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, extra="forbid")
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _without_numpy(cls, value: Any) -> Any:
+        return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
+
+
+class TrainingArguments(Arguments):
+    """Of ``MADDPG``."""
+
+    learning_rate: Positive | Schedule = Field(description="a positive finite number, or a schedule")
+    buffer_size: int = Field(ge=1, description="a number of transitions, at least 1")
+    learning_starts: int = Field(ge=0, description="a number of steps, at least 0")
+    batch_size: int = Field(ge=1, description="a number of transitions, at least 1")
+    tau: float = Field(gt=0, le=1, description="a number between 0 and 1, and not 0")
+    gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
+    train_freq: InstanceOf[TrainFreq] | Annotated[int, Field(ge=1)] | tuple[Annotated[int, Field(ge=1)], str] = Field(
+        description='at least 1, or such a number with its unit, (1, "step") or (1, "episode")'
+    )
+    gradient_steps: int = Field(ge=-1, description="a number of steps, or -1 for as many as environment steps")
+    action_noise: InstanceOf[ActionNoise] | None = Field(description="an ActionNoise of Stable-Baselines3, or None")
+    optimize_memory_usage: bool = Field(description="True or False")
+    n_steps: int = Field(ge=1, description="a number of steps of at least 1")
+    use_action_cost: bool = Field(description="True or False")
+    threshold_price: tuple[Price, Price] | None = Field(
+        description="a positive price and a higher one, both from 1e-12 to 1e12, or None"
+    )
+    exploration_noise: AtLeastZero | tuple[AtLeastZero, AtLeastZero] = Field(
+        description="a standard deviation of at least 0, or two of them, the first and the last"
+    )
+    estimator: str = Field(description="a name of sb3_maddpg.estimators.ESTIMATORS")
+    temperature: Annotated[float, Field(ge=1e-6)] | Schedule = Field(
+        description="positive, at least 1e-6, or a schedule"
+    )
+    policy_delay: int = Field(ge=1, description="at least 1, a number of critic updates")
+    max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
+    policy_regularization: float = Field(ge=0, description="a finite number of at least 0")
+
+    @field_validator("threshold_price")
+    @classmethod
+    def _ascending(cls, prices: tuple[float, float] | None) -> tuple[float, float] | None:
+        if prices is not None and prices[1] < prices[0] * (1 + 1e-6):
+            raise ValueError
+        return prices
+
+
+class SmoothedTrainingArguments(TrainingArguments):
+    """Of ``MATD3``."""
+
+    target_policy_noise: float = Field(ge=0, description="a finite standard deviation, which must not be negative")
+    target_noise_clip: float = Field(ge=0, description="a finite number, which must not be negative")
+
+
+class ThresholdArgument(Arguments):
+    """Of policies with binary actions."""
+
+    threshold: float = Field(ge=0, lt=1, description="a number with 0 <= threshold < 1, as probabilities are")
+
+
+class PolicyArguments(ThresholdArgument):
+    """Of ``MADDPGPolicy``."""
+
+    net_arch: Widths | dict[str, Widths] = Field(
+        description="a list of widths, each at least 1, or dict(pi=[...], qf=[...]) of such lists"
+    )
+    random_thresholds: float = Field(gt=0, le=1, description="a share above 0, up to 1: at 0 nothing is explored")
+    n_critics: int = Field(ge=1, description="at least 1")
+
+    @field_validator("net_arch")
+    @classmethod
+    def _of_actor_and_critic(cls, net_arch: Any) -> Any:
+        if isinstance(net_arch, dict) and set(net_arch) != {"pi", "qf"}:
+            raise ValueError
+        return net_arch
+
+
+class PairPolicyArguments(Arguments):
+    """Of ``PairPolicy``, beside those of ``MADDPGPolicy``."""
+
+    pair_credit: bool = Field(description="True or False")
+    shared_threshold: bool = Field(description="True or False")
+
+
+def validated(arguments: type[Arguments], **values: Any) -> dict[str, Any]:
+    """
+    :param arguments: what they are and what is allowed
+    :param values: of all of them
+    :return: the values, converted to the types that are expected
+    :raises ValueError: one line that names the argument, its value and what is allowed
+    """
+    try:
+        return dict(arguments.model_validate(values))
+    except ValidationError as error:
+        name = str(error.errors()[0]["loc"][0])
+        allowed = arguments.model_fields[name].description
+        raise ValueError(f"{name}={values.get(name)!r} must be {allowed}.") from None

@@ -1,0 +1,37 @@
+"""Arguments that enter: conversion, and one line that says what is allowed."""
+
+import numpy as np
+import pytest
+
+from sb3_maddpg.policies import MADDPGPolicy
+from sb3_maddpg.team import MixedActions, Team
+from sb3_maddpg.validation import PairPolicyArguments, PolicyArguments, validated
+from toys import toy
+
+GOOD = {"net_arch": [8], "threshold": 0.5, "random_thresholds": 1.0, "n_critics": 1}
+
+
+def test_values_become_what_is_expected():
+    given = {**GOOD, "threshold": "0.25", "n_critics": np.int64(2), "net_arch": (8, 8)}
+    assert validated(PolicyArguments, **given) == {**GOOD, "threshold": 0.25, "n_critics": 2, "net_arch": [8, 8]}
+    assert validated(PairPolicyArguments, pair_credit="false", shared_threshold=True)["pair_credit"] is False
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("threshold", 1.0), ("threshold", "high"), ("n_critics", 0), ("n_critics", 1.5), ("net_arch", [8, -1])],
+)
+def test_other_values_are_refused_in_one_line(name, value):
+    with pytest.raises(ValueError, match=rf"^{name}=.* must be .*\.$") as refused:
+        validated(PolicyArguments, **{**GOOD, name: value})
+    assert type(refused.value) is ValueError
+    assert repr(value) in str(refused.value)
+
+
+def test_homogeneous_agents_have_the_same_spaces():
+    env = toy("unlike")
+    assert isinstance(env.action_space, MixedActions)
+    team = Team.from_spaces(env.observation_space, env.action_space)
+    assert [[team.homogeneous(i, j) for j in range(4)] for i in range(4)] == np.eye(4, dtype=bool).tolist()
+    shared = MADDPGPolicy(env.observation_space, env.action_space, lambda _: 1e-3, share_actor=False).team
+    assert shared.homogeneous(2, 2)
