@@ -11,7 +11,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_maddpg.parallel import TeamEnv
-from sb3_maddpg.relational import Views
+from sb3_maddpg.relational import NeighbourViews
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, suggest
 
@@ -59,7 +59,7 @@ def _check_attributes(env: gymnasium.Env, team: Team) -> None:
         if not callable(env.get_wrapper_attr("set_curriculum_level")):
             raise ValueError("set_curriculum_level must be a method that takes the level.")
     if env.has_wrapper_attr("observation_layout"):
-        Views(env.get_wrapper_attr("observation_layout"), team)  # raises ValueError
+        NeighbourViews(env.get_wrapper_attr("observation_layout"), team)  # raises ValueError
 
 
 def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) -> None:
