@@ -19,7 +19,7 @@ SITE = ("quickstart", "tensorboard", "tutorials/swarm", "tutorials/pettingzoo")
 NO_LEARNING = ("tutorials/scenario", "tutorials/rule", "tutorials/reading", "planner", "index", "faq")
 PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (*LEARNER, *SITE, *NO_LEARNING)))
 STEPS, LEARNING_STARTS, BATCH_SIZE = 300, 100, 64
-FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCED = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)  # also ```{eval-rst}
 
 
 def text_of(page: str) -> str:
