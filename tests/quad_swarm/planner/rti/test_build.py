@@ -8,7 +8,6 @@ import sys
 import warnings
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 
@@ -310,18 +309,3 @@ def test_functions_of_lanes_are_accurate(tmp_path):
     errors = [float(text) for text in run_harness(tmp_path, FUNCTIONS).split()]
     limits = [3e-12, 2e-9, 5e-7, 1e-12, 3e-7, 1e-15, 3e-7]
     assert all(error <= limit for error, limit in zip(errors, limits, strict=True)), errors
-
-
-def test_says_what_the_generator_cannot_do():
-    class Spinning(OptimalControlProblem):
-        def dynamics(self, x, u):
-            return ca.atan(super().dynamics(x, u))
-
-    class Cornered(OptimalControlProblem):
-        def box_violations(self, x):
-            return x[0] * x[1]
-
-    with pytest.raises(NotImplementedError, match="no lane form"):
-        generate_model(Spinning(CONFIG, QUADROTOR, 1))
-    with pytest.raises(ValueError, match="must be bounds"):
-        generate_model(Cornered(CONFIG, QUADROTOR, 1))
