@@ -9,6 +9,7 @@ from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.team import Team
 
+BATCH_SIZES = [256, 512, 1024, 2048]
 NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "large": [256, 256]}
 WITHOUT_TEMPERATURE = ("expected", "score")
 # Transitions between two updates: many in the original code, few where samples are dear
@@ -75,7 +76,10 @@ def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) 
     team = Team.from_spaces(env.observation_space, env.action_space)
     actions = TeamActions(team.action_spaces)
     trial.suggest_float("learning_rate", 1e-4, 3e-2, log=True)
-    trial.suggest_categorical("batch_size", [256, 512, 1024, 2048])
+    # A batch is drawn from the replay buffer, whose size is the recipe's
+    buffer_size = int(additional_args["hyperparams"].get("buffer_size", max(BATCH_SIZES)))
+    sizes = [size for size in BATCH_SIZES if size <= buffer_size] or [buffer_size]
+    trial.suggest_categorical("batch_size", sizes)
     trial.suggest_float("tau", 1e-3, 5e-2, log=True)
     one_minus_gamma = trial.suggest_float("one_minus_gamma", 5e-3, 2e-1, log=True)
     trial.set_user_attr("gamma", 1 - one_minus_gamma)

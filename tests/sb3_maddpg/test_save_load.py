@@ -3,16 +3,14 @@
 import io
 import json
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO, TD3
+from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.team_tasks import OtherBit, OwnBit
 
 SMALL = {"learning_starts": 20, "batch_size": 16, "train_freq": 5, "buffer_size": 1000, "seed": 0}
@@ -130,49 +128,6 @@ def test_a_bad_file_is_refused(tmp_path, kind):
         path.write_bytes(path.read_bytes()[:5000] if kind == "truncated" else b"")
     with pytest.raises((ValueError, FileNotFoundError), match=r"model\.zip"):
         MADDPG.load(path)
-
-
-def rewritten(source: Path, target: Path, **changes) -> Path:
-    """:return: the model's file with other entries in its data, None to leave one out"""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
-        for name in old.namelist():
-            content = old.read(name)
-            if name == "data":
-                data = {**json.loads(content), **changes}
-                content = json.dumps({key: value for key, value in data.items() if value is not None}).encode()
-            new.writestr(name, content)
-    return target
-
-
-@pytest.mark.parametrize("stream", [False, True])
-def test_models_of_other_algorithms_are_refused(tmp_path, stream):
-    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
-    TD3("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "td3.zip")
-    MATD3("MlpPolicy", OwnBit()).save(tmp_path / "matd3.zip")
-    learned().save(tmp_path / "maddpg.zip")
-    for algorithm, name, message in (
-        (MADDPG, "ppo", "holds a model of another algorithm than MADDPG"),
-        (MADDPG, "td3", "holds a model of another algorithm than MADDPG"),
-        (MATD3, "td3", "holds a model of another algorithm than MATD3"),
-        (MADDPG, "matd3", r"holds a model of MATD3: load it with `MATD3\.load`"),
-        (MATD3, "maddpg", r"holds a model of MADDPG: load it with `MADDPG\.load`"),
-    ):
-        path = tmp_path / f"{name}.zip"
-        with pytest.raises(ValueError, match=message):
-            algorithm.load(io.BytesIO(path.read_bytes()) if stream else path)
-    assert MATD3.load(tmp_path / "matd3").algorithm == "MATD3"
-
-
-@pytest.mark.parametrize("changes", [{"file_format": 1}, {"file_format": 99}, {"file_format": None, "algorithm": None}])
-def test_a_file_of_another_format_is_refused(tmp_path, changes):
-    model = learned()
-    model.save(tmp_path / "model.zip")
-    path = rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes)
-    written = changes["file_format"] or 1
-    with pytest.raises(ValueError, match=rf"other\.zip has format {written}, .* reads format 2: install the version"):
-        MADDPG.load(path)
-    same = MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "same.zip"))
-    assert_equal_state(same.get_parameters(), model.get_parameters())
 
 
 def test_the_price_of_actions_is_that_of_the_environment(tmp_path):

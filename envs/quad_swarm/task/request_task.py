@@ -152,9 +152,9 @@ class RequestTask:
         self.scenario = [name for name, kept in zip(self.scenario, swarms, strict=True) if kept]
 
     def fork(self) -> RequestTask:
-        """A copy of all episodes as they are now, which flies on by itself."""
+        """A copy of all episodes as they are now, which flies on by itself: the same requests give the same states."""
         fork = copy(self)
-        fork.swarm = self.swarm.part(np.ones(self.swarm.n_swarms, dtype=bool))
+        fork.swarm = self.swarm.fork()
         fork.statistics = deepcopy(self.statistics)
         fork.scenario = list(self.scenario)
         return fork

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -145,6 +145,12 @@ class Swarm:
         part.told = part.beliefs if self.told is self.beliefs else copy(self.told)
         part.keep(swarms)
         return part
+
+    def fork(self) -> Swarm:
+        """A copy of all swarms that flies on by itself, with the disturbances that these would meet."""
+        fork = self.part(np.ones(self.n_swarms, dtype=bool))
+        fork._noise_rngs = deepcopy(self._noise_rngs)
+        return fork
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let every robot ask, plan and fly for one step.

@@ -2,7 +2,6 @@
 
 import warnings
 
-import gymnasium
 import numpy as np
 import pytest
 import supersuit
@@ -51,30 +50,12 @@ def test_the_state_is_in_its_space():
     assert env.state() in env.state_space
 
 
-def test_what_learners_read_is_the_team_s():
-    team, parallel = QuadSwarmEnv(scenario="curriculum"), quad_swarm.parallel_env(scenario="curriculum")
-    vector = quad_swarm.QuadSwarmVectorEnv(2, scenario="curriculum")
-    names = ("agent_names", "n_agents", "observation_layout", "action_cost", "n_curriculum_levels", "config")
-    for name in names:
-        assert getattr(team, name) == getattr(parallel, name) == getattr(vector, name)
-    for env in (parallel, vector):
-        env.set_curriculum_level(2)
-        assert env.curriculum_level == env.task.sampler.level == 2
-        with pytest.raises(ValueError, match="Level 4 does not exist"):
-            env.set_curriculum_level(4)
-
-
 def test_after_the_end_nobody_is_left():
     env = quad_swarm.parallel_env(n_robots=2, max_steps=1)
     env.reset(seed=0)
     env.step({agent: np.zeros(1) for agent in env.agents})
     assert env.agents == []
     assert env.step({}) == ({}, {}, {}, {}, {})
-
-
-def test_a_step_before_the_reset_is_refused():
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before reset\(\)"):
-        quad_swarm.parallel_env(n_robots=2).step({})
 
 
 def test_every_action_has_the_shape_of_its_space():

@@ -134,11 +134,6 @@ def test_refuses_senseless_seeds(seed):
         quad_swarm.QuadSwarmVectorEnv(2, n_robots=2).reset(seed=seed)
 
 
-def test_a_step_before_the_reset_is_refused():
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"before reset\(\)"):
-        quad_swarm.QuadSwarmVectorEnv(2, n_robots=2).step(np.zeros((2, 2)))
-
-
 def test_every_field_of_the_world_can_be_set():
     env = gymnasium.make_vec("QuadSwarm-v0", num_envs="2", n_robots=2, world={"radius": 0.12})
     assert env.unwrapped.config.planner.separation == 0.24

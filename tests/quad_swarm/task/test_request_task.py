@@ -1,7 +1,9 @@
-"""The arguments of a task. What it does is tested through the environments, tests/quad_swarm/interfaces/."""
+"""The task: its arguments, its reward, how episodes end, and forks of them."""
 
+import numpy as np
 import pytest
 
+from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.task.request_task import RewardConfig, make_task
 
 
@@ -60,3 +62,138 @@ def test_a_world_reaches_every_field():
 def test_rewards_are_checked_wherever_they_are_made():
     with pytest.raises(ValueError, match=r"^near_miss_width=0: it must be greater than 0"):
         RewardConfig(near_miss_width=0)
+
+
+@pytest.mark.parametrize(
+    "world",
+    [{}, {"memory": 1.0, "radio": {"delay": 2}}, {"noise": {"vel": 0.05, "wind": 1.0}}, {"radio": {"loss": 0.4}}],
+    ids=["paper", "memory and delay", "noise", "loss"],
+)
+def test_a_fork_flies_on_by_itself(world):
+    task = make_task(n_swarms=2, n_robots=3, scenario="symmetric_swap", **world)
+    for k in range(2):
+        task.reset(k, np.random.default_rng(k))
+    rng = np.random.default_rng(0)
+    requests = rng.random((12, 2, 3, 2)) < 0.5
+    for one in requests[:4]:
+        task.step(one)
+    fork, stays = task.fork(), task.swarm.state.copy()
+    requested = task.statistics.requests_flown.copy()
+    forked = [(fork.step(one).reward, fork.swarm.state.copy(), fork.observe()) for one in requests[4:]]
+    assert np.array_equal(task.swarm.state, stays), "the original stays where it is"
+    assert np.array_equal(task.statistics.requests_flown, requested)
+    for one, (reward, state, observation) in zip(requests[4:], forked, strict=True):
+        assert np.array_equal(task.step(one).reward, reward)
+        assert np.array_equal(task.swarm.state, state), "the same requests give the same states"
+        assert np.array_equal(task.observe(), observation)
+    assert task.statistics.row(0).keys() == fork.statistics.row(0).keys()
+    assert task.statistics.requests_flown.tolist() == fork.statistics.requests_flown.tolist()
+
+
+def test_a_fork_may_lose_swarms_of_its_own():
+    task = make_task(n_swarms=2, n_robots=2)
+    for k in range(2):
+        task.reset(k, np.random.default_rng(k))
+    fork = task.fork()
+    fork.keep(np.array([False, True]))
+    assert (task.swarm.n_swarms, fork.swarm.n_swarms) == (2, 1)
+    assert (len(task.scenario), len(fork.scenario)) == (2, 1)
+    task.step(np.zeros((2, 2, 1), bool))
+    fork.step(np.zeros((1, 2, 1), bool))
+    assert np.array_equal(fork.swarm.state[0], task.swarm.state[1])
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_collisions_need_not_end_episodes(ends):
+    task = make_task(n_robots=2, max_steps=3)
+    task.end_at_collision = ends
+    close = np.array([[-0.25, 0, 1], [0.25, 0, 1]])
+    task.place(0, "given", close, close, np.random.default_rng(0))
+    silent = np.zeros((1, 2, 1), bool)
+    first = task.step(silent)
+    assert (first.terminated[0], first.truncated[0]) == (ends, False)
+    assert first.reward_terms["collision"][0] == -150, "it costs all the same"
+    if not ends:
+        last = [task.step(silent) for _ in range(2)][-1]
+        assert (last.terminated[0], last.truncated[0]) == (False, True)
+
+
+def test_reward_is_the_paper_s():
+    env = QuadSwarmEnv(n_robots=2)
+    line = np.array([[-1.0, 0, 1], [1, 0, 1]])
+    env.reset(options={"starts": line, "goals": line})
+    *_, info = env.step(np.array([1, 0]))
+    assert info["reward_terms"] == pytest.approx({"goal": 1.3, "collision": 0.0, "requests": -0.1})
+    _, reward, *_ = env.step(np.array([1, 1]))
+    assert reward == pytest.approx(1.3 - 0.2)
+
+    env.reset(options={"starts": [[0, 0, 1.0], [0.5, 0, 1.0]], "goals": [[0, 0, 1.0], [0.5, 0, 1.0]]})
+    _, reward, terminated, truncated, info = env.step(np.array([0, 0]))
+    assert (terminated, truncated, info["collision"], info["is_success"]) == (True, False, True, False)
+    assert reward == pytest.approx(1.3 - 150)
+
+
+def test_ends_at_the_time_limit():
+    env = QuadSwarmEnv(max_steps=3)
+    env.reset(seed=0)
+    ends = [env.step(np.ones(12, dtype=np.int8))[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+
+
+def test_collisions_between_steps_can_end_episodes():
+    # Two robots fly through each other within a step: apart at both ends, in contact between.
+    ends = {}
+    for continuous in (False, True):
+        env = QuadSwarmEnv(n_robots=2, continuous_collisions=continuous)
+        env.reset(options={"starts": [[-0.35, 0.5, 1], [0.35, 0.5, 1]], "goals": [[3, 0.5, 1], [-3, 0.5, 1]]})
+        env.task.swarm.state[0, :, 3] = [7.0, -7.0]
+        *_, terminated, _, info = env.step(np.zeros(2))
+        assert info["min_separation"] > 0.6
+        assert info["min_separation_continuous"] < 0.1
+        ends[continuous] = terminated
+    assert ends == {False: False, True: True}
+
+
+def test_near_misses_cost_in_proportion():
+    weights = {"near_miss": 2.0, "near_miss_distance": 0.8, "near_miss_width": 0.1}
+    env = QuadSwarmEnv(n_robots=2, reward=weights)
+    for distance, cost in ((0.9, 0.0), (0.75, 1.0), (0.65, 2.0)):
+        line = np.array([[0, 0, 1.0], [distance, 0, 1.0]])
+        env.reset(options={"starts": line, "goals": line})
+        *_, info = env.step(np.array([1, 1]))
+        separation = info["min_separation"]
+        assert info["reward_terms"]["near_miss"] == pytest.approx(-2 * np.clip((0.8 - separation) / 0.1, 0, 1))
+        assert -info["reward_terms"]["near_miss"] == pytest.approx(cost, abs=0.3)
+
+
+def test_near_misses_may_look_ahead_along_the_plans():
+    weights = {"near_miss": 1.0, "near_miss_distance": 0.6, "near_miss_width": 0.3}
+    costs = []
+    for ahead in (0, 8):
+        env = QuadSwarmEnv(n_robots=2, reward={**weights, "near_miss_ahead": ahead})
+        # Head-on, and neither knows of the other's plan
+        ends = np.array([[-2.0, 0, 1], [2.0, 0.02, 1]])
+        env.reset(options={"starts": ends, "goals": ends[::-1]})
+        rows = [env.step(np.array([0, 0]))[-1]["reward_terms"]["near_miss"] for _ in range(12)]
+        costs.append(np.flatnonzero(np.array(rows) < 0)[:1].tolist() or [99])
+    assert costs[1] < costs[0]
+
+
+def test_near_misses_far_ahead_may_count_from_less_distance():
+    weights = {"near_miss": 1.0, "near_miss_distance": 0.6, "near_miss_width": 0.3, "near_miss_ahead": 8}
+    # Both would stop at the same place: the miss is in the last steps that are looked at
+    ends = np.array([[-0.5, 0, 1], [0.5, 0.02, 1]])
+    costs = {}
+    for narrowing in (0.0, 0.1, 0.7):
+        env = QuadSwarmEnv(n_robots=2, reward={**weights, "near_miss_narrowing": narrowing})
+        env.reset(options={"starts": ends, "goals": np.tile([0.0, 0, 1], (2, 1))})
+        costs[narrowing] = -env.step(np.array([0, 0]))[-1]["reward_terms"]["near_miss"]
+    assert costs[0.0] > costs[0.1] > costs[0.7] == 0
+
+
+def test_episodes_may_end_at_arrival():
+    env = QuadSwarmEnv(n_robots=2, end_at_arrival=True)
+    line = np.array([[-1.0, 0, 1], [1, 0, 1]])
+    env.reset(options={"starts": line, "goals": line})
+    *_, terminated, truncated, info = env.step(np.array([0, 0]))
+    assert (terminated, truncated, info["is_success"]) == (True, False, True)

@@ -58,36 +58,6 @@ def test_a_pretrained_model_is_evaluated_and_replayed_by_its_name(capsys):
     assert "CartPole-v1" in capsys.readouterr().err
 
 
-def test_bench_says_where_the_time_goes(capsys):
-    assert main(["bench", "--env", "OwnBit-v0", "-n", "700", "--json", "bench.json"]) == 0
-    result = json.loads(Path("bench.json").read_text())
-    assert result["steps"] == 700
-    assert result["updates"] > 0
-    shares = [result[f"share_{name}"] for name in ("environments", "learning", "acting", "rest")]
-    assert all(share > 0 for share in shares)
-    assert sum(shares) == pytest.approx(1)
-    assert "steps/s" in capsys.readouterr().out
-    assert not Path("logs").exists()
-
-
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["-n", "0"], "--n-timesteps 0: give 1 or more"),
-        (["--json", "folder"], "folder: Is a directory"),
-        (["--json", "file/bench.json"], "file"),
-    ],
-)
-def test_bench_finds_out_before_the_work_that_it_cannot_be_done(capsys, argv, message):
-    Path("folder").mkdir()
-    Path("file").touch()
-    assert main(["bench", "--env", "OwnBit-v0", *argv]) == 2
-    shown = capsys.readouterr()
-    assert f"error: {message}" in shown.err
-    assert shown.err.count("\n") == 1
-    assert "hyperparameters" not in shown.out
-
-
 def test_modules_of_the_command_line_import_each_other_in_one_direction():
     imported = {}
     for path in Path(commands.__file__).parent.glob("*.py"):

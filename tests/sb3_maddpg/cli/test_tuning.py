@@ -151,7 +151,7 @@ def test_agents_that_are_alike_may_share():
     choices = {json.dumps(params["policy_kwargs"]["share_critic"]) for _, params in trials}
     assert choices == {"false", "[[0, 1, 2]]"}  # the adversaries
     for _, params in trials[:3]:
-        MADDPG("MlpPolicy", tag, buffer_size=10, **params)
+        MADDPG("MlpPolicy", tag, buffer_size=2048, **params)
 
 
 def test_updates_are_counted_in_transitions_and_noise_is_left_to_action_noise():
@@ -159,6 +159,12 @@ def test_updates_are_counted_in_transitions_and_noise_is_left_to_action_noise():
     trial, params = sample("maddpg", env, n_envs=20, action_noise="given")
     assert (trial.distributions["train_freq"].low, trial.distributions["train_freq"].high) == (1, 10)
     assert "exploration_noise" not in params
+
+
+@pytest.mark.parametrize(("buffer_size", "sizes"), [(100, {100}), (1000, {256, 512}), (1024, {256, 512, 1024})])
+def test_batches_fit_into_the_replay_buffer_of_the_recipe(buffer_size, sizes):
+    trials = [sample("maddpg", toy("bits"), seed=seed, buffer_size=buffer_size)[0] for seed in range(12)]
+    assert {trial.params["batch_size"] for trial in trials} == sizes
 
 
 @pytest.mark.parametrize("algo", ALGOS)

@@ -3,14 +3,15 @@
 import multiprocessing
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import warnings
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
+from planning import QUADROTOR, assert_same
 
 from quad_swarm import planner
 from quad_swarm.planner import (
@@ -24,9 +25,7 @@ from quad_swarm.planner import (
 )
 from quad_swarm.planner.rti import build as build_module
 from quad_swarm.planner.rti.codegen import generate_model
-from quad_swarm.quadrotor import QuadrotorParams
 
-QUADROTOR = QuadrotorParams()
 CONFIG = PlannerConfig(horizon=3)
 SOURCES = Path(build_module.__file__).parent
 
@@ -36,6 +35,22 @@ def cache(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("QUAD_SWARM_CACHE", str(tmp_path / "cache"))
     planner._warn_once.cache_clear()
     return tmp_path / "cache"
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory) -> Path:
+    """A cache with the library of `solve` in both precisions, for tests that are not about compiling it."""
+    folder = tmp_path_factory.mktemp("compiled")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("QUAD_SWARM_CACHE", str(folder))
+        for precision in ("float32", "float64"):
+            build_module.build(generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2)), precision)
+    return folder
+
+
+@pytest.fixture
+def filled(cache, compiled) -> Path:
+    return shutil.copytree(compiled, cache)
 
 
 def libraries(cache: Path) -> list[str]:
@@ -50,11 +65,6 @@ def solve(precision: str = "float32", solver: RtiSolver | None = None):
     return solver.solve(problems, np.zeros((21, 4, 9)), np.zeros((21, 3, 4)))
 
 
-def assert_same(first, second) -> None:
-    for a, b in zip(first, second, strict=True):
-        assert np.array_equal(a, b)
-
-
 def test_compiles_once_for_each_problem(cache):
     first = solve()
     (library,) = libraries(cache)
@@ -66,7 +76,7 @@ def test_compiles_once_for_each_problem(cache):
     assert len(libraries(cache)) == 2  # and no temporary folders
 
 
-def test_every_number_of_the_problem_is_in_the_key(cache):
+def test_every_number_of_the_problem_is_in_the_key(cache, stub_compiler):
     for config in (CONFIG, PlannerConfig(horizon=3, goal_weight=9.0)):
         model = generate_model(OptimalControlProblem(config, QUADROTOR, 1))
         assert build_module.build(model, "float32").is_file()
@@ -94,7 +104,7 @@ def test_processes_may_build_at_once(cache):
 
 
 @pytest.mark.parametrize("method", ["spawn", "fork"])
-def test_travels_to_another_process(method):
+def test_travels_to_another_process(method, filled):
     solver = RtiSolver(OptimalControlProblem(CONFIG, QUADROTOR, 2), sqp_iterations=3)
     expected = solve(solver=solver)
     assert_same(solve(solver=pickle.loads(pickle.dumps(solver))), expected)
@@ -105,7 +115,7 @@ def test_travels_to_another_process(method):
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_every_build_gives_the_same_bits(precision, monkeypatch):
+def test_every_build_gives_the_same_bits(precision, filled, monkeypatch):
     expected = solve(precision)
     compiler = " ".join(build_module.compiler())
     for option in ("-DLANES_VECTOR_BYTES=16", "-DLANES_VECTOR_BYTES=32", "-fno-inline -fno-tree-vectorize"):
@@ -147,10 +157,10 @@ def test_without_a_compiler(kind, tmp_path, monkeypatch):
         assert make_planner(CONFIG, QUADROTOR, 2).solver.name == "fatrop"
 
 
-def test_with_a_compiler_the_fast_solver_is_the_default():
+def test_with_a_compiler_the_fast_solver_is_the_default(filled):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert make_planner(CONFIG, QUADROTOR, 2).solver.name == "rti"
+        assert make_planner(CONFIG, QUADROTOR, 3).solver.name == "rti"
 
 
 def flip_a_bit(library: Path) -> None:
@@ -191,7 +201,7 @@ def test_a_damaged_library_is_compiled_again(damage, stub_compiler):
 
 
 @pytest.mark.parametrize("kind", ["absent", "misnamed", "failing"])
-def test_without_a_compiler_the_cache_will_do(kind, tmp_path, monkeypatch):
+def test_without_a_compiler_the_cache_will_do(kind, filled, tmp_path, monkeypatch):
     expected = solve()
     break_compiler(kind, tmp_path, monkeypatch)
     build_module.load.cache_clear()
@@ -310,18 +320,3 @@ def test_functions_of_lanes_are_accurate(tmp_path):
     errors = [float(text) for text in run_harness(tmp_path, FUNCTIONS).split()]
     limits = [3e-12, 2e-9, 5e-7, 1e-12, 3e-7, 1e-15, 3e-7]
     assert all(error <= limit for error, limit in zip(errors, limits, strict=True)), errors
-
-
-def test_says_what_the_generator_cannot_do():
-    class Spinning(OptimalControlProblem):
-        def dynamics(self, x, u):
-            return ca.atan(super().dynamics(x, u))
-
-    class Cornered(OptimalControlProblem):
-        def box_violations(self, x):
-            return x[0] * x[1]
-
-    with pytest.raises(NotImplementedError, match="no lane form"):
-        generate_model(Spinning(CONFIG, QUADROTOR, 1))
-    with pytest.raises(ValueError, match="must be bounds"):
-        generate_model(Cornered(CONFIG, QUADROTOR, 1))

@@ -1,12 +1,12 @@
 """The real-time iteration lane by lane: to the last bit, whatever is asked of it and of its neighbours."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planning import QUADROTOR, Call, assert_same, scattered
 
 from quad_swarm.planner import (
     FatropSolver,
@@ -19,30 +19,12 @@ from quad_swarm.planner import (
     RtiSolver,
     make_planner,
 )
-from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
-
-QUADROTOR = QuadrotorParams()
-Call = tuple[Problems, np.ndarray, np.ndarray]
-
-
-def scattered(config: PlannerConfig, count: int, n_others: int, seed: int = 0, scale: float = 1.0) -> Call:
-    """Problems that no flight would meet: anything anywhere, at any speed, with any guess."""
-    rng = np.random.default_rng(seed)
-    x = scale * rng.normal(size=(count, 9)) * ([2, 2, 1] + [2] * 3 + [0.2] * 3)
-    others = scale * rng.normal(size=(count, n_others, config.horizon, 3)) * 2
-    limits = [config.max_tilt, config.max_tilt, config.max_climb_rate, config.max_yaw_rate]
-    u_guess = rng.uniform(-1, 1, (count, config.horizon, 4)) * limits
-    return Problems(x, 3 * rng.normal(size=(count, 3)), others), np.zeros((count, config.horizon + 1, 9)), u_guess
+from quad_swarm.quadrotor import QuadrotorModel
 
 
 def part(call: Call, index) -> Call:
     problems, x_guess, u_guess = call
     return Problems(*(field[index] for field in problems)), x_guess[index], u_guess[index]
-
-
-def assert_same(first, second) -> None:
-    for a, b in zip(first, second, strict=True):
-        assert np.array_equal(a, b)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -105,7 +87,7 @@ def test_reports_what_it_could_not_solve():
     assert np.isfinite(solution.x).all()
 
 
-def test_the_ladder_holds_the_failed_lane_only():
+def test_the_fallback_chain_holds_the_failed_lane_only():
     config = PlannerConfig()
     problems, _, _ = scattered(config, 6, 3, scale=0.5)
     planner = make_planner(config, QUADROTOR, 4, "rti")
@@ -133,25 +115,6 @@ def test_plans_the_yaw_too():
     assert mine.success.all()
     assert (np.abs(mine.u[:, 0, 3]) > 0.1).any()
     np.testing.assert_allclose(mine.x, reference.x, atol=1e-2)
-
-
-@pytest.mark.parametrize("solver", ["rti", "fatrop"])
-def test_considers_only_the_nearest(solver):
-    config = PlannerConfig(max_neighbours=2)
-    (x, goal, others), _, _ = scattered(config, 5, 4, scale=0.3)
-    others += [3.0, 0, 0]
-    others[:, [1, 3]] -= [2.0, 0, 0]  # these come nearer
-    last = Plans.hover(x, config.horizon)
-    limited = make_planner(config, QUADROTOR, 5, solver).plan(Problems(x, goal, others), last)
-    two = make_planner(dataclasses.replace(config, max_neighbours=None), QUADROTOR, 3, solver)
-    assert_same(limited, two.plan(Problems(x, goal, others[:, [1, 3]]), last))
-
-
-def test_a_limit_above_the_number_of_others_changes_nothing():
-    problems, _, _ = scattered(PlannerConfig(), 4, 2)
-    last = Plans.hover(problems.x, 10)
-    plans = [make_planner(PlannerConfig(max_neighbours=k), QUADROTOR, 3, "rti").plan(problems, last) for k in (None, 9)]
-    assert_same(*plans)
 
 
 @pytest.mark.parametrize(

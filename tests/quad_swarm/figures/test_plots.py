@@ -1,0 +1,107 @@
+"""Figures of an evaluation: that they show the numbers of its rows and the path of its flight."""
+
+import dataclasses
+
+import matplotlib.colors
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from quad_swarm.evaluation.flight import Condition, Flight, fly
+from quad_swarm.figures import plots
+from quad_swarm.world.presets import make_config
+
+
+def row(scenario: str, policy: str, collisions: int, share: float) -> dict:
+    """A row of 20 episodes."""
+    bounds = {"collision_low": collisions / 40, "collision_high": collisions / 20 + 0.1}
+    keys = {"scenario": scenario, "policy": policy, "collisions": collisions, "episodes": 20, "request_share": share}
+    return keys | bounds
+
+
+ROWS = [
+    row("random", "none", 10, 0.0),
+    row("random", "full", 0, 1.0),
+    row("random", "cpa:1:1", 2, 0.2),
+    row("random", "random:0.5", 4, 0.5),  # worse in both
+    row("random_swap", "none", 20, 0.0),
+    row("random_swap", "full", 1, 1.0),
+    row("random_swap", "cpa:1:1", 3, 0.4),
+    row("random_swap", "random:0.5", 5, 0.3),
+]
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[Condition, Flight]:
+    condition = Condition("distance:2.5", "random_swap", make_config("paper"), max_steps=100)
+    return condition, fly(condition, 0)
+
+
+@pytest.mark.parametrize(
+    ("draw", "height"),
+    [
+        (plots.draw_collisions, lambda one: one["collisions"] / one["episodes"]),
+        (plots.draw_requests, lambda one: one["request_share"]),
+    ],
+    ids=["collisions", "requests"],
+)
+def test_bars_are_as_high_as_the_rows_say(draw, height):
+    (axes,) = draw(ROWS).axes
+    bars = {container.get_label(): container for container in axes.containers if len(container.get_label()) > 0}
+    policies = list(dict.fromkeys(one["policy"] for one in ROWS))
+    for policy in policies:
+        expected = [height(one) for one in ROWS if one["policy"] == policy]
+        assert [bar.get_height() for bar in bars[policy]] == expected
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["random", "random swap"]
+
+
+def test_the_front_joins_policies_that_none_is_better_than_in_both():
+    figure = plots.draw_front(ROWS)
+    assert [axes.get_title() for axes in figure.axes] == ["random", "random swap"]
+    fronts = [axes.lines[0].get_xydata().tolist() for axes in figure.axes]
+    assert fronts == [[[0, 0.5], [0.2, 0.1], [1, 0]], [[0, 1.0], [0.3, 0.25], [0.4, 0.15], [1, 0.05]]]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["none", "full", "cpa:1:1", "random:0.5"]
+
+
+def test_a_flight_is_yellow_where_a_robot_asks(flown):
+    _, flight = flown
+    axes = Figure().subplots()
+    plots.draw_flight(axes, flight)
+    asks = flight.requests.any(axis=2)
+    assert 0 < asks.mean() < 1
+    assert len(axes.collections) == len(flight.goal)
+    for robot, points in enumerate(axes.collections):
+        np.testing.assert_array_equal(points.get_offsets(), flight.state[:-1][asks[:, robot], robot, :2])
+        if asks[:, robot].any():
+            assert matplotlib.colors.to_hex(points.get_facecolor()[0]) == plots.ASKING.lower()
+    path, start, goal = axes.lines[:3]
+    np.testing.assert_array_equal(path.get_xydata(), flight.state[:, 0, :2])
+    assert start.get_xydata()[0].tolist() == flight.state[0, 0, :2].tolist()
+    assert goal.get_xydata()[0].tolist() == flight.goal[0, :2].tolist()
+
+
+def test_a_panel_for_each_flight(flown):
+    condition, flight = flown
+    figure = plots.draw_flights([condition] * 3, [flight] * 3)
+    assert [axes.get_visible() for axes in figure.axes] == [True, True, True, False]
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["random swap"] * 3
+    assert "distance:2.5" in figure.get_suptitle()
+
+
+def test_the_animation_ends_shortly_after_all_have_arrived(flown, tmp_path):
+    condition, flight = flown
+    assert flight.arrival is not None
+    end = slice(flight.arrival - 2, None)  # to draw few frames
+    flight = dataclasses.replace(
+        flight, state=flight.state[end], plans=flight.plans[end], requests=flight.requests[end]
+    )
+    plots.animate(condition, flight, tmp_path / "swarm.gif")
+    with Image.open(tmp_path / "swarm.gif") as film:
+        duration = 0
+        for frame in range(film.n_frames):
+            film.seek(frame)
+            duration += film.info["duration"]
+    # Frames that look the same are stored as one that lasts longer
+    assert duration == 100 * (flight.arrival + 9) < 100 * len(flight.requests)

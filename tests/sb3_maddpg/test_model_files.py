@@ -1,0 +1,95 @@
+"""Model files: whose they are, which format they have, and numbers that are not finite."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch as th
+from stable_baselines3 import PPO, TD3
+
+from sb3_maddpg import MADDPG
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.model_files import FILE_FORMAT, check_file, optimizer_not_finite
+from sb3_maddpg.team_tasks import OwnBit
+
+
+def learned(steps: int = 30) -> MADDPG:
+    return MADDPG("MlpPolicy", OwnBit(), learning_starts=20, batch_size=16, train_freq=5, buffer_size=100).learn(steps)
+
+
+def assert_equal_state(a: dict, b: dict) -> None:
+    """Networks and optimizers, leaf by leaf."""
+    for x, y in zip(th.utils._pytree.tree_leaves(a), th.utils._pytree.tree_leaves(b), strict=True):
+        assert th.equal(x, y) if isinstance(x, th.Tensor) else x == y
+
+
+def test_what_is_no_archive_is_left_to_sb3(tmp_path):
+    path = tmp_path / "model.zip"
+    path.write_bytes(b"no archive")
+    check_file(path, "MADDPG", {"MADDPG"})
+
+
+def test_a_stream_can_be_read_after_the_check(tmp_path):
+    learned().save(tmp_path / "model.zip")
+    stream = io.BytesIO((tmp_path / "model.zip").read_bytes())
+    check_file(stream, "MADDPG", {"MADDPG"})
+    assert stream.tell() == 0
+    with zipfile.ZipFile(stream) as archive:
+        assert json.loads(archive.read("data"))["file_format"] == FILE_FORMAT
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), float("-inf")])
+def test_one_number_of_an_optimizer_that_is_not_finite_is_found(wrong):
+    weight = th.nn.Parameter(th.ones(3))
+    optimizer = th.optim.Adam([weight])
+    assert not optimizer_not_finite(optimizer.state_dict())
+    weight.sum().backward()
+    optimizer.step()
+    assert not optimizer_not_finite(optimizer.state_dict())
+    optimizer.state[weight]["exp_avg"][1] = wrong
+    assert optimizer_not_finite(optimizer.state_dict())
+
+
+def rewritten(source: Path, target: Path, **changes) -> Path:
+    """:return: the model's file with other entries in its data, None to leave one out"""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == "data":
+                data = {**json.loads(content), **changes}
+                content = json.dumps({key: value for key, value in data.items() if value is not None}).encode()
+            new.writestr(name, content)
+    return target
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_models_of_other_algorithms_are_refused(tmp_path, stream):
+    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
+    TD3("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "td3.zip")
+    MATD3("MlpPolicy", OwnBit()).save(tmp_path / "matd3.zip")
+    learned().save(tmp_path / "maddpg.zip")
+    for algorithm, name, message in (
+        (MADDPG, "ppo", "holds a model of another algorithm than MADDPG"),
+        (MADDPG, "td3", "holds a model of another algorithm than MADDPG"),
+        (MATD3, "td3", "holds a model of another algorithm than MATD3"),
+        (MADDPG, "matd3", r"holds a model of MATD3: load it with `MATD3\.load`"),
+        (MATD3, "maddpg", r"holds a model of MADDPG: load it with `MADDPG\.load`"),
+    ):
+        path = tmp_path / f"{name}.zip"
+        with pytest.raises(ValueError, match=message):
+            algorithm.load(io.BytesIO(path.read_bytes()) if stream else path)
+    assert MATD3.load(tmp_path / "matd3").algorithm == "MATD3"
+
+
+@pytest.mark.parametrize("changes", [{"file_format": 1}, {"file_format": 99}, {"file_format": None, "algorithm": None}])
+def test_a_file_of_another_format_is_refused(tmp_path, changes):
+    model = learned()
+    model.save(tmp_path / "model.zip")
+    path = rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes)
+    written = changes["file_format"] or 1
+    with pytest.raises(ValueError, match=rf"other\.zip has format {written}, .* reads format 2: install the version"):
+        MADDPG.load(path)
+    same = MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "same.zip"))
+    assert_equal_state(same.get_parameters(), model.get_parameters())
