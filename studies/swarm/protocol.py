@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -120,6 +121,19 @@ def replace_rows(path: Path, rows: list[dict[str, Any]], keys: tuple[str, ...]) 
     write_rows(path, [*kept, *rows])
 
 
+def known_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a table, to look at: a table is parsed again when its file has changed only."""
+    if not path.exists():
+        return []
+    stat = path.stat()
+    return _parsed(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=8)
+def _parsed(path: Path, modified: int, size: int) -> list[dict[str, Any]]:
+    return read_rows(path)
+
+
 def absolute_path(text: str) -> Path:
     """An argument of the command line: what it names here, also after a change of the working directory."""
     return Path(text).resolve()
@@ -134,7 +148,7 @@ def best_rules(preset: str, n_robots: int | None = None) -> dict[str, str]:
     """For each scenario the rule with the fewest requests that was as safe as full communication in validation, in a
     preset or in a team of another size."""
     best: dict[str, dict[str, Any]] = {}
-    for row in read_rows(DATA / ("rules.json" if n_robots is None else "team_rules.json")):
+    for row in known_rows(DATA / ("rules.json" if n_robots is None else "team_rules.json")):
         if row["preset"] == preset and row.get("n_robots") == n_robots and row["safe"]:
             known = best.setdefault(row["scenario"], row)
             if row["request_share"] < known["request_share"]:
@@ -148,7 +162,7 @@ def tuned(recipe: str, scenario: str, n_robots: int | None = None) -> list[str]:
     for_all: dict[str, float] = {}
     for_this: dict[str, float] = {}
     paths = models(recipe)
-    for row in read_rows(DATA / "thresholds.json"):  # tried from the highest on
+    for row in known_rows(DATA / "thresholds.json"):  # tried from the highest on
         if (path := row["model"]) in paths:
             for_all[path] = min(row["threshold"], for_all.get(path, 1.0))
             if row["scenario"] == scenario and n_robots in (None, row["n_robots"]):

@@ -166,6 +166,17 @@ def test_rows_of_other_keys_stay(tmp_path):
     assert read_rows(path) == [{"a": 2, "b": 3}, {"a": 1, "b": 4}]
 
 
+def test_a_table_is_read_again_when_it_has_changed(tmp_path):
+    path = tmp_path / "rows.json"
+    assert protocol.known_rows(path) == []
+    protocol.replace_rows(path, [{"a": 1}], ("a",))
+    rows = protocol.known_rows(path)
+    assert rows == [{"a": 1}]
+    assert protocol.known_rows(path) is rows, "parsed once"
+    protocol.replace_rows(path, [{"a": 2}], ("a",))
+    assert protocol.known_rows(path) == [{"a": 1}, {"a": 2}]
+
+
 def test_rows_of_an_earlier_rule_do_not_stay(tmp_path, monkeypatch):
     monkeypatch.setattr(fly_tests, "QUICK", 1)
     for rule in ("none", "full"):

@@ -77,7 +77,7 @@ def test_continuous_actions():
 
 def test_without_learning_nothing_is_solved():
     for task in (*BINARY_TASKS, FollowTarget, OwnCategory):
-        assert learned(task, 10, learning_starts=100) < 0.9
+        assert learned(task, 10, learning_starts=100, buffer_size=1000) < 0.9
 
 
 def best_of_all_policies(task: TeamTask, signs: np.ndarray, bits: np.ndarray) -> float:

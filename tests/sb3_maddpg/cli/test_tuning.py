@@ -199,7 +199,8 @@ def test_the_best_trial_is_written_as_a_recipe(folder, capsys):
     assert recipe["policy_kwargs"]["threshold"] == 0.25  # of the recipe that was searched from
     assert main([*command.split()[1:], "--eval-freq", "-1", "--verbose", "0"]) == 0
     model = MADDPG.load("logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip")
-    assert (model.tau, model.gamma, model.num_timesteps) == (recipe["tau"], recipe["gamma"], 60)
+    assert (model.tau, model.gamma) == (recipe["tau"], recipe["gamma"])
+    assert 60 <= model.num_timesteps < 60 + recipe["train_freq"]
 
 
 def test_classes_of_a_trial_have_a_form_in_a_recipe():
