@@ -17,7 +17,6 @@ buffer actions and back, ``unscale`` and ``scale`` from these to environment act
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import cast
 
 import numpy as np
 import torch as th
@@ -25,7 +24,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.estimators import Estimator
-from sb3_maddpg.team import AgentActionSpace, Team, heads_of
+from sb3_maddpg.team import AgentActionSpace, heads_of
 
 QOfAlternatives = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
@@ -208,22 +207,6 @@ class Categorical(ActionKind):
         return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
 
 
-def check_bounds(team: Team) -> None:
-    """
-    :param team: whose continuous actions are scaled by their bounds
-    :raises ValueError: bounds whose range is not finite in single precision, or negative
-    """
-    for name, space in zip(team.names, team.action_spaces, strict=True):
-        if isinstance(space, spaces.Box):
-            with np.errstate(over="ignore", invalid="ignore"):
-                span = space.high.astype(np.float32) - space.low.astype(np.float32)
-            if not (np.isfinite(span) & (span >= 0)).all():
-                raise ValueError(
-                    f"The actions of {name} lie between {space.low.tolist()} and {space.high.tolist()}: actions are "
-                    "scaled to [-1, 1], so the range must be finite in single precision. Give the Box narrower bounds."
-                )
-
-
 def make_kinds(
     action_spaces: Sequence[AgentActionSpace], threshold: float, n_thresholds: int = 1, random_thresholds: float = 1.0
 ) -> list[ActionKind]:
@@ -280,8 +263,9 @@ class TeamActions(nn.Module):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
-        kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
-        self.kinds = cast("Sequence[ActionKind]", nn.ModuleList(kinds))
+        # A ModuleList alone is so slow to index that acting shows it
+        self.kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
+        self.modules_of_kinds = nn.ModuleList(self.kinds)
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()
         boxes = [

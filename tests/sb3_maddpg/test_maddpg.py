@@ -331,3 +331,37 @@ def test_a_model_for_a_team_of_another_size_has_its_networks_and_arguments():
     large.learn(40)
     with pytest.raises(ValueError, match="fits one size of team"):
         learned().resized(OwnBit())
+
+
+def test_an_expectation_that_no_memory_holds_is_refused():
+    class Wide(FollowTarget):
+        """One of very many categories each."""
+
+        def __init__(self, categories: int):
+            super().__init__()
+            self.action_space = spaces.MultiDiscrete([categories] * self.n_agents)
+
+    pattern = r"each of the 3000 categories .* agent agent_0 .* batch_size=1024 .* 69 GiB .* batch_size of at most 59\."
+    with pytest.raises(ValueError, match=pattern):
+        MADDPG("MlpPolicy", Wide(3000))
+    MADDPG("MlpPolicy", Wide(3000), batch_size=59)
+    MADDPG("MlpPolicy", Wide(3000), estimator="score")
+
+
+def test_a_short_training_logs_its_episodes_once():
+    written = []
+
+    class Keep(KVWriter):
+        def write(self, key_values, key_excluded, step=0):
+            written.append((step, key_values.get("rollout/ep_rew_mean")))
+
+        def close(self):
+            pass
+
+    model = MADDPG("MlpPolicy", OwnBit(episode_length=10), **SMALL)
+    model.set_logger(Logger(None, [Keep()]))
+    model.learn(30)
+    assert [step for step, _ in written] == [30]
+    assert written[0][1] is not None
+    model.learn(40)  # the fourth episode ends with it
+    assert [step for step, _ in written] == [30, 40]
