@@ -136,16 +136,16 @@ class Binary(ActionKind):
         return th.sigmoid(logits) * self.real if self.padded else th.sigmoid(logits)
 
     def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
-        scores = self.squash(logits)
+        probabilities = self.squash(logits)
         if deterministic:
-            return (scores > self.threshold).to(scores.dtype)
-        thresholds = th.rand_like(scores[..., : self.n_thresholds])
+            return (probabilities > self.threshold).to(probabilities.dtype)
+        thresholds = th.rand_like(probabilities[..., : self.n_thresholds])
         if self.random_thresholds < 1:
             drawn = th.rand_like(thresholds) < self.random_thresholds
-            thresholds = thresholds.where(drawn, th.as_tensor(self.threshold, dtype=scores.dtype))
+            thresholds = thresholds.where(drawn, th.as_tensor(self.threshold, dtype=probabilities.dtype))
         if self.n_thresholds > 1:
             thresholds = thresholds.repeat_interleave(self.width // self.n_thresholds, dim=-1)
-        return (scores > thresholds).to(scores.dtype)
+        return (probabilities > thresholds).to(probabilities.dtype)
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
         return estimator.binary(self.squash(logits), q, temperature)

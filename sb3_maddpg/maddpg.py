@@ -770,15 +770,15 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     return vec_env
 
 
-def _price_up_to(scores: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
+def _price_up_to(probabilities: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
     """
-    :param scores: any shape
+    :param probabilities: of binary actions, any shape
     :param prices: at the thresholds 0 and 1, geometric in between
-    :return: the mean price that bits with these scores pay where the threshold is uniform in [0, 1]: its integral from
-        0 to the score
+    :return: the mean price that actions of these probabilities pay where the threshold is uniform in [0, 1]: its
+        integral from 0 to the probability
     """
     first, growth = prices[0], math.log(prices[1] / prices[0])
-    return first * th.expm1(growth * scores) / growth
+    return first * th.expm1(growth * probabilities) / growth
 
 
 def _mean_over_batch(values: th.Tensor, active: th.Tensor | None, weights: th.Tensor | None) -> th.Tensor:

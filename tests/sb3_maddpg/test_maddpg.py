@@ -44,7 +44,7 @@ def test_processes_train_the_same_parameters():
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("kind", ["unlike", "mixed"])
+@pytest.mark.parametrize("kind", ["heterogeneous", "mixed"])
 def test_runs_with_every_estimator(estimator, kind):
     before = MADDPG("MlpPolicy", TeamEnv(Toy(kind)), **SMALL)
     after = learned(TeamEnv(Toy(kind)), estimator=estimator, temperature=lambda left: 0.5 + left)
@@ -57,7 +57,7 @@ def test_runs_with_every_estimator(estimator, kind):
 @pytest.mark.parametrize(
     ("priced", "n_steps", "clip"), [(False, 1, None), (False, 3, 0.05), (True, 1, 0.05), (True, 3, None)]
 )
-@pytest.mark.parametrize("kind", ["bits", "numbers", "categories", "unlike"])
+@pytest.mark.parametrize("kind", ["binary", "continuous", "categorical", "heterogeneous"])
 def test_one_update_is_that_of_separate_agents(kind, clip, n_steps, priced):
     lr, tau, weight = 0.1, 0.3, 0.02
     env = TeamEnv(Toy(kind))
@@ -88,7 +88,7 @@ def test_one_update_is_that_of_separate_agents(kind, clip, n_steps, priced):
 
 
 def test_a_price_is_on_the_scale_of_normalised_rewards():
-    env = TeamEnv(Toy("unlike"))
+    env = TeamEnv(Toy("heterogeneous"))
     env.action_cost = 0.7
     vec_env = VecNormalize(DummyVecEnv([lambda: env]))
     numbers = {"learning_rate": 0.1, "gamma": 0.9, "max_grad_norm": None, "policy_kwargs": SGD}
@@ -271,9 +271,9 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
 
 def test_numbers_of_numpy_are_numbers():
     numbers = {"exploration_noise": np.float32(0.25), "batch_size": np.int64(16), "gamma": np.float32(0.5)}
-    model = learned(TeamEnv(Toy("numbers")), 60, **numbers)
+    model = learned(TeamEnv(Toy("continuous")), 60, **numbers)
     assert (model.noise_std, model.batch_size, model.gamma) == (0.25, 16, 0.5)
-    assert learned(TeamEnv(Toy("numbers")), 60, exploration_noise=np.array([0.5, 0.5])).noise_std == 0.5
+    assert learned(TeamEnv(Toy("continuous")), 60, exploration_noise=np.array([0.5, 0.5])).noise_std == 0.5
 
 
 @pytest.mark.parametrize("price", [(1e-12, 1e12), (1e-12, 1e-11), (1.0, 1.00001)])
