@@ -17,7 +17,6 @@ buffer actions and back, ``unscale`` and ``scale`` from these to environment act
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import cast
 
 import numpy as np
 import torch as th
@@ -25,7 +24,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.estimators import Estimator
-from sb3_maddpg.team import AgentActionSpace, Team, heads_of
+from sb3_maddpg.team import AgentActionSpace, heads_of
 
 QOfAlternatives = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
@@ -137,16 +136,16 @@ class Binary(ActionKind):
         return th.sigmoid(logits) * self.real if self.padded else th.sigmoid(logits)
 
     def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
-        scores = self.squash(logits)
+        probabilities = self.squash(logits)
         if deterministic:
-            return (scores > self.threshold).to(scores.dtype)
-        thresholds = th.rand_like(scores[..., : self.n_thresholds])
+            return (probabilities > self.threshold).to(probabilities.dtype)
+        thresholds = th.rand_like(probabilities[..., : self.n_thresholds])
         if self.random_thresholds < 1:
             drawn = th.rand_like(thresholds) < self.random_thresholds
-            thresholds = thresholds.where(drawn, th.as_tensor(self.threshold, dtype=scores.dtype))
+            thresholds = thresholds.where(drawn, th.as_tensor(self.threshold, dtype=probabilities.dtype))
         if self.n_thresholds > 1:
             thresholds = thresholds.repeat_interleave(self.width // self.n_thresholds, dim=-1)
-        return (scores > thresholds).to(scores.dtype)
+        return (probabilities > thresholds).to(probabilities.dtype)
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
         return estimator.binary(self.squash(logits), q, temperature)
@@ -208,22 +207,6 @@ class Categorical(ActionKind):
         return estimator.categorical(self._heads(logits), lambda own: q(self._columns(own)), temperature)
 
 
-def check_bounds(team: Team) -> None:
-    """
-    :param team: whose continuous actions are scaled by their bounds
-    :raises ValueError: bounds whose range is not finite in single precision, or negative
-    """
-    for name, space in zip(team.names, team.action_spaces, strict=True):
-        if isinstance(space, spaces.Box):
-            with np.errstate(over="ignore", invalid="ignore"):
-                span = space.high.astype(np.float32) - space.low.astype(np.float32)
-            if not (np.isfinite(span) & (span >= 0)).all():
-                raise ValueError(
-                    f"The actions of {name} lie between {space.low.tolist()} and {space.high.tolist()}: actions are "
-                    "scaled to [-1, 1], so the range must be finite in single precision. Give the Box narrower bounds."
-                )
-
-
 def make_kinds(
     action_spaces: Sequence[AgentActionSpace], threshold: float, n_thresholds: int = 1, random_thresholds: float = 1.0
 ) -> list[ActionKind]:
@@ -280,8 +263,9 @@ class TeamActions(nn.Module):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
-        kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
-        self.kinds = cast("Sequence[ActionKind]", nn.ModuleList(kinds))
+        # A ModuleList alone is so slow to index that acting shows it
+        self.kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
+        self.modules_of_kinds = nn.ModuleList(self.kinds)
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()
         boxes = [

@@ -11,7 +11,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg.team import InfoKey, Team, heads_of
-from sb3_maddpg.utils import all_finite
+from sb3_maddpg.utils import all_finite, not_finite_at
+from sb3_maddpg.validation import PriorityArguments, ReplayBufferArguments, validated
 
 
 class TeamReplayBufferSamples(NamedTuple):
@@ -117,29 +118,40 @@ class TeamReplayBuffer(ReplayBuffer):
         n_pairs: int = 0,
     ):
         self.team = Team.from_spaces(observation_space, action_space)
-        _check_arguments(buffer_size, n_envs, n_steps, gamma, n_pairs, optimize_memory_usage)
-        super().__init__(
-            buffer_size,
-            observation_space,
-            action_space,
-            device,
+        arguments = validated(
+            ReplayBufferArguments,
+            buffer_size=buffer_size,
             n_envs=n_envs,
             optimize_memory_usage=optimize_memory_usage,
-            handle_timeout_termination=handle_timeout_termination,
+            n_steps=n_steps,
+            gamma=gamma,
+            n_pairs=n_pairs,
         )
         self.n_agents = self.team.n_agents
-        self.n_steps = n_steps
-        self.gamma = gamma
-        self.n_pairs = n_pairs
+        self.n_steps = arguments.pop("n_steps")
+        self.gamma = arguments.pop("gamma")
+        self.n_pairs = arguments.pop("n_pairs")
+        if self.n_steps > 1 and arguments["optimize_memory_usage"]:
+            raise ValueError(
+                f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not "
+                "keep where an episode ends. Set n_steps=1 or optimize_memory_usage=False."
+            )
+        super().__init__(
+            observation_space=observation_space,
+            action_space=action_space,
+            device=device,
+            handle_timeout_termination=handle_timeout_termination,
+            **arguments,
+        )
         self.all_active = True
         self.n_added = 0
         names = ["observations", "actions"]
-        if not optimize_memory_usage:
+        if not self.optimize_memory_usage:
             names.append("next_observations")
         fields: list[Any] = [(name, getattr(self, name).dtype, getattr(self, name).shape[2:]) for name in names]
         # Side by side and of one type, so that n steps of them are read with one index
-        fields.append(("numbers", np.float32, (self.n_agents * (3 + n_pairs) + 4,)))
-        self._use(np.zeros((self.buffer_size, n_envs), np.dtype(fields, align=True)))
+        fields.append(("numbers", np.float32, (self.n_agents * (3 + self.n_pairs) + 4,)))
+        self._use(np.zeros((self.buffer_size, self.n_envs), np.dtype(fields, align=True)))
 
     def _use(self, records: np.ndarray) -> None:
         self.records = records
@@ -266,11 +278,9 @@ class TeamReplayBuffer(ReplayBuffer):
                 f"{self.n_agents} agents: it must be {shape}. A buffer fits only the team and the number of "
                 "environments that it was made for."
             )
-        if all_finite(values):
+        values = values.reshape(shape)
+        if (index := not_finite_at(values)) is None:
             return
-        with np.errstate(over="ignore"):
-            values = values.reshape(shape).astype(np.float32)
-        index = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
         env, *place = index
         agent, column = place if what != "action" else self._place_of_action(place[0])
         raise ValueError(
@@ -475,17 +485,13 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     :param kwargs: see ``TeamReplayBuffer``
     """
 
+    alpha: float
+    beta: float
+    epsilon: float
+
     def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.5, epsilon: float = 0.01, **kwargs: Any):
-        if not (0 <= alpha <= 1 and 0 <= beta <= 1):
-            raise ValueError(f"alpha={alpha} and beta={beta} must be between 0 and 1.")
-        if not 0 < epsilon < math.inf:
-            raise ValueError(
-                f"epsilon={epsilon} must be positive and finite: without it, what has no error is never sampled."
-            )
+        self.__dict__.update(validated(PriorityArguments, alpha=alpha, beta=beta, epsilon=epsilon))
         super().__init__(*args, **kwargs)
-        self.alpha = alpha
-        self.beta = beta
-        self.epsilon = epsilon
         self.reset()
 
     def reset(self) -> None:
@@ -584,23 +590,3 @@ class SumTree:
             rest -= left * goes_right
             nodes += goes_right
         return nodes - (1 << self.depth), self.sums[nodes] / self.sums[1]
-
-
-def _check_arguments(
-    buffer_size: int, n_envs: int, n_steps: int, gamma: float, n_pairs: int, optimize_memory_usage: bool
-) -> None:
-    for name, number, least in (
-        ("buffer_size", buffer_size, 1),
-        ("n_envs", n_envs, 1),
-        ("n_steps", n_steps, 1),
-        ("n_pairs", n_pairs, 0),
-    ):
-        if not isinstance(number, (int, np.integer)) or number < least:
-            raise ValueError(f"{name}={number!r} must be an integer of at least {least}.")
-    if not 0 <= gamma <= 1:
-        raise ValueError(f"gamma={gamma} must be between 0 and 1.")
-    if n_steps > 1 and optimize_memory_usage:
-        raise ValueError(
-            f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not keep "
-            "where an episode ends. Set n_steps=1 or optimize_memory_usage=False."
-        )

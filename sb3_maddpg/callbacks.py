@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, HParam, Logger, TensorBoardOutputFormat
 
 from sb3_maddpg.utils import arguments_of
+from sb3_maddpg.validation import CurriculumArguments, validated
 
 # What a text log cannot show
 TENSORBOARD_ONLY = ("stdout", "log", "json", "csv")
@@ -53,12 +54,9 @@ class CurriculumCallback(BaseCallback):
 
     def __init__(self, success_threshold: float = 0.9, window: int = 100, verbose: int = 0):
         super().__init__(verbose)
-        if not 0.0 < success_threshold <= 1.0:
-            raise ValueError(f"success_threshold={success_threshold} is a share of episodes: choose it in (0, 1].")
-        if not isinstance(window, int) or window < 1:
-            raise ValueError(f"window={window} is a number of episodes: choose an integer of at least 1.")
-        self.success_threshold = success_threshold
-        self.successes: deque[bool] = deque(maxlen=window)
+        arguments = validated(CurriculumArguments, success_threshold=success_threshold, window=window)
+        self.success_threshold = arguments["success_threshold"]
+        self.successes: deque[bool] = deque(maxlen=arguments["window"])
         self.n_levels = 0
 
     @property

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.relational import NeighbourViews
 from sb3_maddpg.team import Team, TeamInfo
-from sb3_maddpg.utils import all_finite, suggest
+from sb3_maddpg.utils import all_finite, not_finite_at, suggest
 
 _FLAGS = ("agent_terminated", "agent_active")
 
@@ -72,9 +72,8 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
     for step in range(1, max_steps + 1):
         obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
         where = f"in step {step}"
-        if not all_finite(np.asarray(obs)):
-            agent = np.argwhere(~np.isfinite(obs))[0][0]
-            raise ValueError(f"The observation of agent {team.names[agent]} {where} holds NaN or infinity.")
+        if (index := not_finite_at(np.asarray(obs))) is not None:
+            raise ValueError(f"The observation of agent {team.names[index[0]]} {where} holds NaN or infinity.")
         if not math.isfinite(reward):
             raise ValueError(f"The team's reward {where} is {reward}: it must be finite.")
         _check_info(info, team, where)
@@ -104,9 +103,8 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
                 f"info['{name}'] {where} is {info[name]!r}: it must hold a number for each of the {team.n_agents} "
                 f"agents{' and each of its neighbours' if name == 'pair_rewards' else ''}."
             )
-        if not all_finite(value):
-            agent = np.argwhere(~np.isfinite(value))[0][0]
-            raise ValueError(f"info['{name}'] of agent {team.names[agent]} {where} is not finite.")
+        if (index := not_finite_at(value)) is not None:
+            raise ValueError(f"info['{name}'] of agent {team.names[index[0]]} {where} is not finite.")
         if name in _FLAGS and not np.isin(value, (0, 1)).all():
             raise ValueError(f"info['{name}'] {where} is {value.tolist()}: it must hold True or False for each agent.")
     metrics = info.get("metrics", {})

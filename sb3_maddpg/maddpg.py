@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_normalize,
 )
 
+from sb3_maddpg.actions import Continuous
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import record_metrics
@@ -48,6 +49,8 @@ SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 NOT_POLICY_KWARGS = {"observation_space", "action_space", "lr_schedule"}
 # Arguments that a model for a team of another size does not take over
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
+# Of the actions that ``expected`` looks at in one update; the critics' layers take as much again, or more
+MOST_BYTES_OF_ALTERNATIVES = 4 * 2**30
 
 
 class MADDPG(OffPolicyAlgorithm):
@@ -222,6 +225,7 @@ class MADDPG(OffPolicyAlgorithm):
         finally:
             self.n_steps, self.buffer_size = n_steps, buffer_size
         self._create_aliases()
+        self._check_memory()
         actions = self.policy.actions
         if self.action_noise is not None and not actions.has_continuous:
             raise ValueError(
@@ -312,6 +316,27 @@ class MADDPG(OffPolicyAlgorithm):
                 "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
                 "observations, which a team does not have."
             )
+
+    def _check_memory(self) -> None:
+        """Refuse an expectation over so many actions that no machine could hold them."""
+        if self.estimator != "expected" or self.env is None:
+            return
+        factors, team = self.policy.critic.factors, self.policy.team
+        for kind in factors.kinds:
+            if isinstance(kind, Continuous):
+                continue
+            # As many alternatives as columns, each of them an encoded action in single precision
+            of_sample = 4 * len(kind.agents) * kind.width**2
+            if self.batch_size * of_sample > MOST_BYTES_OF_ALTERNATIVES:
+                widest = max(range(len(kind.agents)), key=lambda row: sum(kind.sizes[row]))
+                agent = kind.agents[widest] * team.n_agents // factors.n_agents
+                fits = MOST_BYTES_OF_ALTERNATIVES // of_sample
+                raise ValueError(
+                    f"estimator='expected' evaluates each of the {kind.width} categories or binary actions of agent "
+                    f"{team.names[agent]} ({team.action_spaces[agent]}): with batch_size={self.batch_size} this takes "
+                    f"{self.batch_size * of_sample / 2**30:.0f} GiB or more. Choose an estimator that samples, such as "
+                    "'gapped_straight_through'" + (f", or a batch_size of at most {fits}." if fits else ".")
+                )
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -571,7 +596,7 @@ class MADDPG(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfMADDPG:
-        return super().learn(
+        super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
             log_interval=log_interval,
@@ -579,6 +604,10 @@ class MADDPG(OffPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+        # Episodes since the last of SB3's tables, all of them in a short training
+        if log_interval and self._episode_num % log_interval:
+            self.dump_logs()
+        return self
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
@@ -741,15 +770,15 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     return vec_env
 
 
-def _price_up_to(scores: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
+def _price_up_to(probabilities: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
     """
-    :param scores: any shape
+    :param probabilities: of binary actions, any shape
     :param prices: at the thresholds 0 and 1, geometric in between
-    :return: the mean price that bits with these scores pay where the threshold is uniform in [0, 1]: its integral from
-        0 to the score
+    :return: the mean price that actions of these probabilities pay where the threshold is uniform in [0, 1]: its
+        integral from 0 to the probability
     """
     first, growth = prices[0], math.log(prices[1] / prices[0])
-    return first * th.expm1(growth * scores) / growth
+    return first * th.expm1(growth * probabilities) / growth
 
 
 def _mean_over_batch(values: th.Tensor, active: th.Tensor | None, weights: th.Tensor | None) -> th.Tensor:

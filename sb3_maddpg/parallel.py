@@ -16,7 +16,7 @@ from gymnasium.spaces.utils import flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint_action_space
-from sb3_maddpg.utils import all_finite, as_seed
+from sb3_maddpg.utils import as_seed, not_finite_at
 
 ENTRY_POINT = f"{__name__}:make"
 
@@ -194,7 +194,7 @@ class TeamEnv(gymnasium.Env):
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
         if over:
             info["metrics"] = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
-            successes = [told["is_success"] for told in infos.values() if told and "is_success" in told]
+            successes = [agent["is_success"] for agent in infos.values() if agent and "is_success" in agent]
             if successes:
                 info["is_success"] = all(successes)
         return self._observe(observations, seen), total / n_agents, over and not cut, cut, info
@@ -336,8 +336,8 @@ class TeamEnv(gymnasium.Env):
             state = np.zeros(len(matrix) * columns, np.float32)
             state[: team.state_dim] = self._state(team.state_dim)
             matrix[:, team.obs_dim :] = state.reshape(len(matrix), columns)
-        if not all_finite(matrix):
-            row, column = np.argwhere(~np.isfinite(matrix))[0].tolist()
+        if (index := not_finite_at(matrix)) is not None:
+            row, column = index
             whose = f"The observation of agent {self._agents[row]!r}" if column < team.obs_dim else "The state"
             raise ValueError(
                 f"{whose} is {matrix[row, column]} in column {column} {self._when} of {self.parallel_env}: it must be "
@@ -510,9 +510,18 @@ def make_parallel_env(
     :param entry: see ``make``
     :param wrappers: see ``make``
     :param kwargs: arguments of ``parallel_env``
+    :raises ValueError: no such module or wrapper, or ``black_death``, with which episodes hardly ever end
     """
+    pairs = _wrappers(wrappers)
+    for path, _ in pairs:
+        if path.rpartition(".")[2].startswith("black_death"):
+            raise ValueError(
+                f"The wrapper {path} keeps agents that ended in the episode, which then hardly ever ends (in SuperSuit "
+                "3.11 only where all agents terminate and are truncated in one step). Leave it out of `wrappers`: "
+                "agents that end before the others are dealt with here."
+            )
     env = find_parallel_env(entry)(**kwargs)
-    for path, arguments in _wrappers(wrappers):
+    for path, arguments in pairs:
         env = _load(path)(env, **arguments)
     return env
 

@@ -14,9 +14,10 @@ from stable_baselines3.common.torch_layers import get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_maddpg.actions import TeamActions, check_bounds
+from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.networks import StackedMLP
 from sb3_maddpg.team import MixedActions, Team
+from sb3_maddpg.utils import all_finite
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
 
 Sharing = bool | Sequence[Sequence[str | int]]
@@ -392,7 +393,6 @@ class MADDPGPolicy(BasePolicy):
             n_critics=n_critics,
         )
         self.team = Team.from_spaces(observation_space, action_space, agent_names)
-        check_bounds(self.team)
         self.net_arch = arguments["net_arch"]
         self.activation_fn = activation_fn
         self.share_actor = share_actor
@@ -474,13 +474,15 @@ class MADDPGPolicy(BasePolicy):
         :param observation: (..., n_agents, obs_dim or more)
         :raises ValueError: NaN or infinity
         """
-        finite = np.isfinite(observation)
-        if not finite.all():
-            agents = np.flatnonzero(~finite.all(axis=-1).reshape(-1, self.team.n_agents).all(axis=0))
-            raise ValueError(
-                f"The observation of agent(s) {', '.join(self.team.names[agent] for agent in agents)} holds NaN or "
-                "infinity. An action for it would mean nothing: clip or replace such values in the environment."
-            )
+        if all_finite(observation):
+            return
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(observation.astype(np.float32))
+        agents = np.flatnonzero(~finite.all(axis=-1).reshape(-1, self.team.n_agents).all(axis=0))
+        raise ValueError(
+            f"The observation of agent(s) {', '.join(self.team.names[agent] for agent in agents)} holds NaN or "
+            "infinity. An action for it would mean nothing: clip or replace such values in the environment."
+        )
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)

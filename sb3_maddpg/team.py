@@ -320,8 +320,8 @@ def check_action_space(agent: Any, space: spaces.Space) -> None:
     if isinstance(space, spaces.Box):
         low, high = _bounds(space)
         with np.errstate(over="ignore", invalid="ignore"):
-            bounded = np.isfinite(high - low).all()
-        if not bounded:
+            span = high - low
+        if not (np.isfinite(span) & (span >= 0)).all():
             raise ValueError(
                 f"Agent {agent!r} has the action space {space} without bounds, which say how far actions reach, or "
                 "with bounds too large for single precision. Give it smaller, finite ones."

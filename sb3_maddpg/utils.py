@@ -2,11 +2,13 @@
 
 import difflib
 import errno
+import glob
 import inspect
 import json
 import math
 import operator
 import os
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +20,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 # Arguments that gymnasium.make and make_vec take and keep among those of the environment
 NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"}
+# A temporary file that nobody has written to for so long is left over
+LEFT_OVER_SECONDS = 3600
 
 
 def suggest(kind: str, name: str, known: Iterable[str]) -> str:
@@ -74,6 +78,7 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
     temporary = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_left_over(target)
         file = temporary.open("wb")
     except OSError as error:
         reason = f"Cannot write here ({error.strerror}): choose another folder"
@@ -87,6 +92,30 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
         _sync_folder(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _remove_left_over(target: Path) -> None:
+    """Remove temporary files of processes that were killed while they wrote this file."""
+    prefix = f".{target.name}."
+    for path in target.parent.glob(f"{glob.escape(prefix)}*"):
+        process = path.name.removeprefix(prefix)
+        # The process may run on another machine, but not for so long without writing
+        if process.isdecimal() and not _runs(int(process)) and time.time() - path.stat().st_mtime > LEFT_OVER_SECONDS:
+            path.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    if os.name == "nt":  # to ask for a process there would end it
+        return process == os.getpid()
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OverflowError:  # no process has such a number
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def _sync_folder(folder: Path) -> None:
@@ -129,6 +158,17 @@ def all_finite(values: np.ndarray) -> bool:
             values = values.astype(np.float32)
     # One quick look at all of them. Large numbers fail it too, and pass the thorough one
     return math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
+
+
+def not_finite_at(values: np.ndarray) -> tuple[int, ...] | None:
+    """
+    :param values: any shape
+    :return: index of the first of them that is not finite in the networks' single precision, None if all are
+    """
+    if all_finite(values):
+        return None
+    with np.errstate(over="ignore"):
+        return tuple(np.argwhere(~np.isfinite(values.astype(np.float32)))[0].tolist())
 
 
 def as_seed(seed: Any) -> int | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,7 +19,7 @@ Schedule = Callable[[float], float]
 
 
 class Arguments(BaseModel):
-    """Arguments whose descriptions say what is allowed: messages quote them."""
+    """Arguments whose descriptions say what is allowed: messages quote them, or else what pydantic says."""
 
     model_config = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, extra="forbid")
 
@@ -98,6 +98,32 @@ class PolicyArguments(ThresholdArgument):
         return net_arch
 
 
+class ReplayBufferArguments(Arguments):
+    """Of ``TeamReplayBuffer``."""
+
+    buffer_size: int = Field(ge=1, description="an integer of at least 1")
+    n_envs: int = Field(ge=1, description="an integer of at least 1")
+    optimize_memory_usage: bool = Field(description="True or False")
+    n_steps: int = Field(ge=1, description="an integer of at least 1")
+    gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
+    n_pairs: int = Field(ge=0, description="an integer of at least 0")
+
+
+class PriorityArguments(Arguments):
+    """Of ``PrioritizedTeamReplayBuffer``, beside those of ``TeamReplayBuffer``."""
+
+    alpha: float = Field(ge=0, le=1, description="a number between 0 and 1")
+    beta: float = Field(ge=0, le=1, description="a number between 0 and 1")
+    epsilon: float = Field(gt=0, description="positive and finite: without it, what has no error is never sampled")
+
+
+class CurriculumArguments(Arguments):
+    """Of ``CurriculumCallback``."""
+
+    success_threshold: float = Field(gt=0, le=1, description="a share of episodes above 0, up to 1")
+    window: int = Field(ge=1, description="a number of episodes, at least 1")
+
+
 class PairPolicyArguments(Arguments):
     """Of ``PairPolicy``, beside those of ``MADDPGPolicy``."""
 
@@ -112,9 +138,31 @@ def validated(arguments: type[Arguments], **values: Any) -> dict[str, Any]:
     :return: the values, converted to the types that are expected
     :raises ValueError: one line that names the argument, its value and what is allowed
     """
+    return validated_as(arguments, values, "{}".format)
+
+
+def validated_as(
+    arguments: type[Arguments], values: Mapping[str, Any], as_written: Callable[[str], str]
+) -> dict[str, Any]:
+    """
+    ``validated`` for values that the user did not write as arguments of Python.
+
+    :param arguments: what they are and what is allowed
+    :param values: by their names
+    :param as_written: how the user wrote the argument of a name
+    :return: the values, converted to the types that are expected
+    :raises ValueError: one line that names the argument, its value and what is allowed
+    """
     try:
-        return dict(arguments.model_validate(values))
+        return dict(arguments.model_validate(dict(values)))
     except ValidationError as error:
-        name = str(error.errors()[0]["loc"][0])
-        allowed = arguments.model_fields[name].description
-        raise ValueError(f"{name}={values.get(name)!r} must be {allowed}.") from None
+        findings = error.errors(include_url=False, include_context=False)
+    name = str(findings[0]["loc"][0])
+    if findings[0]["type"] == "missing":
+        raise ValueError(f"{as_written(name)} is missing.")
+    given = f"{as_written(name)}={values[name]!r}"
+    if allowed := arguments.model_fields[name].description:
+        raise ValueError(f"{given} must be {allowed}.")
+    messages = [one["msg"].removeprefix("Value error, ") for one in findings if one["loc"][0] == name]
+    said = dict.fromkeys(message[:1].lower() + message[1:] for message in messages)
+    raise ValueError(f"{given}: {', or '.join(said)}.")

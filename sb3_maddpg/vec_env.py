@@ -8,7 +8,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_maddpg.utils import all_finite, as_seed
+from sb3_maddpg.utils import as_seed, not_finite_at
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -63,8 +63,8 @@ class GymnasiumVecEnv(VecEnv):
                 f"The actions have shape {actions.shape}, but there are {self.num_envs} environments with the action "
                 f"space {self.action_space}: they must have shape {shape}."
             )
-        if not all_finite(actions):
-            env = np.argwhere(~np.isfinite(actions))[0][0]
+        if (index := not_finite_at(actions)) is not None:
+            env = index[0]
             raise ValueError(f"The action of environment {env} is {actions[env].tolist()}: it must be finite.")
         self._actions = actions
 

@@ -1,5 +1,6 @@
 """``sb3-maddpg bench``: how fast a recipe trains on this machine, and where the time goes."""
 
+import functools
 import json
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_maddpg.cli import zoo
 from sb3_maddpg.cli.experiment import TeamExperimentManager
 from sb3_maddpg.cli.options import check_writable, common_options
+from sb3_maddpg.cli.recipes import LengthOption, check_options
 
 # What of an algorithm is timed, by the attribute that does it. Those that an algorithm lacks take no time of their own.
 PARTS = {"learning": "train", "acting": "_sample_action"}
@@ -37,9 +39,15 @@ def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any
 
 
 class BenchManager(TeamExperimentManager):
-    """Trains with a stopwatch, and keeps nothing but the times."""
+    """
+    Trains with a stopwatch, and keeps nothing but the times.
 
-    result: dict[str, Any]  # of the class, for rl_zoo3 keeps its manager to itself
+    :param result: where the times are put, for rl_zoo3 keeps its manager to itself
+    """
+
+    def __init__(self, result: dict[str, Any], *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.result = result
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
@@ -56,16 +64,15 @@ class BenchManager(TeamExperimentManager):
         seconds = time.perf_counter() - started
         shares = {name: total[0] / seconds for name, total in totals.items()}
         shares["rest"] = 1 - sum(shares.values())
-        updates = getattr(model, "_n_updates", 0)
-        BenchManager.result = {
-            "env": self.env_name.gym_id,
-            "algo": self.algo,
-            "steps": model.num_timesteps,
-            "updates": updates,
-            "seconds": seconds,
-            "steps_per_second": model.num_timesteps / seconds,
+        self.result.update(
+            env=self.env_name.gym_id,
+            algo=self.algo,
+            steps=model.num_timesteps,
+            updates=getattr(model, "_n_updates", 0),
+            seconds=seconds,
+            steps_per_second=model.num_timesteps / seconds,
             **{f"share_{name}": share for name, share in shares.items()},
-        }
+        )
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
@@ -84,16 +91,15 @@ def main(argv: list[str]) -> int:
     known, given = parser.parse_known_args(argv)
     if known.json:
         check_writable(known.json)
-    if known.n_timesteps < 1:
-        raise ValueError(f"--n-timesteps {known.n_timesteps}: give 1 or more")
+    check_options(known, LengthOption)
     zoo.register()
-    rl_zoo3.train.ExperimentManager = BenchManager  # type: ignore[misc]
+    result: dict[str, Any] = {}
+    rl_zoo3.train.ExperimentManager = functools.partial(BenchManager, result)  # type: ignore[assignment,misc]
     with tempfile.TemporaryDirectory() as folder:
         options = ["--algo", known.algo, "--n-timesteps", str(known.n_timesteps), "--log-folder", folder]
         options += ["--env", known.env] if known.env else []
         options += ["--progress"] if sys.stderr.isatty() else []
         zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given])
-    result = BenchManager.result
     print(f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="")
     print(f"{result['steps_per_second']:.0f} steps/s")
     for name in ("environments", "learning", "acting", "rest"):

@@ -204,21 +204,20 @@ class TeamExperimentManager(ExperimentManager):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
         algorithm = ALGOS[self.algo]
         if hyperparams.get("policy") == "PairPolicy" and issubclass(algorithm, MADDPG):
-            team = algorithm.load(self.trained_agent, device=self.device).policy.team.n_agents
-            new = Team.from_spaces(env.observation_space, env.action_space).n_agents
-            if team != new:
-                # Its parameters fit any size of team, its counters and its memory do not
-                resized = algorithm(
-                    env=env, tensorboard_log=self.tensorboard_log, seed=self.seed, verbose=self.verbose, **hyperparams
+            trained = algorithm.load(self.trained_agent, device=self.device)
+            n_agents = Team.from_spaces(env.observation_space, env.action_space).n_agents
+            if n_agents != trained.policy.team.n_agents:
+                print(f"Going on with a team of {n_agents} instead of {trained.policy.team.n_agents}, from step 0")
+                # As rl_zoo3 does: the policy stays as it was trained
+                arguments = {key: one for key, one in hyperparams.items() if key not in ("policy", "policy_kwargs")}
+                return trained.resized(
+                    env, tensorboard_log=self.tensorboard_log, seed=self.seed, verbose=self.verbose, **arguments
                 )
-                resized.set_parameters(self.trained_agent)
-                print(f"Going on with a team of {new} instead of {team}, from step 0")
-                return resized
         model = super()._load_pretrained_agent(hyperparams, env)
         print(f"Continuing at step {model.num_timesteps}")
         buffer = getattr(model, "replay_buffer", None)
         if buffer is not None and buffer.size() == 0:
-            print("There is no replay_buffer.pkl beside the model (see --save-replay-buffer): memory starts empty.")
+            print("There is no replay_buffer.pkl beside the model (see --save-replay-buffer): the buffer starts empty.")
         return model
 
     def learn(self, model: BaseAlgorithm) -> None:

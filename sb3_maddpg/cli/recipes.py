@@ -5,14 +5,14 @@ import inspect
 import math
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium
 import yaml
 from gymnasium.envs.registration import load_env_creator
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, PositiveInt, ValidationError, create_model
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, PositiveInt, create_model
 from rl_zoo3.utils import ALGOS, get_class_by_name
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -23,6 +23,7 @@ from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.literals import parse_literal
 from sb3_maddpg.utils import arguments_of, suggest
+from sb3_maddpg.validation import Arguments, validated_as
 
 # Arguments of the algorithm that the command line gives.
 COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
@@ -51,8 +52,18 @@ One = Annotated[int, at_least(1)]
 OneOrDefault = Annotated[int, at_least(1, otherwise=-1)]
 
 
-class TrainingOptions(BaseModel):
+class LengthOption(Arguments):
+    """How long ``enjoy``, ``record`` and ``bench`` go on."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    n_timesteps: One
+
+
+class TrainingOptions(Arguments):
     """The numbers among rl_zoo3's options of ``train``; -1 is the default, or none at all."""
+
+    model_config = ConfigDict(extra="ignore")
 
     n_timesteps: OneOrDefault = -1
     num_threads: OneOrDefault = -1
@@ -70,36 +81,15 @@ class TrainingOptions(BaseModel):
     verbose: Annotated[int, at_least(0)] = 0
 
 
-def check_options(args: argparse.Namespace) -> None:
+def check_options(args: argparse.Namespace, options: type[Arguments] = TrainingOptions) -> None:
     """
-    Refuse numbers that no training can be asked for.
+    Refuse numbers that a command cannot be asked for.
 
     :param args: the options of the command line, by rl_zoo3's names
+    :param options: those to check
     :raises ValueError: with the option, its value and what is allowed
     """
-    try:
-        TrainingOptions.model_validate(vars(args))
-    except ValidationError as error:
-        raise ValueError(one_line(error, lambda name: f"--{name.replace('_', '-')}")) from None
-
-
-def one_line(error: ValidationError, describe: Callable[[str], str] = str) -> str:
-    """
-    :param error: of pydantic
-    :param describe: how the user wrote the argument of this name
-    :return: its first finding as one line: argument, value and what is allowed
-    """
-    findings = error.errors(include_url=False, include_context=False)
-    name = str(findings[0]["loc"][0])
-    same = [finding for finding in findings if finding["loc"][0] == findings[0]["loc"][0]]
-    allowed = dict.fromkeys(_lower(finding["msg"].removeprefix("Value error, ")) for finding in same)
-    if findings[0]["type"] == "missing":
-        return f"{describe(name)} is missing"
-    return f"{describe(name)} {findings[0]['input']!r}: {', or '.join(allowed)}"
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]
+    validated_as(options, vars(args), lambda name: f"--{name.replace('_', '-')}")
 
 
 def _number(value: Any) -> Any:
@@ -131,26 +121,26 @@ def _literal(value: Any) -> Any:
 
 Schedule = Annotated[Any, BeforeValidator(_schedule)]
 Count = Annotated[PositiveInt, BeforeValidator(_number)]
-Arguments = Annotated[dict[str, Any], BeforeValidator(_literal)]
+KeywordArguments = Annotated[dict[str, Any], BeforeValidator(_literal)]
 
 
-class ZooKeys(BaseModel):
+class ZooKeys(Arguments):
     """Keys of a recipe that rl_zoo3 uses up itself; every other key is an argument of the algorithm."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False, arbitrary_types_allowed=True, protected_namespaces=())
+    model_config = ConfigDict(extra="allow", protected_namespaces=())
 
     n_timesteps: Count
     policy: str | type[BasePolicy]
     n_envs: Count = 1
     callback: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
-    env_kwargs: Arguments | None = None
+    env_kwargs: KeywordArguments | None = None
     env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
-    eval_env_kwargs: Arguments | None = None
+    eval_env_kwargs: KeywordArguments | None = None
     frame_stack: Count | None = None
-    monitor_kwargs: Arguments | None = None
+    monitor_kwargs: KeywordArguments | None = None
     noise_std: Annotated[float, BeforeValidator(_number)] | None = None
     noise_type: str | None = None
-    normalize: bool | Arguments = False
+    normalize: bool | KeywordArguments = False
     vec_env: str | None = None
     vec_env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
 
@@ -207,14 +197,12 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     check_keys(algo, hyperparams)
     fields = {key: hint for key, hint in _hints(ALGOS[algo]).items() if key in hyperparams}
     fields |= {key: Schedule for key in SCHEDULES if key in hyperparams}
-    fields |= {key: Arguments | None for key in ("policy_kwargs", "replay_buffer_kwargs") if key in hyperparams}
+    dicts = ("policy_kwargs", "replay_buffer_kwargs")
+    fields |= {key: KeywordArguments | None for key in dicts if key in hyperparams}
     definitions: Any = {key: (hint, ...) for key, hint in fields.items()}
     model = create_model("Recipe", __base__=ZooKeys, **definitions)
-    try:
-        checked = model.model_validate(dict(hyperparams))
-    except ValidationError as error:
-        raise ValueError(one_line(error, lambda name: f"{source}: {name}")) from None
-    found = {key: getattr(checked, key) for key in hyperparams}
+    checked = validated_as(model, hyperparams, lambda name: f"{source}: {name}")
+    found = {key: checked[key] for key in hyperparams}
     check_policy_kwargs(algo, found)
     if isinstance(name := found.get("replay_buffer_class"), str):
         found["replay_buffer_class"] = _replay_buffer(name)

@@ -96,21 +96,20 @@ def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) 
         estimator = trial.suggest_categorical("estimator", list(ESTIMATORS))
         if estimator not in WITHOUT_TEMPERATURE:
             trial.suggest_float("temperature", 0.2, 2.0, log=True)
-    if "share_actor" in additional_args["policy_arguments"] and (alike := _alike(team)):
+    if "share_actor" in additional_args["policy_arguments"] and (groups := _homogeneous_groups(team)):
         # Optuna keeps no lists among its choices
-        sharing = ["false", "true" if len(alike[0]) == team.n_agents else json.dumps(alike)]
+        sharing = ["false", "true" if len(groups[0]) == team.n_agents else json.dumps(groups)]
         trial.suggest_categorical("share_actor", sharing)
         trial.suggest_categorical("share_critic", sharing)
     return actions
 
 
-def _alike(team: Team) -> list[list[int]]:
+def _homogeneous_groups(team: Team) -> list[list[int]]:
     """:return: the agents that could share a network, with those they could share it with"""
     groups: list[list[int]] = []
     for agent in range(team.n_agents):
         for group in groups:
-            same_obs = team.obs_dims[agent] == team.obs_dims[group[0]]
-            if same_obs and team.action_spaces[agent] == team.action_spaces[group[0]]:
+            if team.homogeneous(agent, group[0]):
                 group.append(agent)
                 break
         else:

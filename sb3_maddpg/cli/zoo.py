@@ -32,6 +32,7 @@ from sb3_maddpg.cli.experiment import TeamExperimentManager
 from sb3_maddpg.cli.literals import StoreValues
 from sb3_maddpg.cli.options import PROG, common_options
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
+from sb3_maddpg.cli.recipes import LengthOption, check_options
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.utils import suggest
@@ -92,10 +93,13 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     parser = common_options()
     parser.add_argument("-f", "--folder", default="logs")
     parser.add_argument("--exp-id", type=int, default=0)
+    parser.add_argument("--n-timesteps", "-n", type=int, default=1000)
     parser.add_argument("--env-kwargs", nargs="+", action=StoreValues, default={})
     known, rest = parser.parse_known_args(argv)
+    rest += ["--n-timesteps", str(known.n_timesteps)]
     algorithm = None
     if not {"-h", "--help"} & set(rest):
+        check_options(known, LengthOption)
         _check(known)
         name = EnvironmentName(known.env)
         exp_id = known.exp_id or get_latest_run_id(str(Path(known.folder, known.algo)), name)

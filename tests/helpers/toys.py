@@ -10,11 +10,15 @@ from sb3_maddpg.team import heads_of
 
 # The agents of a team act alike in all but "mixed", but never in spaces of one size
 AGENT_SPACES: dict[str, tuple[spaces.Space, ...]] = {
-    "bits": (spaces.MultiBinary(2), spaces.MultiBinary(2), spaces.MultiBinary(2)),
-    "numbers": (spaces.Box(-1, 1, (2,)), spaces.Box(-2, 1, (2,)), spaces.Box(np.float32([0, 5]), np.float32([3, 9]))),
-    "categories": (spaces.Discrete(3), spaces.Discrete(5, start=2)),
+    "binary": (spaces.MultiBinary(2), spaces.MultiBinary(2), spaces.MultiBinary(2)),
+    "continuous": (
+        spaces.Box(-1, 1, (2,)),
+        spaces.Box(-2, 1, (2,)),
+        spaces.Box(np.float32([0, 5]), np.float32([3, 9])),
+    ),
+    "categorical": (spaces.Discrete(3), spaces.Discrete(5, start=2)),
     "heads": (spaces.MultiDiscrete([2, 3]), spaces.MultiDiscrete([4, 2])),
-    "unlike": (spaces.MultiBinary(3), spaces.Box(-1, 3, (2,)), spaces.Discrete(4), spaces.MultiBinary(1)),
+    "heterogeneous": (spaces.MultiBinary(3), spaces.Box(-1, 3, (2,)), spaces.Discrete(4), spaces.MultiBinary(1)),
     "mixed": (
         spaces.MultiBinary(2),
         spaces.Box(-1, 3, (2,)),

@@ -193,7 +193,7 @@ def played(kind: str, steps: int = 1500, **kwargs) -> tuple[MADDPG, np.ndarray, 
 
 @pytest.mark.parametrize("noise", [0.1, (0.2, 0.05), (0.0, 0.1)])
 def test_numbers_reach_the_environment_with_noise_of_the_given_size(noise):
-    model, sent, best = played("numbers", exploration_noise=noise)
+    model, sent, best = played("continuous", exploration_noise=noise)
     first, last = np.broadcast_to(noise, 2)
     fifths = zip(np.split(sent - best, 5), np.split(np.linspace(first, last, len(sent)), 5), strict=True)
     for deviations, expected in fifths:
@@ -205,13 +205,13 @@ def test_numbers_reach_the_environment_with_noise_of_the_given_size(noise):
 
 
 def test_much_noise_is_clipped_at_the_bounds():
-    model, sent, _ = played("numbers", 200, exploration_noise=5.0)
+    model, sent, _ = played("continuous", 200, exploration_noise=5.0)
     assert np.abs(sent).max() == pytest.approx(1.0, abs=1e-6)
     assert (np.abs(sent) > 0.999).mean() > 0.7
     assert np.abs(model.replay_buffer.actions).max() == 1.0
 
 
-@pytest.mark.parametrize("kind", ["bits", "mixed"])
+@pytest.mark.parametrize("kind", ["binary", "mixed"])
 def test_bits_and_categories_reach_the_environment_as_they_are_drawn(kind):
     model, sent, best = played(kind, 1000)
     actions = model.policy.actions
@@ -225,7 +225,7 @@ def test_bits_and_categories_reach_the_environment_as_they_are_drawn(kind):
     assert np.allclose(model.replay_buffer.actions[:, 0], sent, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["numbers", "unlike"])
+@pytest.mark.parametrize("kind", ["continuous", "heterogeneous"])
 def test_action_noise_takes_the_place_of_exploration_noise(kind):
     length = len(joint_action_space(AGENT_SPACES[kind]).sample())
     shift = NormalActionNoise(np.full(length, 0.25), np.zeros(length))

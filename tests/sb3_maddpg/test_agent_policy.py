@@ -38,8 +38,8 @@ MODELS = {kind: lambda kind=kind: MADDPG("MlpPolicy", TeamEnv(Toy(kind)), **SMAL
 MODELS |= {
     "threshold and sharing": lambda: MADDPG(
         "MlpPolicy",
-        TeamEnv(Toy("bits"), state=True),
-        **{**SMALL, "policy_kwargs": {"net_arch": [8], "threshold": 0.8, "share_actor": [["bits_2"]]}},
+        TeamEnv(Toy("binary"), state=True),
+        **{**SMALL, "policy_kwargs": {"net_arch": [8], "threshold": 0.8, "share_actor": [["binary_2"]]}},
     ),
     "twins": lambda: MATD3("MlpPolicy", TeamEnv(Toy("mixed")), **SMALL),
     "pairs": lambda: MADDPG("PairPolicy", Neighbours(), **SMALL),
@@ -150,23 +150,23 @@ def test_agents_have_the_names_of_the_environment():
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        (np.zeros(3), r"An observation of bits_2 has length 4, not shape \(3,\)"),
+        (np.zeros(3), r"An observation of binary_2 has length 4, not shape \(3,\)"),
         (np.zeros((2, 5)), r"not shape \(2, 5\)"),
         (np.zeros((1, 2, 4)), r"not shape \(1, 2, 4\)"),
         (np.array(0.0), r"not shape \(\)"),
-        (np.array([0, 0, np.nan, 0]), "observation of bits_2 holds NaN or infinity"),
-        (np.array([[0, 0, np.inf, 0]]), "observation of bits_2 holds NaN or infinity"),
+        (np.array([0, 0, np.nan, 0]), "observation of binary_2 holds NaN or infinity"),
+        (np.array([[0, 0, np.inf, 0]]), "observation of binary_2 holds NaN or infinity"),
     ],
 )
 def test_an_observation_that_does_not_fit_is_refused(observation, message):
-    policy = MODELS["bits"]().agent_policy("bits_2")
+    policy = MODELS["binary"]().agent_policy("binary_2")
     with pytest.raises(ValueError, match=message):
         policy.predict(observation)
 
 
 def test_a_policy_that_is_not_finite_is_not_exported(tmp_path):
-    model = MODELS["bits"]()
-    agent = model.agent_policy("bits_1")
+    model = MODELS["binary"]()
+    agent = model.agent_policy("binary_1")
     exports = {agent.network: lambda: agent.export(tmp_path / "a.pt"), model.actor: lambda: model.agent_policy(0)}
     for policy, export in exports.items():
         with th.no_grad():
@@ -177,7 +177,7 @@ def test_a_policy_that_is_not_finite_is_not_exported(tmp_path):
 
 
 def test_warns_where_an_agent_would_miss_the_statistics_of_observations():
-    env = VecNormalize(DummyVecEnv([lambda: TeamEnv(Toy("bits"))]))
+    env = VecNormalize(DummyVecEnv([lambda: TeamEnv(Toy("binary"))]))
     model = MADDPG("MlpPolicy", env, **SMALL)
     with pytest.warns(UserWarning, match="normalised by VecNormalize.*no part of the agent's policy"):
         model.agent_policy(0)

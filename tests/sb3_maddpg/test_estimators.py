@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 from sb3_maddpg.estimators import (
     ESTIMATORS,
     CriticOfOwnAction,
-    expected_bits,
-    expected_categories,
-    gapped_straight_through_bits,
-    gapped_straight_through_categories,
-    gumbel_softmax_bits,
+    expected_binary,
+    expected_categorical,
+    gapped_straight_through_binary,
+    gapped_straight_through_categorical,
+    gumbel_softmax_binary,
     nested_sets,
-    rao_blackwell_bits,
-    rao_blackwell_categories,
-    score_bits,
-    score_categories,
-    straight_through_bits,
-    straight_through_categories,
+    rao_blackwell_binary,
+    rao_blackwell_categorical,
+    score_binary,
+    score_categorical,
+    straight_through_binary,
+    straight_through_categorical,
 )
 
 KINDS = ("binary", "categorical")
@@ -305,11 +305,11 @@ def test_a_higher_temperature_has_less_variance(name, kind):
 
 @pytest.mark.parametrize(
     "estimate",
-    [expected_bits, straight_through_bits, score_bits, expected_categories, score_categories],
+    [expected_binary, straight_through_binary, score_binary, expected_categorical, score_categorical],
     ids=lambda estimate: estimate.__name__,
 )
 def test_estimators_without_relaxation_do_not_read_the_temperature(estimate):
-    parameters, q = cases("binary" if estimate.__name__.endswith("bits") else "categorical", 5)
+    parameters, q = cases("binary" if estimate.__name__.endswith("binary") else "categorical", 5)
     samples = [gradients(estimate, parameters.requires_grad_(), q, temperature) for temperature in (UNREAD, 0.1, 9.0)]
     assert th.equal(samples[0], samples[1])
     assert th.equal(samples[0], samples[2])
@@ -324,25 +324,25 @@ SCORE = st.sampled_from([0.0, 0.25, 0.5, 1.0]) | st.floats(0, 1)
 def test_expected_is_the_sum_over_the_pieces_of_the_threshold(values, seed):
     scores = th.tensor([[values]], dtype=th.float64)
     q = multilinear(seed, 1, len(values))
-    assert th.allclose(expected_bits(scores, q, UNREAD), by_enumeration(scores, q), atol=1e-12)
+    assert th.allclose(expected_binary(scores, q, UNREAD), by_enumeration(scores, q), atol=1e-12)
 
 
 def test_expected_works_on_a_batch_of_teams():
     scores, q = random_scores(0, 5, 4, 3), multilinear(1, 4, 3)
-    assert th.allclose(expected_bits(scores, q, UNREAD), by_enumeration(scores, q), atol=1e-12)
+    assert th.allclose(expected_binary(scores, q, UNREAD), by_enumeration(scores, q), atol=1e-12)
 
 
 def test_expected_is_the_mean_over_sampled_thresholds():
     scores, q, n = random_scores(2, 1, 2, 3), multilinear(3, 2, 3), 40_000
     delta = th.as_tensor(np.random.default_rng(4).uniform(size=(n, 2, 1)))
     samples = q((scores > delta).to(scores.dtype).unsqueeze(-2)).squeeze(-1)
-    error = (expected_bits(scores, q, UNREAD)[0] - samples.mean(dim=0)).abs()
+    error = (expected_binary(scores, q, UNREAD)[0] - samples.mean(dim=0)).abs()
     assert (error < 4 * standard_error(samples)).all()
 
 
 def test_expected_gradient_is_that_of_finite_differences():
     scores, q = random_scores(5, 3, 2, 4).requires_grad_(), multilinear(6, 2, 4)
-    (gradient,) = th.autograd.grad(expected_bits(scores, q, UNREAD).sum(), scores)
+    (gradient,) = th.autograd.grad(expected_binary(scores, q, UNREAD).sum(), scores)
     step = 1e-6
     for index in np.ndindex(*scores.shape):
         above, below = scores.detach().clone(), scores.detach().clone()
@@ -355,7 +355,7 @@ def test_expected_gradient_is_that_of_finite_differences():
 def test_one_bit_has_the_difference_of_its_values_as_gradient():
     scores, q = random_scores(7, 4, 2, 1).requires_grad_(), multilinear(8, 2, 1)
     off, on = (q(th.full((1, 2, 1, 1), bit, dtype=th.float64)).squeeze(-1) for bit in (0.0, 1.0))
-    value = expected_bits(scores, q, UNREAD)
+    value = expected_binary(scores, q, UNREAD)
     assert th.allclose(value, scores.squeeze(-1) * on + (1 - scores.squeeze(-1)) * off)
     (gradient,) = th.autograd.grad(value.sum(), scores)
     assert th.allclose(gradient.squeeze(-1), (on - off).expand(4, 2))
@@ -364,7 +364,7 @@ def test_one_bit_has_the_difference_of_its_values_as_gradient():
 def test_expected_asks_only_about_bits_that_occur():
     recorder = Recorder(lambda own: own.sum(dim=-1))
     scores = th.tensor([[[0.2, 0.9, 0.9]]], dtype=th.float64)
-    assert expected_bits(scores, recorder, UNREAD).item() == pytest.approx(2.0)
+    assert expected_binary(scores, recorder, UNREAD).item() == pytest.approx(2.0)
     (sets,) = recorder.asked
     assert sets.tolist() == [[[[0, 0, 0], [0, 1, 0], [0, 1, 1], [1, 1, 1]]]]
 
@@ -389,7 +389,7 @@ LOGIT = st.sampled_from([-INF, 0.0, 1.0]) | st.floats(-20, 20)
 def test_expected_is_the_sum_over_the_categories_of_one_head(values, seed):
     logits = th.tensor([[[values]]], dtype=th.float64, requires_grad=True)
     q = multilinear_in_heads(seed, 1, 1, len(values))
-    objective, exact = expected_categories(logits, q, UNREAD), by_enumeration_of_categories(logits, q)
+    objective, exact = expected_categorical(logits, q, UNREAD), by_enumeration_of_categories(logits, q)
     assert th.allclose(objective, exact, atol=1e-12)
     pair = [th.autograd.grad(value.sum(), logits)[0] for value in (objective, exact)]
     assert th.allclose(*pair, atol=1e-12)
@@ -397,7 +397,7 @@ def test_expected_is_the_sum_over_the_categories_of_one_head(values, seed):
 
 def test_expected_categories_works_on_a_batch_of_teams():
     logits, q = random_logits(0, 5, 4, 1, 3).requires_grad_(), multilinear_in_heads(1, 4, 1, 3)
-    objective, exact = expected_categories(logits, q, UNREAD), by_enumeration_of_categories(logits, q)
+    objective, exact = expected_categorical(logits, q, UNREAD), by_enumeration_of_categories(logits, q)
     assert th.allclose(objective, exact)
     assert th.allclose(*(th.autograd.grad(value.sum(), logits)[0] for value in (objective, exact)))
 
@@ -410,8 +410,8 @@ def test_expected_over_several_heads_is_unbiased(heads):
     exact = by_enumeration_of_categories(single, q)
     (exact_gradient,) = th.autograd.grad(exact.sum(), single)
     th.manual_seed(0)
-    samples = expected_categories(logits, q, UNREAD).detach()
-    sampled = gradients(expected_categories, logits, q, UNREAD)
+    samples = expected_categorical(logits, q, UNREAD).detach()
+    sampled = gradients(expected_categorical, logits, q, UNREAD)
     assert ((samples.mean() - exact).abs() < 4 * standard_error(samples)).all()
     assert ((sampled.mean(dim=0) - exact_gradient.flatten()).abs() < 4 * standard_error(sampled)).all()
     assert samples.std() > 0.01
@@ -419,7 +419,7 @@ def test_expected_over_several_heads_is_unbiased(heads):
 
 def test_expected_varies_one_head_at_a_time():
     recorder = Recorder(multilinear_in_heads(21, 1, 2, 3))
-    expected_categories(random_logits(22, 50, 1, 2, 3), recorder, UNREAD)
+    expected_categorical(random_logits(22, 50, 1, 2, 3), recorder, UNREAD)
     (asked,) = recorder.asked
     assert asked.shape == (50, 1, 6, 2, 3)
     assert not asked.requires_grad
@@ -436,7 +436,7 @@ def test_expected_varies_one_head_at_a_time():
 
 def test_straight_through_has_the_critics_gradient_at_sampled_bits():
     scores, q = random_scores(10, 200, 2, 3).requires_grad_(), multilinear(11, 2, 3)
-    gradient = gradients(straight_through_bits, scores, q)
+    gradient = gradients(straight_through_binary, scores, q)
     th.manual_seed(0)
     bits = (scores > th.rand_like(scores[..., :1])).to(scores.dtype).detach().requires_grad_()
     (at_bits,) = th.autograd.grad(q(bits.unsqueeze(-2)).sum(), bits)
@@ -446,8 +446,8 @@ def test_straight_through_has_the_critics_gradient_at_sampled_bits():
 
 def test_straight_through_has_a_gradient_that_is_biased_unless_the_critic_is_linear():
     scores, q = repeated(random_scores(12, 3).tolist(), 40_000), multilinear(13, 1, 3)
-    exact = gradients(expected_bits, scores, q, UNREAD)[0]
-    sampled = gradients(straight_through_bits, scores, q, UNREAD)
+    exact = gradients(expected_binary, scores, q, UNREAD)[0]
+    sampled = gradients(straight_through_binary, scores, q, UNREAD)
     assert ((sampled.mean(dim=0) - exact).abs() / standard_error(sampled)).max() > 10
 
 
@@ -456,17 +456,17 @@ def test_straight_through_of_categories_has_the_slope_of_the_softmax_it_samples_
     th.manual_seed(0)
     soft = ((logits + -th.empty_like(logits).exponential_().log()) / 0.6).softmax(dim=-1)
     (wanted,) = th.autograd.grad((soft * weights).sum(), logits)
-    assert th.allclose(gradients(straight_through_categories, logits, q, 0.6), wanted.flatten(1))
+    assert th.allclose(gradients(straight_through_categorical, logits, q, 0.6), wanted.flatten(1))
 
 
 def test_score_asks_at_the_scores_themselves():
     scores, q = random_scores(14, 5, 2, 3), multilinear(15, 2, 3)
-    assert th.equal(score_bits(scores, q, UNREAD), q(scores.unsqueeze(-2)).squeeze(-1))
+    assert th.equal(score_binary(scores, q, UNREAD), q(scores.unsqueeze(-2)).squeeze(-1))
 
 
 def test_score_asks_at_the_probabilities_which_is_exact_for_a_critic_linear_in_each_head():
     logits, q = random_logits(14, 5, 2, 2, 3).requires_grad_(), multilinear_in_heads(15, 2, 2, 3)
-    objective, exact = score_categories(logits, q, UNREAD), by_enumeration_of_categories(logits, q)
+    objective, exact = score_categorical(logits, q, UNREAD), by_enumeration_of_categories(logits, q)
     assert th.allclose(objective, exact)
     assert th.allclose(*(th.autograd.grad(value.sum(), logits)[0] for value in (objective, exact)))
 
@@ -499,7 +499,7 @@ def test_the_relaxed_bits_are_halved_by_the_same_shared_threshold():
     scores = random_scores(24, 500, 2, 3)
     recorder = Recorder(multilinear(25, 2, 3))
     th.manual_seed(0)
-    gumbel_softmax_bits(scores, recorder, 0.7)
+    gumbel_softmax_binary(scores, recorder, 0.7)
     th.manual_seed(0)
     bits = scores > th.rand_like(scores[..., :1])
     assert th.equal(recorder.asked[0].squeeze(2) > 0.5, bits)
@@ -512,7 +512,7 @@ def test_the_relaxed_bits_are_halved_by_the_same_shared_threshold():
 def test_the_gapped_softmax_is_the_papers_and_has_the_sampled_category_ahead_by_the_gap(gap):
     """The softmax s in the backward pass is read off the slopes: for the critic a_i it is s_i (1[i = j] - s_j) / T."""
     temperature, logits = 0.7, repeated([[0.3, -0.8, 1.1]], 500)
-    estimate = partial(gapped_straight_through_categories, gap=gap)
+    estimate = partial(gapped_straight_through_categorical, gap=gap)
     recorders = [Recorder(lambda own, i=i: own[..., 0, i]) for i in range(3)]
     slopes = th.stack([gradients(estimate, logits, q, temperature) for q in recorders], dim=1) * temperature
     (sample,) = {tuple(recorder.asked[0].flatten().tolist()) for recorder in recorders}
@@ -541,8 +541,8 @@ def test_gapped_bits_are_those_of_two_categories():
     logit = float(np.log(score / (1 - score)))
     scores, logits = repeated([score], 4000), repeated([[logit, 0.0]], 4000)
     asked_bits, asked = Recorder(lambda own: own[..., 0]), Recorder(lambda own: own[..., 0, 0])
-    by_bit = gradients(gapped_straight_through_bits, scores, asked_bits, temperature)[:, 0] * score * (1 - score)
-    by_category = gradients(gapped_straight_through_categories, logits, asked, temperature)[:, 0]
+    by_bit = gradients(gapped_straight_through_binary, scores, asked_bits, temperature)[:, 0] * score * (1 - score)
+    by_category = gradients(gapped_straight_through_categorical, logits, asked, temperature)[:, 0]
     for outcome in (0.0, 1.0):
         bit = by_bit[asked_bits.asked[0].flatten() == outcome]
         category = by_category[asked.asked[0][..., 0].flatten() == outcome]
@@ -553,8 +553,8 @@ def test_gapped_bits_are_those_of_two_categories():
 
 def test_gapped_has_less_variance_than_straight_through():
     logits, q = repeated([[0.3, -0.8, 1.1], [0.2, 0.9, -INF]], 5000), linear(26, 2, 3)[0]
-    gapped = gradients(gapped_straight_through_categories, logits, q, 0.7).var(dim=0).sum()
-    assert gapped < 0.5 * gradients(straight_through_categories, logits, q, 0.7).var(dim=0).sum()
+    gapped = gradients(gapped_straight_through_categorical, logits, q, 0.7).var(dim=0).sum()
+    assert gapped < 0.5 * gradients(straight_through_categorical, logits, q, 0.7).var(dim=0).sum()
 
 
 # Rao-Blackwell
@@ -564,8 +564,8 @@ def test_gapped_has_less_variance_than_straight_through():
 @pytest.mark.parametrize("temperature", [0.5, 1.5])
 def test_rao_blackwell_has_the_mean_of_straight_through_for_any_critic(n_samples, temperature):
     logits, q = repeated([[0.3, -0.8, 1.1, -INF], [0.2, 0.9, 0.0, -0.4]], 40_000), multilinear_in_heads(27, 1, 2, 4)
-    averaged = gradients(partial(rao_blackwell_categories, n_samples=n_samples), logits, q, temperature, seed=1)
-    sampled = gradients(straight_through_categories, logits, q, temperature, seed=2)
+    averaged = gradients(partial(rao_blackwell_categorical, n_samples=n_samples), logits, q, temperature, seed=1)
+    sampled = gradients(straight_through_categorical, logits, q, temperature, seed=2)
     error = (standard_error(averaged).square() + standard_error(sampled).square()).sqrt()
     assert ((averaged.mean(dim=0) - sampled.mean(dim=0)).abs() < 4 * error).all()
 
@@ -573,15 +573,15 @@ def test_rao_blackwell_has_the_mean_of_straight_through_for_any_critic(n_samples
 @pytest.mark.parametrize("temperature", [0.3, 0.7, 1.5])
 def test_rao_blackwell_has_less_variance_than_straight_through(temperature):
     logits, q = repeated([[0.3, -0.8, 1.1, -INF], [0.2, 0.9, 0.0, -0.4]], 5000), linear(28, 2, 4)[0]
-    averaged = gradients(rao_blackwell_categories, logits, q, temperature).var(dim=0).sum()
-    assert averaged < 0.5 * gradients(straight_through_categories, logits, q, temperature).var(dim=0).sum()
+    averaged = gradients(rao_blackwell_categorical, logits, q, temperature).var(dim=0).sum()
+    assert averaged < 0.5 * gradients(straight_through_categorical, logits, q, temperature).var(dim=0).sum()
 
 
 def test_the_noise_given_a_category_is_that_of_the_samples_with_this_category():
     """Straight-through's slopes, sorted by what was sampled, have the means that Rao-Blackwell averages to."""
     logits, n = repeated([[0.3, -0.8, 1.1]], 60_000), 60_000
     by_category = []
-    for estimate in (partial(rao_blackwell_categories, n_samples=3), straight_through_categories):
+    for estimate in (partial(rao_blackwell_categorical, n_samples=3), straight_through_categorical):
         recorder = Recorder(linear(29, 1, 3)[0])
         slopes = gradients(estimate, logits, recorder, 0.5, seed=3)
         sample = recorder.asked[0].view(n, 3).argmax(dim=-1)
@@ -594,7 +594,7 @@ def test_the_noise_given_a_category_is_that_of_the_samples_with_this_category():
 def test_the_noise_given_a_bit_is_that_of_thresholds_that_give_this_bit():
     score, temperature = 0.3, 0.6
     recorder = Recorder(lambda own: own[..., 0])
-    slopes = gradients(rao_blackwell_bits, repeated([score], 20_000), recorder, temperature)[:, 0]
+    slopes = gradients(rao_blackwell_binary, repeated([score], 20_000), recorder, temperature)[:, 0]
     logit = float(np.log(score / (1 - score)))
     for bit, low, high in ((1.0, 0.0, score), (0.0, score, 1.0)):
         delta = np.linspace(low, high, 200_001)[:-1] + (high - low) / 400_000
@@ -606,5 +606,5 @@ def test_the_noise_given_a_bit_is_that_of_thresholds_that_give_this_bit():
 
 def test_rao_blackwell_of_bits_has_less_variance_with_more_samples():
     scores, q = repeated([0.3, 0.8, 0.55], 5000), linear(30, 3)[0]
-    one = gradients(partial(rao_blackwell_bits, n_samples=1), scores, q, 0.5).var(dim=0).sum()
-    assert gradients(rao_blackwell_bits, scores, q, 0.5).var(dim=0).sum() < 0.5 * one
+    one = gradients(partial(rao_blackwell_binary, n_samples=1), scores, q, 0.5).var(dim=0).sum()
+    assert gradients(rao_blackwell_binary, scores, q, 0.5).var(dim=0).sum() < 0.5 * one

@@ -15,7 +15,7 @@ def parameters(model: MADDPG) -> np.ndarray:
     return model.policy.parameters_to_vector()
 
 
-def filled(policy_kwargs=SGD, kind: str = "unlike", garbage: bool = False, **kwargs) -> MADDPG:
+def filled(policy_kwargs=SGD, kind: str = "heterogeneous", garbage: bool = False, **kwargs) -> MADDPG:
     """
     A model whose buffer holds a team of which agents 1 and 3 act now and then and agent 0 never does.
 

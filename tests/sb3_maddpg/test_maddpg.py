@@ -44,7 +44,7 @@ def test_processes_train_the_same_parameters():
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("kind", ["unlike", "mixed"])
+@pytest.mark.parametrize("kind", ["heterogeneous", "mixed"])
 def test_runs_with_every_estimator(estimator, kind):
     before = MADDPG("MlpPolicy", TeamEnv(Toy(kind)), **SMALL)
     after = learned(TeamEnv(Toy(kind)), estimator=estimator, temperature=lambda left: 0.5 + left)
@@ -57,7 +57,7 @@ def test_runs_with_every_estimator(estimator, kind):
 @pytest.mark.parametrize(
     ("priced", "n_steps", "clip"), [(False, 1, None), (False, 3, 0.05), (True, 1, 0.05), (True, 3, None)]
 )
-@pytest.mark.parametrize("kind", ["bits", "numbers", "categories", "unlike"])
+@pytest.mark.parametrize("kind", ["binary", "continuous", "categorical", "heterogeneous"])
 def test_one_update_is_that_of_separate_agents(kind, clip, n_steps, priced):
     lr, tau, weight = 0.1, 0.3, 0.02
     env = TeamEnv(Toy(kind))
@@ -88,7 +88,7 @@ def test_one_update_is_that_of_separate_agents(kind, clip, n_steps, priced):
 
 
 def test_a_price_is_on_the_scale_of_normalised_rewards():
-    env = TeamEnv(Toy("unlike"))
+    env = TeamEnv(Toy("heterogeneous"))
     env.action_cost = 0.7
     vec_env = VecNormalize(DummyVecEnv([lambda: env]))
     numbers = {"learning_rate": 0.1, "gamma": 0.9, "max_grad_norm": None, "policy_kwargs": SGD}
@@ -271,9 +271,9 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
 
 def test_numbers_of_numpy_are_numbers():
     numbers = {"exploration_noise": np.float32(0.25), "batch_size": np.int64(16), "gamma": np.float32(0.5)}
-    model = learned(TeamEnv(Toy("numbers")), 60, **numbers)
+    model = learned(TeamEnv(Toy("continuous")), 60, **numbers)
     assert (model.noise_std, model.batch_size, model.gamma) == (0.25, 16, 0.5)
-    assert learned(TeamEnv(Toy("numbers")), 60, exploration_noise=np.array([0.5, 0.5])).noise_std == 0.5
+    assert learned(TeamEnv(Toy("continuous")), 60, exploration_noise=np.array([0.5, 0.5])).noise_std == 0.5
 
 
 @pytest.mark.parametrize("price", [(1e-12, 1e12), (1e-12, 1e-11), (1.0, 1.00001)])
@@ -331,3 +331,37 @@ def test_a_model_for_a_team_of_another_size_has_its_networks_and_arguments():
     large.learn(40)
     with pytest.raises(ValueError, match="fits one size of team"):
         learned().resized(OwnBit())
+
+
+def test_an_expectation_that_no_memory_holds_is_refused():
+    class Wide(FollowTarget):
+        """One of very many categories each."""
+
+        def __init__(self, categories: int):
+            super().__init__()
+            self.action_space = spaces.MultiDiscrete([categories] * self.n_agents)
+
+    pattern = r"each of the 3000 categories .* agent agent_0 .* batch_size=1024 .* 69 GiB .* batch_size of at most 59\."
+    with pytest.raises(ValueError, match=pattern):
+        MADDPG("MlpPolicy", Wide(3000))
+    MADDPG("MlpPolicy", Wide(3000), batch_size=59)
+    MADDPG("MlpPolicy", Wide(3000), estimator="score")
+
+
+def test_a_short_training_logs_its_episodes_once():
+    written = []
+
+    class Keep(KVWriter):
+        def write(self, key_values, key_excluded, step=0):
+            written.append((step, key_values.get("rollout/ep_rew_mean")))
+
+        def close(self):
+            pass
+
+    model = MADDPG("MlpPolicy", OwnBit(episode_length=10), **SMALL)
+    model.set_logger(Logger(None, [Keep()]))
+    model.learn(30)
+    assert [step for step, _ in written] == [30]
+    assert written[0][1] is not None
+    model.learn(40)  # the fourth episode ends with it
+    assert [step for step, _ in written] == [30, 40]

@@ -19,7 +19,7 @@ def made(kind: str, **kwargs) -> MATD3:
 
 
 @pytest.mark.parametrize(("priced", "n_steps", "clip"), [(False, 1, None), (True, 3, 0.05)])
-@pytest.mark.parametrize("kind", ["bits", "numbers", "categories", "unlike"])
+@pytest.mark.parametrize("kind", ["binary", "continuous", "categorical", "heterogeneous"])
 def test_one_update_is_that_of_separate_agents_with_twin_critics(kind, priced, n_steps, clip):
     model = made(
         kind,
@@ -48,7 +48,7 @@ def test_one_update_is_that_of_separate_agents_with_twin_critics(kind, priced, n
 
 
 def test_the_target_is_the_smaller_of_two_unlike_values():
-    model = made("numbers").learn(100)
+    model = made("continuous").learn(100)
     data = drawn(model, 256)
     values = model.critic_target(data.next_observations, model.actor_target.act(data.next_observations))
     assert values.shape == (2, 256, 3)
@@ -57,7 +57,7 @@ def test_the_target_is_the_smaller_of_two_unlike_values():
 
 
 def test_policy_and_targets_wait_for_the_critics():
-    model = made("numbers", policy_delay=3, gradient_steps=0).learn(60)
+    model = made("continuous", policy_delay=3, gradient_steps=0).learn(60)
     parts = ("actor", "actor_target", "critic_target", "critic")
     for update in range(1, 7):
         before = copy.deepcopy(model.policy)
@@ -69,7 +69,7 @@ def test_policy_and_targets_wait_for_the_critics():
 
 
 def test_target_numbers_are_smoothed_by_clipped_noise():
-    model = made("numbers", target_policy_noise=0.2, target_noise_clip=0.3)
+    model = made("continuous", target_policy_noise=0.2, target_noise_clip=0.3)
     th.manual_seed(0)
     obs = th.rand(1, *model.observation_space.shape).expand(20_000, -1, -1)
     best = model.actor_target.act(obs)
@@ -85,14 +85,14 @@ def test_target_numbers_are_smoothed_by_clipped_noise():
 
 
 def test_smoothed_targets_stay_within_the_bounds():
-    model = made("numbers", target_policy_noise=5.0, target_noise_clip=5.0)
+    model = made("continuous", target_policy_noise=5.0, target_noise_clip=5.0)
     obs = th.rand(100, *model.observation_space.shape)
     actions = model._target_actions(obs)
     assert actions.abs().max() == 1.0
     assert (actions != model.actor_target.act(obs)).float().mean() > 0.9
 
 
-@pytest.mark.parametrize("kind", ["bits", "categories", "heads", "mixed"])
+@pytest.mark.parametrize("kind", ["binary", "categorical", "heads", "mixed"])
 def test_target_bits_and_categories_are_drawn_as_in_exploration(kind):
     n = 5000
     model = made(kind)
@@ -113,7 +113,7 @@ def test_with_one_critic_no_delay_and_no_noise_it_is_maddpg():
     kwargs = {**SMALL, "policy_kwargs": {"net_arch": [8], "n_critics": 1}}
     vectors = []
     for algorithm, further in ((MADDPG, {}), (MATD3, {"policy_delay": 1, "target_policy_noise": 0.0})):
-        model = algorithm("MlpPolicy", TeamEnv(Toy("numbers")), **kwargs, **further).learn(100)
+        model = algorithm("MlpPolicy", TeamEnv(Toy("continuous")), **kwargs, **further).learn(100)
         vectors.append(model.policy.parameters_to_vector())
     assert np.array_equal(*vectors)
 
@@ -122,12 +122,12 @@ def test_takes_the_arguments_of_maddpg_in_the_same_order():
     of_maddpg, of_matd3 = (list(inspect.signature(algorithm).parameters) for algorithm in (MADDPG, MATD3))
     assert of_matd3[: len(of_maddpg)] == of_maddpg
     assert of_matd3[len(of_maddpg) :] == ["target_policy_noise", "target_noise_clip"]
-    model = MATD3("MlpPolicy", TeamEnv(Toy("numbers")), 1e-3, 50_000)
+    model = MATD3("MlpPolicy", TeamEnv(Toy("continuous")), 1e-3, 50_000)
     assert (model.learning_rate, model.buffer_size, model.policy_delay) == (1e-3, 50_000, 2)
 
 
 def test_defaults_are_those_of_td3():
-    model = MATD3("MlpPolicy", TeamEnv(Toy("numbers")))
+    model = MATD3("MlpPolicy", TeamEnv(Toy("continuous")))
     assert (model.policy_delay, model.target_policy_noise, model.target_noise_clip) == (2, 0.2, 0.5)
     assert model.policy.n_critics == 2
     first, second = model.critic.net.weights[0].chunk(2)
@@ -138,4 +138,4 @@ def test_defaults_are_those_of_td3():
 @pytest.mark.parametrize("name", ["target_policy_noise", "target_noise_clip"])
 def test_negative_noise_is_refused(name):
     with pytest.raises(ValueError, match=rf"{name}=-0\.1.* must not be negative"):
-        made("numbers", **{name: -0.1})
+        made("continuous", **{name: -0.1})

@@ -15,15 +15,15 @@ N, M, B = 5, 4, 6
 LAYOUT = {"own": [0, 1], "neighbours": [[2 + j, 6 + j] for j in range(M)], "acts_on_neighbours": True}
 BY_ITSELF = {**LAYOUT, "acts_on_neighbours": False}
 ACTIONS = {
-    "bits": spaces.MultiBinary(N * M * 2),
-    "numbers": spaces.Box(-1, 1, (N * M,)),
-    "categories": spaces.MultiDiscrete([3] * (N * M * 2)),
+    "binary": spaces.MultiBinary(N * M * 2),
+    "continuous": spaces.Box(-1, 1, (N * M,)),
+    "categorical": spaces.MultiDiscrete([3] * (N * M * 2)),
 }
 each_mode = pytest.mark.parametrize("layout", [LAYOUT, BY_ITSELF], ids=["on neighbours", "by itself"])
 each_action = pytest.mark.parametrize("space", ACTIONS.values(), ids=ACTIONS)
 
 
-def policy(space=ACTIONS["bits"], layout=LAYOUT, columns: int = 10, **kwargs) -> PairPolicy:
+def policy(space=ACTIONS["binary"], layout=LAYOUT, columns: int = 10, **kwargs) -> PairPolicy:
     observation_space = spaces.Box(-np.inf, np.inf, (N, columns), np.float32)
     return PairPolicy(
         observation_space, space, lambda _: 1e-3, observation_layout=layout, **{"net_arch": [8, 8], **kwargs}

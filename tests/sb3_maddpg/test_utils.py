@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from sb3_maddpg.utils import all_finite, as_seed, atomic_write
+from sb3_maddpg.utils import all_finite, as_seed, atomic_write, not_finite_at
 
 
 def test_a_file_is_replaced_whole_and_its_folder_synced(tmp_path, monkeypatch):
@@ -59,3 +59,22 @@ def test_large_numbers_are_finite_if_single_precision_holds_them():
     assert all_finite(np.array([1e30, -3e38], np.float32))
     assert not all_finite(np.array([1e39]))
     assert all_finite(np.array([2**62]))
+
+
+def test_the_first_number_that_is_not_finite_is_found_in_single_precision():
+    values = np.zeros((2, 3))
+    assert not_finite_at(values) is None
+    values[1, 2] = 1e39
+    assert not_finite_at(values) == (1, 2)
+
+
+def test_what_killed_processes_left_of_a_file_is_removed(tmp_path):
+    killed, writing, other = (tmp_path / name for name in (".m.zip.999999999", f".m.zip.{os.getppid()}", ".n.zip.1"))
+    recent = tmp_path / ".m.zip.999999998"  # may be a process of another machine
+    for path in (killed, writing, other, recent):
+        path.touch()
+        if path != recent:
+            os.utime(path, (0, 0))
+    with atomic_write(tmp_path / "m", suffix="zip") as file:
+        file.write(b"x")
+    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "m.zip", writing, other, recent])

@@ -29,7 +29,7 @@ def test_other_values_are_refused_in_one_line(name, value):
 
 
 def test_homogeneous_agents_have_the_same_spaces():
-    env = toy("unlike")
+    env = toy("heterogeneous")
     assert isinstance(env.action_space, MixedActions)
     team = Team.from_spaces(env.observation_space, env.action_space)
     assert [[team.homogeneous(i, j) for j in range(4)] for i in range(4)] == np.eye(4, dtype=bool).tolist()

@@ -129,6 +129,13 @@ def test_actions_of_another_shape_are_refused(shape):
         env.step(np.zeros(shape, np.int8))
 
 
+def test_actions_too_large_for_single_precision_are_refused():
+    env = GymnasiumVecEnv(gymnasium.make_vec("Pendulum-v1", 2, "sync", vector_kwargs=SAME_STEP))
+    env.reset()
+    with pytest.raises(ValueError, match=r"action of environment 1 is \[1e\+39\]: it must be finite"):
+        env.step(np.array([[0.0], [1e39]]))
+
+
 def test_actions_that_are_not_finite_are_refused():
     env = GymnasiumVecEnv(gymnasium.make_vec("Pendulum-v1", 2, "sync", vector_kwargs=SAME_STEP))
     env.reset()

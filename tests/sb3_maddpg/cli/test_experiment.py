@@ -6,6 +6,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import gymnasium
 import pytest
 import yaml
 
@@ -103,3 +104,25 @@ def test_a_module_of_the_command_line_is_no_command(module):
     done = subprocess.run([sys.executable, "-m", f"sb3_maddpg.cli.{module}", "train"], capture_output=True, text=True)
     assert done.returncode == 1
     assert "python -m sb3_maddpg" in done.stderr
+
+
+def test_a_team_of_another_size_goes_on_with_the_trained_networks(capsys):
+    gymnasium.register("Neighbours-v0", entry_point="toys:Neighbours")
+    recipe = {"n_timesteps": 60, "policy": "PairPolicy", "learning_starts": 20, "buffer_size": 1000, "batch_size": 16}
+    Path("recipe.yml").write_text(
+        yaml.safe_dump({"Neighbours-v0": {**recipe, "policy_kwargs": {"net_arch": [8]}, "train_freq": 5}})
+    )
+    try:
+        argv = ["train", "--env", "Neighbours-v0", "--conf-file", "recipe.yml", "--eval-freq", "-1", "--verbose", "0"]
+        assert main([*argv, "--env-kwargs", "n_agents:3"]) == 0
+        small = "logs/maddpg/Neighbours-v0_1/Neighbours-v0.zip"
+        # No update before the end, so that the networks are those of the small team
+        further = ["--env-kwargs", "n_agents:5", "-i", small, "-params", "learning_starts:60", "gamma:0.5"]
+        assert main([*argv, *further]) == 0
+    finally:
+        del gymnasium.registry["Neighbours-v0"]
+    assert "a team of 5 instead of 3, from step 0" in capsys.readouterr().out
+    trained, resized = (MADDPG.load(path) for path in (small, "logs/maddpg/Neighbours-v0_2/Neighbours-v0.zip"))
+    assert (resized.policy.team.n_agents, resized.num_timesteps, resized.gamma) == (5, 60, 0.5)
+    assert resized.policy.net_arch == [8]
+    assert (resized.policy.parameters_to_vector() == trained.policy.parameters_to_vector()).all()

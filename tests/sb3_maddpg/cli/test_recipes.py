@@ -48,19 +48,19 @@ def test_a_file_without_a_recipe_is_refused(capsys, text, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"learning_rate": float("nan")}, "learning_rate nan: give a finite number, or lin_NUMBER"),
-        ({"learning_rate": "nan"}, "learning_rate 'nan': give a finite number, or lin_NUMBER"),
-        ({"learning_rate": "lin_x"}, "learning_rate 'lin_x': give a finite number, or lin_NUMBER"),
-        ({"n_timesteps": 0}, "n_timesteps 0: input should be greater than 0"),
-        ({"n_timesteps": "many"}, "n_timesteps 'many': give a number"),
-        ({"n_timesteps": None}, "n_timesteps None: input should be a valid integer"),
-        ({"n_envs": 1.5}, "n_envs 1.5: input should be a valid integer"),
-        ({"env_kwargs": 3}, "env_kwargs 3: input should be a valid dictionary"),
+        ({"learning_rate": float("nan")}, "learning_rate=nan: give a finite number, or lin_NUMBER"),
+        ({"learning_rate": "nan"}, "learning_rate='nan': give a finite number, or lin_NUMBER"),
+        ({"learning_rate": "lin_x"}, "learning_rate='lin_x': give a finite number, or lin_NUMBER"),
+        ({"n_timesteps": 0}, "n_timesteps=0: input should be greater than 0"),
+        ({"n_timesteps": "many"}, "n_timesteps='many': give a number"),
+        ({"n_timesteps": None}, "n_timesteps=None: input should be a valid integer"),
+        ({"n_envs": 1.5}, "n_envs=1.5: input should be a valid integer"),
+        ({"env_kwargs": 3}, "env_kwargs=3: input should be a valid dictionary"),
         ({"policy_kwargs": "dict(net_arch=print(1))"}, "print(1) is not evaluated"),
         ({"policy_kwargs": "dict(net_arc=[8])"}, "did you mean 'net_arch'?"),
-        ({"policy_kwargs": [1]}, "policy_kwargs [1]: input should be a valid dictionary"),
-        ({"batch_size": "big"}, "batch_size 'big': give a number"),
-        ({"tau": float("nan")}, "tau nan: input should be a finite number"),
+        ({"policy_kwargs": [1]}, "policy_kwargs=[1]: input should be a valid dictionary"),
+        ({"batch_size": "big"}, "batch_size='big': give a number"),
+        ({"tau": float("nan")}, "tau=nan: input should be a finite number"),
         ({"normalize": "dict(a=exit())"}, "exit() is not evaluated"),
         ({1: 2}, "Unknown key in the recipe for maddpg '1'"),
     ],
@@ -81,13 +81,13 @@ def test_a_key_that_is_missing_is_named(capsys):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["-n", "0"], "--n-timesteps 0: give 1 or more, or -1"),
-        (["-n", "-5"], "--n-timesteps -5: "),
-        (["--n-eval-envs", "0"], "--n-eval-envs 0: give 1 or more"),
-        (["--eval-freq", "0"], "--eval-freq 0: "),
-        (["--save-freq", "-7"], "--save-freq -7: "),
-        (["--eval-episodes", "0"], "--eval-episodes 0: "),
-        (["--num-threads", "0"], "--num-threads 0: "),
+        (["-n", "0"], "--n-timesteps=0: give 1 or more, or -1"),
+        (["-n", "-5"], "--n-timesteps=-5: "),
+        (["--n-eval-envs", "0"], "--n-eval-envs=0: give 1 or more"),
+        (["--eval-freq", "0"], "--eval-freq=0: "),
+        (["--save-freq", "-7"], "--save-freq=-7: "),
+        (["--eval-episodes", "0"], "--eval-episodes=0: "),
+        (["--num-threads", "0"], "--num-threads=0: "),
         (["--seed", "4294967296"], "Seed must be between"),
         (["-params", "learning_rate:nan"], "nan is not a finite number"),
         (["-params", "learning_rate:1e999"], "inf is not a finite number"),
@@ -95,6 +95,12 @@ def test_a_key_that_is_missing_is_named(capsys):
 )
 def test_a_number_that_no_training_can_be_asked_for_is_refused(capsys, argv, message):
     assert message in refused(capsys, *argv)
+
+
+@pytest.mark.parametrize("command", ["enjoy", "record", "bench"])
+def test_how_long_is_at_least_one_step(capsys, command):
+    assert main([command, "--env", "OwnBit-v0", "-n", "-3"]) == 2
+    assert "--n-timesteps=-3: give 1 or more." in capsys.readouterr().err
 
 
 def test_without_an_environment_the_option_is_named(capsys):

@@ -113,10 +113,10 @@ def sample(algo: str, env, n_envs: int = 1, policy: str = "MlpPolicy", seed: int
 @pytest.mark.parametrize(
     ("kind", "searched"),
     [
-        ("bits", {"estimator"}),
-        ("numbers", NOISE),
-        ("categories", {"estimator"}),
-        ("unlike", {"estimator"} | NOISE),
+        ("binary", {"estimator"}),
+        ("continuous", NOISE),
+        ("categorical", {"estimator"}),
+        ("heterogeneous", {"estimator"} | NOISE),
         ("mixed", {"estimator"} | NOISE),
     ],
 )
@@ -136,9 +136,9 @@ def test_what_matters_to_the_team_is_searched(algo, kind, searched):
 
 
 def test_agents_that_are_alike_may_share():
-    (equal, _), (unlike, _) = sample("maddpg", Neighbours()), sample("maddpg", toy("bits"))
-    assert equal.distributions["share_actor"] == CategoricalDistribution(["false", "true"])
-    assert not SHARING & unlike.params.keys()
+    (homogeneous, _), (heterogeneous, _) = sample("maddpg", Neighbours()), sample("maddpg", toy("binary"))
+    assert homogeneous.distributions["share_actor"] == CategoricalDistribution(["false", "true"])
+    assert not SHARING & heterogeneous.params.keys()
     trial, _ = sample("maddpg", Neighbours(), policy="PairPolicy")
     assert not SHARING & trial.params.keys()
 
@@ -155,7 +155,7 @@ def test_agents_that_are_alike_may_share():
 
 
 def test_updates_are_counted_in_transitions_and_noise_is_left_to_action_noise():
-    env = DummyVecEnv([lambda: toy("numbers")] * 20)
+    env = DummyVecEnv([lambda: toy("continuous")] * 20)
     trial, params = sample("maddpg", env, n_envs=20, action_noise="given")
     assert (trial.distributions["train_freq"].low, trial.distributions["train_freq"].high) == (1, 10)
     assert "exploration_noise" not in params
