@@ -373,6 +373,18 @@ class MADDPGPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ):
+        arguments = validated(
+            PolicyArguments,
+            net_arch=[64, 64] if net_arch is None else net_arch,
+            threshold=threshold,
+            random_thresholds=random_thresholds,
+            n_critics=n_critics,
+            activation_fn=activation_fn,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            agent_names=agent_names,
+            normalize_images=normalize_images,
+        )
         optimizer_kwargs = dict(optimizer_kwargs or {})
         if optimizer_class is th.optim.Adam:
             optimizer_kwargs.setdefault("fused", True)
@@ -384,14 +396,7 @@ class MADDPGPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             squash_output=isinstance(action_space, spaces.Box) and not isinstance(action_space, MixedActions),
         )
-        arguments = validated(
-            PolicyArguments,
-            net_arch=[64, 64] if net_arch is None else net_arch,
-            threshold=threshold,
-            random_thresholds=random_thresholds,
-            n_critics=n_critics,
-        )
-        self.team = Team.from_spaces(observation_space, action_space, agent_names)
+        self.team = Team.from_spaces(observation_space, action_space, arguments["agent_names"])
         check_bounds(self.team)
         self.net_arch = arguments["net_arch"]
         self.activation_fn = activation_fn
@@ -408,9 +413,13 @@ class MADDPGPolicy(BasePolicy):
         self.actor_target = deepcopy(self.actor)
         self.critic_target = deepcopy(self.critic)
         for module in (self.actor, self.critic):
-            module.optimizer = self.optimizer_class(  # type: ignore[call-arg]
-                module.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
-            )
+            try:
+                module.optimizer = self.optimizer_class(  # type: ignore[call-arg]
+                    module.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
+                )
+            except (TypeError, ValueError, RuntimeError) as error:
+                name = self.optimizer_class.__name__
+                raise ValueError(f"optimizer_kwargs={self.optimizer_kwargs} do not fit {name}: {error}.") from error
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
 

@@ -92,6 +92,7 @@ def judge(case: Case) -> Verdict:
         where = traceback.extract_tb(error.__traceback__)[-1]
         told = f"{type(error).__name__}: {error}"
         own = any(where.filename.startswith(package) for package in PACKAGES)
+        own = own or (isinstance(error, OSError) and error.filename is not None)
         if isinstance(error, CLEAR) and own and "\n" not in str(error).strip():
             return Verdict("clear", told)
         return Verdict("raw", f"{told} [{Path(where.filename).name}:{where.lineno}]")
@@ -236,7 +237,10 @@ def model_files(files: Files, rng: random.Random) -> Iterator[Case]:
         for value in ("MATD3", "TD3", "x", "", 5, [], None):
             spoilt[f"algorithm = {value!r}"] = {**members, "data": json.dumps({**data, "algorithm": value}).encode()}
         for value in (1, 3, "2", 2.0, None, [], True):
-            spoilt[f"file_format = {value!r}"] = {**members, "data": json.dumps({**data, "file_format": value}).encode()}
+            spoilt[f"file_format = {value!r}"] = {
+                **members,
+                "data": json.dumps({**data, "file_format": value}).encode(),
+            }
         state = _torch(members["policy.pth"])
         for name in rng.sample(list(state), min(6, len(state))):
             tensor = state[name]
@@ -262,7 +266,10 @@ def model_files(files: Files, rng: random.Random) -> Iterator[Case]:
             spoilt[f"exp_avg {what}"] = {**members, "actor.optimizer.pth": _saved(changed)}
         for what, value in {"lr": np.nan, "betas": None, "params": [0], "eps": -1.0}.items():
             groups = [{**optimizer["param_groups"][0], what: value}]
-            spoilt[f"optimizer {what}"] = {**members, "actor.optimizer.pth": _saved({**optimizer, "param_groups": groups})}
+            spoilt[f"optimizer {what}"] = {
+                **members,
+                "actor.optimizer.pth": _saved({**optimizer, "param_groups": groups}),
+            }
 
         def load(content: Any, path: Path = path) -> None:
             model = MADDPG.load(files.write(content))
@@ -288,15 +295,17 @@ def model_files(files: Files, rng: random.Random) -> Iterator[Case]:
             if path == files.pairs:
                 yield Case(f"evaluate {what}", lambda c=content, f=evaluate: f(c))
     for name in ("empty", "text", "folder", "no file"):
-        for loader in (MADDPG.load, MATD3.load, lambda path: _call("evaluate", "--policy", str(path), "--episodes", "1")):
+        for loader in (
+            MADDPG.load,
+            MATD3.load,
+            lambda path: _call("evaluate", "--policy", str(path), "--episodes", "1"),
+        ):
             yield Case(f"a model's zip is {name}", lambda name=name, loader=loader: loader(_no_zip(files.folder, name)))
     yield Case("MATD3.load(MADDPG's)", lambda: MATD3.load(files.binary))
     for value in NONSENSE:
         yield Case(f"MADDPG.load({value!r})", lambda value=value: MADDPG.load(value))
         yield Case(f"pretrained({value!r})", lambda value=value: pretrained(value))
-        yield Case(
-            f"set_parameters({value!r})", lambda value=value: MADDPG.load(files.binary).set_parameters(value)
-        )
+        yield Case(f"set_parameters({value!r})", lambda value=value: MADDPG.load(files.binary).set_parameters(value))
 
 
 def _no_zip(folder: Path, name: str) -> Path:
@@ -410,7 +419,23 @@ KEYS = (
     "env_kwargs", "eval_env_kwargs", "env_wrapper", "vec_env", "vec_env_wrapper", "callback", "frame_stack",
     "noise_type", "noise_std", "monitor_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "action_noise",
 )  # fmt: skip
-YAML_VALUES = ("null", "''", "x", ".nan", ".inf", "-1", "0", "1e300", "[]", "[x]", "{}", "{x: 1}", "true", "2020-01-01", "0.5")
+YAML_VALUES = (
+    "null",
+    "''",
+    "x",
+    ".nan",
+    ".inf",
+    "-1",
+    "0",
+    "1e300",
+    "[]",
+    "[x]",
+    "{}",
+    "{x: 1}",
+    "true",
+    "2020-01-01",
+    "0.5",
+)
 WORDS = ("", "x", "nan", "-1", "0", "1.5", "1e9", "[", "{", "None", "é", "../..", "--", "a:b", "\0")
 BROKEN = (
     "", "[]", "- 1", "5", "x", "null", "{", "a: b: c", "\t- x", "OwnBit-v0:", "OwnBit-v0: []", "OwnBit-v0: 5",
@@ -475,7 +500,9 @@ def commands(files: Files, rng: random.Random) -> Iterator[Case]:
     for policy in POLICIES:
         yield case("evaluate", *bases["evaluate"], "--policy", policy)
     for world in WORLDS:
-        yield case(rng.choice(["evaluate", "replay"]), *bases["evaluate"][:-4], "--scenario", "random", "--world", world)
+        yield case(
+            rng.choice(["evaluate", "replay"]), *bases["evaluate"][:-4], "--scenario", "random", "--world", world
+        )
     for words in ([], ["x"], [""], ["--x"], ["pretrained", "x"], ["pretrained", "--out", "x"], ["pretrained", "a", "b"],
                   ["pretrained", "quad-swarm-paper", "--out", "/proc/x"], ["pretrained", ""]):  # fmt: skip
         yield case(*words)
@@ -605,7 +632,14 @@ def interfaces(files: Files, rng: random.Random) -> Iterator[Case]:
                     np.zeros((4, 3)), "x"):  # fmt: skip
         yield Case(f"parallel step({actions!r})", lambda a=actions: [(env := _agents()).reset(), env.step(a)])
 
-    observations = {"one less": (1, 2), "one more": (1, 4), "two": (2, 2), "flat": (3,), "none": (0,), "many": (5, 1, 3)}
+    observations = {
+        "one less": (1, 2),
+        "one more": (1, 4),
+        "two": (2, 2),
+        "flat": (3,),
+        "none": (0,),
+        "many": (5, 1, 3),
+    }
     for path, shape in ((files.binary, None), (files.pairs, None)):
 
         def ask(call: Callable[[MADDPG, tuple], Any], path: Path = path) -> Any:
@@ -723,7 +757,10 @@ def algorithms(files: Files, rng: random.Random) -> Iterator[Case]:
             yield case(MADDPG, replay_buffer_kwargs={name: value})
     for name in ("alpha", "beta", "epsilon", "x"):
         for value in rng.sample(NONSENSE, 20):
-            kwargs = {"replay_buffer_class": sb3_maddpg.PrioritizedTeamReplayBuffer, "replay_buffer_kwargs": {name: value}}
+            kwargs = {
+                "replay_buffer_class": sb3_maddpg.PrioritizedTeamReplayBuffer,
+                "replay_buffer_kwargs": {name: value},
+            }
             yield case(MADDPG, **kwargs)
 
     def load(content: bytes) -> None:
