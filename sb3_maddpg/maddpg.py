@@ -13,6 +13,7 @@ from copy import deepcopy
 from operator import attrgetter
 from typing import Any, ClassVar, TypeVar, cast
 
+import gymnasium
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -50,7 +51,7 @@ from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
-from sb3_maddpg.validation import Arguments, RunArguments, TrainingArguments, validated
+from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TrainingArguments, validated
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 
@@ -174,6 +175,12 @@ class MADDPG(OffPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
+        if isinstance(policy, str) and policy not in self.policy_aliases:
+            raise ValueError(suggest("policy", policy, self.policy_aliases))
+        if not isinstance(policy, (str, type)):
+            raise ValueError(f"policy={str(policy)[:100]} is neither MlpPolicy, PairPolicy nor a class of policies.")
+        if env is None and _init_setup_model:
+            raise ValueError("env=None: give an environment, or the id of one.")
         given = validated(
             RunArguments,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -614,9 +621,10 @@ class MADDPG(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfMADDPG:
+        given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
         return super().learn(
             total_timesteps=total_timesteps,
-            callback=callback,
+            callback=given["callback"],
             log_interval=log_interval,
             tb_log_name=tb_log_name,
             reset_num_timesteps=reset_num_timesteps,
@@ -628,6 +636,7 @@ class MADDPG(OffPolicyAlgorithm):
         record_metrics(self.logger, infos)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        env = self._wrap_env(env, self.verbose)
         self._check_normalization(env)
         before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
         if self.replay_buffer.size() and self.replay_buffer.n_envs != n_envs:
@@ -694,6 +703,7 @@ class MADDPG(OffPolicyAlgorithm):
 
         :raises ValueError: a parameter is not finite, which nothing could be done with
         """
+        check_path(path)
         if problem := self._not_finite(self.get_parameters()):
             raise ValueError(f"This model cannot be saved: {problem}")
         if not isinstance(path, (str, os.PathLike)):
@@ -784,6 +794,7 @@ class MADDPG(OffPolicyAlgorithm):
                 )
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        check_path(path)
         if not isinstance(path, (str, os.PathLike)):
             return super().save_replay_buffer(path)
         with atomic_write(path, suffix="pkl") as file:
@@ -807,6 +818,11 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     :return: the environment as algorithms train on it
     :raises ValueError: spaces that describe no team
     """
+    if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
+        raise ValueError(
+            f"env={str(env)[:100]} is no environment: give a PettingZoo or Gymnasium environment, or a VecEnv of "
+            "Stable-Baselines3."
+        )
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)

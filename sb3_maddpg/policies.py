@@ -475,7 +475,15 @@ class MADDPGPolicy(BasePolicy):
             actions.set_threshold(threshold)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        self.check_finite(np.asarray(observation))
+        try:
+            numbers = np.asarray(observation, np.float32)
+        except (TypeError, ValueError):
+            got, shape = " ".join(repr(observation).split())[:100], self.observation_space.shape
+            raise ValueError(
+                f"observation={got} is no array of numbers of shape {shape}, or several of them."
+            ) from None
+        self.check_finite(numbers)
+        observation = observation if isinstance(observation, np.ndarray) else numbers
         return super().obs_to_tensor(observation)
 
     def check_finite(self, observation: np.ndarray) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch as th
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, InstanceOf, ValidationError, field_validator
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import get_device
@@ -53,6 +54,16 @@ class RunArguments(Arguments):
     device: Annotated[Any, AfterValidator(_device)] = Field(
         description='"auto", "cpu", or another device of PyTorch that this machine has'
     )
+
+
+class LearnArguments(Arguments):
+    """Of ``learn``."""
+
+    total_timesteps: float = Field(ge=0, description="a finite number of steps of at least 0")
+    callback: InstanceOf[BaseCallback] | list[InstanceOf[BaseCallback]] | Callable[..., Any] | None = Field(
+        description="a callback of Stable-Baselines3, a list of them, a function, or None"
+    )
+    log_interval: int | None = Field(description="a number of episodes, or None")
 
 
 class TrainingArguments(Arguments):

@@ -34,12 +34,12 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
+from faulty import Faulty, trained
 from gymnasium import spaces
 
 import quad_swarm
 import sb3_maddpg
 import sb3_maddpg.team_tasks  # registers the tasks
-from faulty import Faulty, trained
 from sb3_maddpg import MADDPG, MATD3, pretrained
 from sb3_maddpg.cli.commands import main as command_line
 from sb3_maddpg.pretrained_models import pretrained_folder
@@ -91,7 +91,9 @@ def judge(case: Case) -> Verdict:
     except BaseException as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         told = f"{type(error).__name__}: {error}"
-        own = any(where.filename.startswith(package) for package in PACKAGES)
+        # Gymnasium knows which ids exist, and Stable-Baselines3 shapes
+        foreign = isinstance(error, gymnasium.error.Error) or "observation shape" in str(error)
+        own = foreign or any(where.filename.startswith(package) for package in PACKAGES)
         own = own or (isinstance(error, OSError) and error.filename is not None)
         if isinstance(error, CLEAR) and own and "\n" not in str(error).strip():
             return Verdict("clear", told)
@@ -664,7 +666,7 @@ def interfaces(files: Files, rng: random.Random) -> Iterator[Case]:
                 "save_replay_buffer": lambda m, _, v=value: m.save_replay_buffer(v),
                 "load_replay_buffer": lambda m, _, v=value: m.load_replay_buffer(v),
                 "learn": lambda m, _, v=value: (m.set_env(gymnasium.make("OwnBit-v0")), m.learn(v), check_model(m)),
-                "agent_policy.act": lambda m, _, v=value: m.agent_policy(0).act(v),
+                "agent_policy.predict": lambda m, _, v=value: m.agent_policy(0).predict(v),
                 "agent_policy.export": lambda m, _, v=value: m.agent_policy(0).export(v),
                 "resized": lambda m, _, v=value: m.resized(v),
                 "callback": lambda m, _, v=value: (m.set_env(gymnasium.make("OwnBit-v0")), m.learn(20, callback=v)),
@@ -676,7 +678,7 @@ def interfaces(files: Files, rng: random.Random) -> Iterator[Case]:
             for name in ("save", "save_replay_buffer"):
                 yield Case(f"{name}({where.name})", lambda a=ask, n=name, w=where: a(lambda m, _: getattr(m, n)(w)))
             yield Case(f"export({where.name})", lambda a=ask, w=where: a(lambda m, _: m.agent_policy(0).export(w)))
-    for env in ("CounterPhase-v0", "CartPole-v1", "Pendulum-v1", "no-such", "OwnBit", ""):
+    for env in ("CartPole-v1", "Pendulum-v1", "no-such", "OwnBit", ""):
         yield Case(f"set_env({env})", lambda env=env: MADDPG.load(files.binary).set_env(gymnasium.make(env)))
         yield Case(f"load(env={env})", lambda env=env: MADDPG.load(files.binary, env=gymnasium.make(env)))
         yield Case(f"MADDPG(env={env!r})", lambda env=env: MADDPG("MlpPolicy", env, **QUICK))
