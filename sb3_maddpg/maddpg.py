@@ -259,6 +259,8 @@ class MADDPG(OffPolicyAlgorithm):
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": n_steps, "gamma": self.gamma}
         try:
             super()._setup_model()
+        except MemoryError as error:
+            raise ValueError(f"buffer_size={buffer_size} or the networks need too much memory: {error}") from error
         finally:
             self.n_steps, self.buffer_size = n_steps, buffer_size
         self._create_aliases()

@@ -29,12 +29,17 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
     :param team: whose agents
     :param argument: name of the argument, for the error's message
     :return: for each agent the number of its network
-    :raises ValueError: an agent in two lists, or heterogeneous agents in one
+    :raises ValueError: something else, an agent in two lists, or heterogeneous agents in one
     """
     if isinstance(share, bool):
         lists = [list(range(team.n_agents))] if share else []
     else:
-        lists = [[team.index(agent) for agent in agents] for agents in share]
+        try:
+            lists = [[team.index(agent) for agent in agents] for agents in share]
+        except TypeError:
+            raise ValueError(
+                f"{argument}={share!r} must be True, False or lists of agents that share a network."
+            ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
         raise ValueError(f"{argument}={share} names an agent twice: an agent has one network.")

@@ -358,6 +358,7 @@ def test_a_model_for_a_team_of_another_size_has_its_networks_and_arguments():
         ({"policy_kwargs": {"optimizer_class": int}}, "optimizer_class=<class 'int'> must be a class of torch.optim"),
         ({"policy_kwargs": {"optimizer_kwargs": 5}}, "optimizer_kwargs=5 must be a dict"),
         ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "do not fit Adam: .*'x'"),
+        ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or lists of agents"),
         ({"policy_kwargs": {"agent_names": 5}}, "agent_names=5 must be a list of names"),
     ],
 )

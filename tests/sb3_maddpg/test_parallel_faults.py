@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from faulty import Faulty, trained
 
 import sb3_maddpg
+from faulty import Faulty, trained
 from sb3_maddpg import MADDPG
 
 

@@ -303,7 +303,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path):
     assert_equal_state(model.get_parameters(), before)
 
 
-@pytest.mark.parametrize("changes", [{"_n_updates": "x"}, {"num_timesteps": None}, {"start_time": float("nan")}])
+@pytest.mark.parametrize("changes", [{"_n_updates": "x"}, {"num_timesteps": -1}, {"start_time": float("nan")}])
 def test_counters_that_no_training_wrote_are_refused(tmp_path, changes):
     learned().save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=f"its {next(iter(changes))} is"):

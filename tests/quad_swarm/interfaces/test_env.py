@@ -357,5 +357,5 @@ def test_points_beyond_any_number_are_refused_in_one_line():
 
 @pytest.mark.parametrize("level", ["x", 0.5, None, -1])
 def test_a_level_that_is_none_is_refused(level):
-    with pytest.raises(ValueError, match="Level .* does not exist"):
+    with pytest.raises(ValueError, match=r"Level .* does not exist"):
         QuadSwarmEnv(scenario="curriculum").set_curriculum_level(level)

@@ -119,5 +119,5 @@ def test_ppo_learns_through_supersuit():
 def test_actions_that_are_no_mapping_are_refused(actions):
     env = quad_swarm.parallel_env()
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="step.. takes a mapping"):
+    with pytest.raises(ValueError, match=r"step\(\) takes a mapping"):
         env.step(actions)
