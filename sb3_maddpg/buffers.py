@@ -476,6 +476,7 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     """
 
     def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.5, epsilon: float = 0.01, **kwargs: Any):
+        _check_numbers(alpha=alpha, beta=beta, epsilon=epsilon)
         if not (0 <= alpha <= 1 and 0 <= beta <= 1):
             raise ValueError(f"alpha={alpha} and beta={beta} must be between 0 and 1.")
         if not 0 < epsilon < math.inf:
@@ -597,6 +598,7 @@ def _check_arguments(
     ):
         if not isinstance(number, (int, np.integer)) or number < least:
             raise ValueError(f"{name}={number!r} must be an integer of at least {least}.")
+    _check_numbers(gamma=gamma)
     if not 0 <= gamma <= 1:
         raise ValueError(f"gamma={gamma} must be between 0 and 1.")
     if n_steps > 1 and optimize_memory_usage:
@@ -604,3 +606,9 @@ def _check_arguments(
             f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not keep "
             "where an episode ends. Set n_steps=1 or optimize_memory_usage=False."
         )
+
+
+def _check_numbers(**numbers: Any) -> None:
+    for name, number in numbers.items():
+        if not isinstance(number, (int, float, np.number)) or isinstance(number, bool):
+            raise ValueError(f"{name}={number!r} must be a number.")
