@@ -96,7 +96,12 @@ class AgentPolicy(nn.Module):
         :return: an action of the agent's own space, or (batch, length of the action)
         :raises ValueError: another length, NaN or infinity
         """
-        obs = th.as_tensor(np.asarray(observation, dtype=np.float32))
+        try:
+            obs = th.as_tensor(np.asarray(observation, dtype=np.float32))
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"The observation of {self.name} is no array of numbers: {' '.join(repr(observation).split())[:100]}"
+            ) from None
         if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
             raise ValueError(f"An observation of {self.name} has length {self.obs_dim}, not shape {tuple(obs.shape)}.")
         if not obs.isfinite().all():
@@ -117,6 +122,8 @@ class AgentPolicy(nn.Module):
         :param path: of the file
         :raises ValueError: a parameter is not finite
         """
+        if not isinstance(path, (str, os.PathLike)):
+            raise ValueError(f"{path!r} is no path of a file.")
         for name, parameter in self.named_parameters():
             if not parameter.isfinite().all():
                 raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")

@@ -485,12 +485,9 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     :param kwargs: see ``TeamReplayBuffer``
     """
 
-    alpha: float
-    beta: float
-    epsilon: float
-
     def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.5, epsilon: float = 0.01, **kwargs: Any):
-        self.__dict__.update(validated(PriorityArguments, alpha=alpha, beta=beta, epsilon=epsilon))
+        given = validated(PriorityArguments, alpha=alpha, beta=beta, epsilon=epsilon)
+        self.alpha, self.beta, self.epsilon = given["alpha"], given["beta"], given["epsilon"]
         super().__init__(*args, **kwargs)
         self.reset()
 

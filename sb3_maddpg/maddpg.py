@@ -9,8 +9,11 @@ import pathlib
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
+from operator import attrgetter
 from typing import Any, ClassVar, TypeVar, cast
 
+import gymnasium
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -34,19 +37,37 @@ from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import record_metrics
 from sb3_maddpg.estimators import ESTIMATORS
-from sb3_maddpg.model_files import FILE_FORMAT, check_file, optimizer_not_finite
+from sb3_maddpg.model_files import (
+    FILE_FORMAT,
+    as_damage,
+    check_attributes,
+    check_file,
+    check_path,
+    optimizer_not_finite,
+    optimizer_problem,
+)
 from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
-from sb3_maddpg.validation import Arguments, TrainingArguments, validated
+from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TrainingArguments, validated
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 
 # Arguments of policies that the algorithm gives itself
 NOT_POLICY_KWARGS = {"observation_space", "action_space", "lr_schedule"}
+# Arguments of replay buffers that the algorithm gives itself
+NOT_BUFFER_KWARGS = {
+    "buffer_size",
+    "observation_space",
+    "action_space",
+    "device",
+    "n_envs",
+    "optimize_memory_usage",
+    "args",
+}
 # Arguments that a model for a team of another size does not take over
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
 # Of the actions that ``expected`` looks at in one update; the critics' layers take as much again, or more
@@ -157,6 +178,25 @@ class MADDPG(OffPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
+        if isinstance(policy, str) and policy not in self.policy_aliases:
+            raise ValueError(suggest("policy", policy, self.policy_aliases))
+        if not isinstance(policy, (str, type)):
+            raise ValueError(f"policy={str(policy)[:100]} is neither MlpPolicy, PairPolicy nor a class of policies.")
+        if env is None and _init_setup_model:
+            raise ValueError("env=None: give an environment, or the id of one.")
+        given = validated(
+            RunArguments,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+        )
+        for name in ("n_steps", "gamma"):
+            if replay_buffer_kwargs and name in replay_buffer_kwargs:
+                raise ValueError(f"replay_buffer_kwargs[{name!r}] is the algorithm's own: give it {name} itself.")
         super().__init__(
             policy,
             env,
@@ -174,11 +214,11 @@ class MADDPG(OffPolicyAlgorithm):
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
             policy_kwargs=dict(policy_kwargs or {}),
-            stats_window_size=stats_window_size,
+            stats_window_size=given["stats_window_size"],
             tensorboard_log=tensorboard_log,
-            verbose=verbose,
+            verbose=given["verbose"],
             device=device,
-            seed=seed,
+            seed=given["seed"],
             sde_support=False,
             supported_action_spaces=ACTION_SPACES,
             support_multi_env=True,
@@ -222,6 +262,8 @@ class MADDPG(OffPolicyAlgorithm):
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": n_steps, "gamma": self.gamma}
         try:
             super()._setup_model()
+        except MemoryError as error:
+            raise ValueError(f"buffer_size={buffer_size} or the networks need too much memory: {error}") from error
         finally:
             self.n_steps, self.buffer_size = n_steps, buffer_size
         self._create_aliases()
@@ -286,10 +328,11 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
             raise ValueError(f"{self.policy_class.__name__} is no policy of a team: use MlpPolicy or PairPolicy.")
-        if self.estimator not in ESTIMATORS:
+        if not isinstance(self.estimator, str) or self.estimator not in ESTIMATORS:
             raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
         names = self.arguments.model_fields
-        self.__dict__.update(validated(self.arguments, **{name: getattr(self, name) for name in names}))
+        for name, value in validated(self.arguments, **{name: getattr(self, name) for name in names}).items():
+            setattr(self, name, value)
         if self.batch_size > self.buffer_size:
             raise ValueError(
                 f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}: a batch is drawn from "
@@ -307,15 +350,25 @@ class MADDPG(OffPolicyAlgorithm):
         for name in self.policy_kwargs:
             if name not in (known := arguments_of(self.policy_class)):
                 raise ValueError(suggest("argument in policy_kwargs", name, known - NOT_POLICY_KWARGS))
+        self._check_replay_buffer_arguments()
+
+    def _check_replay_buffer_arguments(self) -> None:
         buffer = self.replay_buffer_class
         if isinstance(buffer, str):
             raise ValueError(f"replay_buffer_class={buffer!r} is a name, which only recipes know: give the class.")
+        if buffer is not None and not isinstance(buffer, type):
+            raise ValueError(
+                f"replay_buffer_class={buffer!r} is no class: give TeamReplayBuffer or one derived from it."
+            )
         if buffer is not None and not issubclass(buffer, TeamReplayBuffer):
             raise ValueError(
                 f"replay_buffer_class={buffer.__name__} knows no agents: derive it from "
                 "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
                 "observations, which a team does not have."
             )
+        for name in self.replay_buffer_kwargs:
+            if name not in (known := arguments_of(buffer or TeamReplayBuffer) - NOT_BUFFER_KWARGS):
+                raise ValueError(suggest("argument in replay_buffer_kwargs", name, known))
 
     def _check_memory(self) -> None:
         """Refuse an expectation over so many actions that no machine could hold them."""
@@ -596,9 +649,10 @@ class MADDPG(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfMADDPG:
+        given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
         super().learn(
             total_timesteps=total_timesteps,
-            callback=callback,
+            callback=given["callback"],
             log_interval=log_interval,
             tb_log_name=tb_log_name,
             reset_num_timesteps=reset_num_timesteps,
@@ -614,6 +668,7 @@ class MADDPG(OffPolicyAlgorithm):
         record_metrics(self.logger, infos)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        env = self._wrap_env(env, self.verbose)
         self._check_normalization(env)
         before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
         if self.replay_buffer.size() and self.replay_buffer.n_envs != n_envs:
@@ -660,9 +715,14 @@ class MADDPG(OffPolicyAlgorithm):
         **kwargs,
     ) -> SelfMADDPG:
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
-        check_file(path, cls.__name__, {base.__name__ for base in algorithms})
-        with _remedy_for_other_team(), _as_value_error():
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if env is not None:
+            env = cls._wrap_env(env)
+        with as_damage(path):
+            check_file(path, cls.__name__, {base.__name__ for base in algorithms})
+            with _remedy_for_other_team():
+                model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            check_attributes(model, path)
+        return model
 
     def save(
         self,
@@ -675,6 +735,7 @@ class MADDPG(OffPolicyAlgorithm):
 
         :raises ValueError: a parameter is not finite, which nothing could be done with
         """
+        check_path(path)
         if problem := self._not_finite(self.get_parameters()):
             raise ValueError(f"This model cannot be saved: {problem}")
         if not isinstance(path, (str, os.PathLike)):
@@ -688,13 +749,39 @@ class MADDPG(OffPolicyAlgorithm):
         """
         SB3's ``set_parameters``, which ``load`` calls too.
 
-        :raises RuntimeError: a parameter is not finite; nothing has changed then
+        :raises ValueError: parameters that are not finite or fit other networks; nothing has changed then
         """
-        if not isinstance(load_path_or_dict, dict):
-            load_path_or_dict = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
-        if problem := self._not_finite(load_path_or_dict):
-            raise _NotFiniteError(f"These parameters cannot be used: {problem}")
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        parameters: dict[str, Any]
+        if isinstance(load_path_or_dict, dict):
+            parameters = load_path_or_dict
+        else:
+            check_path(load_path_or_dict)
+            with as_damage(load_path_or_dict):
+                parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+        before: Any = deepcopy(self.get_parameters())
+        try:
+            if problem := self._not_finite(parameters):
+                raise UnusableParametersError(f"These parameters cannot be used: {problem}")
+            for name, state in parameters.items():
+                if name.endswith(".optimizer") and (problem := optimizer_problem(state, attrgetter(name)(self))):
+                    raise UnusableParametersError(f"These parameters cannot be used: the state of {name} {problem}.")
+            if name := next(
+                (name for name, one in parameters.get("policy", {}).items() if not one.is_floating_point()), ""
+            ):
+                raise UnusableParametersError(
+                    f"These parameters cannot be used: parameter {name} holds no real numbers."
+                )
+            super().set_parameters(parameters, exact_match, device)
+            if problem := self._not_finite(self.get_parameters()):  # numbers too large for single precision
+                raise UnusableParametersError(f"These parameters cannot be used: {problem}")
+        except Exception as error:
+            super().set_parameters(before, True, device)
+            if isinstance(error, UnusableParametersError):
+                raise
+            raise UnusableParametersError(
+                "These parameters cannot be used, they are damaged or of other networks than this model's: "
+                + " ".join(str(error).split())[:400]
+            ) from error
 
     def _not_finite(self, parameters: dict[str, Any]) -> str | None:
         """:return: which of the parameters (see ``get_parameters``) are not finite, and what to do, None if all are"""
@@ -713,9 +800,11 @@ class MADDPG(OffPolicyAlgorithm):
 
         :raises ValueError: a buffer of another kind, team or number of environments; the present one stays then
         """
+        check_path(path)
         present = self.replay_buffer
         try:
-            super().load_replay_buffer(path, truncate_last_traj)
+            with as_damage(path, "replay buffer"):
+                super().load_replay_buffer(path, truncate_last_traj)
             self._check_replay_buffer(self.replay_buffer, path)
         except BaseException:
             self.replay_buffer = present
@@ -740,6 +829,7 @@ class MADDPG(OffPolicyAlgorithm):
                 )
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        check_path(path)
         if not isinstance(path, (str, os.PathLike)):
             return super().save_replay_buffer(path)
         with atomic_write(path, suffix="pkl") as file:
@@ -763,6 +853,11 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     :return: the environment as algorithms train on it
     :raises ValueError: spaces that describe no team
     """
+    if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
+        raise ValueError(
+            f"env={str(env)[:100]} is no environment: give a PettingZoo or Gymnasium environment, or a VecEnv of "
+            "Stable-Baselines3."
+        )
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
@@ -813,16 +908,11 @@ def _normalizer_of_observations(env: GymEnv | None) -> VecNormalize | None:
     return normalizer if normalizer is not None and normalizer.norm_obs else None
 
 
-class _NotFiniteError(RuntimeError):
-    """Not a ValueError, by which SB3's ``load`` recognises models of its older versions."""
-
-
-@contextmanager
-def _as_value_error() -> Iterator[None]:
-    try:
-        yield
-    except _NotFiniteError as error:
-        raise ValueError(str(error)) from None
+class UnusableParametersError(ValueError, RuntimeError):
+    """
+    Parameters that are not finite, or fit other networks. Also a RuntimeError, for SB3's ``load`` takes a mere
+    ValueError for a sign of an older file.
+    """
 
 
 @contextmanager

@@ -132,7 +132,7 @@ class MATD3(MADDPG):
             policy_delay=policy_delay,
             max_grad_norm=max_grad_norm,
             policy_regularization=policy_regularization,
-            policy_kwargs={"n_critics": 2, **(policy_kwargs or {})},
+            policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -140,6 +140,7 @@ class MATD3(MADDPG):
             device=device,
             _init_setup_model=False,
         )
+        self.policy_kwargs = {"n_critics": 2, **self.policy_kwargs}
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
         if _init_setup_model:

@@ -30,12 +30,17 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
     :param team: whose agents
     :param argument: name of the argument, for the error's message
     :return: for each agent the number of its network
-    :raises ValueError: an agent in two lists, or heterogeneous agents in one
+    :raises ValueError: something else, an agent in two lists, or heterogeneous agents in one
     """
     if isinstance(share, bool):
         lists = [list(range(team.n_agents))] if share else []
     else:
-        lists = [[team.index(agent) for agent in agents] for agents in share]
+        try:
+            lists = [[team.index(agent) for agent in agents] for agents in share]
+        except TypeError:
+            raise ValueError(
+                f"{argument}={share!r} must be True, False or lists of agents that share a network."
+            ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
         raise ValueError(f"{argument}={share} names an agent twice: an agent has one network.")
@@ -374,6 +379,18 @@ class MADDPGPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ):
+        arguments = validated(
+            PolicyArguments,
+            net_arch=[64, 64] if net_arch is None else net_arch,
+            threshold=threshold,
+            random_thresholds=random_thresholds,
+            n_critics=n_critics,
+            activation_fn=activation_fn,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            agent_names=agent_names,
+            normalize_images=normalize_images,
+        )
         optimizer_kwargs = dict(optimizer_kwargs or {})
         if optimizer_class is th.optim.Adam:
             optimizer_kwargs.setdefault("fused", True)
@@ -385,14 +402,7 @@ class MADDPGPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             squash_output=isinstance(action_space, spaces.Box) and not isinstance(action_space, MixedActions),
         )
-        arguments = validated(
-            PolicyArguments,
-            net_arch=[64, 64] if net_arch is None else net_arch,
-            threshold=threshold,
-            random_thresholds=random_thresholds,
-            n_critics=n_critics,
-        )
-        self.team = Team.from_spaces(observation_space, action_space, agent_names)
+        self.team = Team.from_spaces(observation_space, action_space, arguments["agent_names"])
         self.net_arch = arguments["net_arch"]
         self.activation_fn = activation_fn
         self.share_actor = share_actor
@@ -408,9 +418,13 @@ class MADDPGPolicy(BasePolicy):
         self.actor_target = deepcopy(self.actor)
         self.critic_target = deepcopy(self.critic)
         for module in (self.actor, self.critic):
-            module.optimizer = self.optimizer_class(  # type: ignore[call-arg]
-                module.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
-            )
+            try:
+                module.optimizer = self.optimizer_class(  # type: ignore[call-arg]
+                    module.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
+                )
+            except (TypeError, ValueError, RuntimeError) as error:
+                name = self.optimizer_class.__name__
+                raise ValueError(f"optimizer_kwargs={self.optimizer_kwargs} do not fit {name}: {error}.") from error
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
 
@@ -466,7 +480,15 @@ class MADDPGPolicy(BasePolicy):
             actions.set_threshold(threshold)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        self.check_finite(np.asarray(observation))
+        try:
+            numbers = np.asarray(observation, np.float32)
+        except (TypeError, ValueError):
+            got, shape = " ".join(repr(observation).split())[:100], self.observation_space.shape
+            raise ValueError(
+                f"observation={got} is no array of numbers of shape {shape}, or several of them."
+            ) from None
+        self.check_finite(numbers)
+        observation = observation if isinstance(observation, np.ndarray) else numbers
         return super().obs_to_tensor(observation)
 
     def check_finite(self, observation: np.ndarray) -> None:

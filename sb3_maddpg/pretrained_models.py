@@ -52,6 +52,6 @@ def pretrained_folder(name: str) -> Path:
     :raises ValueError: no such model
     """
     known = pretrained_models()
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         raise ValueError(suggest("pretrained model", name, known))
     return known[name]

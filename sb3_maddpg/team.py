@@ -245,7 +245,7 @@ class Team:
         """
         if isinstance(agent, str) and agent in self.names:
             return self.names.index(agent)
-        if not isinstance(agent, str) and 0 <= agent < self.n_agents:
+        if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and 0 <= agent < self.n_agents:
             return int(agent)
         raise ValueError(
             f"There is no agent {agent!r}: the agents are {', '.join(self.names)}, or 0 to {self.n_agents - 1}."

@@ -32,7 +32,7 @@ def suggest(kind: str, name: str, known: Iterable[str]) -> str:
     :param name: the name that was given
     :param known: the names that exist
     """
-    known = sorted(known)
+    known, name = sorted(known), str(name)
     nearest = difflib.get_close_matches(name, known, n=1)
     if nearest:
         return f"Unknown {kind} '{name}': did you mean '{nearest[0]}'?"

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError, field_validator
+import torch as th
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, InstanceOf, ValidationError, field_validator
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.utils import get_device
+from torch import nn
 
 AtLeastZero = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
@@ -27,6 +32,38 @@ class Arguments(BaseModel):
     @classmethod
     def _without_numpy(cls, value: Any) -> Any:
         return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
+
+
+def _device(device: Any) -> Any:
+    try:
+        th.empty(0, device=get_device(device))
+    except (RuntimeError, TypeError, AssertionError, NotImplementedError):
+        raise ValueError from None
+    return device
+
+
+class RunArguments(Arguments):
+    """Of any algorithm of Stable-Baselines3, which reads them before it asks its sub-classes."""
+
+    replay_buffer_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by their names, or None")
+    policy_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by their names, or None")
+    stats_window_size: int = Field(ge=1, le=10**9, description="a number of episodes, at least 1")
+    tensorboard_log: str | Path | None = Field(description="a folder, or None")
+    verbose: int = Field(ge=0, description="0, 1 or 2")
+    seed: int | None = Field(ge=0, lt=2**32, description="an integer from 0 to 2**32 - 1, or None")
+    device: Annotated[Any, AfterValidator(_device)] = Field(
+        description='"auto", "cpu", or another device of PyTorch that this machine has'
+    )
+
+
+class LearnArguments(Arguments):
+    """Of ``learn``."""
+
+    total_timesteps: float = Field(ge=0, description="a finite number of steps of at least 0")
+    callback: InstanceOf[BaseCallback] | list[InstanceOf[BaseCallback]] | Callable[..., Any] | None = Field(
+        description="a callback of Stable-Baselines3, a list of them, a function, or None"
+    )
+    log_interval: int | None = Field(description="a number of episodes, or None")
 
 
 class TrainingArguments(Arguments):
@@ -89,6 +126,11 @@ class PolicyArguments(ThresholdArgument):
     )
     random_thresholds: float = Field(gt=0, le=1, description="a share above 0, up to 1: at 0 nothing is explored")
     n_critics: int = Field(ge=1, description="at least 1")
+    activation_fn: type[nn.Module] = Field(description="a class of torch.nn, such as torch.nn.ReLU")
+    optimizer_class: type[th.optim.Optimizer] = Field(description="a class of torch.optim, such as torch.optim.Adam")
+    optimizer_kwargs: dict[str, Any] | None = Field(description="a dict of the optimizer's arguments, or None")
+    agent_names: list[str] | tuple[str, ...] | None = Field(description="a list of names, one of each agent, or None")
+    normalize_images: bool = Field(description="True or False")
 
     @field_validator("net_arch")
     @classmethod

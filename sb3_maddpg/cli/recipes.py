@@ -156,6 +156,8 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
     :raises ValueError: it holds something else
     """
     if not path.endswith((".yml", ".yaml")):  # a module, which Python reads
+        if not all(part.isidentifier() for part in path.split(".")):
+            raise ValueError(f"--conf-file {path!r} is neither a YAML file nor a module.")
         return
     if not Path(path).is_file():
         raise FileNotFoundError(f"There is no recipe {path}: --conf-file names a YAML file.")
@@ -204,8 +206,11 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     checked = validated_as(model, hyperparams, lambda name: f"{source}: {name}")
     found = {key: checked[key] for key in hyperparams}
     check_policy_kwargs(algo, found)
-    if isinstance(name := found.get("replay_buffer_class"), str):
-        found["replay_buffer_class"] = _replay_buffer(name)
+    for key in ("env_wrapper", "vec_env_wrapper", "callback"):
+        for name in _names_of_classes(found.get(key)):
+            _check_callable(key, name)
+    if isinstance(buffer := found.get("replay_buffer_class"), str):
+        found["replay_buffer_class"] = _replay_buffer(buffer)
     return found
 
 
@@ -283,6 +288,22 @@ def _replay_buffer(name: str) -> type[ReplayBuffer]:
             f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Give the dotted path of a class, "
             "such as sb3_maddpg.PrioritizedTeamReplayBuffer."
         ) from error
+
+
+def _names_of_classes(value: Any) -> list[str]:
+    """What rl_zoo3 imports: a name, the only key of a dict, or several of them."""
+    if isinstance(value, list):
+        return [name for one in value for name in _names_of_classes(one)]
+    return [value] if isinstance(value, str) else [str(name) for name in value or ()]
+
+
+def _check_callable(key: str, name: str) -> None:
+    try:
+        found = get_class_by_name(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{key}: {name} in the recipe cannot be imported ({error}).") from error
+    if not callable(found):
+        raise ValueError(f"{key}: {name} in the recipe is no class. Give the dotted path of one.")
 
 
 def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:

@@ -524,3 +524,10 @@ def test_arrays_of_the_buffer_are_views_of_its_records():
     memory = buffer(n_pairs=1)
     for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pair_rewards"):
         assert np.shares_memory(getattr(memory, name), memory.records), name
+
+
+@pytest.mark.parametrize("name", ["alpha", "beta", "epsilon", "gamma"])
+def test_priorities_and_discounts_are_numbers(name):
+    for value in ("x", None, True, [1]):
+        with pytest.raises(ValueError, match=f"{name}=.* must be a number"):
+            PrioritizedTeamReplayBuffer(10, spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(4), **{name: value})

@@ -365,3 +365,44 @@ def test_a_short_training_logs_its_episodes_once():
     assert written[0][1] is not None
     model.learn(40)  # the fourth episode ends with it
     assert [step for step, _ in written] == [30, 40]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"policy": "x"}, "Unknown policy 'x'"),
+        ({"policy": 5}, "policy=5 is neither"),
+        ({"env": None}, "env=None: give an environment"),
+        ({"env": object}, "is no environment"),
+        ({"device": "None"}, "device='None' must be"),
+        ({"device": 1.5}, "device=1.5 must be"),
+        ({"seed": 0.5}, "seed=0.5 must be"),
+        ({"seed": -1}, "seed=-1 must be"),
+        ({"verbose": b"x"}, "verbose=b'x' must be"),
+        ({"stats_window_size": ()}, r"stats_window_size=\(\) must be"),
+        ({"tensorboard_log": 2}, "tensorboard_log=2 must be"),
+        ({"policy_kwargs": [1]}, r"policy_kwargs=\[1\] must be a dict"),
+        ({"replay_buffer_kwargs": {1: 2}}, "replay_buffer_kwargs={1: 2} must be a dict"),
+        ({"replay_buffer_kwargs": {"alpha": 1}}, "Unknown argument in replay_buffer_kwargs 'alpha'"),
+        ({"replay_buffer_kwargs": {"optimize_memory_usage": True}}, "Unknown argument in replay_buffer_kwargs"),
+        ({"replay_buffer_kwargs": {"n_steps": 3}}, "'n_steps'. is the algorithm's own"),
+        ({"replay_buffer_class": 2}, "replay_buffer_class=2 is no class"),
+        ({"estimator": {}}, "Unknown estimator '{}'"),
+        ({"policy_kwargs": {"activation_fn": 0.5}}, "activation_fn=0.5 must be a class of torch.nn"),
+        ({"policy_kwargs": {"optimizer_class": int}}, "optimizer_class=<class 'int'> must be a class of torch.optim"),
+        ({"policy_kwargs": {"optimizer_kwargs": 5}}, "optimizer_kwargs=5 must be a dict"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "do not fit Adam: .*'x'"),
+        ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or lists of agents"),
+        ({"policy_kwargs": {"agent_names": 5}}, "agent_names=5 must be a list of names"),
+    ],
+)
+def test_arguments_of_a_wrong_type_are_refused_by_name(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        MADDPG(**{"policy": "MlpPolicy", "env": "OwnBit-v0", **SMALL, **arguments})
+
+
+@pytest.mark.parametrize("arguments", [{"total_timesteps": "x"}, {"total_timesteps": np.nan}, {"callback": 2}])
+def test_learn_names_an_argument_of_a_wrong_type(arguments):
+    model = MADDPG("MlpPolicy", "OwnBit-v0", **SMALL)
+    with pytest.raises(ValueError, match=f"{next(iter(arguments))}=.* must be"):
+        model.learn(**{"total_timesteps": 10, **arguments})

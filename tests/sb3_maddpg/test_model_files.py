@@ -93,3 +93,10 @@ def test_a_file_of_another_format_is_refused(tmp_path, changes):
         MADDPG.load(path)
     same = MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "same.zip"))
     assert_equal_state(same.get_parameters(), model.get_parameters())
+
+
+@pytest.mark.parametrize("changes", [{"_n_updates": "x"}, {"num_timesteps": -1}, {"start_time": float("nan")}])
+def test_counters_that_no_training_wrote_are_refused(tmp_path, changes):
+    learned().save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=f"its {next(iter(changes))} is"):
+        MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes))

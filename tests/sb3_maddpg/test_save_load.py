@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -231,3 +232,65 @@ def test_other_numbers_of_environments_need_an_empty_replay_buffer():
     model.replay_buffer.reset()
     model.set_env(make_vec_env("OwnBit-v0", 2))
     assert model.learn(40, reset_num_timesteps=False).replay_buffer.n_envs == 2
+
+
+def spoilt(source: Path, **members: bytes) -> Path:
+    """A copy of a model's zip with other contents of some members, by their names without what follows the dot."""
+    target = source.with_name("spoilt.zip")
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, members.get(name.split(".")[0], old.read(name)))
+    return target
+
+
+def test_damaged_files_are_refused_in_one_line(tmp_path):
+    model = learned()
+    model.save(tmp_path / "model.zip")
+    before = model.get_parameters()
+    for members in ({"data": b"["}, {"data": b"[]"}, {"data": b"\xff"}, {"policy": b"x"}, {"actor": b""}):
+        for read in (MADDPG.load, model.set_parameters):
+            if "data" in members and read == model.set_parameters:
+                continue  # which does not read it
+            with pytest.raises(ValueError, match=r"spoilt\.zip is damaged") as told:
+                read(spoilt(tmp_path / "model.zip", **members))
+            assert "\n" not in str(told.value)
+    with pytest.raises(ValueError, match="5 is neither a path nor a file"):
+        MADDPG.load(5)
+    assert_equal_state(model.get_parameters(), before)
+
+
+def test_parameters_of_other_networks_are_refused_and_nothing_has_changed():
+    model = learned()
+    before = model.get_parameters()
+    name, weights = next(iter(before["policy"].items()))
+    moments = before["actor.optimizer"]["state"]
+    for spoilt_parameters in (
+        {**before, "policy": {**before["policy"], name: weights[:0]}},
+        {**before, "policy": {**before["policy"], name: weights.double() + 1e300}},
+        {**before, "policy": {**before["policy"], name: weights.long()}},
+        {**before, "policy": []},
+        {**before, "actor.optimizer": {}},
+        {**before, "actor.optimizer": before["critic.optimizer"]},
+        {
+            **before,
+            "actor.optimizer": {
+                **before["actor.optimizer"],
+                "state": {**moments, 0: {**moments[0], "exp_avg": th.zeros(2)}},
+            },
+        },
+    ):
+        with pytest.raises(ValueError, match="These parameters cannot be used") as told:
+            model.set_parameters(spoilt_parameters)
+        assert "\n" not in str(told.value)
+        assert_equal_state(model.get_parameters(), before)
+
+
+def test_a_truncated_replay_buffer_is_refused(tmp_path):
+    model = learned()
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    content = (tmp_path / "buffer.pkl").read_bytes()
+    (tmp_path / "buffer.pkl").write_bytes(content[: len(content) // 2])
+    present = model.replay_buffer
+    with pytest.raises(ValueError, match=r"buffer\.pkl is damaged, or holds no replay buffer"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.replay_buffer is present

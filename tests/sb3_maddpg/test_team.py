@@ -185,3 +185,10 @@ def test_names_that_do_not_fit_are_refused():
         Team.from_spaces(*given, names=["a", "b", "c"])
     with pytest.raises(ValueError, match="occurs twice: a, a"):
         Team.from_spaces(*given, names=["a", "a"])
+
+
+@pytest.mark.parametrize("agent", [0.5, True, None, {1: 2}, "x", -1, 9])
+def test_an_agent_that_is_none_is_refused(agent):
+    team = Team.from_spaces(spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(4))
+    with pytest.raises(ValueError, match="There is no agent"):
+        team.index(agent)

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from pydantic import PositiveInt
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.interfaces.shared import TaskAttributes, checked_seed, need_reset, request_matrices
+from quad_swarm.interfaces.shared import TaskAttributes, checked_options, checked_seed, need_reset, request_matrices
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import checked_arguments
 
@@ -136,7 +136,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         :raises ValueError: a wrong seed or option
         """
         super().reset(seed=checked_seed(seed))
-        options = options or {}
+        options = checked_options(options)
         if unknown := set(options).difference(self.reset_options):
             raise unknown_name("reset option", unknown.pop(), self.reset_options)
         if len(options) == 1:

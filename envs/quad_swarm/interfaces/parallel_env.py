@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from quad_swarm.interfaces.env import QuadSwarmEnv
-from quad_swarm.interfaces.shared import TaskAttributes, need_reset, request_matrices
+from quad_swarm.interfaces.shared import TaskAttributes, checked_options, need_reset, request_matrices
 
 
 class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
@@ -49,7 +50,7 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         self, seed: int | None = None, options: dict | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
         """See `QuadSwarmEnv.reset`; unknown options are ignored, as PettingZoo's API test demands."""
-        known = {name: value for name, value in (options or {}).items() if name in QuadSwarmEnv.reset_options}
+        known = {name: value for name, value in checked_options(options).items() if name in QuadSwarmEnv.reset_options}
         observation, info = self.team.reset(seed=seed, options=known)
         self._is_reset = True
         self.agents = list(self.possible_agents)
@@ -66,6 +67,9 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
             raise need_reset()
         if not self.agents:
             return {}, {}, {}, {}, {}
+        if not isinstance(actions, Mapping):
+            got = " ".join(repr(actions).split())[:100]
+            raise ValueError(f"actions={got}: step() takes a mapping from each robot's name to its action.")
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise ValueError(f"No action for {', '.join(missing)}; every robot must act in every step.")
         width = (self.n_agents - 1,)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -75,6 +76,19 @@ def checked_seed(seed: Any) -> int | None:
     if number < 0:
         raise ValueError(f"seed={seed!r}: a seed is an integer of at least 0, or None.")
     return number
+
+
+def checked_options(options: Any) -> dict[str, Any]:
+    """Options of ``reset``; none are an empty mapping.
+
+    :raises ValueError: it is no mapping of names
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping) or not all(isinstance(name, str) for name in options):
+        got = " ".join(repr(options).split())[:100]
+        raise ValueError(f"options={got}: the options of reset() are a mapping by their names, or None.")
+    return dict(options)
 
 
 def need_reset() -> gym.error.ResetNeeded:

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from pydantic import PositiveInt
 
-from quad_swarm.interfaces.shared import TaskAttributes, checked_seed, need_reset, request_matrices
+from quad_swarm.interfaces.shared import TaskAttributes, checked_options, checked_seed, need_reset, request_matrices
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import checked_arguments
 
@@ -54,7 +54,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         :param options: none are known
         :raises ValueError: a wrong seed or option
         """
-        if options:
+        if options := checked_options(options):
             raise ValueError(f"Unknown reset options {sorted(options)}: the vector environment has none.")
         if isinstance(seed, (list, tuple, np.ndarray)):
             seeds = [checked_seed(value) for value in seed]

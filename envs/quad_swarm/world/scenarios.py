@@ -186,9 +186,9 @@ class ScenarioSampler:
 
         :raises ValueError: no such level
         """
-        if not 0 <= level < self.n_levels:
+        if not isinstance(level, (int, np.integer)) or not 0 <= level < self.n_levels:
             raise ValueError(
-                f"Level {level} does not exist: scenario {self.name!r} has levels 0 to {self.n_levels - 1}."
+                f"Level {level!r} does not exist: scenario {self.name!r} has levels 0 to {self.n_levels - 1}."
             )
         self.level = level
 

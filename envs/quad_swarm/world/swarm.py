@@ -231,11 +231,12 @@ def _points(name: str, points: Any, count: int) -> np.ndarray:
     try:
         array = np.asarray(points, dtype=float)
         valid = array.shape == (count, 3) and bool((np.abs(array) <= _FARTHEST).all())
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:
+        got = " ".join(repr(points).split())[:200]
         raise ValueError(
-            f"{name} must be {count} finite points, shape ({count}, 3), within {_FARTHEST:.0f} m; got {points!r}."
+            f"{name} must be {count} finite points, shape ({count}, 3), within {_FARTHEST:.0f} m; got {got}."
         )
     return array
 

@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+import quad_swarm
 from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -201,3 +202,27 @@ def test_every_field_of_the_world_can_be_set():
 def test_unknown_arguments_are_named():
     with pytest.raises(ValueError, match=r"Unknown argument 'sceanrio'.*Did you mean 'scenario'"):
         QuadSwarmEnv(sceanrio="random")
+
+
+@pytest.mark.parametrize("options", [5, "x", int, [1], {1: 2}])
+def test_options_that_are_no_mapping_of_names_are_refused(options):
+    for env in (
+        QuadSwarmEnv(),
+        gymnasium.make_vec("QuadSwarm-v0", num_envs=2).unwrapped,
+        quad_swarm.parallel_env(),
+    ):
+        with pytest.raises(ValueError, match="the options of reset"):
+            env.reset(options=options)
+
+
+def test_points_beyond_any_number_are_refused_in_one_line():
+    for starts in (10**400, np.full((4, 3), np.nan)):
+        with pytest.raises(ValueError, match="starts must be 4 finite points") as told:
+            QuadSwarmEnv().reset(options={"starts": starts, "goals": np.ones((4, 3))})
+        assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("level", ["x", 0.5, None, -1])
+def test_a_level_that_is_none_is_refused(level):
+    with pytest.raises(ValueError, match=r"Level .* does not exist"):
+        QuadSwarmEnv(scenario="curriculum").set_curriculum_level(level)

@@ -94,3 +94,11 @@ def test_ppo_learns_through_supersuit():
     before = model.policy.action_net.weight.detach().clone()
     assert model.learn(400).num_timesteps >= 400
     assert not before.equal(model.policy.action_net.weight)
+
+
+@pytest.mark.parametrize("actions", [None, [], "x", np.zeros((4, 3))])
+def test_actions_that_are_no_mapping_are_refused(actions):
+    env = quad_swarm.parallel_env()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"step\(\) takes a mapping"):
+        env.step(actions)

@@ -135,3 +135,17 @@ def test_packaged_recipes_pass_unchanged(algo):
 
 def test_the_defaults_of_rl_zoo3_are_allowed():
     check_options(argparse.Namespace(n_timesteps=-1, num_threads=-1, save_freq=-1, eval_freq=25000, log_interval=-2))
+
+
+@pytest.mark.parametrize("key", ["env_wrapper", "vec_env_wrapper", "callback"])
+@pytest.mark.parametrize("name", ["os.path", "no.such.module", "x"])
+def test_a_wrapper_or_callback_that_is_no_class_is_refused(key, name):
+    recipe = {"n_timesteps": 10, "policy": "MlpPolicy"}
+    for value in (name, [name], {name: {}}, [{name: {"a": 1}}]):
+        with pytest.raises(ValueError, match=f"{key}: {name}"):
+            check_recipe("maddpg", {**recipe, key: value}, "recipe")
+
+
+def test_a_recipe_that_is_neither_file_nor_module_is_refused(capsys):
+    assert main(["train", "--env", "OwnBit-v0", "--conf-file", "../.."]) == 2
+    assert "neither a YAML file nor a module" in capsys.readouterr().err
