@@ -751,10 +751,8 @@ class MADDPG(OffPolicyAlgorithm):
 
         :raises ValueError: parameters that are not finite or fit other networks; nothing has changed then
         """
-        parameters: dict[str, Any]
-        if isinstance(load_path_or_dict, dict):
-            parameters = load_path_or_dict
-        else:
+        parameters = cast(dict[str, Any], load_path_or_dict)
+        if not isinstance(load_path_or_dict, dict):
             check_path(load_path_or_dict)
             with as_damage(load_path_or_dict):
                 parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
