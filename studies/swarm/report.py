@@ -145,9 +145,14 @@ def overview(rows: Rows) -> str:
     """Some rows of one scenario in short."""
     if not rows:
         return "-"
-    rates = [f"{100 * rate:.2g} %" for rate in sorted(map(rate_of, rows))]
-    deeper = [f"{100 * rate:.2g} %" for rate in sorted(r["collisions_1cm"] / r["episodes"] for r in rows)]
-    shares = [f"{100 * share:.2g} %" for share in sorted(row["request_share"] for row in rows)]
+    rates, deeper, shares = (
+        [f"{float(f'{100 * value:.2g}'):g} %" for value in sorted(values)]
+        for values in (
+            map(rate_of, rows),
+            (row["collisions_1cm"] / row["episodes"] for row in rows),
+            (row["request_share"] for row in rows),
+        )
+    )
     return f"{spread(rates)} ({spread(deeper)}), asks {spread(shares)}"
 
 
