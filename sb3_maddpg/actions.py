@@ -17,6 +17,7 @@ buffer actions and back, ``unscale`` and ``scale`` from these to environment act
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch as th
@@ -264,8 +265,8 @@ class TeamActions(nn.Module):
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
         # A ModuleList alone is so slow to index that acting shows it
-        self.kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
-        self.modules_of_kinds = nn.ModuleList(self.kinds)
+        kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
+        self.kinds = cast("Sequence[ActionKind]", nn.ModuleList(kinds))
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()
         boxes = [

@@ -69,7 +69,10 @@ class LearnArguments(Arguments):
 class TrainingArguments(Arguments):
     """Of ``MADDPG``."""
 
-    learning_rate: Positive | Schedule = Field(description="a positive finite number, or a schedule")
+    # 0 too: rl_zoo3 loads models so to watch them
+    learning_rate: Annotated[float, Field(ge=0)] | Schedule = Field(
+        description="a finite number that is not negative, or a schedule"
+    )
     buffer_size: int = Field(ge=1, description="a number of transitions, at least 1")
     learning_starts: int = Field(ge=0, description="a number of steps, at least 0")
     batch_size: int = Field(ge=1, description="a number of transitions, at least 1")

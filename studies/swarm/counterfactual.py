@@ -116,7 +116,9 @@ def train(forks: int, seed: int) -> tuple[MADDPG, Forks]:
     """Regress the actor on what forks say; it decides which states are seen meanwhile."""
     env = gymnasium.make("QuadSwarm-v0", **env_kwargs(0.0))
     policy_kwargs = {"net_arch": [64, 64], "pair_credit": True}
-    model = MADDPG("PairPolicy", env, policy_kwargs=policy_kwargs, buffer_size=1000, seed=seed, device="cpu")
+    model = MADDPG(
+        "PairPolicy", env, policy_kwargs=policy_kwargs, buffer_size=1000, batch_size=1000, seed=seed, device="cpu"
+    )
     source, n_robots = Forks(model, seed), make_config("paper").n_robots
     known: list[Labels] = []
     optimizer = th.optim.Adam(model.actor.parameters(), lr=1e-3)

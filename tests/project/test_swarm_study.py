@@ -254,7 +254,9 @@ def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
 
 def test_forks_differ_by_the_request_that_is_turned_round_and_by_nothing_else(monkeypatch):
     env = gymnasium.make("QuadSwarm-v0", **ppo.env_kwargs(0.0))
-    model = MADDPG("PairPolicy", env, policy_kwargs={"pair_credit": True}, buffer_size=100, seed=0, device="cpu")
+    model = MADDPG(
+        "PairPolicy", env, policy_kwargs={"pair_credit": True}, buffer_size=100, batch_size=100, seed=0, device="cpu"
+    )
     monkeypatch.setattr(counterfactual, "SWARMS", 4)
     source = counterfactual.Forks(model, 0)
     monkeypatch.setattr(counterfactual, "HELD", 0)

@@ -2,13 +2,24 @@
 
 import numpy as np
 import pytest
+import torch as th
 
 from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.team import MixedActions, Team
 from sb3_maddpg.validation import PairPolicyArguments, PolicyArguments, validated
 from toys import toy
 
-GOOD = {"net_arch": [8], "threshold": 0.5, "random_thresholds": 1.0, "n_critics": 1}
+GOOD = {
+    "net_arch": [8],
+    "threshold": 0.5,
+    "random_thresholds": 1.0,
+    "n_critics": 1,
+    "activation_fn": th.nn.ReLU,
+    "optimizer_class": th.optim.Adam,
+    "optimizer_kwargs": None,
+    "agent_names": None,
+    "normalize_images": True,
+}
 
 
 def test_values_become_what_is_expected():

@@ -163,7 +163,7 @@ def test_updates_are_counted_in_transitions_and_noise_is_left_to_action_noise():
 
 @pytest.mark.parametrize(("buffer_size", "sizes"), [(100, {100}), (1000, {256, 512}), (1024, {256, 512, 1024})])
 def test_batches_fit_into_the_replay_buffer_of_the_recipe(buffer_size, sizes):
-    trials = [sample("maddpg", toy("bits"), seed=seed, buffer_size=buffer_size)[0] for seed in range(12)]
+    trials = [sample("maddpg", toy("binary"), seed=seed, buffer_size=buffer_size)[0] for seed in range(12)]
     assert {trial.params["batch_size"] for trial in trials} == sizes
 
 
