@@ -240,7 +240,7 @@ NAN, INF = float("nan"), float("inf")
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("learning_rate", INF), ("learning_rate", -1e-3), ("buffer_size", -5), ("batch_size", 0), ("gradient_steps", -5),
+        ("learning_rate", INF), ("learning_rate", -1), ("buffer_size", -5), ("batch_size", 0), ("gradient_steps", -5),
         ("policy_delay", 1.5), ("n_steps", 2.5), ("tau", 0), ("gamma", NAN), ("policy_regularization", NAN),
         ("max_grad_norm", NAN), ("temperature", NAN), ("exploration_noise", (0.1, NAN)), ("train_freq", 0),
         ("threshold_price", (1e-300, 1.0)), ("threshold_price", (1.0, INF)), ("threshold_price", (1.0, 1.0)),
