@@ -1,6 +1,8 @@
 """Figures of an evaluation: that they show the numbers of its rows and the path of its flight."""
 
 import dataclasses
+import subprocess
+import sys
 
 import matplotlib.colors
 import numpy as np
@@ -105,3 +107,11 @@ def test_the_animation_ends_shortly_after_all_have_arrived(flown, tmp_path):
             duration += film.info["duration"]
     # Frames that look the same are stored as one that lasts longer
     assert duration == 100 * (flight.arrival + 9) < 100 * len(flight.requests)
+
+
+def test_drawing_leaves_the_backend_of_matplotlib_alone():
+    code = (
+        "import matplotlib; matplotlib.use('svg'); import quad_swarm.figures.plots, quad_swarm.figures.dashboard; "
+        "assert matplotlib.get_backend() == 'svg'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
