@@ -528,6 +528,6 @@ def test_arrays_of_the_buffer_are_views_of_its_records():
 
 @pytest.mark.parametrize("name", ["alpha", "beta", "epsilon", "gamma"])
 def test_priorities_and_discounts_are_numbers(name):
-    for value in ("x", None, True, [1]):
+    for value in ("x", None, [1]):
         with pytest.raises(ValueError, match=f"{name}=.* must be "):
             PrioritizedTeamReplayBuffer(10, spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(4), **{name: value})
