@@ -62,7 +62,7 @@ class Call(NamedTuple):
 
     def part(self, index: Any) -> Call:
         """Some of its problems."""
-        return Call(Problems(*(field[index] for field in self.problems)), self.x_guess[index], self.u_guess[index])
+        return Call(self.problems.part(index), self.x_guess[index], self.u_guess[index])
 
 
 Solve = Callable[[Call], Solution]
@@ -168,8 +168,9 @@ def ipopt(problem: OptimalControlProblem, compiled: bool) -> Solve:
             guess = np.zeros(program.bounds["lbx"].size)
             guess[program.x_index] = call.x_guess[b, 1:, :nx]
             guess[program.u_index] = call.u_guess[b, :, :nu]
-            x, goal, others = (field[b] for field in call.problems)
-            solver(x0=guess, p=np.concatenate([x[:nx], goal, others.ravel()]), **program.bounds)
+            x, goal, others = call.problems.x[b], call.problems.goal[b], call.problems.others[b]
+            clearance = np.zeros(others.shape[0] * others.shape[1])
+            solver(x0=guess, p=np.concatenate([x[:nx], goal, others.ravel(), clearance]), **program.bounds)
             stats = solver.stats()
             success[b], iterations[b] = stats["success"], stats["iter_count"]
         return Solution(call.x_guess, call.u_guess, success, iterations)
@@ -203,7 +204,7 @@ def hpipm(problem: OptimalControlProblem, sqp_iterations: int, folder: Path) -> 
         solution = Solution(
             np.array(call.x_guess), np.array(call.u_guess), np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
         )
-        inputs = [np.ascontiguousarray(field) for field in call.problems]
+        inputs = [np.ascontiguousarray(field) for field in (call.problems.x, call.problems.goal, call.problems.others)]
         library.hpipm_solve(count, *[array.ctypes.data for array in (*inputs, *solution)], sqp_iterations)
         return solution
 
@@ -316,7 +317,7 @@ def agreement() -> None:
         preset, config = world(n_robots, 10)
         calls = record(config, 16)
         every = range(0, STEPS, 2 if n_robots == 4 else 4)
-        fields = [[*calls[k].problems, calls[k].x_guess, calls[k].u_guess] for k in every]
+        fields = [[*calls[k].problems[:3], calls[k].x_guess, calls[k].u_guess] for k in every]
         x, goal, others, x_guess, u_guess = (np.concatenate(field) for field in zip(*fields, strict=True))
         call = Call(Problems(x, goal, others), x_guess, u_guess)
         problem = OptimalControlProblem(config.planner, config.quadrotor, n_robots - 1)

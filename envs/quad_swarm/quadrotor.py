@@ -11,7 +11,9 @@ commands with first-order lags, and yaw does not couple into the translation.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -61,6 +63,16 @@ class QuadrotorParams:
         return 2.785 / max(self.drag_x, self.drag_y, *lags)
 
 
+# What may differ from robot to robot, in the order of the factors that `QuadrotorModel.step` takes.
+VEHICLE_PARAMETERS = tuple(field.name for field in fields(QuadrotorParams) if field.name != "gravity")
+
+
+def scaled(params: QuadrotorParams, factors: ca.SX) -> Any:
+    """The parameters of a vehicle unlike its model, as expressions: each of `VEHICLE_PARAMETERS` times its factor."""
+    values = {name: getattr(params, name) * factors[k] for k, name in enumerate(VEHICLE_PARAMETERS)}
+    return SimpleNamespace(gravity=params.gravity, **values)
+
+
 def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -> ca.SX:
     """Time derivative of the state.
 
@@ -93,11 +105,18 @@ def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def step_function(params: QuadrotorParams, dt: float) -> ca.Function:
-    """The discrete dynamics as a CasADi function ``(x, u, wind) -> x_next`` with shapes (9,), (4,), (2,) -> (9,)."""
+def step_function(params: QuadrotorParams, dt: float, varied: bool = False) -> ca.Function:
+    """The discrete dynamics as a CasADi function ``(x, u, wind) -> x_next`` with shapes (9,), (4,), (2,) -> (9,).
+
+    :param varied: a fourth argument, (8,), holds the factors of `VEHICLE_PARAMETERS`
+    """
     x, u, wind = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS), ca.SX.sym("wind", 2)
+    inputs = {"x": x, "u": u, "wind": wind}
+    if varied:
+        inputs["factors"] = ca.SX.sym("factors", len(VEHICLE_PARAMETERS))
+        params = scaled(params, inputs["factors"])
     x_next = ca.cse(rk4_step(x, u, wind, params, dt))
-    return ca.Function("quadrotor_step", [x, u, wind], [x_next], ["x", "u", "wind"], ["x_next"])
+    return ca.Function("quadrotor_step", list(inputs.values()), [x_next], list(inputs), ["x_next"])
 
 
 class QuadrotorModel:
@@ -112,22 +131,28 @@ class QuadrotorModel:
         self.dt = dt
         self._local = threading.local()  # calls write into buffers, so every thread has its own
 
-    def step(self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None) -> np.ndarray:
+    def step(
+        self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None, factors: np.ndarray | None = None
+    ) -> np.ndarray:
         """Next states.
 
         :param x: states, (..., 9)
         :param u: inputs, (..., 4)
         :param wind: velocity of the air, (..., 2) (m/s); None for still air
+        :param factors: of each vehicle's `VEHICLE_PARAMETERS`, (..., 8); None for vehicles like the model
         :return: states one step later, (..., 9)
         """
         count = x.size // N_STATES
         if count == 0:
             return x.copy()
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
+        varied = factors is not None
         calls: dict[Any, _BufferedCall] = self._local.__dict__
-        if capacity not in calls:
-            calls[capacity] = _BufferedCall(step_function(self.params, self.dt), capacity)
-        return calls[capacity](x, u, wind).reshape(x.shape)
+        key = f"varied{capacity}" if varied else capacity
+        if key not in calls:
+            calls[key] = _BufferedCall(step_function(self.params, self.dt, varied), capacity)
+        arguments = [x, u, wind] if factors is None else [x, u, wind, factors]
+        return calls[key](count, arguments).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """States that follow from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
@@ -145,7 +170,7 @@ class _BufferedCall:
     """Calls a CasADi function on preallocated memory: a plain call converts every array to a CasADi matrix and back."""
 
     def __init__(self, function: ca.Function, capacity: int):
-        self._arguments = [np.zeros((capacity, size)) for size in (N_STATES, N_INPUTS, 2)]
+        self._arguments = [np.ones((capacity, function.numel_in(k))) for k in range(function.n_in())]
         self._result = np.zeros((capacity, N_STATES))
         mapped = function if capacity == 1 else function.map(capacity)
         self._buffer, self._evaluate = mapped.buffer()
@@ -153,9 +178,8 @@ class _BufferedCall:
             self._buffer.set_arg(k, argument.data)
         self._buffer.set_res(0, self._result.data)
 
-    def __call__(self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None) -> np.ndarray:
-        count = x.size // N_STATES
-        for argument, value in zip(self._arguments, (x, u, wind), strict=True):
+    def __call__(self, count: int, values: Sequence[np.ndarray | None]) -> np.ndarray:
+        for argument, value in zip(self._arguments, values, strict=True):
             argument[:count] = 0.0 if value is None else value.reshape(count, -1)
         self._evaluate()
         return self._result[:count].copy()

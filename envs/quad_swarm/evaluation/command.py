@@ -96,7 +96,7 @@ def add_policy_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset", help=f"{', '.join(PRESETS)} (default: the one in which the models were trained, paper for rules)"
     )
     parser.add_argument("--n-robots", type=int, default=None, help="number of robots (default: the preset's)")
-    parser.add_argument("--max-steps", type=int, default=100, help="time limit in steps (default 100)")
+    parser.add_argument("--max-steps", type=int, help="time limit in steps (default: the preset's)")
     parser.add_argument(
         "--world", nargs="+", default=[], metavar="NAME=VALUE", help="fields of SwarmConfig, e.g. noise.wind=1"
     )

@@ -31,7 +31,7 @@ class Condition:
     :param policy: rule or path of a model's zip, as given on the command line
     :param scenario: a name of `SCENARIOS`
     :param config: the world
-    :param max_steps: time limit (steps)
+    :param max_steps: time limit (steps); None: the world's
     :param algo: ``module:Class`` that loads models
     :param solver: see `make_planner`
     :param linger: steps that are flown on after all robots have reached their goals; None: until the time limit
@@ -41,13 +41,13 @@ class Condition:
     policy: str
     scenario: str
     config: SwarmConfig
-    max_steps: int = 100
+    max_steps: int | None = None
     algo: str = "sb3_maddpg:MADDPG"
     solver: str = "auto"
     linger: int | None = None
 
     def __post_init__(self) -> None:
-        if self.max_steps < 1:
+        if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
         if self.linger is not None and self.linger < 0:
             raise ValueError(f"linger={self.linger} is a number of steps, or None to fly until the time limit.")

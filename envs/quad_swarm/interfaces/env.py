@@ -53,10 +53,11 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     :param preset: "paper" or "dense" (`presets.PRESETS`)
     :param scenario: a name of `scenarios.SCENARIOS`, "mixed" or "curriculum", or names with weights
     :param n_robots: number of robots; None: the preset's
-    :param max_steps: time limit (steps)
+    :param max_steps: time limit (steps); None: the preset's
     :param observation: "paper", or names of `observation.GROUPS` joined by "+", for example "state+memory+plan"
     :param scale_observation: of the paper's: divide distances by 4 m and velocities by 4 m/s
-    :param continuous_collisions: end episodes at collisions between steps too
+    :param continuous_collisions: whether a collision is contact at any time of a step, or at the steps alone; None: as
+        in the preset
     :param end_at_arrival: end episodes as soon as all robots are at their goals
     :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the
         preset's
@@ -84,10 +85,10 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         preset: str = "paper",
         scenario: str | Mapping[str, float] = "mixed",
         n_robots: int | None = None,
-        max_steps: PositiveInt = 100,
+        max_steps: PositiveInt | None = None,
         observation: str = "paper",
         scale_observation: bool = False,
-        continuous_collisions: bool = False,
+        continuous_collisions: bool | None = None,
         end_at_arrival: bool = False,
         memory: float | None = None,
         reward: Mapping[str, Any] | None = None,

@@ -6,9 +6,9 @@ import functools
 import warnings
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.planner.base import Planner, Plans, PlanStatus, Problems, Solution, Solver
+from quad_swarm.planner.base import Planner, Plans, PlanStatus, Solution, Solver
 from quad_swarm.planner.fatrop import FatropSolver
-from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig
+from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Problems
 from quad_swarm.planner.rti import BuildError, RtiSolver
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 

@@ -8,21 +8,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from quad_swarm.planner.problem import PlannerConfig
+from quad_swarm.planner.problem import PlannerConfig, Problems
+from quad_swarm.planner.right_of_way import keep_right
 from quad_swarm.quadrotor import N_INPUTS, QuadrotorModel
-
-
-class Problems(NamedTuple):
-    """A batch of B optimal control problems.
-
-    :param x: present states, (B, 9)
-    :param goal: goals, (B, 3), world frame (m)
-    :param others: believed positions of the n - 1 others at stages 1..N, (B, n - 1, N, 3) (m)
-    """
-
-    x: np.ndarray
-    goal: np.ndarray
-    others: np.ndarray
 
 
 class Solution(NamedTuple):
@@ -120,6 +108,8 @@ class Planner:
         """
         x_guess, u_guess = shift(previous.x), shift(previous.u)
         problems = self._nearest_others(problems, x_guess)
+        if self.config.right_of_way:
+            problems = keep_right(problems, self.config.right_of_way, self.config.dt)
         x, u, success, iterations = self._solve(problems, x_guess, u_guess)
         status = np.where(success, PlanStatus.SOLVED, PlanStatus.BRAKING)
         age = np.zeros(len(status), dtype=np.int64)
@@ -128,7 +118,7 @@ class Planner:
         if failed.size:
             # Cold: the present state held, no input.
             cold = Plans.hover(problems.x[failed], self.config.horizon)
-            retry = self._solve(Problems(*(field[failed] for field in problems)), cold.x, cold.u)
+            retry = self._solve(problems.part(failed), cold.x, cold.u)
             iterations[failed] += retry.iterations
             x[failed], u[failed] = retry.x, retry.u
             status[failed[retry.success]] = PlanStatus.RETRIED
@@ -163,7 +153,12 @@ class Planner:
             return problems
         squared = sum((problems.others[..., i] - x_guess[:, None, 1:, i]) ** 2 for i in range(3))
         nearest = np.sort(np.argsort(squared.min(axis=2), axis=1, kind="stable")[:, :kept], axis=1)
-        return problems._replace(others=problems.others[np.arange(len(nearest))[:, None], nearest])
+        rows, clearance, announced = np.arange(len(nearest))[:, None], problems.clearance, problems.announced
+        return problems._replace(
+            others=problems.others[rows, nearest],
+            clearance=None if clearance is None else clearance[rows, nearest],
+            announced=None if announced is None else announced[rows, nearest],
+        )
 
     def braking_inputs(self, x: np.ndarray) -> np.ndarray:
         """Inputs that bring robots to hover without a solver, from their states alone: (B, 9) -> (B, N, 4).

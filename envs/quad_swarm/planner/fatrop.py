@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from quad_swarm.planner.base import Problems, Solution
-from quad_swarm.planner.problem import OptimalControlProblem
+from quad_swarm.planner.base import Solution
+from quad_swarm.planner.problem import OptimalControlProblem, Problems
 from quad_swarm.quadrotor import N_INPUTS, N_STATES
 
 _LARGEST_EXPONENT = 300.0  # of the repulsion: its square is still far from the overflow of a double
@@ -54,8 +54,10 @@ class FatropSolver:
         success = np.zeros(count, dtype=bool)
         iterations = np.zeros(count, dtype=np.int64)
         variables = np.zeros(program.bounds["lbx"].size)
+        clearance = np.zeros(problems.others.shape[:3]) if problems.clearance is None else problems.clearance
         for b in range(count):
-            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], problems.others[b].ravel()])
+            about_others = (problems.others[b].ravel(), clearance[b].ravel())
+            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others])
             variables[program.x_index] = x_guess[b, 1:, :nx]
             variables[program.u_index] = u_guess[b, :, :nu]
             if not (_is_sane(parameters) and _is_sane(variables)):
@@ -84,7 +86,7 @@ def _is_sane(numbers: np.ndarray) -> bool:
 class Program(NamedTuple):
     """The problem as a nonlinear program.
 
-    :param nlp: variables ``x``, parameters ``p`` (present state, goal, others), cost ``f``, constraints ``g``
+    :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance), cost ``f``, constraints ``g``
     :param bounds: of variables and constraints
     :param structure: fatrop's description of the stages
     :param x_index: where the states at stages 1..N stand among the variables, (N, nx)
@@ -104,6 +106,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
     horizon = config.horizon
     x0, goal = ca.SX.sym("x0", nx), ca.SX.sym("goal", 3)
     others = ca.SX.sym("others", 3, horizon * n_others)  # column j * N + k - 1: robot j at stage k
+    clearance = ca.SX.sym("clearance", horizon, n_others)
     states = [x0] + [ca.SX.sym(f"x{k}", nx) for k in range(1, horizon + 1)]
     inputs = [ca.SX.sym(f"u{k}", nu) for k in range(horizon)]
     step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
@@ -142,7 +145,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
         lower.append(np.full(n_slacks[k], -np.inf))
         offset += n_slacks[k]
         if k > 0:
-            constraints += [d - config.separation + slack[j] for j, d in enumerate(distances)]
+            constraints += [d - config.separation - clearance[k - 1, j] + slack[j] for j, d in enumerate(distances)]
             constraint_lower.append(np.zeros(n_others))
             equality += [False] * n_others
     bounds = np.concatenate(lower)
@@ -151,7 +154,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             "x": ca.vertcat(*variables),
             "f": cost,
             "g": ca.vertcat(*constraints),
-            "p": ca.vertcat(x0, goal, ca.vec(others)),
+            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance)),
         },
         bounds={
             "lbx": bounds,

@@ -1,12 +1,13 @@
-"""The optimal control problem of one robot (eq. 2), written down once for every solver."""
+"""The optimal control problem of one robot (eq. 2), written down once for every solver, and batches of it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
@@ -34,6 +35,8 @@ class PlannerConfig:
     :param repulsion_weight: weight of the smooth repulsion from each other robot
     :param repulsion_buffer: distance at which half of the repulsion acts, in separations (-)
     :param repulsion_steepness: steepness of the repulsion, per separation (-)
+    :param right_of_way: by so much farther a robot keeps from another one, whose plan it knows, on the side on which it
+        should not pass, see `quad_swarm.planner.right_of_way` (m); 0 leaves the side to the optimum, as in the paper
     :param violation_weight: weight of the squared violation of a soft constraint (1/m^2)
     :param max_neighbours: consider only so many others, those whose believed trajectories come nearest to the robot's
         last plan; None considers all
@@ -55,6 +58,7 @@ class PlannerConfig:
     repulsion_weight: NonNegativeFloat = 0.1
     repulsion_buffer: PositiveFloat = 1.2
     repulsion_steepness: PositiveFloat = 10.0
+    right_of_way: NonNegativeFloat = 0.0
     violation_weight: PositiveFloat = 1e4
     max_neighbours: PositiveInt | None = None
 
@@ -64,6 +68,33 @@ class PlannerConfig:
                 f"Empty workspace: planner.workspace_low={self.workspace_low} must be below "
                 f"planner.workspace_high={self.workspace_high} along every axis"
             )
+
+
+class Problems(NamedTuple):
+    """A batch of B optimal control problems.
+
+    :param x: present states, (B, 9)
+    :param goal: goals, (B, 3), world frame (m)
+    :param others: believed positions of the n - 1 others at stages 1..N, (B, n - 1, N, 3) (m)
+    :param clearance: distance to keep from them beyond the separation, (B, n - 1, N) (m); None keeps none
+    :param announced: whose believed positions are those of a plan, (B, n - 1) bool, see `right_of_way`; None: nobody's
+    """
+
+    x: np.ndarray
+    goal: np.ndarray
+    others: np.ndarray
+    clearance: np.ndarray | None = None
+    announced: np.ndarray | None = None
+
+    def part(self, which: Any) -> Problems:
+        """Some of the problems (anything that indexes an array)."""
+        return Problems(
+            self.x[which],
+            self.goal[which],
+            self.others[which],
+            None if self.clearance is None else self.clearance[which],
+            None if self.announced is None else self.announced[which],
+        )
 
 
 class OptimalControlProblem:

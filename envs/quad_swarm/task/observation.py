@@ -14,7 +14,7 @@ import numpy as np
 from quad_swarm.errors import unknown_name
 from quad_swarm.geometry import length
 from quad_swarm.task.view import View
-from quad_swarm.world.beliefs import advance, other_indices
+from quad_swarm.world.beliefs import advance
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import Swarm
 
@@ -51,7 +51,6 @@ class PaperObservation:
     def __init__(self, n_robots: int, scaled: bool = False):
         self.n_robots, self.size = n_robots, 6 * n_robots
         distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
-        self._others = other_indices(n_robots)
         others = 3 * (n_robots - 1)
         self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, others, others])
 
@@ -62,11 +61,9 @@ class PaperObservation:
         return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
-        pos, vel = swarm.pos, swarm.vel
-        relative_pos = pos[:, self._others] - pos[:, :, None]
-        relative_vel = vel[:, self._others] - vel[:, :, None]
-        flat = (*pos.shape[:2], -1)
-        parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
+        view = View(swarm)
+        flat = (*view.own_pos.shape[:2], -1)
+        parts = (view.own_vel, view.goal, view.pos.reshape(flat), view.vel.reshape(flat))
         return (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
 
 
@@ -159,7 +156,7 @@ def _approach(pair: PairView) -> np.ndarray:
 def _memory(pair: PairView) -> np.ndarray:
     """The plan received last: its age, how far off it is, and where it departs from a constant velocity."""
     view = pair.view
-    remembers = view.outlook.remembers.astype(float)
+    remembers = view.prediction.remembers.astype(float)
     age = np.minimum(view.age / pair.horizon, 1.0)
     drift = np.minimum(view.drift / max(view.memory, 1e-6), 2.0) * (age < 1.0)
     stages = _stages(pair.horizon)[1:]
@@ -190,8 +187,8 @@ def _plan(pair: PairView) -> np.ndarray:
 def _told(pair: PairView) -> np.ndarray:
     """What the other knows of this robot: whether it still believes a plan that it was told, and how far it is off."""
     view, stages = pair.view, _stages(pair.horizon)
-    told = view.told(stages)
-    off = view.plan[:, :, None, stages] - (told.believed - pair.swarm.pos[:, :, None, None])
+    told = view.presumed(stages)
+    off = view.plan[:, :, None, stages] - (told.believed - view.own_pos[:, :, None, None])
     parts = (
         np.stack(
             [told.remembers.astype(float), np.minimum(told.age / pair.horizon, 1.0), np.exp(2 - told.age)], axis=-1
@@ -206,8 +203,8 @@ def _critic(pair: PairView) -> np.ndarray:
     """What no robot knows: how wrong the two are about each other, and how close their plans are."""
     view, stages = pair.view, _stages(pair.horizon)
     others = pair.swarm.beliefs.others
-    plans = advance(pair.swarm.plans[..., :3])[:, :, 1:]
-    theirs = plans[:, others] - pair.swarm.pos[:, :, None, None]
+    plans = advance(pair.swarm.planned_positions())[:, :, 1:]
+    theirs = plans[:, others] - view.own_pos[:, :, None, None]
     surprise = theirs - view.expected
     reverse = pair.swarm.beliefs.reverse  # the other's view of this robot: the same numbers with the two exchanged
     size = length(surprise)[..., stages]
@@ -218,7 +215,7 @@ def _critic(pair: PairView) -> np.ndarray:
         np.tanh(size[:, others, reverse] / 0.1),
         pair.closeness(separation.min(axis=-1)),
         pair.closeness(view.plan_separation.min(axis=-1)),
-        view.outlook.remembers[:, others, reverse, None],
+        view.prediction.remembers[:, others, reverse, None],
     )
     return np.concatenate(parts, axis=-1)
 

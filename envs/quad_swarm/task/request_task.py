@@ -77,9 +77,10 @@ class RequestTask:
     :param swarm: the swarms
     :param sampler: draws episodes
     :param reward: weights of the reward
-    :param max_steps: time limit (steps)
+    :param max_steps: time limit (steps); None: the world's
     :param observation: what robots observe, the paper's without scaling if None
-    :param continuous_collisions: end episodes at collisions between steps too; the paper looks at the steps alone
+    :param continuous_collisions: whether a collision is contact at any time of a step, or at the steps alone; None: as
+        the world says
     :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
     :param end_at_collision: end episodes at collisions; otherwise they fly on, to see how deep a collision gets
     :raises ValueError: near misses are looked for beyond the plans' end
@@ -90,9 +91,9 @@ class RequestTask:
         swarm: Swarm,
         sampler: ScenarioSampler,
         reward: RewardConfig,
-        max_steps: int = 100,
+        max_steps: int | None = None,
         observation: Observation | None = None,
-        continuous_collisions: bool = False,
+        continuous_collisions: bool | None = None,
         end_at_arrival: bool = False,
         end_at_collision: bool = True,
     ):
@@ -105,7 +106,9 @@ class RequestTask:
         self.swarm = swarm
         self.sampler = sampler
         self.reward = reward
-        self.max_steps = max_steps
+        self.max_steps = swarm.config.max_steps if max_steps is None else max_steps
+        if continuous_collisions is None:
+            continuous_collisions = swarm.config.continuous_collisions
         self.continuous_collisions = continuous_collisions
         self.end_at_arrival = end_at_arrival
         self.end_at_collision = end_at_collision
@@ -234,10 +237,10 @@ def make_task(
     preset: str = "paper",
     scenario: str | Mapping[str, float] = "mixed",
     n_robots: int | None = None,
-    max_steps: PositiveInt = 100,
+    max_steps: PositiveInt | None = None,
     observation: str = "paper",
     scale_observation: bool = False,
-    continuous_collisions: bool = False,
+    continuous_collisions: bool | None = None,
     end_at_arrival: bool = False,
     memory: float | None = None,
     reward: Mapping[str, Any] | None = None,

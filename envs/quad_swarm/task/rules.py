@@ -51,7 +51,7 @@ def event(drift: float) -> Rule:
 
 def stale(age: float) -> Rule:
     """Asks again when the newest plan was made at least ``age`` steps ago or is no longer believed."""
-    return lambda view: (view.age >= age) | ~view.outlook.remembers
+    return lambda view: (view.age >= age) | ~view.prediction.remembers
 
 
 def plan(distance: float) -> Rule:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from quad_swarm.geometry import length
+from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import Prediction, advance
 from quad_swarm.world.swarm import Swarm
 
@@ -26,26 +27,37 @@ class View:
         self.horizon = swarm.config.planner.horizon
 
     @cached_property
+    def _observed(self) -> tuple[np.ndarray, np.ndarray]:
+        return self._swarm.observe()
+
+    @cached_property
+    def _estimate(self) -> np.ndarray:
+        return self._swarm.estimate()
+
+    @property
+    def own_pos(self) -> np.ndarray:
+        """The robot's position, (E, n, 3), world frame (m)."""
+        return self._estimate[..., POSITION]
+
+    @property
+    def own_vel(self) -> np.ndarray:
+        """The robot's velocity, (E, n, 3) (m/s)."""
+        return self._estimate[..., VELOCITY]
+
+    @cached_property
     def pos(self) -> np.ndarray:
         """Positions of the others, (E, n, n - 1, 3) (m)."""
-        pos = self._swarm.pos
-        return pos[:, self._swarm.beliefs.others] - pos[:, :, None]
+        return self._observed[0] - self.own_pos[:, :, None]
 
     @cached_property
     def vel(self) -> np.ndarray:
         """Velocities of the others relative to the robot's, (E, n, n - 1, 3) (m/s)."""
-        vel = self._swarm.vel
-        return vel[:, self._swarm.beliefs.others] - vel[:, :, None]
-
-    @cached_property
-    def own_vel(self) -> np.ndarray:
-        """The robot's velocity, (E, n, 3) (m/s)."""
-        return self._swarm.vel
+        return self._observed[1] - self.own_vel[:, :, None]
 
     @cached_property
     def goal(self) -> np.ndarray:
         """The robot's goal, (E, n, 3) (m)."""
-        return self._swarm.goal - self._swarm.pos
+        return self._swarm.goal - self.own_pos
 
     @cached_property
     def plan(self) -> np.ndarray:
@@ -55,42 +67,42 @@ class View:
     @cached_property
     def current_plans(self) -> np.ndarray:
         """The same from now on, stages 0..N, (E, n, N + 1, 3) (m)."""
-        return advance(self._swarm.plans[..., :3]) - self._swarm.pos[:, :, None]
+        return advance(self._swarm.planned_positions()) - self.own_pos[:, :, None]
 
     @cached_property
-    def outlook(self) -> Prediction:
+    def prediction(self) -> Prediction:
         """What the robot predicts of those it does not ask, `Prediction`; absolute positions."""
-        return self._swarm.beliefs.predict(self._swarm.pos, self._swarm.vel)
+        return self._swarm.beliefs.predict(*self._observed)
 
     @cached_property
     def expected(self) -> np.ndarray:
         """Where the others will be at the next N steps as far as the robot knows without asking, (E, n, n - 1, N, 3)
         (m)."""
-        believed, pos = self.outlook.believed, self._swarm.pos
+        believed, pos = self.prediction.believed, self.own_pos
         # Stages and coordinates as one axis: numpy is slow along three numbers
         relative = believed.reshape(*believed.shape[:3], -1) - np.tile(pos, self.horizon)[:, :, None]
         return relative.reshape(believed.shape)
 
-    def told(self, stages: Sequence[int]) -> Prediction:
-        """What each of the others believes of this robot unless it asks, as far as this robot can tell: it knows what
+    def presumed(self, stages: Sequence[int]) -> Prediction:
+        """What each of the others predicts of this robot unless it asks, as far as this robot can tell: it knows what
         it answered, and takes every answer to have arrived.
 
         :param stages: which of the next N steps, from 0 on; `Prediction.believed` holds no others
         """
-        beliefs = self._swarm.told
-        outlook = beliefs.predict(self._swarm.pos, self._swarm.vel)
-        outlook = outlook._replace(believed=outlook.believed.take(stages, axis=-2))
-        return Prediction(*(field[:, beliefs.others, beliefs.reverse] for field in outlook))
+        beliefs = self._swarm.beliefs
+        presumed = self._swarm.presume()
+        presumed = presumed._replace(believed=presumed.believed.take(stages, axis=-2))
+        return Prediction(*(field[:, beliefs.others, beliefs.reverse] for field in presumed))
 
     @property
     def age(self) -> np.ndarray:
         """Steps since the newest plan of each of the others was made, N or more without any, (E, n, n - 1)."""
-        return self.outlook.age
+        return self.prediction.age
 
     @property
     def drift(self) -> np.ndarray:
         """How far off that plan is by now, (E, n, n - 1) (m)."""
-        return self.outlook.error
+        return self.prediction.error
 
     @cached_property
     def plan_separation(self) -> np.ndarray:

@@ -48,6 +48,26 @@ def advance(trajectory: np.ndarray) -> np.ndarray:
     return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
 
 
+def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:
+    """A trajectory (..., K, 3) at times that are later by a share of a step, (...) in (-1, 1), linear in between; its
+    first and last pieces go on in a straight line."""
+    part = np.abs(later)[..., None, None]
+    slope = np.diff(trajectory, axis=-2)
+    after = np.concatenate([slope, slope[..., -1:, :]], axis=-2)
+    before = np.concatenate([slope[..., :1, :], slope], axis=-2)
+    return trajectory + part * np.where((later < 0)[..., None, None], -before, after)
+
+
+def answered(arriving: np.ndarray, trajectories: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Of trajectories of all robots, (E, n, K, 3), those that reach who asked for them, (number of answers, K, 3).
+
+    :param arriving: whose trajectory each robot receives, (E, n, n - 1) bool; the order is that of its true entries
+    :param others: see `other_indices`
+    """
+    swarms, robots, places = np.nonzero(arriving)
+    return trajectories[swarms, others[robots, places]]
+
+
 class Prediction(NamedTuple):
     """What robots predict of the others as long as they do not request their plans.
 
@@ -101,8 +121,8 @@ class Beliefs:
     def predict(self, pos: np.ndarray, vel: np.ndarray) -> Prediction:
         """What the robots believe in this step without a request; `update` has not been called for it.
 
-        :param pos: present positions, (E, n, 3), world frame (m)
-        :param vel: present velocities, (E, n, 3), world frame (m/s)
+        :param pos: present positions of the others, (E, n, n - 1, 3), world frame (m)
+        :param vel: present velocities of the others, (E, n, n - 1, 3), world frame (m/s)
         """
         return self._predict_once(pos, vel)[0]
 
@@ -114,39 +134,44 @@ class Beliefs:
 
     def _predict(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Prediction, np.ndarray]:
         """:return: what is believed, and what is remembered, from now on; nothing else holds these arrays"""
-        believed = constant_velocity(pos, vel, self.horizon, self.dt)[:, self.others]
+        believed = constant_velocity(pos, vel, self.horizon, self.dt)
         if not self.memory:
             never = np.full(self._age.shape, self.horizon)
             return Prediction(believed, np.zeros(never.shape, bool), never, np.zeros(never.shape)), self._remembered
         remembered, age = advance(self._remembered), self._age + 1
-        error = length(remembered[..., 0, :] - pos[:, self.others])
+        error = length(remembered[..., 0, :] - pos)
         remembers = (age < self.horizon) & (error <= self.memory)
         believed[remembers] = remembered[remembers, 1:]
         return Prediction(believed, remembers, age, error), remembered
 
     def update(
-        self, requests: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray, age: int = 1
+        self, arriving: np.ndarray, pos: np.ndarray, vel: np.ndarray, received: np.ndarray, age: np.ndarray | int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         """Believed trajectories after this step's requests.
 
-        :param requests: whose plans each robot receives, (E, n, n - 1) bool
-        :param pos: present positions, (E, n, 3), world frame (m)
-        :param vel: present velocities, (E, n, 3), world frame (m/s)
-        :param plans: positions that each robot planned one step ago, stages 0..N, (E, n, N + 1, 3) (m)
-        :param age: steps since these plans were made, if they are older and were advanced to one step ago
+        :param arriving: whose plans each robot receives, (E, n, n - 1) bool
+        :param pos: present positions of the others, (E, n, n - 1, 3), world frame (m)
+        :param vel: present velocities of the others, (E, n, n - 1, 3), world frame (m/s)
+        :param received: the plans that arrive, as positions now and at the next N steps, (number of answers, N + 1, 3)
+            (m); see `answered`
+        :param age: steps since each of them was made, (number of answers,), or one number for all
         :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
             1)
         """
         prediction, remembered = self._predict_once(pos, vel)
-        swarms, robots, places = np.nonzero(requests)
-        received = advance(plans)[swarms, self.others[robots, places]]  # now, and the next N steps
+        if isinstance(age, np.ndarray):
+            # An answer may come after one that was made later.
+            newer = age <= prediction.age[arriving]
+            arriving, received, age = arriving.copy(), received[newer], age[newer]
+            arriving[arriving] = newer
         believed = prediction.believed.copy()
-        believed[requests] = received[:, 1:]
+        believed[arriving] = received[:, 1:]
         unasked = np.where(prediction.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
-        source = np.where(requests, BeliefSource.REQUESTED, unasked)
+        source = np.where(arriving, BeliefSource.REQUESTED, unasked)
         if self.memory:
-            remembered[requests] = received
+            remembered[arriving] = received
             self._remembered = remembered
-            self._age = np.where(requests, age, prediction.age)
+            self._age = prediction.age.copy()
+            self._age[arriving] = age
         self._known = None
         return believed, source

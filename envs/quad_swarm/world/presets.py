@@ -5,56 +5,19 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from quad_swarm.errors import unknown_name
 from quad_swarm.planner import PlannerConfig
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.validation import checked, replaced
+from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.scenarios import ScenarioSpace
 
 PRESET_VERSION = 1
-
-# Beyond these nothing flies, and numbers lose their meaning before they overflow.
-Disturbance = Annotated[float, Field(ge=0, le=1e3)]
-
-
-@checked
-@dataclass(frozen=True)
-class ProcessNoise:
-    """Disturbances of the simulated flight; the planner knows nothing of them. All off by default.
-
-    :param pos: standard deviation added to each position component in each step (m)
-    :param vel: standard deviation added to each velocity component in each step (m/s)
-    :param attitude: standard deviation added to roll and pitch in each step (rad)
-    :param wind: speed of a steady horizontal wind whose direction is drawn for each episode (m/s)
-    :raises ValueError: a value is negative, not finite, or beyond 1000 (pi for the attitude)
-    """
-
-    pos: Disturbance = 0.0
-    vel: Disturbance = 0.0
-    attitude: Annotated[float, Field(ge=0, le=math.pi)] = 0.0
-    wind: Disturbance = 0.0
-
-    def __bool__(self) -> bool:
-        return any((self.pos, self.vel, self.attitude, self.wind))
-
-
-@checked
-@dataclass(frozen=True)
-class Radio:
-    """How plans travel. A request counts whether or not its answer arrives. Perfect by default.
-
-    :param loss: share of the answers that get lost, each for itself
-    :param delay: steps by which answers are late: with 0 a robot receives the plan that was made one step ago
-    :raises ValueError: the loss lies outside [0, 1], or the delay is negative
-    """
-
-    loss: Annotated[float, Field(ge=0, le=1)] = 0.0
-    delay: NonNegativeInt = 0
 
 
 @checked
@@ -71,8 +34,18 @@ class SwarmConfig:
     :param quadrotor: physical parameters
     :param planner: horizon, limits and weights
     :param space: room of the scenarios
-    :param noise: disturbances
+    :param max_steps: time limit of an episode unless another one is given (steps)
+    :param substeps: into how many parts a step is divided to move the robots and to look for collisions; between two
+        of them each robot moves in a straight line
+    :param continuous_collisions: a collision is contact at any time of a step; the paper looks at the steps alone
+    :param noise: disturbances of the flight
+    :param sensing: errors of the estimated states
     :param radio: how plans travel
+    :param mismatch: by up to this share each vehicle's parameters differ from the planner's model, drawn evenly for
+        each robot, parameter and episode
+    :param clock_skew: the latest time, as a share of a step, after the beginning of a step at which a robot's new input
+        acts, drawn evenly from the sub-steps up to it for each robot and episode. A robot knows its own and plans from
+        where it will be then
     :raises ValueError: a value out of its range, a planner that keeps less than 2r, a tolerance that hides every
         collision, or a step too long for the vehicle's dynamics
     """
@@ -85,8 +58,14 @@ class SwarmConfig:
     quadrotor: QuadrotorParams = field(default_factory=QuadrotorParams)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     space: ScenarioSpace = field(default_factory=ScenarioSpace)
+    max_steps: PositiveInt = 100
+    substeps: Annotated[int, Field(ge=1, le=1000)] = 1
+    continuous_collisions: bool = False
     noise: ProcessNoise = field(default_factory=ProcessNoise)
+    sensing: SensingError = field(default_factory=SensingError)
     radio: Radio = field(default_factory=Radio)
+    mismatch: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
     def __post_init__(self) -> None:
         contact, planner = 2 * self.radius, self.planner
@@ -107,11 +86,34 @@ class SwarmConfig:
                 "the stability limit of the integration of the quadrotor's fastest response"
             )
 
+        if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
+            raise ValueError(
+                f"clock_skew={self.clock_skew} is less than one of the substeps={self.substeps} of a step: raise either"
+            )
+
     @property
     def is_random(self) -> bool:
         """Whether the world itself draws random numbers during an episode."""
-        return bool(self.noise) or self.radio.loss > 0
+        return bool(self.noise or self.sensing or self.radio.is_random or self.mismatch or self.clock_skew)
 
+
+_SMALL_ROOM = ScenarioSpace(half_width=3.0, circle_radius=(2.5, 3.0), sector_radius=(1.5, 3.0))
+
+# Eight robots with a margin that holds in continuous time, in a laboratory with motion capture: docs/flight.md gives
+# the source of each level.
+_FLIGHT = SwarmConfig(
+    n_robots=8,
+    planner=PlannerConfig(horizon=20, dt=0.05, separation=0.72, max_tilt=math.radians(20.0), right_of_way=0.3),
+    space=_SMALL_ROOM,
+    max_steps=200,
+    substeps=5,
+    continuous_collisions=True,
+    noise=ProcessNoise(vel=0.02, attitude=0.005, wind=1.0, gust=0.5),
+    sensing=SensingError(pos=0.005, vel=0.03, attitude=0.01, others_pos=0.005, others_vel=0.05),
+    radio=Radio(loss=0.1, delay=1, jitter=1),
+    mismatch=0.1,
+    clock_skew=0.8,
+)
 
 PRESETS: dict[str, SwarmConfig] = {
     # The paper's four robots. The planner keeps exactly 2r, which is what makes communication matter here.
@@ -121,7 +123,18 @@ PRESETS: dict[str, SwarmConfig] = {
     "dense": SwarmConfig(
         n_robots=8,
         planner=PlannerConfig(separation=0.64, max_tilt=math.radians(20.0)),
-        space=ScenarioSpace(half_width=3.0, circle_radius=(2.5, 3.0), sector_radius=(1.5, 3.0)),
+        space=_SMALL_ROOM,
+    ),
+    "flight": _FLIGHT,
+    # The same team without motion capture and in more wind: errors two to four times as large, links that drop out, and
+    # robots that fall silent.
+    "flight-hard": replace(
+        _FLIGHT,
+        max_steps=300,
+        noise=ProcessNoise(vel=0.03, attitude=0.01, wind=1.5, gust=1.0),
+        sensing=SensingError(pos=0.01, vel=0.05, attitude=0.015, others_pos=0.02, others_vel=0.1),
+        radio=Radio(loss=0.2, delay=1, jitter=2, bursts=0.05, burst_length=10, outage=0.02),
+        mismatch=0.2,
     ),
 }
 

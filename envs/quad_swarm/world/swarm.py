@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from copy import copy, deepcopy
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
-from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.world.beliefs import Beliefs, advance, other_indices
+from quad_swarm.quadrotor import POSITION, VELOCITY, QuadrotorModel
+from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, advance, answered, other_indices, resampled
 from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.realisation import Realisation
 
 _FARTHEST = 1e4  # m, of starts and goals; far beyond any room, and well before squares lose their meaning
 
@@ -20,7 +21,8 @@ class StepReport(NamedTuple):
     """What happened in one step of E swarms.
 
     :param min_separation: smallest distance between two robots after the step, (E,) (m)
-    :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line, (E,) (m)
+    :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line between
+        two sub-steps, (E,) (m)
     :param separation: distance of each robot to each of the others after the step, (E, n, n - 1) (m)
     :param colliding: which of the others each robot collides with after the step, (E, n, n - 1) bool
     :param colliding_continuous: the same at any time during the step
@@ -52,6 +54,12 @@ class StepReport(NamedTuple):
 class Swarm:
     """State, plans and beliefs of E swarms that do not see each other and share one planner call.
 
+    :ivar state: true states, (E, n, 9)
+    :ivar goal: goals, (E, n, 3), world frame (m)
+    :ivar chance: errors, gusts and losses that are met
+    :ivar beliefs: what each robot believes of the others
+    :ivar presumed_beliefs: what each robot's others take it to believe of them: all that they answered has arrived
+
     :param config: the world
     :param n_swarms: number of swarms E
     :param solver: see `make_planner`
@@ -60,18 +68,20 @@ class Swarm:
     def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
         self.config = config
         self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_robots, solver)
-        n, horizon = config.n_robots, config.planner.horizon
+        n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
+        self._vehicle = QuadrotorModel(config.quadrotor, dt / config.substeps) if config.substeps > 1 else None
         self.state = np.zeros((n_swarms, n, 9))
         self.goal = np.zeros((n_swarms, n, 3))
-        self.wind = np.zeros((n_swarms, n, 2))
-        beliefs = (n_swarms, n, horizon, config.planner.dt, config.memory)
+        self.chance = Realisation(config, n_swarms)
+        beliefs = (n_swarms, n, horizon, dt, config.memory)
         self.beliefs = Beliefs(*beliefs)
-        # What they would believe had every answer arrived, which is what those who answered have to assume
-        self.told = Beliefs(*beliefs) if config.radio.loss else self.beliefs
+        differ = config.radio.is_random or config.sensing.others
+        self.presumed_beliefs = Beliefs(*beliefs) if differ else self.beliefs
         self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
         # Positions planned in the last steps, the oldest first: what a late answer holds
-        self._earlier = [self.plans[..., POSITION].copy() for _ in range(config.radio.delay)]
-        self._noise_rngs = [np.random.default_rng(0) for _ in range(n_swarms)]
+        late = config.radio.delay + config.radio.jitter
+        self._earlier = [self.plans[..., POSITION].copy() for _ in range(late)]
+        self._u = np.zeros((n_swarms, n, 4))  # inputs that act
         self._pairs = np.triu_indices(n, k=1)
         number = np.zeros((n, n), dtype=int)
         number[self._pairs] = np.arange(len(self._pairs[0]))
@@ -85,24 +95,49 @@ class Swarm:
 
     @property
     def pos(self) -> np.ndarray:
-        """Positions, (E, n, 3), world frame (m)."""
+        """True positions, (E, n, 3), world frame (m)."""
         return self.state[..., POSITION]
 
     @property
     def vel(self) -> np.ndarray:
-        """Velocities, (E, n, 3), world frame (m/s)."""
+        """True velocities, (E, n, 3), world frame (m/s)."""
         return self.state[..., VELOCITY]
+
+    def estimate(self) -> np.ndarray:
+        """The state in which each robot takes itself to be, (E, n, 9)."""
+        return self.chance.estimate(self.state)
+
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (m) and velocities (m/s) of the others as each robot sees them, (E, n, n - 1, 3) each, world
+        frame."""
+        return self.chance.observe(*self._seen_by_all())
+
+    def _seen_by_all(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same without what each observer gets wrong in its own way."""
+        estimate = self.estimate()[:, self.beliefs.others]
+        return estimate[..., POSITION], estimate[..., VELOCITY]
+
+    def presume(self) -> Prediction:
+        """What the others of each robot take it to predict of them as long as it does not ask."""
+        return self.presumed_beliefs.predict(*self._seen_by_all())
 
     @property
     def plans(self) -> np.ndarray:
         """Planned states at stages 0..N, (E, n, N + 1, 9), as of the last step."""
         return self._plans.x.reshape(*self.state.shape[:2], *self._plans.x.shape[1:])
 
+    def planned_positions(self) -> np.ndarray:
+        """Planned positions at the beginning of the last step and of the N steps from there, (E, n, N + 1, 3) (m):
+        those of `plans`, which begin where a robot's input acts."""
+        plans = self.plans[..., POSITION]
+        start = self.chance.start
+        return plans if start is None else resampled(plans, -start / self.config.substeps)
+
     def planned_separation(self, steps: int) -> np.ndarray:
         """How far each robot is from each of the others by their plans in each of the ``steps`` after the present
         one, (E, n, n - 1, steps) (m)."""
         i, j = self._pairs
-        plans = self.plans[..., 2 : 2 + steps, POSITION]
+        plans = self.planned_positions()[..., 2 : 2 + steps, :]
         between = plans[:, i] - plans[:, j]
         return np.sqrt(_dot(between, between))[:, self._pair_of]
 
@@ -117,39 +152,39 @@ class Swarm:
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
-        for beliefs in {self.beliefs, self.told}:
+        for beliefs in {self.beliefs, self.presumed_beliefs}:
             beliefs.forget(np.array([swarm]))
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
         for mine, fresh in zip(self._plans, hover, strict=True):
             mine[swarm * n : (swarm + 1) * n] = fresh
         for plans in self._earlier:
             plans[swarm] = self.plans[swarm, ..., POSITION]
+        self._u[swarm] = 0.0
         if self.config.is_random:
-            rng = self._noise_rngs[swarm] = np.random.default_rng(noise_seed)
-            direction = rng.uniform(0, 2 * np.pi)
-            self.wind[swarm] = self.config.noise.wind * np.array([np.cos(direction), np.sin(direction)])
+            self.chance.reset(swarm, noise_seed)
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
-        self.state, self.goal, self.wind = self.state[swarms], self.goal[swarms], self.wind[swarms]
-        for beliefs in {self.beliefs, self.told}:
+        self.state, self.goal, self._u = self.state[swarms], self.goal[swarms], self._u[swarms]
+        self.chance.keep(swarms)
+        for beliefs in {self.beliefs, self.presumed_beliefs}:
             beliefs.keep(swarms)
         self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
         self._earlier = [plans[swarms] for plans in self._earlier]
-        self._noise_rngs = [rng for rng, kept in zip(self._noise_rngs, swarms, strict=True) if kept]
 
     def part(self, swarms: np.ndarray) -> Swarm:
         """Some of the swarms (mask) to look at: a copy, but for the planner and the generators."""
         part = copy(self)
         part.beliefs = copy(self.beliefs)
-        part.told = part.beliefs if self.told is self.beliefs else copy(self.told)
+        part.presumed_beliefs = part.beliefs if self.presumed_beliefs is self.beliefs else copy(self.presumed_beliefs)
+        part.chance = copy(self.chance)
         part.keep(swarms)
         return part
 
     def fork(self) -> Swarm:
         """A copy of all swarms that flies on by itself, with the disturbances that these would meet."""
         fork = self.part(np.ones(self.n_swarms, dtype=bool))
-        fork._noise_rngs = deepcopy(self._noise_rngs)
+        fork.chance = self.chance.fork()
         return fork
 
     def step(self, requests: np.ndarray) -> StepReport:
@@ -157,53 +192,75 @@ class Swarm:
 
         :param requests: whom each robot asks, (E, n, n - 1) bool, the others of a robot in ascending order
         """
-        arriving, plans = self._answers(requests)
-        age = 1 + self.config.radio.delay
-        if self.told is not self.beliefs:
-            self.told.update(requests, self.pos, self.vel, plans, age)
-        believed, source = self.beliefs.update(arriving, self.pos, self.vel, plans, age)
-        problems = Problems(
-            x=self.state.reshape(-1, 9), goal=self.goal.reshape(-1, 3), others=believed.reshape(-1, *believed.shape[2:])
-        )
+        believed, source = self._believe(requests)
         started = time.perf_counter()
-        self._plans = self.planner.plan(problems, self._plans)
+        self._plans = self.planner.plan(self._problems(believed, source), self._plans)
         solve_seconds = time.perf_counter() - started
+        return self._report(self._fly(), source, solve_seconds)
 
-        before = self.pos.copy()
-        u = self._plans.u[:, 0].reshape(*self.state.shape[:2], -1)
-        self.state = self.planner.model.step(self.state, u, self.wind)
-        if self.config.noise:
-            self.state = self.state + self._disturbances()
-        return self._report(before, source, solve_seconds)
+    def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What robots believe once answers have arrived, see `Beliefs.update`."""
+        radio, others = self.config.radio, self.beliefs.others
+        trajectories = advance(self.planned_positions())
+        if self._earlier:
+            self._earlier = [*map(advance, self._earlier), trajectories]  # each as of now
+            trajectories = self._earlier[-1 - radio.delay]
+        age = 1 + radio.delay
+        if self.presumed_beliefs is not self.beliefs:
+            presumed = answered(requests, trajectories, others)
+            self.presumed_beliefs.update(requests, *self._seen_by_all(), presumed, age)
+        arriving, lateness = self.chance.arrivals(requests, others)
+        received, ages = answered(arriving, trajectories, others), age
+        if lateness is not None:
+            late = lateness[arriving]
+            for k in range(1, radio.jitter + 1):
+                received[late == k] = answered(arriving, self._earlier[-1 - radio.delay - k], others)[late == k]
+            ages = age + late
+        self._earlier = self._earlier[1:]
+        return self.beliefs.update(arriving, *self.observe(), received, ages)
 
-    def _answers(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whose plans arrive where, (E, n, n - 1) bool, and the plans as of one step ago, (E, n, N + 1, 3) (m)."""
-        radio, plans = self.config.radio, self.plans[..., POSITION]
-        if radio.loss:
-            kept = [rng.random(requests.shape[1:]) >= radio.loss for rng in self._noise_rngs]
-            requests = requests & np.stack(kept)
-        if radio.delay:
-            self._earlier.append(plans.copy())
-            plans = self._earlier.pop(0)
-            for _ in range(radio.delay):
-                plans = advance(plans)
-        return requests, plans
+    def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
+        """What each robot has to plan for, from the time on when its input will act."""
+        x, start = self.estimate(), self.chance.start
+        if start is not None and self._vehicle is not None:
+            for k in range(start.max()):
+                x = np.where((start > k)[..., None], self._vehicle.step(x, self._u), x)
+            believed = resampled(
+                believed, np.broadcast_to((start / self.config.substeps)[..., None], believed.shape[:3])
+            )
+        return Problems(
+            x=x.reshape(-1, 9),
+            goal=self.goal.reshape(-1, 3),
+            others=believed.reshape(-1, *believed.shape[2:]),
+            announced=(source != BeliefSource.CONSTANT_VELOCITY).reshape(-1, source.shape[2]),
+        )
 
-    def _disturbances(self) -> np.ndarray:
-        noise = self.config.noise
-        scale = np.repeat([noise.pos, noise.vel, noise.attitude], 3)
-        scale[8] = 0.0  # the yaw is held
-        return np.stack([rng.normal(size=self.state.shape[1:]) for rng in self._noise_rngs]) * scale
+    def _fly(self) -> list[np.ndarray]:
+        """Move the robots by a step; their positions before it and after each sub-step, (E, n, 3) each (m)."""
+        chance, before, planned = self.chance, self._u, self._plans.u[:, 0].reshape(self._u.shape)
+        positions = [self.pos.copy()]
+        vehicle = self._vehicle or self.planner.model
+        for k in range(self.config.substeps):
+            self._u = planned if chance.start is None else np.where((chance.start <= k)[..., None], planned, before)
+            self.state = vehicle.step(self.state, self._u, chance.air, chance.factors)
+            positions.append(self.pos)
+        if self.config.is_random:
+            kicks = chance.advance()
+            if kicks is not None:
+                self.state = self.state + kicks
+                positions[-1] = self.pos
+        return positions
 
-    def _report(self, before: np.ndarray, source: np.ndarray, solve_seconds: float) -> StepReport:
+    def _report(self, positions: list[np.ndarray], source: np.ndarray, solve_seconds: float) -> StepReport:
         i, j = self._pairs
-        pos = self.pos
-        start, end = before[:, i] - before[:, j], pos[:, i] - pos[:, j]
-        # Closest point of the segment from start to end to the origin.
+        before, pos = positions[0], positions[-1]
+        apart = [each[:, i] - each[:, j] for each in positions]
+        start, end = np.stack(apart[:-1]), np.stack(apart[1:])
+        # Closest point of the segments from start to end to the origin.
         change = end - start
         along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
         closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
-        separation, separation_continuous = np.sqrt(_dot(end, end)), np.sqrt(_dot(closest, closest))
+        separation, separation_continuous = np.sqrt(_dot(end[-1], end[-1])), np.sqrt(_dot(closest, closest)).min(axis=0)
         limit = 2 * self.config.radius - self.config.collision_tolerance
         shape = self.state.shape[:2]
         return StepReport(

@@ -113,7 +113,7 @@ def test_braking_stops_from_full_speed():
 @pytest.mark.parametrize("solver", ["rti", "fatrop"])
 def test_considers_only_the_nearest(solver):
     config = PlannerConfig(max_neighbours=2)
-    (x, goal, others), _, _ = scattered(config, 5, 4, scale=0.3)
+    (x, goal, others, *_), _, _ = scattered(config, 5, 4, scale=0.3)
     others += [3.0, 0, 0]
     others[:, [1, 3]] -= [2.0, 0, 0]  # these come nearer
     last = Plans.hover(x, config.horizon)

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from quad_swarm.world.beliefs import Beliefs, BeliefSource, advance, constant_velocity, other_indices
+from quad_swarm.world.beliefs import (
+    Beliefs,
+    BeliefSource,
+    advance,
+    answered,
+    constant_velocity,
+    other_indices,
+    resampled,
+)
 
 N, DT = 4, 0.1
 
@@ -14,6 +22,14 @@ def straight_plans(pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
     return pos[:, :, None] + times[:, None] * vel[:, :, None]
 
 
+def update(
+    beliefs: Beliefs, asked: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Beliefs.update` with what everybody sees and planned."""
+    received = answered(asked, advance(plans), beliefs.others)
+    return beliefs.update(asked, pos[:, beliefs.others], vel[:, beliefs.others], received)
+
+
 def test_other_indices():
     assert other_indices(3).tolist() == [[1, 2], [0, 2], [0, 1]]
 
@@ -21,6 +37,26 @@ def test_other_indices():
 def test_advance_goes_on_straight():
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 1, 0]])
     assert advance(line).tolist() == [[1, 0, 0], [2, 1, 0], [3, 2, 0]]
+
+
+def test_resampled_goes_on_straight_at_both_ends():
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 2, 0]])
+    assert resampled(line, np.array(0.0)).tolist() == line.tolist()
+    assert resampled(line, np.array(0.5)).tolist() == [[0.5, 0, 0], [1.5, 1, 0], [2.5, 3, 0]]
+    assert resampled(line, np.array(-0.5)).tolist() == [[-0.5, 0, 0], [0.5, 0, 0], [1.5, 1, 0]]
+
+
+def test_of_two_answers_the_one_made_later_is_kept():
+    beliefs = Beliefs(1, 2, N, DT, memory=0.3)
+    pos, vel = np.array([[[[3.0, 0, 1]], [[0.0, 0, 1]]]]), np.zeros((1, 2, 1, 3))
+    asked = np.ones((1, 2, 1), bool)
+    still = np.repeat(pos.reshape(2, 1, 3), N + 1, axis=1)
+    beliefs.update(asked, pos, vel, still, np.array([1, 1]))
+    moving = still + np.array([0, 0.1, 0])
+    believed, source = beliefs.update(asked, pos, vel, moving, np.array([3, 2]))
+    assert source.ravel().tolist() == [BeliefSource.REMEMBERED, BeliefSource.REQUESTED]
+    assert believed[0, 0, 0].tolist() == still[0, 1:].tolist()
+    assert believed[0, 1, 0].tolist() == moving[1, 1:].tolist()
 
 
 def test_constant_velocity_starts_one_step_ahead():
@@ -33,7 +69,7 @@ def test_a_requested_plan_is_shifted_to_now():
     pos = np.array([[[0.0, 0, 1], [3, 0, 1]]])
     vel = np.array([[[1.0, 0, 0], [0, 2, 0]]])
     plans = straight_plans(pos, np.array([[[0.0, 0, 0], [0, -1, 0]]]))  # robot 1 plans something else than it does now
-    believed, source = beliefs.update(np.array([[[True], [False]]]), pos, vel, plans)
+    believed, source = update(beliefs, np.array([[[True], [False]]]), pos, vel, plans)
     assert source.ravel().tolist() == [BeliefSource.REQUESTED, BeliefSource.CONSTANT_VELOCITY]
     # Stage k of the belief is stage k + 1 of the plan of one step ago.
     np.testing.assert_allclose(believed[0, 0, 0, : N - 1], plans[0, 1, 2:])
@@ -46,9 +82,9 @@ def test_memory_is_a_switch(memory, remembers):
     pos, vel = np.array([[[0.0, 0, 1], [3, 0, 1]]]), np.zeros((1, 2, 3))
     turning = np.array([[[0.0, 0, 0], [0, 1, 0]]])
     asked, silent = np.ones((1, 2, 1), bool), np.zeros((1, 2, 1), bool)
-    beliefs.update(asked, pos, vel, straight_plans(pos, turning))
+    update(beliefs, asked, pos, vel, straight_plans(pos, turning))
     pos = pos + DT * turning
-    believed, source = beliefs.update(silent, pos, vel, straight_plans(pos, turning))
+    believed, source = update(beliefs, silent, pos, vel, straight_plans(pos, turning))
     if remembers:
         assert (source == BeliefSource.REMEMBERED).all()
         np.testing.assert_allclose(believed[0, 0, 0], constant_velocity(pos[0, 1], turning[0, 1], N, DT))
@@ -61,15 +97,15 @@ def test_memory_ends_when_the_plan_no_longer_fits_and_when_it_is_old():
     asked, silent = np.ones((1, 2, 1), bool), np.zeros((1, 2, 1), bool)
 
     beliefs = Beliefs(1, 2, N, DT, memory=0.3)
-    beliefs.update(asked, pos, vel, straight_plans(pos, vel))
-    _, source = beliefs.update(silent, pos + np.array([[[0, 0, 0], [0.2, 0, 0]]]), vel, straight_plans(pos, vel))
+    update(beliefs, asked, pos, vel, straight_plans(pos, vel))
+    _, source = update(beliefs, silent, pos + np.array([[[0, 0, 0], [0.2, 0, 0]]]), vel, straight_plans(pos, vel))
     assert (source == BeliefSource.REMEMBERED).all()
-    _, source = beliefs.update(silent, pos + np.array([[[0, 0, 0], [0.4, 0, 0]]]), vel, straight_plans(pos, vel))
+    _, source = update(beliefs, silent, pos + np.array([[[0, 0, 0], [0.4, 0, 0]]]), vel, straight_plans(pos, vel))
     assert source.ravel().tolist() == [BeliefSource.CONSTANT_VELOCITY, BeliefSource.REMEMBERED]
 
     beliefs = Beliefs(1, 2, N, DT, memory=0.3)
-    beliefs.update(asked, pos, vel, straight_plans(pos, vel))
-    sources = [beliefs.update(silent, pos, vel, straight_plans(pos, vel))[1][0, 0, 0] for _ in range(N)]
+    update(beliefs, asked, pos, vel, straight_plans(pos, vel))
+    sources = [update(beliefs, silent, pos, vel, straight_plans(pos, vel))[1][0, 0, 0] for _ in range(N)]
     assert sources == [BeliefSource.REMEMBERED] * (N - 2) + [BeliefSource.CONSTANT_VELOCITY] * 2
 
 
@@ -77,10 +113,10 @@ def test_forget_and_keep_touch_only_the_given_swarms():
     pos, vel = np.tile([[[0.0, 0, 1], [3, 0, 1]]], (3, 1, 1)), np.zeros((3, 2, 3))
     asked, silent = np.ones((3, 2, 1), bool), np.zeros((3, 2, 1), bool)
     beliefs = Beliefs(3, 2, N, DT, memory=0.3)
-    beliefs.update(asked, pos, vel, straight_plans(pos, vel))
+    update(beliefs, asked, pos, vel, straight_plans(pos, vel))
     beliefs.forget(np.array([1]))
     beliefs.keep(np.array([False, True, True]))
-    _, source = beliefs.update(silent[1:], pos[1:], vel[1:], straight_plans(pos[1:], vel[1:]))
+    _, source = update(beliefs, silent[1:], pos[1:], vel[1:], straight_plans(pos[1:], vel[1:]))
     assert (source[0] == BeliefSource.CONSTANT_VELOCITY).all()
     assert (source[1] == BeliefSource.REMEMBERED).all()
 

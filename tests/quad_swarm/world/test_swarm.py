@@ -47,7 +47,7 @@ def test_a_swarm_flies_the_same_alone_and_in_company():
 
 def test_first_plan_asked_for_is_to_stay():
     swarm = make_swarm(1)
-    believed, source = swarm.beliefs.update(all_ask(swarm), swarm.pos, swarm.vel, swarm.plans[..., :3])
+    believed, source = swarm._believe(all_ask(swarm))
     assert (source == BeliefSource.REQUESTED).all()
     assert np.array_equal(believed, np.broadcast_to(swarm.pos[:, swarm.beliefs.others, None], believed.shape))
 
@@ -84,7 +84,7 @@ def test_separation_at_and_between_steps(start, end, at_step, between):
     swarm = make_swarm(1, n_robots=2)
     before = np.array([[[0, 0, 1.0], np.add([0, 0, 1.0], start)]])
     swarm.state[0, :, :3] = [[0, 0, 1.0], np.add([0, 0, 1.0], end)]
-    report = swarm._report(before, np.zeros((1, 2, 1)), 0.0)
+    report = swarm._report([before, swarm.pos], np.zeros((1, 2, 1)), 0.0)
     assert report.min_separation[0] == pytest.approx(at_step)
     assert report.min_separation_continuous[0] == pytest.approx(between)
     assert report.collision[0] == (at_step < 0.599)
@@ -95,7 +95,7 @@ def test_separation_at_and_between_steps(start, end, at_step, between):
 def test_collision_tolerance_is_one_millimetre(distance, collides):
     swarm = make_swarm(1, n_robots=2)
     swarm.state[0, :, :3] = [[0, 0, 1], [distance, 0, 1]]
-    report = swarm._report(swarm.pos.copy(), np.zeros((1, 2, 1)), 0.0)
+    report = swarm._report([swarm.pos, swarm.pos], np.zeros((1, 2, 1)), 0.0)
     assert report.collision[0] == collides
 
 
@@ -146,12 +146,13 @@ def test_a_robot_knows_what_the_others_believe_of_it():
     swarm, rng = make_swarm(2), np.random.default_rng(0)
     for _ in range(8):
         swarm.step(rng.random((2, 4, 3)) < 0.3)
-    told, outlook = View(swarm).told(range(swarm.config.planner.horizon)), swarm.beliefs.predict(swarm.pos, swarm.vel)
-    assert 0 < told.remembers.mean() < 1
+    presumed = View(swarm).presumed(range(swarm.config.planner.horizon))
+    prediction = swarm.beliefs.predict(*swarm.observe())
+    assert 0 < presumed.remembers.mean() < 1
     for i, m in np.ndindex(4, 3):
         j = swarm.beliefs.others[i, m]
         mine = swarm.beliefs.others[j].tolist().index(i)
-        for field, of_other in zip(told, outlook, strict=True):
+        for field, of_other in zip(presumed, prediction, strict=True):
             assert np.array_equal(field[:, i, m], of_other[:, j, mine])
 
 
@@ -160,10 +161,10 @@ def test_a_robot_takes_its_answers_to_have_arrived():
     for _ in range(5):
         swarm.step(all_ask(swarm))
     view = View(swarm)
-    assert view.told([0]).remembers.all()
-    assert not view.outlook.remembers.any()
+    assert view.presumed([0]).remembers.all()
+    assert not view.prediction.remembers.any()
     swarm.reset(0, swarm.pos[0], swarm.goal[0])
-    assert not View(swarm).told([0]).remembers.any()
+    assert not View(swarm).presumed([0]).remembers.any()
 
 
 def test_late_answers_are_older_plans():

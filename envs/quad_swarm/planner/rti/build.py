@@ -120,7 +120,7 @@ def load(path: str) -> ctypes.CDLL:
             f"cannot load {path} ({error}); delete that file to have it compiled again, or name a directory from which "
             "libraries may be loaded in QUAD_SWARM_CACHE"
         ) from error
-    function.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 8, *[ctypes.c_int64] * 3, ctypes.c_double]
+    function.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 3, ctypes.c_double]
     function.restype = None
     return library
 

@@ -29,6 +29,7 @@ struct Batch {
   const double* x;        // (count, 9)
   const double* goal;     // (count, 3)
   const double* others;   // (count, N_OTHERS, N, 3)
+  const double* clearance;  // (count, N_OTHERS, N), or null
   double* x_plan;         // (count, N + 1, 9)
   double* u_plan;         // (count, N, 4)
   std::uint8_t* success;  // (count,)
@@ -115,6 +116,7 @@ struct Stage {
   V a[N_A], b[N_B];  // entries of dx_{k+1}/dx_k and dx_{k+1}/du_k that are no constants
   V input_gradient[NU];
   V others[N_OTHERS][3];
+  V clearance[N_OTHERS];     // to keep beyond the separation
   V direction[N_OTHERS][3];  // from each other robot to this one
   V repulsion_gradient[N_OTHERS], repulsion_curvature[N_OTHERS];
   V bound_sign[N_BOUNDS];
@@ -161,11 +163,14 @@ class LaneGroup {
       for (int i = 0; i < 3; i++) goal_[i][q] = static_cast<T>(batch.goal[problem * 3 + i]);
       const double* u = u_guess + problem * N * INPUT_STRIDE;
       const double* others = batch.others + problem * N_OTHERS * N * 3;
+      const double* clearance = batch.clearance ? batch.clearance + problem * N_OTHERS * N : nullptr;
       for (int k = 0; k < N; k++) {
         Stage<V>& s = stages_[k];
         for (int i = 0; i < NU; i++) s.u[i][q] = static_cast<T>(u[k * INPUT_STRIDE + i]);
-        for (int j = 0; j < N_OTHERS; j++)
+        for (int j = 0; j < N_OTHERS; j++) {
           for (int i = 0; i < 3; i++) s.others[j][i][q] = static_cast<T>(others[(j * N + k) * 3 + i]);
+          s.clearance[j][q] = clearance ? static_cast<T>(clearance[j * N + k]) : T(0);
+        }
       }
     }
     for (int k = 0; k < N; k++) limit_inputs(stages_[k].u);
@@ -204,7 +209,7 @@ class LaneGroup {
         V distance, gap;
         ::separation<V>(x, s.others[j], &distance, &gap, s.direction[j]);
         ::repulsion<V>(&distance, &s.repulsion_gradient[j], &s.repulsion_curvature[j]);
-        s.separation[j].start(gap);
+        s.separation[j].start(gap - s.clearance[j]);
       }
     }
     ::goal_derivatives<V>(stages_[N - 1].x, x0_, goal_, goal_gradient_, goal_hessian_);
@@ -441,11 +446,11 @@ void solve_all(const Batch& batch, const double* u_guess, const std::vector<std:
 }  // namespace
 
 extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
-    std::int64_t count, const double* x, const double* goal, const double* others, const double* u_guess,
-    double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations, std::int64_t sqp_iterations,
-    std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
+    std::int64_t count, const double* x, const double* goal, const double* others, const double* clearance,
+    const double* u_guess, double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations,
+    std::int64_t sqp_iterations, std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
   std::vector<std::uint8_t> moving(count);
-  const Batch batch{x, goal, others, x_plan, u_plan, success, iterations, moving.data()};
+  const Batch batch{x, goal, others, clearance, x_plan, u_plan, success, iterations, moving.data()};
   const Options options{max_iterations, tolerance};
   std::fill(iterations, iterations + count, 0);
   std::vector<std::int64_t> problems(count);

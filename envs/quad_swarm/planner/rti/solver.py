@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.planner.base import Problems, Solution
-from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig
+from quad_swarm.planner.base import Solution
+from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Problems
 from quad_swarm.planner.rti.build import build, load
 from quad_swarm.planner.rti.codegen import generate_model
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams
@@ -71,10 +71,12 @@ class RtiSolver:
         """See `Solver.solve`."""
         self.compile()
         count, horizon, n_others = problems.x.shape[0], self.problem.config.horizon, self.problem.n_others
+        clearance = problems.clearance
         arguments = (
             _array("x", problems.x, (count, N_STATES)),
             _array("goal", problems.goal, (count, 3)),
             _array("others", problems.others, (count, n_others, horizon, 3)),
+            None if clearance is None else _array("clearance", clearance, (count, n_others, horizon)),
             _array("u_guess", u_guess, (count, horizon, N_INPUTS)),
         )
         solution = Solution(
@@ -85,7 +87,7 @@ class RtiSolver:
         )
         self._kernel(
             count,
-            *[array.ctypes.data for array in (*arguments, *solution)],
+            *[None if array is None else array.ctypes.data for array in (*arguments, *solution)],
             self.sqp_iterations,
             self.extra_iterations,
             self.max_iterations,

@@ -264,14 +264,15 @@ int main() {
   long solved = 0;
   for (int count : {0, 1, 2, 3, 5, 8, 9, 16, 17, 33, 50}) {
     std::vector<double> x(count * 9), goal(count * 3), others(count * N_OTHERS * N * 3), guess(count * N * 4);
-    for (auto* array : {&x, &goal, &others, &guess})
+    std::vector<double> clearance(count * N_OTHERS * N);
+    for (auto* array : {&x, &goal, &others, &guess, &clearance})
       for (double& value : *array) value = normal(random);
     for (int k = 0; k < count; k += 4) x[k * 9] = bad[k / 4 % 3];
     std::vector<double> x_plan(count * (N + 1) * 9), u_plan(count * N * 4);
     std::vector<std::uint8_t> success(count);
     std::vector<std::int64_t> iterations(count);
-    quad_swarm_rti(count, x.data(), goal.data(), others.data(), guess.data(), x_plan.data(), u_plan.data(),
-                   success.data(), iterations.data(), 2, 6, 50, 1e-4);
+    quad_swarm_rti(count, x.data(), goal.data(), others.data(), count % 2 ? clearance.data() : nullptr, guess.data(),
+                   x_plan.data(), u_plan.data(), success.data(), iterations.data(), 2, 6, 50, 1e-4);
     for (auto s : success) solved += s;
   }
   std::printf("%ld", solved);

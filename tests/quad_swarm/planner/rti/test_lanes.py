@@ -24,7 +24,7 @@ from quad_swarm.quadrotor import QuadrotorModel
 
 def part(call: Call, index) -> Call:
     problems, x_guess, u_guess = call
-    return Problems(*(field[index] for field in problems)), x_guess[index], u_guess[index]
+    return problems.part(index), x_guess[index], u_guess[index]
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -47,7 +47,7 @@ def test_absurd_problems_stay_in_their_lanes(bad):
     solver = RtiSolver(OptimalControlProblem(config, QUADROTOR, 2))
     call = scattered(config, 30, 2)
     expected = solver.solve(*call)
-    (x, goal, others), x_guess, u_guess = (Problems(*(field.copy() for field in call[0])), call[1], call[2].copy())
+    (x, goal, others), x_guess, u_guess = ([field.copy() for field in call[0][:3]], call[1], call[2].copy())
     x[3, 0] = goal[8] = others[13, 1, 2] = x[17] = bad
     if np.isnan(bad):
         u_guess[25] = bad
@@ -105,7 +105,7 @@ def test_the_fallback_chain_holds_the_failed_lane_only():
 def test_plans_the_yaw_too():
     config = PlannerConfig(max_yaw_rate=math.pi / 2)
     problem = OptimalControlProblem(config, QUADROTOR, 1)
-    (x, goal, others), x_guess, _ = scattered(config, 8, 1, scale=0.1)
+    (x, goal, others, *_), x_guess, _ = scattered(config, 8, 1, scale=0.1)
     x[:, 2] += 1.5
     x[:, 8] *= 20
     goal[:, 2] = 1.0

@@ -8,7 +8,7 @@ from quad_swarm.planner import FatropSolver, OptimalControlProblem, Problems, Rt
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
-from quad_swarm.world.presets import PRESETS, make_config
+from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
@@ -41,7 +41,8 @@ class Recorded:
             requests = [parse_rule(rule)(view) for rule in RULES]
             swarm.step(np.stack([requests[k % len(RULES)][k] for k in range(swarm.n_swarms)]))
         calls = [calls[k] for k in steps]
-        self.problems = Problems(*(np.concatenate(field) for field in zip(*(call[0] for call in calls), strict=True)))
+        fields = zip(*(call[0] for call in calls), strict=True)
+        self.problems = Problems(*(None if field[0] is None else np.concatenate(field) for field in fields))
         self.x_guess, self.u_guess = (np.concatenate([call[k] for call in calls]) for k in (1, 2))
         self.optimum = FatropSolver(self.problem, tolerance=1e-6).solve(self.problems, self.x_guess, self.u_guess)
 
@@ -50,7 +51,7 @@ class Recorded:
 
     def cost(self, u: np.ndarray) -> np.ndarray:
         """Eq. (2) written a second time, on arrays, for the states that follow from the inputs."""
-        c, (x0, goal, others) = self.config, self.problems
+        c, (x0, goal, others, *_) = self.config, self.problems
         x = QuadrotorModel(QUADROTOR, c.dt).rollout(x0, u)[:, 1:]
         cost = c.input_weight * ((u[..., :3] / [c.max_tilt, c.max_tilt, c.max_climb_rate]) ** 2).sum((1, 2))
         distance = np.linalg.norm(x[:, None, :, :3] - others, axis=-1)
@@ -66,9 +67,12 @@ class Recorded:
         return cost + c.goal_weight * ((goal - x[:, -1, :3]) ** 2).sum(1) / np.maximum(present, 1)
 
 
-@pytest.fixture(scope="module", params=PRESETS)
+STEPS = {"paper": range(0, 36, 2), "dense": range(1, 36, 4)}
+
+
+@pytest.fixture(scope="module", params=STEPS)
 def recorded(request) -> Recorded:
-    return Recorded(request.param, {"paper": range(0, 36, 2), "dense": range(1, 36, 4)}[request.param])
+    return Recorded(request.param, STEPS[request.param])
 
 
 def spread(values: np.ndarray) -> tuple[float, float]:

@@ -1,0 +1,41 @@
+"""Passing on the right: a convention that settles who passes whom on which side, where plans arrive late.
+
+Two robots that approach each other head-on and know only each other's old plans may both dodge to the same side, again
+and again. The rules of the air have an answer: each alters its heading to the right (ICAO Annex 2, 3.2.2.2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quad_swarm.planner.problem import Problems
+
+_FADE = 1.0  # s before the closest approach, from which on less and less is asked for: then the sides are settled
+_SLOW = 0.5  # m/s of closing speed, below which less is asked for: then there is no head-on
+
+
+def keep_right(problems: Problems, distance: float, dt: float) -> Problems:
+    """The same problems with every other robot whose plan is known grown by ``distance`` on the side on which it should
+    not be passed.
+
+    Its believed positions move by that distance to the left, as seen along the relative motion, and the clearance grows
+    as much: on the right everything stays as it was.
+
+    :param problems: a batch of B problems
+    :param distance: how much to grow the others (m)
+    :param dt: length of a stage (s)
+    """
+    others, known = problems.others, problems.announced
+    if known is None or not known.any():
+        return problems
+    velocity = (others[:, :, 1] - others[:, :, 0]) / dt
+    pos = others[:, :, 0] - dt * velocity - problems.x[:, None, :3]
+    vel = velocity - problems.x[:, None, 3:6]
+    speed = np.hypot(vel[..., 0], vel[..., 1])
+    time = -(pos * vel).sum(axis=-1) / np.maximum((vel * vel).sum(axis=-1), 1e-9)
+    grown = distance * known * np.clip(time / _FADE, 0.0, 1.0) * np.clip(speed / _SLOW, 0.0, 1.0)
+    left = np.stack([vel[..., 1], -vel[..., 0], np.zeros_like(speed)], axis=-1) / np.maximum(speed, 1e-9)[..., None]
+    clearance = np.repeat(grown[..., None], others.shape[2], axis=2)
+    if problems.clearance is not None:
+        clearance += problems.clearance
+    return problems._replace(others=others + (grown[..., None] * left)[:, :, None], clearance=clearance)

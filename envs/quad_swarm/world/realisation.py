@@ -1,0 +1,171 @@
+"""What chance makes of the disturbances in E swarms: the errors, gusts and losses that are met."""
+
+from __future__ import annotations
+
+import math
+from copy import copy, deepcopy
+
+import numpy as np
+
+from quad_swarm.quadrotor import N_STATES, VEHICLE_PARAMETERS
+from quad_swarm.world.presets import SwarmConfig
+
+OUTAGE_WITHIN = 5.0  # s, of an episode: when robots stop answering
+_NEVER = np.iinfo(np.int64).max
+
+
+class Realisation:
+    """Random numbers of E swarms, each from a generator of its own: an episode does not depend on the batch it is in.
+
+    :param config: the world
+    :param n_swarms: number of swarms E
+    :ivar air: velocity of the air at each robot, (E, n, 2) (m/s)
+    :ivar factors: of each robot's vehicle parameters, (E, n, 8); None where all are as the planner's model
+    :ivar start: sub-step of each step at which each robot's new input acts, (E, n); None where it is the first
+    """
+
+    _ARRAYS = ("_wind", "_gust", "_own", "_observer", "_factors", "_start", "_down", "_silent_from", "_step")
+
+    def __init__(self, config: SwarmConfig, n_swarms: int):
+        n, dt = config.n_robots, config.planner.dt
+        self.config = config
+        self._rngs = [np.random.default_rng(0) for _ in range(n_swarms)]
+        self._wind = np.zeros((n_swarms, n, 2))
+        self._gust = np.zeros((n_swarms, n, 2))
+        self._own = np.zeros((n_swarms, n, N_STATES))
+        self._observer = np.zeros((n_swarms, n, n - 1, 6))
+        self._factors = np.ones((n_swarms, n, len(VEHICLE_PARAMETERS)))
+        self._start = np.zeros((n_swarms, n), dtype=np.int64)
+        self._down = np.zeros((n_swarms, n, n - 1), dtype=bool)
+        self._silent_from = np.full((n_swarms, n), _NEVER)
+        self._step = np.zeros(n_swarms, dtype=np.int64)
+
+        noise, sensing = config.noise, config.sensing
+        # Of position, velocity and attitude; the yaw is held
+        self._kick = _by_state(noise.pos, noise.vel, noise.attitude)
+        self._own_scale = _by_state(sensing.pos, sensing.vel, sensing.attitude)
+        self._observer_scale = np.repeat([sensing.others_pos, sensing.others_vel], 3)
+        self._gust_keeps = _keeps(dt, noise.gust_time)
+        self._errors_keep = _keeps(dt, sensing.correlation_time)
+        self._latest_start = int(config.clock_skew * config.substeps)
+
+    @property
+    def air(self) -> np.ndarray:
+        return self._wind + self._gust if self.config.noise.gust else self._wind
+
+    @property
+    def factors(self) -> np.ndarray | None:
+        return self._factors if self.config.mismatch else None
+
+    @property
+    def start(self) -> np.ndarray | None:
+        return self._start if self._latest_start else None
+
+    def reset(self, swarm: int, seed: int) -> None:
+        """Draw what stays for an episode of one swarm, and begin what varies."""
+        config, radio = self.config, self.config.radio
+        rng = self._rngs[swarm] = np.random.default_rng(seed)
+        direction = rng.uniform(0, 2 * np.pi)
+        self._wind[swarm] = config.noise.wind * np.array([np.cos(direction), np.sin(direction)])
+        self._step[swarm] = 0
+        if config.mismatch:
+            self._factors[swarm] = 1 + config.mismatch * rng.uniform(-1, 1, self._factors.shape[1:])
+        if self._latest_start:
+            self._start[swarm] = rng.integers(0, self._latest_start + 1, self._start.shape[1:])
+        if radio.outage:
+            fails = rng.random(self._silent_from.shape[1:]) < radio.outage
+            when = rng.integers(0, max(round(OUTAGE_WITHIN / config.planner.dt), 1), fails.shape)
+            self._silent_from[swarm] = np.where(fails, when, _NEVER)
+        if radio.bursts:
+            self._down[swarm] = rng.random(self._down.shape[1:]) < radio.bursts
+        if config.noise.gust:
+            self._gust[swarm] = config.noise.gust * rng.normal(size=self._gust.shape[1:])
+        if config.sensing.own:
+            self._own[swarm] = self._own_scale * rng.normal(size=self._own.shape[1:])
+        if config.sensing.others:
+            self._observer[swarm] = self._observer_scale * rng.normal(size=self._observer.shape[1:])
+
+    def keep(self, swarms: np.ndarray) -> None:
+        """Drop all but the given swarms (mask)."""
+        for name in self._ARRAYS:
+            setattr(self, name, getattr(self, name)[swarms])
+        self._rngs = [rng for rng, kept in zip(self._rngs, swarms, strict=True) if kept]
+
+    def fork(self) -> Realisation:
+        """A copy that draws the same from here on."""
+        fork = copy(self)
+        for name in self._ARRAYS:
+            setattr(fork, name, getattr(self, name).copy())
+        fork._rngs = deepcopy(self._rngs)
+        return fork
+
+    def estimate(self, state: np.ndarray) -> np.ndarray:
+        """Where robots take themselves to be, (E, n, 9)."""
+        return state + self._own if self.config.sensing.own else state
+
+    def observe(self, pos: np.ndarray, vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities of others, (E, n, n - 1, 3) each, as their observers see them."""
+        if not self.config.sensing.others:
+            return pos, vel
+        return pos + self._observer[..., :3], vel + self._observer[..., 3:]
+
+    def arrivals(self, requests: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Which answers of this step arrive.
+
+        :param requests: whom each robot asks, (E, n, n - 1) bool
+        :param others: see `other_indices`
+        :return: which are answered, (E, n, n - 1) bool, and by how many steps each is later than the radio's delay,
+            (E, n, n - 1); None where that does not vary
+        """
+        radio, lateness = self.config.radio, None
+        shape = requests.shape[1:]
+        if radio.loss:
+            requests = requests & (np.stack([rng.random(shape) for rng in self._rngs]) >= radio.loss)
+        if radio.bursts:
+            chance = np.stack([rng.random(shape) for rng in self._rngs])
+            ends = 1 / radio.burst_length
+            begins = radio.bursts * ends / (1 - radio.bursts)
+            self._down = np.where(self._down, chance >= ends, chance < begins)
+            requests = requests & ~self._down
+        if radio.outage:
+            silent = self._silent_from <= self._step[:, None]
+            requests = requests & ~silent[:, others]
+        if radio.jitter:
+            lateness = np.stack([rng.integers(0, radio.jitter + 1, shape) for rng in self._rngs])
+        return requests, lateness
+
+    def advance(self) -> np.ndarray | None:
+        """Let a step pass for all that varies.
+
+        :return: what the step adds to the states, (E, n, 9); None without such noise
+        """
+        self._step += 1
+        noise, sensing = self.config.noise, self.config.sensing
+        kicks = self._kick * self._normal(self._own.shape) if noise else None
+        if noise.gust:
+            self._gust = _continued(self._gust, self._gust_keeps, noise.gust, self._normal(self._gust.shape))
+        if sensing.own:
+            self._own = _continued(self._own, self._errors_keep, self._own_scale, self._normal(self._own.shape))
+        if sensing.others:
+            drawn = self._normal(self._observer.shape)
+            self._observer = _continued(self._observer, self._errors_keep, self._observer_scale, drawn)
+        return kicks
+
+    def _normal(self, shape: tuple[int, ...]) -> np.ndarray:
+        return np.stack([rng.normal(size=shape[1:]) for rng in self._rngs]) if self._rngs else np.zeros(shape)
+
+
+def _by_state(pos: float, vel: float, attitude: float) -> np.ndarray:
+    scale = np.repeat([pos, vel, attitude], 3)
+    scale[8] = 0.0
+    return scale
+
+
+def _keeps(dt: float, correlation_time: float) -> float:
+    """How much of a Gauss-Markov process is left after a step."""
+    return math.exp(-dt / correlation_time) if correlation_time else 0.0
+
+
+def _continued(process: np.ndarray, keeps: float, scale: np.ndarray | float, drawn: np.ndarray) -> np.ndarray:
+    """A stationary Gauss-Markov process one step later."""
+    return keeps * process + math.sqrt(1 - keeps**2) * scale * drawn

@@ -1,0 +1,191 @@
+"""What chance makes of the disturbances: statistics, seeds, and that nobody sees what a robot could not know."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.world.beliefs import BeliefSource, other_indices
+from quad_swarm.world.presets import SwarmConfig, make_config
+from quad_swarm.world.realisation import OUTAGE_WITHIN, Realisation
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import Swarm
+
+EVERYTHING = {
+    "substeps": 5,
+    "noise": {"pos": 0.002, "vel": 0.02, "attitude": 0.005, "wind": 1.0, "gust": 0.5},
+    "sensing": {"pos": 0.01, "vel": 0.05, "attitude": 0.01, "others_pos": 0.01, "others_vel": 0.05},
+    "radio": {"loss": 0.2, "delay": 1, "jitter": 2, "bursts": 0.1, "outage": 0.3},
+    "mismatch": 0.1,
+    "clock_skew": 0.8,
+}
+
+
+def drawn(n_swarms: int = 200, **world) -> tuple[SwarmConfig, Realisation]:
+    config = make_config(world=world)
+    chance = Realisation(config, n_swarms)
+    for k in range(n_swarms):
+        chance.reset(k, seed=k)
+    return config, chance
+
+
+def make_swarm(n_swarms: int, **world) -> Swarm:
+    swarm = Swarm(make_config(world=world), n_swarms, "rti")
+    for k in range(n_swarms):
+        rng = np.random.default_rng(k)
+        swarm.reset(k, *ScenarioSampler("symmetric_swap", 4, swarm.config.space).sample(rng)[1:], noise_seed=k)
+    return swarm
+
+
+def fly(swarm: Swarm, steps: int, seed: int = 0) -> np.ndarray:
+    requests = np.random.default_rng(seed).random((steps, 1, *swarm.beliefs.others.shape)) < 0.5
+    path = []
+    for k in range(steps):
+        swarm.step(np.broadcast_to(requests[k], (swarm.n_swarms, *requests.shape[2:])))
+        path.append(swarm.state.copy())
+    return np.array(path)
+
+
+def test_the_same_seeds_give_the_same_flight_and_others_another():
+    first, second = (fly(make_swarm(3, **EVERYTHING), 25) for _ in range(2))
+    assert np.array_equal(first, second)
+    assert np.abs(first[:, 0] - first[:, 1]).max() > 0.01
+
+
+def test_a_swarm_does_not_depend_on_its_company_nor_a_fork_on_its_origin():
+    together, alone = make_swarm(3, **EVERYTHING), make_swarm(3, **EVERYTHING)
+    alone.keep(np.arange(3) == 1)
+    assert np.array_equal(fly(alone, 25)[:, 0], fly(together, 25)[:, 1])
+    fork = together.fork()
+    assert np.array_equal(fly(fork, 10, seed=1), fly(together, 10, seed=1))
+
+
+@pytest.mark.parametrize("correlation_time", [0.0, 0.2, 1.0])
+def test_errors_are_stationary_and_forgotten_in_the_time_given(correlation_time):
+    sensing = {"pos": 0.02, "vel": 0.05, "attitude": 0.01, "others_pos": 0.03, "correlation_time": correlation_time}
+    config, chance = drawn(400, sensing=sensing)
+    state, pos = np.zeros((400, 4, 9)), np.zeros((400, 4, 3, 3))
+    own, seen = [chance.estimate(state)], [chance.observe(pos, pos)[0]]
+    for _ in range(5):
+        assert chance.advance() is None
+        own.append(chance.estimate(state))
+        seen.append(chance.observe(pos, pos)[0])
+    for step in (0, 5):
+        spread = own[step].std(axis=(0, 1))
+        np.testing.assert_allclose(spread[:8], np.repeat([0.02, 0.05, 0.01], 3)[:8], rtol=0.08)
+        assert spread[8] == 0, "the yaw is held"
+        assert seen[step].std() == pytest.approx(0.03, rel=0.05)
+    correlation = np.corrcoef(own[0][..., 0].ravel(), own[5][..., 0].ravel())[0, 1]
+    expected = np.exp(-5 * config.planner.dt / correlation_time) if correlation_time else 0.0
+    assert correlation == pytest.approx(expected, abs=0.08)
+
+
+def test_gusts_come_on_top_of_the_wind():
+    _, chance = drawn(400, noise={"wind": 2.0, "gust": 0.5})
+    assert np.linalg.norm(chance.air.mean(axis=1), axis=-1).mean() == pytest.approx(2.0, abs=0.1)
+    gusts = chance.air - chance.air.mean(axis=1, keepdims=True)
+    assert gusts.std() == pytest.approx(0.5 * np.sqrt(3 / 4), rel=0.05)
+
+
+def test_vehicles_differ_by_the_share_given():
+    _, chance = drawn(200, mismatch=0.1)
+    assert chance.factors is not None
+    assert 0.9 <= chance.factors.min() < 0.91
+    assert 1.09 < chance.factors.max() <= 1.1
+    assert drawn(2)[1].factors is None
+
+
+def test_a_vehicle_unlike_its_model_flies_otherwise():
+    # Everything else is alike, so that what differs is the vehicle.
+    assert np.abs(fly(make_swarm(1, mismatch=0.2), 20) - fly(make_swarm(1), 20)).max() > 0.02
+
+
+def test_links_are_interrupted_for_the_share_and_the_time_given():
+    config, chance = drawn(50, radio={"bursts": 0.2, "burst_length": 8})
+    requests, others = np.ones((50, 4, 3), bool), other_indices(config.n_robots)
+    arrived = np.stack([chance.arrivals(requests, others)[0] for _ in range(400)])
+    assert (~arrived).mean() == pytest.approx(0.2, abs=0.02)
+    ends = (~arrived[:-1] & arrived[1:]).sum() / (~arrived[:-1]).sum()
+    assert 1 / ends == pytest.approx(8, rel=0.1)
+
+
+def test_silent_robots_answer_nobody_and_stay_silent():
+    config, chance = drawn(100, radio={"outage": 0.3})
+    requests, others = np.ones((100, 4, 3), bool), other_indices(config.n_robots)
+    answers = []
+    for _ in range(round(OUTAGE_WITHIN / config.planner.dt) + 1):
+        answers.append(chance.arrivals(requests, others)[0])
+        chance.advance()
+    silent = np.zeros((len(answers), 100, 4), bool)
+    for robot in range(4):
+        silent[..., robot] = ~np.stack([a[:, others == robot] for a in answers]).any(axis=-1)
+        assert np.array_equal(silent[..., robot], ~np.stack([a[:, others == robot] for a in answers]).all(axis=-1))
+    assert (silent[1:] >= silent[:-1]).all()
+    assert silent[0].mean() < 0.05
+    assert silent[-1].mean() == pytest.approx(0.3, abs=0.07)
+
+
+def test_answers_are_late_by_up_to_the_jitter():
+    config, chance = drawn(50, radio={"jitter": 2})
+    requests, others = np.ones((50, 4, 3), bool), other_indices(config.n_robots)
+    lateness = np.stack([chance.arrivals(requests, others)[1] for _ in range(50)])
+    assert np.bincount(lateness.ravel()) / lateness.size == pytest.approx([1 / 3] * 3, abs=0.02)
+    swarm = make_swarm(3, radio={"delay": 1, "jitter": 2}, memory=0.3)
+    for _ in range(5):
+        swarm.step(np.ones((3, 4, 3), bool))
+    assert set(np.unique(swarm.beliefs.predict(*swarm.observe()).age)) <= {3, 4, 5}
+
+
+def test_a_late_answer_holds_the_plan_of_its_time():
+    swarm = make_swarm(1, radio={"jitter": 1}, memory=0.0)
+    fly(swarm, 6)
+    newest, older = swarm.plans[0, :, 2:, :3].copy(), None
+    swarm.step(np.zeros((1, 4, 3), bool))
+    older, newest = newest, swarm.plans[0, :, 2:, :3].copy()
+    believed, source = swarm._believe(np.ones((1, 4, 3), bool))
+    assert (source == BeliefSource.REQUESTED).all()
+    late = 0
+    for i, m in np.ndindex(4, 3):
+        j = swarm.beliefs.others[i, m]
+        is_new = np.allclose(believed[0, i, m, :-1], newest[j])
+        assert is_new or np.allclose(believed[0, i, m, :-2], older[j][1:])
+        late += not is_new
+    assert 0 < late < 12
+
+
+def test_robots_act_on_a_plan_when_their_clock_says_so():
+    swarm = make_swarm(8, substeps=4, clock_skew=0.8, noise={"wind": 1e-12})
+    start = swarm.chance.start
+    assert start is not None
+    assert set(np.unique(start)) == {0, 1, 2, 3}
+    # A robot that knows when its input will act plans from where it will be then: the plan holds without a model error.
+    for _ in range(10):
+        swarm.step(np.ones((8, 4, 3), bool))
+    planned = swarm.planned_positions()[:, :, 1]
+    np.testing.assert_allclose(swarm.pos, planned, atol=5e-3)
+    aligned = start == 0
+    np.testing.assert_allclose(swarm.pos[aligned], swarm.plans[..., 1, :3][aligned], atol=1e-3)
+
+
+def test_substeps_find_what_passes_between_steps():
+    coarse, fine = make_swarm(4), make_swarm(4, substeps=20)
+    requests = np.zeros((4, 4, 3), bool)
+    closest = []
+    for swarm in (coarse, fine):
+        reports = [swarm.step(requests) for _ in range(40)]
+        closest.append(np.min([report.min_separation_continuous for report in reports], axis=0))
+        assert all((r.min_separation_continuous <= r.min_separation + 1e-12).all() for r in reports)
+    np.testing.assert_allclose(*closest, atol=0.05)
+
+
+def test_robots_see_estimates_and_not_the_truth():
+    swarm = make_swarm(2, sensing={"pos": 0.05, "others_pos": 0.05})
+    fly(swarm, 3)
+    others = swarm.beliefs.others
+    estimate, (seen, _) = swarm.estimate(), swarm.observe()
+    assert np.abs(estimate[..., :3] - swarm.pos).max() > 0.02
+    assert np.abs(seen - swarm.pos[:, others]).max() > 0.02
+    assert np.abs(seen - estimate[:, others, :3]).max() > 0.02, "observers err each in its own way"
+    asked = []
+    plan = swarm.planner.plan
+    swarm.planner.plan = lambda problems, last: asked.append(problems) or plan(problems, last)
+    swarm.step(np.zeros((2, 4, 3), bool))
+    assert np.array_equal(asked[0].x.reshape(2, 4, 9), estimate)
