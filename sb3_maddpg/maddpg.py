@@ -68,6 +68,8 @@ NOT_BUFFER_KWARGS = {
     "optimize_memory_usage",
     "args",
 }
+# Arguments of replay buffers that are the algorithm's too
+OWN_BUFFER_KWARGS = ("n_steps", "gamma")
 # Arguments that a model for a team of another size does not take over
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
 # Of the actions that ``expected`` looks at in one update; the critics' layers take as much again, or more
@@ -194,7 +196,7 @@ class MADDPG(OffPolicyAlgorithm):
             seed=seed,
             device=device,
         )
-        for name in ("n_steps", "gamma"):
+        for name in OWN_BUFFER_KWARGS:
             if replay_buffer_kwargs and name in replay_buffer_kwargs:
                 raise ValueError(f"replay_buffer_kwargs[{name!r}] is the algorithm's own: give it {name} itself.")
         super().__init__(
@@ -634,6 +636,10 @@ class MADDPG(OffPolicyAlgorithm):
         with remedy_for_other_observations():
             resized.set_parameters(self.get_parameters())  # type: ignore[arg-type]
         return resized
+        if "replay_buffer_class" not in kwargs:
+            of_team = (*OWN_BUFFER_KWARGS, "n_pairs")
+            buffer = {key: value for key, value in self.replay_buffer_kwargs.items() if key not in of_team}
+            arguments["replay_buffer_kwargs"] = buffer
 
     def _resizable_policy(self) -> PairPolicy:
         if not isinstance(self.policy, PairPolicy):

@@ -16,6 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
 from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
+from sb3_maddpg.callbacks import MetricsCallback
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.team_tasks import BINARY_TASKS, FollowTarget, OwnBit
@@ -329,6 +331,10 @@ def test_a_model_for_a_team_of_another_size_has_its_networks_and_arguments():
     assert np.array_equal(parameters(large), parameters(small))
     assert large.critic.optimizer.state_dict()["state"][0]["step"] == small._n_updates
     large.learn(40)
+    buffer = {"replay_buffer_class": PrioritizedTeamReplayBuffer, "replay_buffer_kwargs": {"alpha": 0.5}}
+    prioritized = MADDPG("PairPolicy", Neighbours(3), **SMALL, **buffer)
+    assert prioritized.resized(Neighbours(5)).replay_buffer.alpha == 0.5
+    assert type(prioritized.resized(Neighbours(5), replay_buffer_class=None).replay_buffer) is TeamReplayBuffer
     with pytest.raises(ValueError, match="fits one size of team"):
         learned().resized(OwnBit())
 
