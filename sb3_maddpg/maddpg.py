@@ -51,7 +51,7 @@ from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
+from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, shown, suggest
 from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TrainingArguments, validated
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
@@ -183,7 +183,7 @@ class MADDPG(OffPolicyAlgorithm):
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise ValueError(suggest("policy", policy, self.policy_aliases))
         if not isinstance(policy, (str, type)):
-            raise ValueError(f"policy={str(policy)[:100]} is neither MlpPolicy, PairPolicy nor a class of policies.")
+            raise ValueError(f"policy={shown(policy)} is neither MlpPolicy, PairPolicy nor a class of policies.")
         if env is None and _init_setup_model:
             raise ValueError("env=None: give an environment, or the id of one.")
         given = validated(
@@ -357,10 +357,10 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_replay_buffer_arguments(self) -> None:
         buffer = self.replay_buffer_class
         if isinstance(buffer, str):
-            raise ValueError(f"replay_buffer_class={buffer!r} is a name, which only recipes know: give the class.")
+            raise ValueError(f"replay_buffer_class={shown(buffer)} is a name, which only recipes know: give the class.")
         if buffer is not None and not isinstance(buffer, type):
             raise ValueError(
-                f"replay_buffer_class={buffer!r} is no class: give TeamReplayBuffer or one derived from it."
+                f"replay_buffer_class={shown(buffer)} is no class: give TeamReplayBuffer or one derived from it."
             )
         if buffer is not None and not issubclass(buffer, TeamReplayBuffer):
             raise ValueError(
@@ -859,7 +859,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
         raise ValueError(
-            f"env={str(env)[:100]} is no environment: give a PettingZoo or Gymnasium environment, or a VecEnv of "
+            f"env={shown(env)} is no environment: give a PettingZoo or Gymnasium environment, or a VecEnv of "
             "Stable-Baselines3."
         )
     if isinstance(env, (ParallelEnv, AECEnv)):

@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar
 import pydantic
 import pydantic.dataclasses
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -117,7 +117,7 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         return ValueError(f"{told}.")  # from `__post_init__`, which names the fields that do not go together
     if errors[0]["type"] == "missing":  # of a tuple
         name, told = name.rpartition(".")[0], "it has too few entries"
-    return ValueError(f"{name}={value!r}: {told}.")
+    return ValueError(f"{name}={shown(value)}: {told}.")
 
 
 def _told(message: str) -> str:
