@@ -22,13 +22,20 @@ F = TypeVar("F", bound=Callable[..., Any])
 _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
+# Beyond these (m) nothing flies, and squares lose their meaning before they overflow.
+_FARTHEST = 1e4
+Length = Annotated[float, pydantic.Field(ge=0, le=_FARTHEST)]
+PositiveLength = Annotated[float, pydantic.Field(gt=0, le=_FARTHEST)]
+Coordinate = Annotated[float, pydantic.Field(ge=-_FARTHEST, le=_FARTHEST)]
+
+
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] > pair[1]:
         raise ValueError("it must be lowest first, highest second")
     return pair
 
 
-Range = Annotated[tuple[float, float], pydantic.AfterValidator(_ascending)]
+Range = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ascending)]
 
 
 def checked(cls: type[T]) -> type[T]:

@@ -7,10 +7,21 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import casadi as ca
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic_core import PydanticCustomError
 
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
-from quad_swarm.validation import checked
+from quad_swarm.validation import PositiveLength, checked
+
+# Outside these, squares leave the range of numbers, and a solver may never come to an end.
+_TINIEST = 1e-6
+_Rate = Annotated[float, Field(ge=_TINIEST, le=1e4)]
+
+
+def _not_tiny(rate: float) -> float:
+    if 0 < rate < _TINIEST:
+        raise PydanticCustomError("tiny", f"it must be 0, or at least {_TINIEST:f}")
+    return rate
 
 
 @checked
@@ -40,12 +51,12 @@ class PlannerConfig:
     :raises ValueError: a value that is not finite or out of its range, or an empty workspace
     """
 
-    horizon: Annotated[int, Field(ge=2)] = 10
+    horizon: Annotated[int, Field(ge=2, le=1000)] = 10
     dt: PositiveFloat = 0.1
-    separation: PositiveFloat = 0.6
-    max_tilt: Annotated[float, Field(gt=0, lt=math.pi / 2)] = math.radians(12.0)
-    max_climb_rate: PositiveFloat = 1.0
-    max_yaw_rate: NonNegativeFloat = 0.0
+    separation: PositiveLength = 0.6
+    max_tilt: Annotated[float, Field(ge=_TINIEST, lt=math.pi / 2)] = math.radians(12.0)
+    max_climb_rate: _Rate = 1.0
+    max_yaw_rate: Annotated[float, Field(ge=0, le=1e4), AfterValidator(_not_tiny)] = 0.0
     max_speed: PositiveFloat = 4.0
     max_vertical_speed: PositiveFloat = 1.5
     workspace_low: tuple[float, float, float] = (-4.8, -4.8, 0.48)
