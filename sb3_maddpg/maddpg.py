@@ -74,6 +74,8 @@ OWN_BUFFER_KWARGS = ("n_steps", "gamma")
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
 # Of the actions that ``expected`` looks at in one update; the critics' layers take as much again, or more
 MOST_BYTES_OF_ALTERNATIVES = 4 * 2**30
+# What PyTorch and NumPy say of arrays that no machine can hold, beside MemoryError
+NO_MEMORY = ("allocate memory", "out of memory", "Storage size", "dimension exceeded", "array is too big")
 
 
 class MADDPG(OffPolicyAlgorithm):
@@ -217,7 +219,7 @@ class MADDPG(OffPolicyAlgorithm):
             n_steps=n_steps,
             policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=given["stats_window_size"],
-            tensorboard_log=tensorboard_log,
+            tensorboard_log=None if tensorboard_log is None else str(given["tensorboard_log"]),
             verbose=given["verbose"],
             device=device,
             seed=given["seed"],
@@ -264,8 +266,11 @@ class MADDPG(OffPolicyAlgorithm):
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": n_steps, "gamma": self.gamma}
         try:
             super()._setup_model()
-        except MemoryError as error:
-            raise ValueError(f"buffer_size={buffer_size} or the networks need too much memory: {error}") from error
+        except (MemoryError, RuntimeError, ValueError) as error:
+            text = " ".join(str(error).split())[:200]
+            if not isinstance(error, MemoryError) and not any(words in text for words in NO_MEMORY):
+                raise
+            raise ValueError(f"buffer_size={buffer_size} or the networks need too much memory: {text}") from error
         finally:
             self.n_steps, self.buffer_size = n_steps, buffer_size
         self._create_aliases()
@@ -631,15 +636,15 @@ class MADDPG(OffPolicyAlgorithm):
             name: getattr(self, name) for name in arguments_of(type(self)) - NOT_RESIZED if hasattr(self, name)
         }
         own = {key: value for key, value in self.policy_kwargs.items() if key not in PairPolicy.env_attributes}
+        if "replay_buffer_class" not in kwargs:
+            of_team = (*OWN_BUFFER_KWARGS, "n_pairs")
+            buffer = {key: value for key, value in self.replay_buffer_kwargs.items() if key not in of_team}
+            arguments["replay_buffer_kwargs"] = buffer
         arguments |= {"policy_kwargs": own, "device": self.device, **kwargs}
         resized = type(self)(arguments.pop("policy", type(policy)), vec_env, **arguments)
         with remedy_for_other_observations():
             resized.set_parameters(self.get_parameters())  # type: ignore[arg-type]
         return resized
-        if "replay_buffer_class" not in kwargs:
-            of_team = (*OWN_BUFFER_KWARGS, "n_pairs")
-            buffer = {key: value for key, value in self.replay_buffer_kwargs.items() if key not in of_team}
-            arguments["replay_buffer_kwargs"] = buffer
 
     def _resizable_policy(self) -> PairPolicy:
         if not isinstance(self.policy, PairPolicy):
@@ -657,15 +662,15 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> SelfMADDPG:
         given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
         super().learn(
-            total_timesteps=total_timesteps,
+            total_timesteps=math.ceil(given["total_timesteps"]),
             callback=given["callback"],
-            log_interval=log_interval,
+            log_interval=given["log_interval"],
             tb_log_name=tb_log_name,
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
         # Episodes since the last of SB3's tables, all of them in a short training
-        if log_interval and self._episode_num % log_interval:
+        if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
         return self
 
