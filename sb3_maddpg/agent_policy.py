@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_maddpg.actions import ActionKind, Categorical, Continuous, make_kinds
 from sb3_maddpg.team import AgentActionSpace
-from sb3_maddpg.utils import atomic_write
+from sb3_maddpg.utils import as_numbers, atomic_write, shown
 
 if TYPE_CHECKING:
     from sb3_maddpg.policies import MADDPGPolicy
@@ -97,11 +97,9 @@ class AgentPolicy(nn.Module):
         :raises ValueError: another length, NaN or infinity
         """
         try:
-            obs = th.as_tensor(np.asarray(observation, dtype=np.float32))
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"The observation of {self.name} is no array of numbers: {' '.join(repr(observation).split())[:100]}"
-            ) from None
+            obs = th.as_tensor(as_numbers(observation))
+        except ValueError:
+            raise ValueError(f"The observation of {self.name} is no array of numbers: {shown(observation)}") from None
         if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
             raise ValueError(f"An observation of {self.name} has length {self.obs_dim}, not shape {tuple(obs.shape)}.")
         if not obs.isfinite().all():
@@ -123,7 +121,7 @@ class AgentPolicy(nn.Module):
         :raises ValueError: a parameter is not finite
         """
         if not isinstance(path, (str, os.PathLike)):
-            raise ValueError(f"{path!r} is no path of a file.")
+            raise ValueError(f"{shown(path)} is no path of a file.")
         for name, parameter in self.named_parameters():
             if not parameter.isfinite().all():
                 raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")

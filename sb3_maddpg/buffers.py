@@ -96,7 +96,8 @@ class TeamReplayBuffer(ReplayBuffer):
     :param action_space: flat joint action space
     :param device: PyTorch device
     :param n_envs: number of parallel environments
-    :param optimize_memory_usage: see SB3's ``ReplayBuffer``, only with ``n_steps=1``
+    :param optimize_memory_usage: see SB3's ``ReplayBuffer``, only with ``n_steps=1`` and
+        ``handle_timeout_termination=False``
     :param handle_timeout_termination: see SB3's ``ReplayBuffer``
     :param n_steps: how many rewards to sum before the value of the next observation is used
     :param gamma: discount factor
@@ -123,6 +124,7 @@ class TeamReplayBuffer(ReplayBuffer):
             buffer_size=buffer_size,
             n_envs=n_envs,
             optimize_memory_usage=optimize_memory_usage,
+            handle_timeout_termination=handle_timeout_termination,
             n_steps=n_steps,
             gamma=gamma,
             n_pairs=n_pairs,
@@ -136,11 +138,16 @@ class TeamReplayBuffer(ReplayBuffer):
                 f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not "
                 "keep where an episode ends. Set n_steps=1 or optimize_memory_usage=False."
             )
+        if arguments["optimize_memory_usage"] and arguments["handle_timeout_termination"]:
+            raise ValueError(
+                "optimize_memory_usage=True forgets the last observation of an episode that a time limit ends. Set it "
+                "to False, or give handle_timeout_termination=False (in replay_buffer_kwargs) to learn as if such ends "
+                "were real."
+            )
         super().__init__(
             observation_space=observation_space,
             action_space=action_space,
             device=device,
-            handle_timeout_termination=handle_timeout_termination,
             **arguments,
         )
         self.all_active = True

@@ -8,7 +8,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, HParam, Logger, TensorBoardOutputFormat
 
-from sb3_maddpg.utils import arguments_of
+from sb3_maddpg.utils import arguments_of, shown
 from sb3_maddpg.validation import CurriculumArguments, validated
 
 # What a text log cannot show
@@ -28,7 +28,7 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
             try:
                 number = float(value)
             except (TypeError, ValueError):
-                raise ValueError(f"info['metrics'][{name!r}] is {value!r}: a metric must be a number.") from None
+                raise ValueError(f"info['metrics'][{name!r}] is {shown(value)}: a metric must be a number.") from None
             logger.record_mean(name, number)
 
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.relational import NeighbourViews
 from sb3_maddpg.team import Team, TeamInfo
-from sb3_maddpg.utils import all_finite, not_finite_at, suggest
+from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
 
 _FLAGS = ("agent_terminated", "agent_active")
 
@@ -32,7 +32,7 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     if not isinstance(env, gymnasium.Env):
-        raise ValueError(f"{env!r} is neither a Gymnasium environment nor a PettingZoo ParallelEnv.")
+        raise ValueError(f"{shown(env)} is neither a Gymnasium environment nor a PettingZoo ParallelEnv.")
     names = env.get_wrapper_attr("agent_names") if env.has_wrapper_attr("agent_names") else None
     team = Team.from_spaces(env.observation_space, env.action_space, names)
     try:
@@ -55,7 +55,7 @@ def _check_attributes(env: gymnasium.Env, team: Team) -> None:
     if all(curriculum):
         levels = env.get_wrapper_attr("n_curriculum_levels")
         if not isinstance(levels, (int, np.integer)) or levels < 1:
-            raise ValueError(f"n_curriculum_levels={levels!r} must be an integer of at least 1.")
+            raise ValueError(f"n_curriculum_levels={shown(levels)} must be an integer of at least 1.")
         if not callable(env.get_wrapper_attr("set_curriculum_level")):
             raise ValueError("set_curriculum_level must be a method that takes the level.")
     if env.has_wrapper_attr("observation_layout"):
@@ -100,7 +100,7 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
         shape = value.shape[:1] if name == "pair_rewards" and value.ndim == 2 else value.shape
         if shape != (team.n_agents,) or value.dtype.kind not in "biuf":
             raise ValueError(
-                f"info['{name}'] {where} is {info[name]!r}: it must hold a number for each of the {team.n_agents} "
+                f"info['{name}'] {where} is {shown(info[name])}: it must hold a number for each of the {team.n_agents} "
                 f"agents{' and each of its neighbours' if name == 'pair_rewards' else ''}."
             )
         if (index := not_finite_at(value)) is not None:
@@ -109,7 +109,7 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
             raise ValueError(f"info['{name}'] {where} is {value.tolist()}: it must hold True or False for each agent.")
     metrics = info.get("metrics", {})
     if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
-        raise ValueError(f"info['metrics'] {where} is {metrics!r}: it must be a flat dict of numbers.")
+        raise ValueError(f"info['metrics'] {where} is {shown(metrics)}: it must be a flat dict of numbers.")
 
 
 def _is_number(value: Any) -> bool:

@@ -51,7 +51,7 @@ from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
+from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, shown, suggest
 from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TrainingArguments, validated
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
@@ -68,10 +68,14 @@ NOT_BUFFER_KWARGS = {
     "optimize_memory_usage",
     "args",
 }
+# Arguments of replay buffers that are the algorithm's too
+OWN_BUFFER_KWARGS = ("n_steps", "gamma")
 # Arguments that a model for a team of another size does not take over
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
 # Of the actions that ``expected`` looks at in one update; the critics' layers take as much again, or more
 MOST_BYTES_OF_ALTERNATIVES = 4 * 2**30
+# What PyTorch and NumPy say of arrays that no machine can hold, beside MemoryError
+NO_MEMORY = ("allocate memory", "out of memory", "Storage size", "dimension exceeded", "array is too big")
 
 
 class MADDPG(OffPolicyAlgorithm):
@@ -181,7 +185,7 @@ class MADDPG(OffPolicyAlgorithm):
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise ValueError(suggest("policy", policy, self.policy_aliases))
         if not isinstance(policy, (str, type)):
-            raise ValueError(f"policy={str(policy)[:100]} is neither MlpPolicy, PairPolicy nor a class of policies.")
+            raise ValueError(f"policy={shown(policy)} is neither MlpPolicy, PairPolicy nor a class of policies.")
         if env is None and _init_setup_model:
             raise ValueError("env=None: give an environment, or the id of one.")
         given = validated(
@@ -194,7 +198,7 @@ class MADDPG(OffPolicyAlgorithm):
             seed=seed,
             device=device,
         )
-        for name in ("n_steps", "gamma"):
+        for name in OWN_BUFFER_KWARGS:
             if replay_buffer_kwargs and name in replay_buffer_kwargs:
                 raise ValueError(f"replay_buffer_kwargs[{name!r}] is the algorithm's own: give it {name} itself.")
         super().__init__(
@@ -215,7 +219,7 @@ class MADDPG(OffPolicyAlgorithm):
             n_steps=n_steps,
             policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=given["stats_window_size"],
-            tensorboard_log=tensorboard_log,
+            tensorboard_log=None if tensorboard_log is None else str(given["tensorboard_log"]),
             verbose=given["verbose"],
             device=device,
             seed=given["seed"],
@@ -262,8 +266,11 @@ class MADDPG(OffPolicyAlgorithm):
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": n_steps, "gamma": self.gamma}
         try:
             super()._setup_model()
-        except MemoryError as error:
-            raise ValueError(f"buffer_size={buffer_size} or the networks need too much memory: {error}") from error
+        except (MemoryError, RuntimeError, ValueError) as error:
+            text = " ".join(str(error).split())[:200]
+            if not isinstance(error, MemoryError) and not any(words in text for words in NO_MEMORY):
+                raise
+            raise ValueError(f"buffer_size={buffer_size} or the networks need too much memory: {text}") from error
         finally:
             self.n_steps, self.buffer_size = n_steps, buffer_size
         self._create_aliases()
@@ -355,10 +362,10 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_replay_buffer_arguments(self) -> None:
         buffer = self.replay_buffer_class
         if isinstance(buffer, str):
-            raise ValueError(f"replay_buffer_class={buffer!r} is a name, which only recipes know: give the class.")
+            raise ValueError(f"replay_buffer_class={shown(buffer)} is a name, which only recipes know: give the class.")
         if buffer is not None and not isinstance(buffer, type):
             raise ValueError(
-                f"replay_buffer_class={buffer!r} is no class: give TeamReplayBuffer or one derived from it."
+                f"replay_buffer_class={shown(buffer)} is no class: give TeamReplayBuffer or one derived from it."
             )
         if buffer is not None and not issubclass(buffer, TeamReplayBuffer):
             raise ValueError(
@@ -629,6 +636,10 @@ class MADDPG(OffPolicyAlgorithm):
             name: getattr(self, name) for name in arguments_of(type(self)) - NOT_RESIZED if hasattr(self, name)
         }
         own = {key: value for key, value in self.policy_kwargs.items() if key not in PairPolicy.env_attributes}
+        if "replay_buffer_class" not in kwargs:
+            of_team = (*OWN_BUFFER_KWARGS, "n_pairs")
+            buffer = {key: value for key, value in self.replay_buffer_kwargs.items() if key not in of_team}
+            arguments["replay_buffer_kwargs"] = buffer
         arguments |= {"policy_kwargs": own, "device": self.device, **kwargs}
         resized = type(self)(arguments.pop("policy", type(policy)), vec_env, **arguments)
         with remedy_for_other_observations():
@@ -651,15 +662,15 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> SelfMADDPG:
         given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
         super().learn(
-            total_timesteps=total_timesteps,
+            total_timesteps=math.ceil(given["total_timesteps"]),
             callback=given["callback"],
-            log_interval=log_interval,
+            log_interval=given["log_interval"],
             tb_log_name=tb_log_name,
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
         # Episodes since the last of SB3's tables, all of them in a short training
-        if log_interval and self._episode_num % log_interval:
+        if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
         return self
 
@@ -853,7 +864,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
         raise ValueError(
-            f"env={str(env)[:100]} is no environment: give a PettingZoo or Gymnasium environment, or a VecEnv of "
+            f"env={shown(env)} is no environment: give a PettingZoo or Gymnasium environment, or a VecEnv of "
             "Stable-Baselines3."
         )
     if isinstance(env, (ParallelEnv, AECEnv)):

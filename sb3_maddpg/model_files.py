@@ -17,6 +17,8 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.save_util import open_path
 
+from sb3_maddpg.utils import shown
+
 # Raised whenever an older model's networks would be read wrongly
 FILE_FORMAT = 2
 # Attributes in files that are neither arguments, which have their checks, nor made anew
@@ -47,7 +49,7 @@ def check_path(path: Any) -> None:
     :raises ValueError: it is neither
     """
     if not (isinstance(path, (str, os.PathLike)) or hasattr(path, "read")):
-        raise ValueError(f"{path!r} is neither a path nor a file.")
+        raise ValueError(f"{shown(path)} is neither a path nor a file.")
 
 
 def check_file(path: str | pathlib.Path | io.BufferedIOBase, algorithm: str, readable: set[str]) -> None:
@@ -123,7 +125,7 @@ def check_attributes(model: Any, path: Any) -> None:
             elif isinstance(value, int):
                 fits = fits and value >= 0
             if not fits:
-                raise ValueError(f"{path} is damaged: its {name} is {value!r}.")
+                raise ValueError(f"{path} is damaged: its {name} is {shown(value)}.")
 
 
 def optimizer_problem(state: Mapping[str, Any], present: th.optim.Optimizer) -> str | None:
@@ -141,7 +143,7 @@ def optimizer_problem(state: Mapping[str, Any], present: th.optim.Optimizer) -> 
                     return f"has a {name} that does not fit a parameter of shape {tuple(parameter.shape)}"
         for name, default in present.defaults.items():
             if name != "lr" and type(given.get(name, default)) is not type(default):
-                return f"has {name}={given[name]!r}"
+                return f"has {name}={shown(given[name])}"
     return None
 
 

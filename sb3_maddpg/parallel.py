@@ -16,7 +16,7 @@ from gymnasium.spaces.utils import flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint_action_space
-from sb3_maddpg.utils import as_seed, not_finite_at
+from sb3_maddpg.utils import as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
 
@@ -218,19 +218,19 @@ class TeamEnv(gymnasium.Env):
             names = ["observations", "rewards", "terminations", "truncations", "infos"]
         if not isinstance(returned, (tuple, list)) or len(returned) != len(names):
             raise ValueError(
-                f"{method}() of {self.parallel_env} returned {_short(returned)}: it must return ({', '.join(names)})."
+                f"{method}() of {self.parallel_env} returned {shown(returned)}: it must return ({', '.join(names)})."
             )
         for name, part in zip(names, returned, strict=True):
             if type(part) is not dict and not isinstance(part, Mapping) and not (part is None and name == "infos"):
                 raise ValueError(
-                    f"{method}() of {self.parallel_env} gave {_short(part)} as {name} {self._when}: it must give a "
+                    f"{method}() of {self.parallel_env} gave {shown(part)} as {name} {self._when}: it must give a "
                     "dict with an entry for each agent."
                 )
         *others, infos = returned
         for agent, info in (infos or {}).items():
             if type(info) is not dict and info is not None and not isinstance(info, Mapping):
                 raise ValueError(
-                    f"{method}() of {self.parallel_env} gave {_short(info)} as info of agent {agent!r} {self._when}: "
+                    f"{method}() of {self.parallel_env} gave {shown(info)} as info of agent {agent!r} {self._when}: "
                     "it must be a dict."
                 )
         return *others, infos or {}
@@ -241,7 +241,7 @@ class TeamEnv(gymnasium.Env):
             return set(agents)  # type: ignore[arg-type]
         except TypeError:
             raise ValueError(
-                f"`agents` of {self.parallel_env} is {_short(agents)} {self._when}: it must be the list of agents that "
+                f"`agents` of {self.parallel_env} is {shown(agents)} {self._when}: it must be the list of agents that "
                 "are taking part."
             ) from None
 
@@ -250,7 +250,7 @@ class TeamEnv(gymnasium.Env):
             with suppress(TypeError, ValueError, OverflowError):
                 return float(reward)
         raise ValueError(
-            f"{self.parallel_env} gave a reward of {_short(reward)} for agent {agent!r} {self._when}: a reward must be "
+            f"{self.parallel_env} gave a reward of {shown(reward)} for agent {agent!r} {self._when}: a reward must be "
             "a number."
         )
 
@@ -258,7 +258,7 @@ class TeamEnv(gymnasium.Env):
         if isinstance(value, (bool, np.bool_, int, np.integer)) or getattr(value, "shape", None) == ():
             return bool(value)
         raise ValueError(
-            f"{self.parallel_env} gave {_short(value)} as {name} of agent {agent!r} {self._when}: it must be True or "
+            f"{self.parallel_env} gave {shown(value)} as {name} of agent {agent!r} {self._when}: it must be True or "
             "False."
         )
 
@@ -326,7 +326,7 @@ class TeamEnv(gymnasium.Env):
                 fits = False
             if not fits:
                 shape = getattr(observation, "shape", None)
-                what = f"is {_short(observation)}" if shape in (None, space.shape) else f"has shape {shape}"
+                what = f"is {shown(observation)}" if shape in (None, space.shape) else f"has shape {shape}"
                 raise ValueError(
                     f"The observation of agent {agent!r} {what}, but its space is {space} ({self._when} of "
                     f"{self.parallel_env})."
@@ -403,11 +403,6 @@ def _agent_infos(infos: Mapping[Any, Any]) -> dict[str, Any]:
     return {"agent_infos": {str(agent): info for agent, info in infos.items() if info}}
 
 
-def _short(value: Any, length: int = 80) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= length else f"{text[:length]}..."
-
-
 def _fits(space: spaces.Space, value: Any) -> bool:
     """Whether a value has the space's structure, shapes and categories. Unlike ``contains`` it takes any data type."""
     if isinstance(space, spaces.Box):
@@ -435,7 +430,7 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
             "pettingzoo.utils.conversions.aec_to_parallel, or take its parallel_env."
         )
     if not isinstance(env, ParallelEnv):
-        raise ValueError(f"{env!r} is no PettingZoo ParallelEnv.")
+        raise ValueError(f"{shown(env)} is no PettingZoo ParallelEnv.")
     agents = getattr(env, "possible_agents", None) or ()
     agents = tuple(agents) if isinstance(agents, Iterable) else ()
     if not agents:
@@ -460,7 +455,7 @@ def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:
             "agent in possible_agents."
         ) from error
     if not isinstance(space, spaces.Space):
-        raise ValueError(f"{kind}({agent!r}) of {env} is {_short(space)}: it must be a Gymnasium space.")
+        raise ValueError(f"{kind}({agent!r}) of {env} is {shown(space)}: it must be a Gymnasium space.")
     return space
 
 
@@ -534,7 +529,9 @@ def _wrappers(wrappers: Iterable[str | Mapping[str, Any]] | None) -> list[tuple[
         elif isinstance(wrapper, Mapping):
             pairs.extend((path, dict(arguments or {})) for path, arguments in wrapper.items())
         else:
-            raise ValueError(f"wrappers: {wrapper!r} is neither a dotted path nor a dict from one to its arguments.")
+            raise ValueError(
+                f"wrappers: {shown(wrapper)} is neither a dotted path nor a dict from one to its arguments."
+            )
     return pairs
 
 

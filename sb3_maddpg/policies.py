@@ -17,7 +17,7 @@ from torch import nn
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.networks import StackedMLP
 from sb3_maddpg.team import MixedActions, Team
-from sb3_maddpg.utils import all_finite
+from sb3_maddpg.utils import all_finite, as_numbers, shown
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
 
 Sharing = bool | Sequence[Sequence[str | int]]
@@ -39,7 +39,7 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
             lists = [[team.index(agent) for agent in agents] for agents in share]
         except TypeError:
             raise ValueError(
-                f"{argument}={share!r} must be True, False or lists of agents that share a network."
+                f"{argument}={shown(share)} must be True, False or lists of agents that share a network."
             ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
@@ -481,15 +481,14 @@ class MADDPGPolicy(BasePolicy):
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         try:
-            numbers = np.asarray(observation, np.float32)
-        except (TypeError, ValueError):
-            got, shape = " ".join(repr(observation).split())[:100], self.observation_space.shape
+            numbers = as_numbers(observation)
+        except ValueError:
             raise ValueError(
-                f"observation={got} is no array of numbers of shape {shape}, or several of them."
+                f"observation={shown(observation)} is no array of numbers of shape {self.observation_space.shape}, or "
+                "several of them."
             ) from None
         self.check_finite(numbers)
-        observation = observation if isinstance(observation, np.ndarray) else numbers
-        return super().obs_to_tensor(observation)
+        return super().obs_to_tensor(numbers)
 
     def check_finite(self, observation: np.ndarray) -> None:
         """

@@ -12,6 +12,8 @@ from typing import Any, Literal, Protocol, TypedDict
 import numpy as np
 from gymnasium import spaces
 
+from sb3_maddpg.utils import shown
+
 AgentActionSpace = spaces.MultiBinary | spaces.Box | spaces.Discrete | spaces.MultiDiscrete
 ACTION_SPACES = (spaces.MultiBinary, spaces.Box, spaces.Discrete, spaces.MultiDiscrete)
 
@@ -248,7 +250,7 @@ class Team:
         if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and 0 <= agent < self.n_agents:
             return int(agent)
         raise ValueError(
-            f"There is no agent {agent!r}: the agents are {', '.join(self.names)}, or 0 to {self.n_agents - 1}."
+            f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}, or 0 to {self.n_agents - 1}."
         )
 
     def homogeneous(self, agent: int, other: int) -> bool:

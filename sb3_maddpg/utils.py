@@ -24,7 +24,20 @@ NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"
 LEFT_OVER_SECONDS = 3600
 
 
-def suggest(kind: str, name: str, known: Iterable[str]) -> str:
+def shown(value: Any, most: int = 200) -> str:
+    """
+    :param value: any, as it was given
+    :param most: number of characters
+    :return: the value as Python writes it, for a message: in one line, and shortened where it is long
+    """
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # of an object of somebody else's, or of an integer of too many digits for Python
+        text = f"<{type(value).__name__}>"
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 3) :]}"
+
+
+def suggest(kind: str, name: Any, known: Iterable[str]) -> str:
     """
     Message for a name that is not known, with the nearest one that is.
 
@@ -32,11 +45,11 @@ def suggest(kind: str, name: str, known: Iterable[str]) -> str:
     :param name: the name that was given
     :param known: the names that exist
     """
-    known, name = sorted(known), str(name)
+    known, name = sorted(known), name if isinstance(name, str) else shown(name)
     nearest = difflib.get_close_matches(name, known, n=1)
     if nearest:
-        return f"Unknown {kind} '{name}': did you mean '{nearest[0]}'?"
-    return f"Unknown {kind} '{name}'. There are: {', '.join(known)}."
+        return f"Unknown {kind} '{name[:100]}': did you mean '{nearest[0]}'?"
+    return f"Unknown {kind} '{name[:100]}'. There are: {', '.join(known)}."
 
 
 def describe_env(env: VecEnv) -> dict[str, Any] | None:
@@ -72,7 +85,7 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
     target = Path(path)
     if not target.suffix:
         target = Path(f"{target}.{suffix}")
-    if target.is_dir():
+    if target.is_dir() or Path(path).name in ("", ".."):
         raise IsADirectoryError(errno.EISDIR, "This is a folder: name a file in it", str(target))
     # In the same folder, because a file cannot be renamed across file systems
     temporary = target.with_name(f".{target.name}.{os.getpid()}")
@@ -171,6 +184,22 @@ def not_finite_at(values: np.ndarray) -> tuple[int, ...] | None:
         return tuple(np.argwhere(~np.isfinite(values.astype(np.float32)))[0].tolist())
 
 
+def as_numbers(values: Any) -> np.ndarray:
+    """
+    :param values: array-like of real numbers
+    :return: in single precision
+    :raises ValueError: anything else
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "biufO":
+        raise ValueError("no real numbers")
+    try:
+        with np.errstate(over="ignore"):
+            return array.astype(np.float32)
+    except (TypeError, OverflowError):
+        raise ValueError("no real numbers") from None
+
+
 def as_seed(seed: Any) -> int | None:
     """
     :param seed: None, or an integer of any type
@@ -184,5 +213,5 @@ def as_seed(seed: Any) -> int | None:
     except TypeError:
         number = -1
     if number < 0:
-        raise ValueError(f"seed={seed!r} must be an integer of at least 0, or None.")
+        raise ValueError(f"seed={shown(seed)} must be an integer of at least 0, or None.")
     return number

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch as th
@@ -15,11 +15,16 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
+from sb3_maddpg.utils import shown, suggest
+
 AtLeastZero = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 # Beyond these a price is 0, or infinite, in single precision
 Price = Annotated[float, Field(ge=1e-12, le=1e12)]
-Widths = list[Annotated[int, Field(ge=1)]]
+LARGEST = 2**63  # beyond it integers fit no array
+Natural = Annotated[int, Field(ge=1, lt=LARGEST)]
+NaturalOrZero = Annotated[int, Field(ge=0, lt=LARGEST)]
+Widths = list[Natural]
 Schedule = Callable[[float], float]
 
 
@@ -49,7 +54,7 @@ class RunArguments(Arguments):
     policy_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by their names, or None")
     stats_window_size: int = Field(ge=1, le=10**9, description="a number of episodes, at least 1")
     tensorboard_log: str | Path | None = Field(description="a folder, or None")
-    verbose: int = Field(ge=0, description="0, 1 or 2")
+    verbose: NaturalOrZero = Field(description="0, 1 or 2")
     seed: int | None = Field(ge=0, lt=2**32, description="an integer from 0 to 2**32 - 1, or None")
     device: Annotated[Any, AfterValidator(_device)] = Field(
         description='"auto", "cpu", or another device of PyTorch that this machine has'
@@ -59,11 +64,18 @@ class RunArguments(Arguments):
 class LearnArguments(Arguments):
     """Of ``learn``."""
 
-    total_timesteps: float = Field(ge=0, description="a finite number of steps of at least 0")
+    total_timesteps: float = Field(ge=0, lt=LARGEST, description="a finite number of steps of at least 0")
     callback: InstanceOf[BaseCallback] | list[InstanceOf[BaseCallback]] | Callable[..., Any] | None = Field(
-        description="a callback of Stable-Baselines3, a list of them, a function, or None"
+        description="a callback of Stable-Baselines3, a list of them, a function (but no class), or None"
     )
     log_interval: int | None = Field(description="a number of episodes, or None")
+
+    @field_validator("callback")
+    @classmethod
+    def _made(cls, callback: Any) -> Any:
+        if isinstance(callback, type):
+            raise ValueError
+        return callback
 
 
 class TrainingArguments(Arguments):
@@ -73,18 +85,20 @@ class TrainingArguments(Arguments):
     learning_rate: Annotated[float, Field(ge=0)] | Schedule = Field(
         description="a finite number that is not negative, or a schedule"
     )
-    buffer_size: int = Field(ge=1, description="a number of transitions, at least 1")
-    learning_starts: int = Field(ge=0, description="a number of steps, at least 0")
-    batch_size: int = Field(ge=1, description="a number of transitions, at least 1")
+    buffer_size: Natural = Field(description="a number of transitions, at least 1")
+    learning_starts: NaturalOrZero = Field(description="a number of steps, at least 0")
+    batch_size: Natural = Field(description="a number of transitions, at least 1")
     tau: float = Field(gt=0, le=1, description="a number between 0 and 1, and not 0")
     gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
-    train_freq: InstanceOf[TrainFreq] | Annotated[int, Field(ge=1)] | tuple[Annotated[int, Field(ge=1)], str] = Field(
+    train_freq: InstanceOf[TrainFreq] | Natural | tuple[Natural, Literal["step", "episode"]] = Field(
         description='at least 1, or such a number with its unit, (1, "step") or (1, "episode")'
     )
-    gradient_steps: int = Field(ge=-1, description="a number of steps, or -1 for as many as environment steps")
+    gradient_steps: Annotated[int, Field(ge=-1, lt=LARGEST)] = Field(
+        description="a number of steps, or -1 for as many as environment steps"
+    )
     action_noise: InstanceOf[ActionNoise] | None = Field(description="an ActionNoise of Stable-Baselines3, or None")
     optimize_memory_usage: bool = Field(description="True or False")
-    n_steps: int = Field(ge=1, description="a number of steps of at least 1")
+    n_steps: Natural = Field(description="a number of steps of at least 1")
     use_action_cost: bool = Field(description="True or False")
     threshold_price: tuple[Price, Price] | None = Field(
         description="a positive price and a higher one, both from 1e-12 to 1e12, or None"
@@ -96,7 +110,7 @@ class TrainingArguments(Arguments):
     temperature: Annotated[float, Field(ge=1e-6)] | Schedule = Field(
         description="positive, at least 1e-6, or a schedule"
     )
-    policy_delay: int = Field(ge=1, description="at least 1, a number of critic updates")
+    policy_delay: Natural = Field(description="at least 1, a number of critic updates")
     max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
     policy_regularization: float = Field(ge=0, description="a finite number of at least 0")
 
@@ -128,7 +142,7 @@ class PolicyArguments(ThresholdArgument):
         description="a list of widths, each at least 1, or dict(pi=[...], qf=[...]) of such lists"
     )
     random_thresholds: float = Field(gt=0, le=1, description="a share above 0, up to 1: at 0 nothing is explored")
-    n_critics: int = Field(ge=1, description="at least 1")
+    n_critics: Natural = Field(description="at least 1")
     activation_fn: type[nn.Module] = Field(description="a class of torch.nn, such as torch.nn.ReLU")
     optimizer_class: type[th.optim.Optimizer] = Field(description="a class of torch.optim, such as torch.optim.Adam")
     optimizer_kwargs: dict[str, Any] | None = Field(description="a dict of the optimizer's arguments, or None")
@@ -146,12 +160,13 @@ class PolicyArguments(ThresholdArgument):
 class ReplayBufferArguments(Arguments):
     """Of ``TeamReplayBuffer``."""
 
-    buffer_size: int = Field(ge=1, description="an integer of at least 1")
-    n_envs: int = Field(ge=1, description="an integer of at least 1")
+    buffer_size: Natural = Field(description="an integer of at least 1")
+    n_envs: Natural = Field(description="an integer of at least 1")
     optimize_memory_usage: bool = Field(description="True or False")
-    n_steps: int = Field(ge=1, description="an integer of at least 1")
+    handle_timeout_termination: bool = Field(description="True or False")
+    n_steps: Natural = Field(description="an integer of at least 1")
     gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
-    n_pairs: int = Field(ge=0, description="an integer of at least 0")
+    n_pairs: NaturalOrZero = Field(description="an integer of at least 0")
 
 
 class PriorityArguments(Arguments):
@@ -166,7 +181,7 @@ class CurriculumArguments(Arguments):
     """Of ``CurriculumCallback``."""
 
     success_threshold: float = Field(gt=0, le=1, description="a share of episodes above 0, up to 1")
-    window: int = Field(ge=1, description="a number of episodes, at least 1")
+    window: Natural = Field(description="a number of episodes, at least 1")
 
 
 class PairPolicyArguments(Arguments):
@@ -201,13 +216,18 @@ def validated_as(
     try:
         return dict(arguments.model_validate(dict(values)))
     except ValidationError as error:
-        findings = error.errors(include_url=False, include_context=False)
+        findings = error.errors(include_url=False)
     name = str(findings[0]["loc"][0])
     if findings[0]["type"] == "missing":
         raise ValueError(f"{as_written(name)} is missing.")
-    given = f"{as_written(name)}={values[name]!r}"
+    if findings[0]["type"] == "extra_forbidden":
+        raise ValueError(suggest("argument", as_written(name), map(as_written, arguments.model_fields)))
+    given = f"{as_written(name)}={shown(values.get(name))}"
+    findings = [one for one in findings if one["loc"][0] == name]
+    if any(one.get("ctx", {}).get("lt") == LARGEST for one in findings):
+        raise ValueError(f"{given} is too large: it must be less than 2**63.")
     if allowed := arguments.model_fields[name].description:
         raise ValueError(f"{given} must be {allowed}.")
-    messages = [one["msg"].removeprefix("Value error, ") for one in findings if one["loc"][0] == name]
+    messages = [one["msg"].removeprefix("Value error, ") for one in findings]
     said = dict.fromkeys(message[:1].lower() + message[1:] for message in messages)
     raise ValueError(f"{given}: {', or '.join(said)}.")

@@ -8,7 +8,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_maddpg.utils import as_seed, not_finite_at
+from sb3_maddpg.utils import as_seed, not_finite_at, shown
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -24,8 +24,8 @@ class GymnasiumVecEnv(VecEnv):
     def __init__(self, envs: VectorEnv):
         if not isinstance(envs, VectorEnv):
             raise ValueError(
-                f"{envs!r} is no Gymnasium VectorEnv: make one with gymnasium.make_vec. For a single environment use "
-                "Stable-Baselines3's make_vec_env."
+                f"{shown(envs)} is no Gymnasium VectorEnv: make one with gymnasium.make_vec. For a single environment "
+                "use Stable-Baselines3's make_vec_env."
             )
         mode = envs.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:

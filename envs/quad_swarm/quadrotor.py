@@ -14,11 +14,11 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
-from pydantic import NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from quad_swarm.validation import checked
 
@@ -27,6 +27,10 @@ N_INPUTS = 4
 POSITION = slice(0, 3)
 VELOCITY = slice(3, 6)
 ATTITUDE = slice(6, 9)
+
+
+# Larger ones overflow within a step
+_Moderate = Annotated[float, Field(gt=0, le=1e4)]
 
 
 @checked
@@ -46,14 +50,14 @@ class QuadrotorParams:
     :raises ValueError: a drag is negative, or another value not positive
     """
 
-    gravity: PositiveFloat = 9.81
+    gravity: _Moderate = 9.81
     drag_x: NonNegativeFloat = 0.25
     drag_y: NonNegativeFloat = 0.33
-    roll_gain: PositiveFloat = 1.1260
+    roll_gain: _Moderate = 1.1260
     roll_time_constant: PositiveFloat = 0.2368
-    pitch_gain: PositiveFloat = 1.1075
+    pitch_gain: _Moderate = 1.1075
     pitch_time_constant: PositiveFloat = 0.2318
-    climb_gain: PositiveFloat = 1.2270
+    climb_gain: _Moderate = 1.2270
     climb_time_constant: PositiveFloat = 0.3367
 
     @property

@@ -14,12 +14,19 @@ from typing import Annotated, Any, TypeVar
 import pydantic
 import pydantic.dataclasses
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 
 _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+# Beyond these (m) nothing flies, and squares lose their meaning before they overflow.
+_FARTHEST = 1e4
+Length = Annotated[float, pydantic.Field(ge=0, le=_FARTHEST)]
+PositiveLength = Annotated[float, pydantic.Field(gt=0, le=_FARTHEST)]
+Coordinate = Annotated[float, pydantic.Field(ge=-_FARTHEST, le=_FARTHEST)]
 
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
@@ -28,7 +35,7 @@ def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-Range = Annotated[tuple[float, float], pydantic.AfterValidator(_ascending)]
+Range = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ascending)]
 
 
 def checked(cls: type[T]) -> type[T]:
@@ -117,7 +124,7 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         return ValueError(f"{told}.")  # from `__post_init__`, which names the fields that do not go together
     if errors[0]["type"] == "missing":  # of a tuple
         name, told = name.rpartition(".")[0], "it has too few entries"
-    return ValueError(f"{name}={value!r}: {told}.")
+    return ValueError(f"{name}={shown(value)}: {told}.")
 
 
 def _told(message: str) -> str:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import gymnasium
 
-from sb3_maddpg.cli.options import PROG, common_options
+from sb3_maddpg.cli.options import PROG, common_options, import_packages
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.utils import suggest
 
@@ -73,8 +73,7 @@ def _hand_over(group: str, argv: list[str]) -> int:
     """
     offers = entry_points(group=f"sb3_maddpg.{group}")
     known, rest = common_options().parse_known_args(argv)
-    for package in known.gym_packages:
-        importlib.import_module(package)
+    import_packages(known.gym_packages)
     if known.env is None and len(offers.names) != 1:
         choice = f"choose one of {', '.join(sorted(offers.names))}" if offers else f"no installed package has {group}"
         raise ValueError(f"--env is missing: {choice}.")

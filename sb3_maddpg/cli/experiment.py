@@ -137,6 +137,8 @@ class TeamExperimentManager(ExperimentManager):
         except KeyError:
             names = optuna.get_all_study_names(storage)
             raise ValueError(suggest(f"study in {self.storage}", self.study_name, names)) from None
+        except DBAPIError as error:
+            raise _no_database(self.storage, error) from error
         for trial in study.get_trials(deepcopy=False):
             if trial.number == trial_id:
                 return HYPERPARAMS_CONVERTER[self.algo](trial.params)
@@ -409,12 +411,16 @@ def _make_tables(url: str) -> None:
     for attempt in range(20):
         try:
             optuna.storages.RDBStorage(url)
-        except DBAPIError:
+        except DBAPIError as error:
             if attempt == 19:
-                raise
+                raise _no_database(url, error) from error
             time.sleep(0.25)
         else:
             return
+
+
+def _no_database(url: str, error: DBAPIError) -> ValueError:
+    return ValueError(f"--storage {url} cannot be opened: {' '.join(str(error.orig).split())}.")
 
 
 def update(hyperparams: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,8 @@ import torch
 import yaml
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
+from sb3_maddpg.utils import shown
+
 WORDS = {"true": True, "false": False, "null": None, "none": None}
 NOT_FINITE = ("nan", "inf", "infinity")
 SEQUENCES = {"list": list, "tuple": tuple}
@@ -30,7 +32,7 @@ def parse_literal(text: str) -> Any:
     try:
         tree = ast.parse(text.strip(), mode="eval")
     except SyntaxError as error:
-        raise ValueError(f"{text!r} is not valid Python: {error.msg}") from error
+        raise ValueError(f"{shown(text)} is not valid Python: {error.msg}") from error
     return _finite(_value(tree.body))
 
 

@@ -1,7 +1,11 @@
 """What all commands share: their name, the options that each of them looks at, and what is checked for each of them."""
 
 import argparse
+import importlib
+from collections.abc import Iterable
 from pathlib import Path
+
+from sb3_maddpg.utils import shown
 
 PROG = "sb3-maddpg"
 
@@ -13,6 +17,20 @@ def common_options() -> argparse.ArgumentParser:
     parser.add_argument("--env")
     parser.add_argument("--gym-packages", nargs="+", default=[])
     return parser
+
+
+def import_packages(names: Iterable[str]) -> None:
+    """
+    Import what ``--gym-packages`` names.
+
+    :param names: of packages or modules
+    :raises ValueError: no such name can be imported
+    :raises ImportError: the package is missing, or what it needs
+    """
+    for name in names:
+        if not all(part.isidentifier() for part in name.split(".")):
+            raise ValueError(f"--gym-packages {shown(name)}: give the names of packages, as after `import`.")
+        importlib.import_module(name)
 
 
 def check_writable(path: Path) -> None:

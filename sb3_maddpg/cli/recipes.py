@@ -12,8 +12,19 @@ from typing import Annotated, Any
 import gymnasium
 import yaml
 from gymnasium.envs.registration import load_env_creator
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, PositiveInt, create_model
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PositiveInt,
+    ValidationInfo,
+    create_model,
+    field_validator,
+)
 from rl_zoo3.utils import ALGOS, get_class_by_name
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
@@ -22,7 +33,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.literals import parse_literal
-from sb3_maddpg.utils import arguments_of, suggest
+from sb3_maddpg.utils import arguments_of, shown, suggest
 from sb3_maddpg.validation import Arguments, validated_as
 
 # Arguments of the algorithm that the command line gives.
@@ -31,6 +42,8 @@ COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_se
 OF_ALGORITHM = {"observation_space", "action_space", "lr_schedule"}
 # Arguments that rl_zoo3 turns into schedules
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
+# More of an environment side by side than any machine can step
+MOST_COPIES = 10_000
 SIMPLE = (int, float, bool, str, type(None))
 
 
@@ -46,6 +59,29 @@ def at_least(low: int, otherwise: int | None = None) -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+def at_most(high: int) -> AfterValidator:
+    """
+    :param high: the highest value
+    """
+
+    def check(value: int) -> int:
+        if value > high:
+            raise ValueError(f"give {high} or less")
+        return value
+
+    return AfterValidator(check)
+
+
+def _storage(storage: str | None) -> str | None:
+    """Optuna's: a journal, or a database."""
+    if storage is not None and not storage.endswith(".log"):
+        try:
+            make_url(storage).get_dialect()
+        except ArgumentError:
+            raise ValueError("give a file FILE.log, or the URL of a database such as sqlite:///FILE.db") from None
+    return storage
 
 
 One = Annotated[int, at_least(1)]
@@ -71,7 +107,7 @@ class TrainingOptions(Arguments):
     save_freq: OneOrDefault = -1
     log_interval: Annotated[int, at_least(-2)] = -1
     eval_episodes: One = 1
-    n_eval_envs: One = 1
+    n_eval_envs: Annotated[One, at_most(MOST_COPIES)] = 1
     n_trials: One = 1
     max_total_trials: One | None = None
     n_startup_trials: Annotated[int, at_least(0)] = 0
@@ -79,6 +115,7 @@ class TrainingOptions(Arguments):
     n_jobs: OneOrDefault = 1
     trial_id: Annotated[int, at_least(0)] | None = None
     verbose: Annotated[int, at_least(0)] = 0
+    storage: Annotated[str | None, AfterValidator(_storage)] = None
 
 
 def check_options(args: argparse.Namespace, options: type[Arguments] = TrainingOptions) -> None:
@@ -119,8 +156,16 @@ def _literal(value: Any) -> Any:
     return parse_literal(value) if isinstance(value, str) else value
 
 
+def _noise_type(name: str) -> str:
+    if not any(kind in name for kind in ("normal", "ornstein-uhlenbeck")):
+        raise ValueError("give normal or ornstein-uhlenbeck")
+    return name
+
+
 Schedule = Annotated[Any, BeforeValidator(_schedule)]
 Count = Annotated[PositiveInt, BeforeValidator(_number)]
+NotNegative = Annotated[float, Field(ge=0)]
+Copies = Annotated[Count, at_most(MOST_COPIES)]
 KeywordArguments = Annotated[dict[str, Any], BeforeValidator(_literal)]
 
 
@@ -131,18 +176,35 @@ class ZooKeys(Arguments):
 
     n_timesteps: Count
     policy: str | type[BasePolicy]
-    n_envs: Count = 1
+    n_envs: Copies = 1
     callback: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
     env_kwargs: KeywordArguments | None = None
     env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
     eval_env_kwargs: KeywordArguments | None = None
-    frame_stack: Count | None = None
+    frame_stack: Copies | None = None
     monitor_kwargs: KeywordArguments | None = None
-    noise_std: Annotated[float, BeforeValidator(_number)] | None = None
-    noise_type: str | None = None
+    noise_type: Annotated[str, AfterValidator(_noise_type)] | None = None
+    noise_std: Annotated[NotNegative | None, BeforeValidator(_number), Field(validate_default=True)] = None
     normalize: bool | KeywordArguments = False
     vec_env: str | None = None
     vec_env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
+
+    @field_validator("noise_std")
+    @classmethod
+    def _with_noise_type(cls, noise_std: float | None, info: ValidationInfo) -> float | None:
+        if noise_std is None and info.data.get("noise_type") is not None:
+            raise ValueError("noise_type needs a standard deviation, give a number")
+        return noise_std
+
+
+class MonitorArguments(Arguments):
+    """Of Stable-Baselines3's ``Monitor``, which a recipe may choose."""
+
+    filename: str | None = None
+    allow_early_resets: bool = True
+    reset_keywords: tuple[str, ...] = ()
+    info_keywords: tuple[str, ...] = ()
+    override_existing: bool = True
 
 
 def read_recipe(path: str, algo: str, env_id: str) -> None:
@@ -183,7 +245,7 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
 
 
 def _kind(value: Any) -> str:
-    return "nothing" if value is None else f"{type(value).__name__} {value!r}"[:60]
+    return "nothing" if value is None else f"{type(value).__name__} {shown(value, 60)}"
 
 
 def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict[str, Any]:
@@ -206,6 +268,7 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     checked = validated_as(model, hyperparams, lambda name: f"{source}: {name}")
     found = {key: checked[key] for key in hyperparams}
     check_policy_kwargs(algo, found)
+    validated_as(MonitorArguments, found.get("monitor_kwargs") or {}, lambda name: f"{source}: monitor_kwargs: {name}")
     for key in ("env_wrapper", "vec_env_wrapper", "callback"):
         for name in _names_of_classes(found.get(key)):
             _check_callable(key, name)
@@ -272,9 +335,11 @@ def policy_class(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | 
     """
     :param algo: name of the algorithm
     :param name: what the recipe calls the policy
-    :return: the policy, or None for a dotted path, which rl_zoo3 imports later
+    :return: the policy, or None for a dotted path, which rl_zoo3 imports later, and for what is no name
     """
-    return ALGOS[algo].policy_aliases.get(name) if isinstance(name, str) else name
+    if isinstance(name, str):
+        return ALGOS[algo].policy_aliases.get(name)
+    return name if isinstance(name, type) else None
 
 
 def _replay_buffer(name: str) -> type[ReplayBuffer]:

@@ -30,7 +30,7 @@ from sb3_maddpg import MADDPG, parallel
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.experiment import TeamExperimentManager
 from sb3_maddpg.cli.literals import StoreValues
-from sb3_maddpg.cli.options import PROG, common_options
+from sb3_maddpg.cli.options import PROG, common_options, import_packages
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.recipes import LengthOption, check_options
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
@@ -142,8 +142,7 @@ def _check(known: argparse.Namespace) -> None:
         raise ValueError(suggest("algorithm", known.algo, ALGOS))
     if known.env is None:
         raise ValueError("--env is missing: give the id of a Gymnasium environment, or PACKAGE/MODULE of PettingZoo's.")
-    for package in known.gym_packages:
-        importlib.import_module(package)
+    import_packages(known.gym_packages)
     if pettingzoo_ids.register(known.env):
         return
     package, slash, _ = known.env.rpartition("/")

@@ -43,6 +43,8 @@ def function(number: PositiveInt, text: str | Mapping[str, float] = "", **others
         (lambda: replaced(Outer(), {"inner": {"count": 0}}), "inner.count=0: it must be greater than 0."),
         (lambda: replaced(Inner(), {"count": 0}, "there"), "there.count=0: it must be greater than 0."),
         (lambda: function(0), "number=0: it must be greater than 0."),
+        (lambda: Inner((0, 1e5)), "pair.1=100000.0: it must be less than or equal to 10000."),
+        (lambda: function(-(10**400)), f"number=-1{'0' * 98} ... {'0' * 66}: it must be greater than 0."),
         (lambda: function(1, 5), "text=5: it must be a valid string or it must be a valid mapping."),
         (
             lambda: function(1, others="x"),

@@ -156,6 +156,8 @@ def test_agents_have_the_names_of_the_environment():
         (np.array(0.0), r"not shape \(\)"),
         (np.array([0, 0, np.nan, 0]), "observation of binary_2 holds NaN or infinity"),
         (np.array([[0, 0, np.inf, 0]]), "observation of binary_2 holds NaN or infinity"),
+        (10**400, "observation of binary_2 is no array of numbers: 10"),
+        (np.array(["1", "0", "1", "0"]), "observation of binary_2 is no array of numbers"),
     ],
 )
 def test_an_observation_that_does_not_fit_is_refused(observation, message):

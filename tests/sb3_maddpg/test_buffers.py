@@ -100,7 +100,7 @@ def test_optimize_memory_usage_gives_the_next_observation_without_storing_it():
 
 
 def test_optimize_memory_usage_has_sb3s_condition():
-    with pytest.raises(ValueError, match="handle_timeout_termination"):
+    with pytest.raises(ValueError, match="give handle_timeout_termination=False"):
         buffer(optimize_memory_usage=True)
     kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
     model = MADDPG("MlpPolicy", OwnBit(), **kwargs, buffer_size=100, learning_starts=20, train_freq=10, batch_size=16)

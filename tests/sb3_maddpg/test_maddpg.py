@@ -16,6 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
 from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
+from sb3_maddpg.callbacks import MetricsCallback
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.team_tasks import BINARY_TASKS, FollowTarget, OwnBit
@@ -244,7 +246,7 @@ NAN, INF = float("nan"), float("inf")
         ("policy_delay", 1.5), ("n_steps", 2.5), ("tau", 0), ("gamma", NAN), ("policy_regularization", NAN),
         ("max_grad_norm", NAN), ("temperature", NAN), ("exploration_noise", (0.1, NAN)), ("train_freq", 0),
         ("threshold_price", (1e-300, 1.0)), ("threshold_price", (1.0, INF)), ("threshold_price", (1.0, 1.0)),
-        ("action_noise", 0.1), ("learning_starts", -1),
+        ("action_noise", 0.1), ("learning_starts", -1), ("train_freq", (1, "x")),
     ],
 )  # fmt: skip
 def test_a_value_out_of_range_is_refused_in_one_line(name, value):
@@ -329,6 +331,10 @@ def test_a_model_for_a_team_of_another_size_has_its_networks_and_arguments():
     assert np.array_equal(parameters(large), parameters(small))
     assert large.critic.optimizer.state_dict()["state"][0]["step"] == small._n_updates
     large.learn(40)
+    buffer = {"replay_buffer_class": PrioritizedTeamReplayBuffer, "replay_buffer_kwargs": {"alpha": 0.5}}
+    prioritized = MADDPG("PairPolicy", Neighbours(3), **SMALL, **buffer)
+    assert prioritized.resized(Neighbours(5)).replay_buffer.alpha == 0.5
+    assert type(prioritized.resized(Neighbours(5), replay_buffer_class=None).replay_buffer) is TeamReplayBuffer
     with pytest.raises(ValueError, match="fits one size of team"):
         learned().resized(OwnBit())
 
@@ -394,6 +400,15 @@ def test_a_short_training_logs_its_episodes_once():
         ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "do not fit Adam: .*'x'"),
         ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or lists of agents"),
         ({"policy_kwargs": {"agent_names": 5}}, "agent_names=5 must be a list of names"),
+        ({"policy_kwargs": {"n_critics": 10**400}}, r"n_critics=10* \.\.\. 0* is too large: it must be less than"),
+        ({"policy_kwargs": {"n_critics": 10**9}}, "the networks need too much memory"),
+        ({"policy_kwargs": {"net_arch": [10**7, 10**7]}}, "the networks need too much memory"),
+        ({"buffer_size": 10**18}, "buffer_size=1000000000000000000 or the networks need too much memory"),
+        ({"buffer_size": 10**400}, r"buffer_size=10* \.\.\. 0* is too large: it must be less than 2\*\*63"),
+        ({"train_freq": 10**400}, r"train_freq=10* \.\.\. 0* is too large"),
+        ({"gradient_steps": 10**5000}, "gradient_steps=<int> is too large"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage=True forgets"),
+        ({"replay_buffer_kwargs": {"handle_timeout_termination": 5}}, "handle_timeout_termination=5 must be"),
     ],
 )
 def test_arguments_of_a_wrong_type_are_refused_by_name(arguments, message):
@@ -401,8 +416,25 @@ def test_arguments_of_a_wrong_type_are_refused_by_name(arguments, message):
         MADDPG(**{"policy": "MlpPolicy", "env": "OwnBit-v0", **SMALL, **arguments})
 
 
-@pytest.mark.parametrize("arguments", [{"total_timesteps": "x"}, {"total_timesteps": np.nan}, {"callback": 2}])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"total_timesteps": "x"},
+        {"total_timesteps": np.nan},
+        {"total_timesteps": 1e300},
+        {"callback": 2},
+        {"callback": MetricsCallback},
+    ],
+)
 def test_learn_names_an_argument_of_a_wrong_type(arguments):
     model = MADDPG("MlpPolicy", "OwnBit-v0", **SMALL)
     with pytest.raises(ValueError, match=f"{next(iter(arguments))}=.* must be"):
         model.learn(**{"total_timesteps": 10, **arguments})
+
+
+def test_steps_and_folders_may_come_in_other_types(tmp_path):
+    model = MADDPG("MlpPolicy", "OwnBit-v0", **SMALL, tensorboard_log=tmp_path)
+    assert model.learn("25", log_interval="1").num_timesteps == 25
+    assert model.tensorboard_log == str(tmp_path)
+    model.save(tmp_path / "model")
+    assert MADDPG.load(tmp_path / "model").num_timesteps == 25

@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from sb3_maddpg.utils import all_finite, as_seed, atomic_write, not_finite_at
+from sb3_maddpg.utils import all_finite, as_numbers, as_seed, atomic_write, not_finite_at, shown, suggest
 
 
 def test_a_file_is_replaced_whole_and_its_folder_synced(tmp_path, monkeypatch):
@@ -29,6 +29,8 @@ def test_a_path_that_cannot_be_written_is_refused_before_any_work(tmp_path):
     (tmp_path / "file").write_text("")
     for path, message in (
         (tmp_path / "folder", "This is a folder: name a file in it: '.*folder.zip'"),
+        ("", "This is a folder: name a file in it: '.*zip'"),
+        ("..", "This is a folder: name a file in it: '.*zip'"),
         (tmp_path / "file" / "model", "Cannot write here .*choose another folder: '.*file/model.zip'"),
     ):
         worked = False
@@ -36,6 +38,33 @@ def test_a_path_that_cannot_be_written_is_refused_before_any_work(tmp_path):
             worked = True
         assert not worked
     assert sorted(os.listdir(tmp_path)) == ["file", "folder.zip"]
+
+
+class Unspeakable:
+    def __repr__(self):
+        raise RuntimeError
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("a\nb", r"'a\nb'"),
+        (np.zeros((2, 2)), "array([[0., 0.], [0., 0.]])"),
+        (10**400, f"1{'0' * 99} ... {'0' * 66}"),
+        ([10**5000], "<list>"),
+        (Unspeakable(), "<Unspeakable>"),
+    ],
+)
+def test_any_value_is_shown_in_a_short_line(value, text):
+    assert shown(value) == text
+    assert len(suggest("name", value, ["a"])) < 200
+
+
+def test_numbers_are_real_numbers():
+    assert as_numbers([[1, True], [2.5, 1e300]]).tolist() == [[1.0, 1.0], [2.5, np.inf]]
+    for wrong in ("x", ["1"], [object()], {}, 1j, 10**400, [[1], [1, 2]], np.zeros(2, "datetime64[s]")):
+        with pytest.raises(ValueError, match=r"no real numbers|inhomogeneous"):
+            as_numbers(wrong)
 
 
 def test_seeds_are_integers_of_any_type():

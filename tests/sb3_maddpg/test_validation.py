@@ -39,6 +39,18 @@ def test_other_values_are_refused_in_one_line(name, value):
     assert repr(value) in str(refused.value)
 
 
+def test_messages_about_long_values_are_short():
+    for value in (10**400, 10**5000, [10**400], "x" * 5000):
+        with pytest.raises(ValueError, match=r"^n_critics=") as refused:
+            validated(PolicyArguments, **{**GOOD, "n_critics": value})
+        assert len(str(refused.value)) < 300
+
+
+def test_an_unknown_argument_is_named():
+    with pytest.raises(ValueError, match="Unknown argument 'n_critic': did you mean 'n_critics'"):
+        validated(PolicyArguments, **GOOD, n_critic=2)
+
+
 def test_homogeneous_agents_have_the_same_spaces():
     env = toy("heterogeneous")
     assert isinstance(env.action_space, MixedActions)

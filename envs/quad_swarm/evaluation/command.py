@@ -73,7 +73,10 @@ def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
                 raise ValueError(f"--world {assignment!r}: {parent!r} was given a plain value before.")
         if leaf in place:
             raise ValueError(f"--world {assignment!r}: {name!r} is given twice.")
-        place[leaf] = yaml.safe_load(value)
+        try:
+            place[leaf] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ValueError(f"--world {assignment!r}: {value!r} is no valid YAML; quote text.") from None
     return world
 
 

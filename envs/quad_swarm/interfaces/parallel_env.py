@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from quad_swarm.errors import shown
 from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.interfaces.shared import TaskAttributes, checked_options, need_reset, request_matrices
 
@@ -68,8 +69,7 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         if not self.agents:
             return {}, {}, {}, {}, {}
         if not isinstance(actions, Mapping):
-            got = " ".join(repr(actions).split())[:100]
-            raise ValueError(f"actions={got}: step() takes a mapping from each robot's name to its action.")
+            raise ValueError(f"actions={shown(actions)}: step() takes a mapping from each robot's name to its action.")
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise ValueError(f"No action for {', '.join(missing)}; every robot must act in every step.")
         width = (self.n_agents - 1,)

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from quad_swarm.errors import shown
 from quad_swarm.task.request_task import RequestTask
 from quad_swarm.world.presets import SwarmConfig
 
@@ -74,7 +75,7 @@ def checked_seed(seed: Any) -> int | None:
     except TypeError:
         number = -1
     if number < 0:
-        raise ValueError(f"seed={seed!r}: a seed is an integer of at least 0, or None.")
+        raise ValueError(f"seed={shown(seed)}: a seed is an integer of at least 0, or None.")
     return number
 
 
@@ -86,8 +87,7 @@ def checked_options(options: Any) -> dict[str, Any]:
     if options is None:
         return {}
     if not isinstance(options, Mapping) or not all(isinstance(name, str) for name in options):
-        got = " ".join(repr(options).split())[:100]
-        raise ValueError(f"options={got}: the options of reset() are a mapping by their names, or None.")
+        raise ValueError(f"options={shown(options)}: the options of reset() are a mapping by their names, or None.")
     return dict(options)
 
 
@@ -114,5 +114,7 @@ def request_matrices(actions: Any, shape: tuple[int, ...], n_robots: int, whose:
     asked = bits == 1
     if not (asked | (bits == 0)).all():
         wrong = bits[~(asked | (bits == 0))].ravel()[0]
-        raise ValueError(f"{whose} contains {wrong!r}; every entry must be 0 or 1. Threshold scores before acting.")
+        raise ValueError(
+            f"{whose} contains {shown(wrong)}; every entry must be 0 or 1. Threshold scores before acting."
+        )
     return asked.reshape(*shape[:-1], -1, n_robots - 1)

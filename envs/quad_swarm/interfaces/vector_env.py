@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from pydantic import PositiveInt
+from pydantic import Field
 
+from quad_swarm.errors import shown
 from quad_swarm.interfaces.shared import TaskAttributes, checked_options, checked_seed, need_reset, request_matrices
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import checked_arguments
@@ -24,7 +25,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
     (`AutoresetMode.SAME_STEP`): the last observation is in ``infos["final_obs"]`` and the last step's info in
     ``infos["final_info"]``, valid where ``infos["_final_obs"]``.
 
-    :param num_envs: number of swarms E
+    :param num_envs: number of swarms E, at most 100 000
     :param kwargs: arguments of `QuadSwarmEnv`
     :raises ValueError: a wrong value; the message names it and the remedy
     """
@@ -32,9 +33,9 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's convention
 
     @checked_arguments
-    def __init__(self, num_envs: PositiveInt = 1, render_mode: Any = None, **kwargs: Any):
+    def __init__(self, num_envs: Annotated[int, Field(ge=1, le=100_000)] = 1, render_mode: Any = None, **kwargs: Any):
         if render_mode is not None:
-            raise ValueError(f"render_mode={render_mode!r}: the vector environment draws nothing; use QuadSwarmEnv.")
+            raise _draws_nothing(f"render_mode={shown(render_mode)}")
         self.num_envs = num_envs
         self.task = make_task(num_envs, **kwargs)
         n = self.n_agents
@@ -56,7 +57,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """
         if options := checked_options(options):
             raise ValueError(f"Unknown reset options {sorted(options)}: the vector environment has none.")
-        if isinstance(seed, (list, tuple, np.ndarray)):
+        if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim > 0):
             seeds = [checked_seed(value) for value in seed]
         else:
             first = checked_seed(seed)
@@ -95,8 +96,19 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
             observations[done] = self.task.observe(done)
         return observations, outcome.reward, outcome.terminated, outcome.truncated, infos
 
+    def render(self) -> Any:
+        """Refused: the vector environment draws nothing.
+
+        :raises ValueError: always
+        """
+        raise _draws_nothing("render()")
+
     def _with_masks(self, info: Mapping[str, Any]) -> dict[str, Any]:
         return _masked(info, np.ones(self.num_envs, dtype=bool))
+
+
+def _draws_nothing(asked: str) -> ValueError:
+    return ValueError(f"{asked}: the vector environment draws nothing; use QuadSwarmEnv.")
 
 
 def _masked(info: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:

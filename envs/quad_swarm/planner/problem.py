@@ -8,10 +8,21 @@ from typing import Annotated, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic_core import PydanticCustomError
 
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
-from quad_swarm.validation import checked
+from quad_swarm.validation import Length, PositiveLength, checked
+
+# Outside these, squares leave the range of numbers, and a solver may never come to an end.
+_TINIEST = 1e-6
+_Rate = Annotated[float, Field(ge=_TINIEST, le=1e4)]
+
+
+def _not_tiny(rate: float) -> float:
+    if 0 < rate < _TINIEST:
+        raise PydanticCustomError("tiny", f"it must be 0, or at least {_TINIEST:f}")
+    return rate
 
 
 @checked
@@ -43,12 +54,12 @@ class PlannerConfig:
     :raises ValueError: a value that is not finite or out of its range, or an empty workspace
     """
 
-    horizon: Annotated[int, Field(ge=2)] = 10
+    horizon: Annotated[int, Field(ge=2, le=1000)] = 10
     dt: PositiveFloat = 0.1
-    separation: PositiveFloat = 0.6
-    max_tilt: Annotated[float, Field(gt=0, lt=math.pi / 2)] = math.radians(12.0)
-    max_climb_rate: PositiveFloat = 1.0
-    max_yaw_rate: NonNegativeFloat = 0.0
+    separation: PositiveLength = 0.6
+    max_tilt: Annotated[float, Field(ge=_TINIEST, lt=math.pi / 2)] = math.radians(12.0)
+    max_climb_rate: _Rate = 1.0
+    max_yaw_rate: Annotated[float, Field(ge=0, le=1e4), AfterValidator(_not_tiny)] = 0.0
     max_speed: PositiveFloat = 4.0
     max_vertical_speed: PositiveFloat = 1.5
     workspace_low: tuple[float, float, float] = (-4.8, -4.8, 0.48)
@@ -58,7 +69,7 @@ class PlannerConfig:
     repulsion_weight: NonNegativeFloat = 0.1
     repulsion_buffer: PositiveFloat = 1.2
     repulsion_steepness: PositiveFloat = 10.0
-    right_of_way: NonNegativeFloat = 0.0
+    right_of_way: Length = 0.0
     violation_weight: PositiveFloat = 1e4
     max_neighbours: PositiveInt | None = None
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import copy, deepcopy
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
@@ -42,7 +42,7 @@ class RewardConfig:
     near_miss: NonNegativeFloat = 0.0
     near_miss_distance: PositiveFloat = 0.6
     near_miss_width: PositiveFloat = 0.01
-    near_miss_ahead: NonNegativeInt = 0
+    near_miss_ahead: Annotated[int, Field(ge=0, le=1000)] = 0
     near_miss_narrowing: NonNegativeFloat = 0.0
 
 

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt
+from pydantic import Field, NonNegativeFloat
 
 from quad_swarm.validation import checked
 
@@ -95,13 +95,13 @@ class Radio:
     :param burst_length: mean length of an interruption (steps)
     :param outage: share of the robots that stop answering for good, at a time drawn evenly from the first 5 s; they fly
         and ask on
-    :raises ValueError: a share lies outside [0, 1] (bursts: below 1), a delay is negative, or a burst is shorter than
-        a step
+    :raises ValueError: a share lies outside [0, 1] (bursts: below 1), a delay outside 0 to 1000, or a burst is shorter
+        than a step
     """
 
     loss: Share = 0.0
-    delay: NonNegativeInt = 0
-    jitter: NonNegativeInt = 0
+    delay: Annotated[int, Field(ge=0, le=1000)] = 0
+    jitter: Annotated[int, Field(ge=0, le=1000)] = 0
     bursts: Annotated[float, Field(ge=0, lt=1)] = 0.0
     burst_length: Annotated[float, Field(ge=1)] = 10.0
     outage: Share = 0.0

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveInt
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.planner import PlannerConfig
 from quad_swarm.quadrotor import QuadrotorParams
-from quad_swarm.validation import checked, replaced
+from quad_swarm.validation import Length, PositiveLength, checked, replaced
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.scenarios import ScenarioSpace
 
@@ -25,7 +25,7 @@ PRESET_VERSION = 1
 class SwarmConfig:
     """Everything that defines a world but the scenario.
 
-    :param n_robots: number of robots n, at least 2
+    :param n_robots: number of robots n, 2 to 1000
     :param radius: radius r of the sphere around a robot (m)
     :param collision_tolerance: two robots collide when their centres are closer than 2r by more than this (m); the
         planner's soft constraint sits exactly at 2r in the paper's world
@@ -50,11 +50,11 @@ class SwarmConfig:
         collision, or a step too long for the vehicle's dynamics
     """
 
-    n_robots: Annotated[int, Field(ge=2)] = 4
-    radius: PositiveFloat = 0.3
-    collision_tolerance: NonNegativeFloat = 1e-3
-    goal_radius: PositiveFloat = 0.3
-    memory: NonNegativeFloat = 0.03
+    n_robots: Annotated[int, Field(ge=2, le=1000)] = 4
+    radius: PositiveLength = 0.3
+    collision_tolerance: Length = 1e-3
+    goal_radius: PositiveLength = 0.3
+    memory: Length = 0.03
     quadrotor: QuadrotorParams = field(default_factory=QuadrotorParams)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     space: ScenarioSpace = field(default_factory=ScenarioSpace)
@@ -85,7 +85,12 @@ class SwarmConfig:
                 f"planner.dt={planner.dt}: steps must not exceed {longest:.2g} s, "
                 "the stability limit of the integration of the quadrotor's fastest response"
             )
-
+        fastest = longest * (1 - self.mismatch)
+        if planner.dt / self.substeps > fastest:
+            raise ValueError(
+                f"mismatch={self.mismatch}: the fastest vehicles take sub-steps of up to {fastest:.2g} s, not "
+                f"planner.dt / substeps = {planner.dt / self.substeps:.2g} s: raise substeps"
+            )
         if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
             raise ValueError(
                 f"clock_skew={self.clock_skew} is less than one of the substeps={self.substeps} of a step: raise either"
@@ -156,7 +161,7 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
     base = PRESETS[preset]
     planner = changes.get("planner", {})
     if "radius" in changes and isinstance(planner, Mapping) and "separation" not in planner:
-        with contextlib.suppress(TypeError, ValueError):  # no number: the check of the fields says so
+        with contextlib.suppress(TypeError, ValueError, OverflowError):  # no number: the check of the fields says so
             separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
             changes = {**changes, "planner": {**planner, "separation": separation}}
     return replaced(base, changes)
@@ -175,6 +180,7 @@ def _joined(first: Mapping[str, Any], second: Mapping[str, Any], path: str = "")
             joined[name] = _joined(joined[name], value, f"{path}{name}.")
         else:
             raise ValueError(
-                f"{path}{name} is given twice, {joined[name]!r} in `world` and {value!r} beside it: leave one out."
+                f"{path}{name} is given twice, {shown(joined[name])} in `world` and {shown(value)} beside it: leave "
+                "one out."
             )
     return joined

@@ -10,10 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import NonNegativeFloat, PositiveFloat
 
-from quad_swarm.errors import unknown_name
-from quad_swarm.validation import Range, checked
+from quad_swarm.errors import shown, unknown_name
+from quad_swarm.validation import Length, PositiveLength, Range, checked
 
 Rng = np.random.Generator
 Scenario = Callable[[int, "ScenarioSpace", Rng], tuple[np.ndarray, np.ndarray]]
@@ -37,11 +36,11 @@ class ScenarioSpace:
         sectors begin at the x axis and are used in full; otherwise they are centred on it and used to 80 %
     """
 
-    half_width: PositiveFloat = 4.0
+    half_width: PositiveLength = 4.0
     heights: Range = (0.7, 2.1)
-    spacing: NonNegativeFloat = 1.0
+    spacing: Length = 1.0
     circle_radius: Range = (2.0, 3.0)
-    circle_jitter: NonNegativeFloat = 0.15
+    circle_jitter: Length = 0.15
     sector_radius: Range = (2.0, 4.5)
     whole_sectors: bool = False
 
@@ -154,8 +153,10 @@ class ScenarioSampler:
             if one not in SCENARIOS and (one not in MIXTURES or not isinstance(name, str)):
                 raise unknown_name("scenario", one, [*SCENARIOS, *MIXTURES])
         weights = [] if isinstance(name, str) else [float(weight) for weight in name.values()]
-        if not isinstance(name, str) and not (all(weight >= 0 for weight in weights) and sum(weights) > 0):
-            raise ValueError(f"scenario={dict(name)}: weights are not negative, and one of them is positive.")
+        if not isinstance(name, str) and not (all(weight >= 0 for weight in weights) and 0 < sum(weights) < np.inf):
+            raise ValueError(
+                f"scenario={dict(name)}: weights are not negative, one of them is positive, and their sum is finite."
+            )
         if n_robots < 2:
             raise ValueError(f"n_robots={n_robots}: a swarm needs at least 2 robots.")
         self.name = name
@@ -188,7 +189,7 @@ class ScenarioSampler:
         """
         if not isinstance(level, (int, np.integer)) or not 0 <= level < self.n_levels:
             raise ValueError(
-                f"Level {level!r} does not exist: scenario {self.name!r} has levels 0 to {self.n_levels - 1}."
+                f"Level {shown(level)} does not exist: scenario {self.name!r} has levels 0 to {self.n_levels - 1}."
             )
         self.level = level
 

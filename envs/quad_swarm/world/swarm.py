@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quad_swarm.errors import shown
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.quadrotor import POSITION, VELOCITY, QuadrotorModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, advance, answered, other_indices, resampled
@@ -291,9 +292,8 @@ def _points(name: str, points: Any, count: int) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:
-        got = " ".join(repr(points).split())[:200]
         raise ValueError(
-            f"{name} must be {count} finite points, shape ({count}, 3), within {_FARTHEST:.0f} m; got {got}."
+            f"{name} must be {count} finite points, shape ({count}, 3), within {_FARTHEST:.0f} m; got {shown(points)}."
         )
     return array
 

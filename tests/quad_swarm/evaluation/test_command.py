@@ -70,6 +70,7 @@ def test_world_can_be_changed(capsys):
         (["--policy", "none", "--solver", "fatrob"], "Did you mean 'fatrop'"),
         (["--policy", "none", "--world", "separation"], "write NAME=VALUE"),
         (["--policy", "none", "--world", "planner.seperation=1"], "Did you mean 'separation'"),
+        (["--policy", "none", "--world", "memory={"], "'{' is no valid YAML"),
         (["--policy", "none", "--world", "preset=dense"], "Unknown SwarmConfig parameter 'preset'"),
         (["--policy", "none", "--world", "noise=1", "noise.wind=2"], "was given a plain value before"),
         (["--policy", "none", "--world", "noise.wind=1", "noise.wind=2"], "is given twice"),

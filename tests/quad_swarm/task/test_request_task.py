@@ -32,6 +32,7 @@ from quad_swarm.task.request_task import RewardConfig, make_task
         ({"reward": {"collision": -150}}, r"reward\.collision=-150: it must be greater than or equal to 0"),
         ({"reward": {"near_miss_width": 0}}, r"reward\.near_miss_width=0: it must be greater than 0"),
         ({"reward": {"near_miss_ahead": -1}}, r"reward\.near_miss_ahead=-1"),
+        ({"reward": {"near_miss_ahead": 10**5000}}, r"reward\.near_miss_ahead=<int>: it must be less than"),
         ({"reward": {"near_miss_ahead": 10}}, r"reward\.near_miss_ahead=10: plans reach .* 9 steps"),
     ],
 )

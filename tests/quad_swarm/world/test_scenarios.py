@@ -106,7 +106,11 @@ def test_weights_are_shares():
 
 @pytest.mark.parametrize(
     ("weights", "message"),
-    [({"random": -1, "random_swap": 2}, "not negative"), ({"rnadom": 1}, "Did you mean 'random'")],
+    [
+        ({"random": -1, "random_swap": 2}, "not negative"),
+        ({"random": 1e308, "random_swap": 1e308}, "their sum is finite"),
+        ({"rnadom": 1}, "Did you mean 'random'"),
+    ],
 )
 def test_senseless_weights_are_refused(weights, message):
     with pytest.raises(ValueError, match=message):

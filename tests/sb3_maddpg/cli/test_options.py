@@ -2,7 +2,7 @@
 
 import pytest
 
-from sb3_maddpg.cli.options import check_writable, common_options
+from sb3_maddpg.cli.options import check_writable, common_options, import_packages
 
 
 def test_what_is_not_common_is_left_to_others():
@@ -11,6 +11,12 @@ def test_what_is_not_common_is_left_to_others():
     assert rest == ["--seed", "1"]
     options, rest = common_options().parse_known_args(["--al", "matd3"])
     assert (options.algo, rest) == ("maddpg", ["--al", "matd3"]), "options are not abbreviated"
+
+
+@pytest.mark.parametrize("name", ["../..", "", ".json", "a b", "\0", "json."])
+def test_what_names_no_package_is_refused(name):
+    with pytest.raises(ValueError, match=r"^--gym-packages .*: give the names of packages"):
+        import_packages(["json", name])
 
 
 def test_a_file_that_can_be_written_is_left_as_it_is(tmp_path):
