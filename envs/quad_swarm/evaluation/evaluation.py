@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from tqdm import tqdm
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import make_policy
+from quad_swarm.task.episode_statistics import exchange_bytes
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
@@ -30,6 +32,9 @@ _POOLS = 3
 # Depths of a collision that are counted apart (m): much of what is deeper than the tolerance of 1 mm is a graze
 DEPTHS = {"1cm": 0.01, "3cm": 0.03}
 
+# Of the smallest separation of an episode at any time
+QUANTILES = (0.001, 0.01, 0.05, 0.25, 0.5)
+
 Rows = list[dict[str, float]]
 
 
@@ -38,13 +43,15 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
 
     :param rows: see `run_episodes`
     :param config: the world
-    :return: number of episodes and of those with a collision, with its 95 % interval, ``collisions_1cm`` and
-        ``collisions_3cm`` (deeper than that), the same ``_continuous`` (at or between steps), requests until arrival
-        or collision, absolute, by step and as a share of those that were possible, requests in all steps flown,
-        arrivals, and mean steps and path (m) until then, smallest separation (m), plans without a successful solve,
-        and the planner's time for a plan (us)
+    :return: number of episodes and of those with a collision, with its 95 % interval, ``collisions_at_steps``,
+        ``collisions_1cm`` and ``collisions_3cm`` (deeper than that, at steps), the same ``_continuous`` (at or between
+        steps); requests until arrival or collision, absolute, by step and as a share of those that were possible, the
+        most in one step, bytes that a robot sends in a second (requests and answers), mean age of the plans that were
+        believed (s), requests in all steps flown; arrivals, and mean steps and path (m) until then; smallest separation
+        and quantiles of each episode's smallest at any time (m); plans without a successful solve, and the planner's
+        time for a plan (us)
     """
-    n = config.n_robots
+    n, dt = config.n_robots, config.planner.dt
     figures = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     arrived = figures["arrived"].astype(bool)
     collisions = int(figures["collided"].sum())
@@ -62,6 +69,7 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
         "collisions": collisions,
         "collision_low": low,
         "collision_high": high,
+        "collisions_at_steps": int(figures["collided_at_steps"].sum()),
         "collisions_continuous": int(figures["collided_continuous"].sum()),
         **deeper,
         "requests": requests,
@@ -69,12 +77,19 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
         "requests_per_step": float(figures["requests"].sum() / figures["steps_counted"].sum()),
         "request_share": share,
         "reduction": 1.0 - share,
+        "peak_requests": int(figures["peak_requests"].max()),
+        "bytes_per_second": exchange_bytes(config) * requests / (float(figures["steps_counted"].sum()) * n * dt),
+        "plan_age": dt * float(figures["plan_ages"].sum() / max(figures["plans_used"].sum(), 1)),
         "requests_flown": int(figures["requests_flown"].sum()),
         "steps_flown": int(figures["steps"].sum()),
         "arrived": int(arrived.sum()),
         "steps_to_arrival": float(figures["steps_counted"][arrived].mean()) if arrived.any() else None,
         "min_separation": float(figures["min_separation"].min()),
         "min_separation_continuous": float(figures["min_separation_continuous"].min()),
+        "min_separation_quantiles": {
+            f"{quantile:g}": float(np.quantile(figures["min_separation_continuous"], quantile))
+            for quantile in QUANTILES
+        },
         "path_length": float(figures["path_length"][arrived].mean()) if arrived.any() else None,
         "planner_failures": int(figures["planner_failures"].sum()),
         "solve_us": float(1e6 * figures["solve_seconds"].sum() / (figures["steps"].sum() * n)),
@@ -88,18 +103,29 @@ def evaluate(conditions: Sequence[Condition], episodes: int, seed: int = 0, jobs
     :param episodes: number of episodes of each condition
     :param seed: which set of held-out episodes; every condition flies the same
     :param jobs: processes
-    :return: one row a condition, see `summarise`
+    :return: one row a condition, see `summarise` and, where full communication is among the policies, `lost_against`
     """
     flown = fly_all(conditions, episodes, seed, jobs)
-    return [
-        {
-            "policy": condition.policy,
-            "scenario": condition.scenario,
-            **summarise(rows, condition.config),
-            "n_robots": condition.config.n_robots,
-        }
-        for condition, rows in flown.items()
-    ]
+    table = []
+    for condition, rows in flown.items():
+        row = {"policy": condition.policy, "scenario": condition.scenario, **summarise(rows, condition.config)}
+        full = flown.get(replace(condition, policy="full"))
+        table.append(
+            row | (lost_against(full, rows, condition.config) if full else {}) | {"n_robots": condition.config.n_robots}
+        )
+    return table
+
+
+def lost_against(full: Rows, rows: Rows, config: SwarmConfig) -> dict[str, float | None]:
+    """What a policy loses against full communication, over the episodes in which the robots arrive with both.
+
+    :return: ``time_lost`` (s) and ``path_lost`` (m), means; None without such episodes
+    """
+    both = [(a, b) for a, b in zip(full, rows, strict=True) if a["arrived"] and b["arrived"]]
+    if not both:
+        return {"time_lost": None, "path_lost": None}
+    steps, path = (float(np.mean([b[name] - a[name] for a, b in both])) for name in ("steps_counted", "path_length"))
+    return {"time_lost": config.planner.dt * steps, "path_lost": path}
 
 
 def fly_all(

@@ -5,11 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from quad_swarm.planner import PlanStatus
+from quad_swarm.world.beliefs import BeliefSource
+from quad_swarm.world.messages import REQUEST_BYTES, plan_bytes
+from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import StepReport
+
+
+def exchange_bytes(config: SwarmConfig) -> int:
+    """Size of a request and its answer."""
+    return REQUEST_BYTES + plan_bytes(config.planner.horizon)
 
 
 class EpisodeStatistics:
     """Figures of the running episodes of E swarms, as arrays of length E.
+
+    :param n_swarms: number of swarms E
+    :param config: the world
 
     Requests and path count from the start until all robots are at their goals at once, a collision, or the time limit,
     whichever comes first. Separations are taken over all steps flown: where an episode goes on after a collision they
@@ -18,11 +29,15 @@ class EpisodeStatistics:
     :ivar steps: steps flown
     :ivar steps_counted: steps in which requests and path counted
     :ivar requests: requests made in them
+    :ivar peak_requests: most requests in one of them
+    :ivar plans_used: plans of others that were believed in them, and
+    :ivar plan_ages: the sum of their ages when they were (steps)
     :ivar requests_flown: requests made in all steps flown
     :ivar path_length: distance flown in the steps counted, mean over the robots (m)
     :ivar reached: all robots were at their goals at once
     :ivar arrived: the same, before any collision
     :ivar collided: two robots collided, by the collisions that end episodes
+    :ivar collided_at_steps: a collision seen at a step
     :ivar collided_continuous: a collision seen at or between steps
     :ivar min_separation: smallest distance between two robots at a step (m)
     :ivar min_separation_continuous: the same at or between steps (m)
@@ -34,11 +49,15 @@ class EpisodeStatistics:
         "steps": 0,
         "steps_counted": 0,
         "requests": 0,
+        "peak_requests": 0,
+        "plans_used": 0,
+        "plan_ages": 0,
         "requests_flown": 0,
         "path_length": 0.0,
         "reached": False,
         "arrived": False,
         "collided": False,
+        "collided_at_steps": False,
         "collided_continuous": False,
         "min_separation": np.inf,
         "min_separation_continuous": np.inf,
@@ -49,19 +68,23 @@ class EpisodeStatistics:
     steps: np.ndarray
     steps_counted: np.ndarray
     requests: np.ndarray
+    peak_requests: np.ndarray
+    plans_used: np.ndarray
+    plan_ages: np.ndarray
     requests_flown: np.ndarray
     path_length: np.ndarray
     reached: np.ndarray
     arrived: np.ndarray
     collided: np.ndarray
+    collided_at_steps: np.ndarray
     collided_continuous: np.ndarray
     min_separation: np.ndarray
     min_separation_continuous: np.ndarray
     planner_failures: np.ndarray
     solve_seconds: np.ndarray
 
-    def __init__(self, n_swarms: int, n_robots: int):
-        self.n_robots = n_robots
+    def __init__(self, n_swarms: int, config: SwarmConfig):
+        self.config = config
         for name, value in self._START.items():
             setattr(self, name, np.full(n_swarms, value))
 
@@ -86,9 +109,14 @@ class EpisodeStatistics:
         self.steps += 1
         self.steps_counted += counted
         self.requests += counted * n_requests
+        self.peak_requests = np.maximum(self.peak_requests, counted * n_requests)
+        used = counted[:, None, None] & (report.belief_source != BeliefSource.CONSTANT_VELOCITY)
+        self.plans_used += used.sum(axis=(1, 2))
+        self.plan_ages += (used * report.plan_age).sum(axis=(1, 2))
         self.requests_flown += n_requests
         self.path_length += counted * report.moved.mean(axis=1)
         self.collided |= collided
+        self.collided_at_steps |= report.collision
         self.collided_continuous |= report.collision_continuous
         at_goals = report.at_goal.all(axis=1)
         self.arrived |= at_goals & ~self.collided
@@ -109,13 +137,17 @@ class EpisodeStatistics:
 
     def metrics(self) -> dict[str, np.ndarray]:
         """Figures of the episodes so far, each (E,), by the names under which they are logged."""
-        plans = self.steps * self.n_robots
-        possible = self.steps_counted * self.n_robots * (self.n_robots - 1)
+        n, dt = self.config.n_robots, self.config.planner.dt
+        plans = self.steps * n
+        possible = self.steps_counted * n * (n - 1)
         return {
             "swarm/collision_rate": self.collided.astype(float),
             "swarm/arrival_rate": self.success.astype(float),
             "swarm/min_separation": self.min_separation.copy(),
             "comm/request_share": self.requests / possible,
+            "comm/peak_requests": self.peak_requests.astype(float),
+            "comm/bytes_per_second": exchange_bytes(self.config) * self.requests / (self.steps_counted * n * dt),
+            "comm/plan_age": dt * self.plan_ages / np.maximum(self.plans_used, 1),
             "planner/failure_rate": self.planner_failures / plans,
             "planner/solve_us": 1e6 * self.solve_seconds / plans,
         }

@@ -114,7 +114,7 @@ class RequestTask:
         self.end_at_collision = end_at_collision
         n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
-        self.statistics = EpisodeStatistics(swarm.n_swarms, n)
+        self.statistics = EpisodeStatistics(swarm.n_swarms, swarm.config)
         self.observation = observation or PaperObservation(n, scaled=False)
 
     @property

@@ -108,6 +108,11 @@ class Beliefs:
         # The last positions, velocities and prediction: who decides predicts first, and the step does so again.
         self._known: tuple[np.ndarray, np.ndarray, tuple[Prediction, np.ndarray]] | None = None
 
+    @property
+    def age(self) -> np.ndarray:
+        """Steps since each believed plan was made, as of the last `update`, (E, n, n - 1)."""
+        return self._age
+
     def forget(self, swarms: np.ndarray) -> None:
         """Forget every received plan in the given swarms (indices or mask)."""
         self._age[swarms] = self.horizon
@@ -173,5 +178,14 @@ class Beliefs:
             self._remembered = remembered
             self._age = prediction.age.copy()
             self._age[arriving] = age
+        else:
+            self._age = np.where(arriving, _filled(arriving, age), self.horizon)
         self._known = None
         return believed, source
+
+
+def _filled(where: np.ndarray, values: np.ndarray | int) -> np.ndarray:
+    """An array with values where a mask is true, in its order."""
+    filled = np.zeros(where.shape, dtype=np.int64)
+    filled[where] = values
+    return filled

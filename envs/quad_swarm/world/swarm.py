@@ -32,6 +32,7 @@ class StepReport(NamedTuple):
     :param moved: distance that each robot flew, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
+    :param plan_age: steps since the plans were made that are believed, (E, n, n - 1); only where one is
     :param plan_status: `PlanStatus` of each robot's plan, (E, n)
     :param iterations: solver iterations of each robot, (E, n)
     :param solve_seconds: wall-clock time of the planner's batch call (s)
@@ -47,6 +48,7 @@ class StepReport(NamedTuple):
     moved: np.ndarray
     at_goal: np.ndarray
     belief_source: np.ndarray
+    plan_age: np.ndarray
     plan_status: np.ndarray
     iterations: np.ndarray
     solve_seconds: float
@@ -275,6 +277,7 @@ class Swarm:
             moved=np.sqrt(_dot(pos - before, pos - before)),
             at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
             belief_source=source,
+            plan_age=self.beliefs.age.copy(),  # a later reset writes into it
             plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,

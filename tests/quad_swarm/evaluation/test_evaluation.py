@@ -8,9 +8,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from quad_swarm.evaluation.evaluation import _run_all, evaluate, summarise
+from quad_swarm.evaluation.evaluation import _run_all, evaluate, fly_all, summarise
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import make_config
@@ -72,6 +73,18 @@ def test_depths_of_collisions_are_counted_apart():
     figures = summarise(rows, config)
     assert (figures["collisions"], figures["collisions_1cm"], figures["collisions_3cm"]) == (5, 3, 1)
     assert (figures["collisions_continuous_1cm"], figures["collisions_continuous_3cm"]) == (5, 3)
+
+
+def test_what_is_lost_against_full_communication():
+    config = make_config("paper")
+    conditions = [Condition(policy, "symmetric_swap", config) for policy in ("full", "cpa:0.7:1.5")]
+    full, rule = evaluate(conditions, 5)
+    assert (full["time_lost"], full["path_lost"]) == (0.0, 0.0)
+    flown = fly_all(conditions, 5)
+    both = [(a, b) for a, b in zip(*flown.values(), strict=True) if a["arrived"] and b["arrived"]]
+    assert rule["time_lost"] == pytest.approx(0.1 * np.mean([b["steps_counted"] - a["steps_counted"] for a, b in both]))
+    assert rule["path_lost"] == pytest.approx(np.mean([b["path_length"] - a["path_length"] for a, b in both]))
+    assert "time_lost" not in evaluate(conditions[1:], 2)[0]
 
 
 def killed_once(condition: Condition, episodes: range) -> list[dict[str, float]]:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from quad_swarm.planner import PlanStatus
-from quad_swarm.task.episode_statistics import EpisodeStatistics
+from quad_swarm.task.episode_statistics import EpisodeStatistics, exchange_bytes
 from quad_swarm.task.request_task import RequestTask, make_task
+from quad_swarm.world.messages import REQUEST_BYTES, pack_plan
 
 ALL = np.ones((1, 2, 1), bool)
 APART = np.array([[-1.0, 0, 1], [1.0, 0, 1]])
@@ -91,7 +92,7 @@ def test_swarms_are_counted_by_themselves():
     row = statistics.row(1)
     statistics.keep(np.array([False, True, True]))
     assert statistics.row(0) == row
-    assert row.keys() == EpisodeStatistics(1, 2).row(0).keys()
+    assert row.keys() == EpisodeStatistics(1, task.swarm.config).row(0).keys()
     assert all(type(value) in (int, float, bool) for value in row.values()), "rows are written as JSON"
 
 
@@ -106,3 +107,31 @@ def test_plans_without_a_solve_are_failures():
     seconds = task.statistics.solve_seconds[0]
     assert metrics["planner/solve_us"] == pytest.approx(1e6 * seconds / 6)
     assert seconds > 0
+
+
+def test_what_communication_costs():
+    task = make_task(n_robots=2, planner={"dt": 0.05})
+    task.place(0, "given", APART, [[0.0, 3, 1], [0, -3, 1]], np.random.default_rng(0))
+    one = np.array([[[True], [False]]])
+    for requests in (ALL, ALL, one, ~ALL):
+        task.step(requests)
+    metrics = task.statistics.metrics()
+    size = exchange_bytes(task.swarm.config)
+    assert size == REQUEST_BYTES + len(pack_plan(0, 1, 0, np.zeros((11, 3))))
+    assert metrics["comm/bytes_per_second"][0] == pytest.approx(size * 5 / (2 * 4 * 0.05))
+    assert metrics["comm/peak_requests"][0] == 2
+    # One step old when they are asked for; remembered plans are older.
+    ages = [1, 1, 1, 1, 1, 2, 2, 3]
+    assert metrics["comm/plan_age"][0] == pytest.approx(0.05 * np.mean(ages))
+
+
+def test_contact_between_steps_is_told_from_contact_at_them():
+    task = begun([[-1.0, 0.1, 1], [1.0, -0.1, 1]], APART[::-1])
+    task.swarm.state[0, :, 3] = [20.0, -20.0]
+    task.step(ALL)
+    assert task.statistics.collided_continuous[0]
+    assert not task.statistics.collided_at_steps[0]
+    assert not task.statistics.collided[0]
+    put(task, [[-0.1, 0, 1], [0.1, 0, 1]])
+    task.step(ALL)
+    assert task.statistics.collided_at_steps[0]
