@@ -100,7 +100,7 @@ def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -
     )
 
 
-def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float) -> ca.SX:
+def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float | ca.SX) -> ca.SX:
     """One classical Runge-Kutta step of length ``dt`` (s) with held input (eq. 1); shapes as `state_derivative`."""
     k1 = state_derivative(x, u, wind, params)
     k2 = state_derivative(x + dt / 2 * k1, u, wind, params)
@@ -109,17 +109,20 @@ def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def step_function(params: QuadrotorParams, dt: float, varied: bool = False) -> ca.Function:
+def step_function(params: QuadrotorParams, dt: float | None, varied: bool = False) -> ca.Function:
     """The discrete dynamics as a CasADi function ``(x, u, wind) -> x_next`` with shapes (9,), (4,), (2,) -> (9,).
 
-    :param varied: a fourth argument, (8,), holds the factors of `VEHICLE_PARAMETERS`
+    :param dt: length of the step (s); None makes it a further argument
+    :param varied: a further argument, (8,), holds the factors of `VEHICLE_PARAMETERS`
     """
     x, u, wind = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS), ca.SX.sym("wind", 2)
     inputs = {"x": x, "u": u, "wind": wind}
     if varied:
         inputs["factors"] = ca.SX.sym("factors", len(VEHICLE_PARAMETERS))
         params = scaled(params, inputs["factors"])
-    x_next = ca.cse(rk4_step(x, u, wind, params, dt))
+    if dt is None:
+        inputs["dt"] = ca.SX.sym("dt")
+    x_next = ca.cse(rk4_step(x, u, wind, params, inputs.get("dt", dt)))
     return ca.Function("quadrotor_step", list(inputs.values()), [x_next], list(inputs), ["x_next"])
 
 
@@ -146,16 +149,23 @@ class QuadrotorModel:
         :param factors: of each vehicle's `VEHICLE_PARAMETERS`, (..., 8); None for vehicles like the model
         :return: states one step later, (..., 9)
         """
+        if factors is None:
+            return self._call(x, [x, u, wind], self.dt, False)
+        return self._call(x, [x, u, wind, factors], self.dt, True)
+
+    def ahead(self, x: np.ndarray, u: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """States after times of their own, in still air: (..., 9), (..., 4), (...) (s) -> (..., 9)."""
+        return self._call(x, [x, u, None, time], None, False)
+
+    def _call(self, x: np.ndarray, arguments: list[np.ndarray | None], dt: float | None, varied: bool) -> np.ndarray:
         count = x.size // N_STATES
         if count == 0:
             return x.copy()
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
-        varied = factors is not None
         calls: dict[Any, _BufferedCall] = self._local.__dict__
-        key = f"varied{capacity}" if varied else capacity
+        key = (dt, varied, capacity)
         if key not in calls:
-            calls[key] = _BufferedCall(step_function(self.params, self.dt, varied), capacity)
-        arguments = [x, u, wind] if factors is None else [x, u, wind, factors]
+            calls[key] = _BufferedCall(step_function(self.params, dt, varied), capacity)
         return calls[key](count, arguments).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams, state_derivative
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams, state_derivative
 
 PARAMS = QuadrotorParams()
 
@@ -105,3 +105,28 @@ def test_threads_may_share_a_model():
 def test_refuses_senseless_parameters():
     with pytest.raises(ValueError, match="drag_x=-1: it must be greater than or equal to 0"):
         QuadrotorParams(drag_x=-1)
+
+
+def test_states_after_times_of_their_own():
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(5, 9)) * 0.3, rng.normal(size=(5, 4)) * 0.2
+    model = QuadrotorModel(QuadrotorParams(), 0.1)
+    assert np.array_equal(model.ahead(x, u, np.zeros(5)), x)
+    np.testing.assert_allclose(model.ahead(x, u, np.full(5, 0.1)), model.step(x, u), atol=1e-12)
+    half = QuadrotorModel(QuadrotorParams(), 0.05).step(x, u)
+    times = np.array([0.1, 0.05, 0.1, 0.05, 0.0])
+    expected = np.where(times[:, None] == 0.1, model.step(x, u), np.where(times[:, None] == 0.05, half, x))
+    np.testing.assert_allclose(model.ahead(x, u, times), expected, atol=1e-12)
+
+
+def test_a_vehicle_with_other_parameters_flies_as_the_model_of_those():
+    rng = np.random.default_rng(1)
+    x, u, wind = rng.normal(size=(3, 9)) * 0.3, rng.normal(size=(3, 4)) * 0.2, rng.normal(size=(3, 2))
+    factors = rng.uniform(0.8, 1.2, (3, len(VEHICLE_PARAMETERS)))
+    model = QuadrotorModel(QuadrotorParams(), 0.02)
+    flown = model.step(x, u, wind, factors)
+    for k in range(3):
+        params = {name: getattr(model.params, name) * f for name, f in zip(VEHICLE_PARAMETERS, factors[k], strict=True)}
+        alone = QuadrotorModel(QuadrotorParams(**params), 0.02).step(x[k], u[k], wind[k])
+        np.testing.assert_allclose(flown[k], alone, atol=1e-12)
+    np.testing.assert_allclose(model.step(x, u, wind, np.ones_like(factors)), model.step(x, u, wind), atol=1e-12)

@@ -38,8 +38,11 @@ def reverse_indices(n_robots: int) -> np.ndarray:
 
 def constant_velocity(pos: np.ndarray, vel: np.ndarray, horizon: int, dt: float) -> np.ndarray:
     """Positions at the next ``horizon`` steps if the velocity stayed: (..., 3), (..., 3) -> (..., N, 3) (m)."""
-    times = dt * np.arange(1, horizon + 1)
-    return pos[..., None, :] + times[:, None] * vel[..., None, :]
+    # Stages and coordinates as one axis: numpy is slow along three numbers
+    trajectory = np.tile(vel, horizon)
+    trajectory *= np.repeat(dt * np.arange(1, horizon + 1), 3)
+    trajectory += np.tile(pos, horizon)
+    return trajectory.reshape(*pos.shape[:-1], horizon, 3)
 
 
 def advance(trajectory: np.ndarray) -> np.ndarray:
@@ -49,13 +52,19 @@ def advance(trajectory: np.ndarray) -> np.ndarray:
 
 
 def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:
-    """A trajectory (..., K, 3) at times that are later by a share of a step, (...) in (-1, 1), linear in between; its
-    first and last pieces go on in a straight line."""
-    part = np.abs(later)[..., None, None]
-    slope = np.diff(trajectory, axis=-2)
-    after = np.concatenate([slope, slope[..., -1:, :]], axis=-2)
-    before = np.concatenate([slope[..., :1, :], slope], axis=-2)
-    return trajectory + part * np.where((later < 0)[..., None, None], -before, after)
+    """A trajectory (..., K, 3) at times that are later, or all earlier, by a share of a step, (...) in [0, 1) or
+    (-1, 0]; linear in between, and its first and last pieces go on in a straight line."""
+    flat = trajectory.reshape(*trajectory.shape[:-2], -1)
+    pieces = flat[..., 3:] - flat[..., :-3]
+    pieces *= later[..., None]
+    moved = flat.copy()
+    if (later >= 0).all():
+        moved[..., :-3] += pieces
+        moved[..., -3:] += pieces[..., -3:]
+    else:
+        moved[..., 3:] += pieces
+        moved[..., :3] += pieces[..., :3]
+    return moved.reshape(trajectory.shape)
 
 
 def answered(arriving: np.ndarray, trajectories: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -225,12 +225,10 @@ class Swarm:
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """What each robot has to plan for, from the time on when its input will act."""
         x, start = self.estimate(), self.chance.start
-        if start is not None and self._vehicle is not None:
-            for k in range(start.max()):
-                x = np.where((start > k)[..., None], self._vehicle.step(x, self._u), x)
-            believed = resampled(
-                believed, np.broadcast_to((start / self.config.substeps)[..., None], believed.shape[:3])
-            )
+        if start is not None:
+            later = start / self.config.substeps
+            x = self.planner.model.ahead(x, self._u, later * self.config.planner.dt)
+            believed = resampled(believed, np.broadcast_to(later[..., None], believed.shape[:3]))
         return Problems(
             x=x.reshape(-1, 9),
             goal=self.goal.reshape(-1, 3),
