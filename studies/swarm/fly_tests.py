@@ -30,6 +30,7 @@ from studies.swarm.protocol import (
     DATA,
     EARLIER,
     NAMES,
+    PRESETS_TESTED,
     ROOT,
     TEST,
     absolute_path,
@@ -51,7 +52,6 @@ QUICK = 20
 RECKLESS = 0.6
 # The rule that the paper compares with, and the simplest one that is better
 DBCP, CPA = "distance:4", "cpa:0.7:1.5"
-PRESETS_TESTED = ("paper", "dense")
 # What tells the conditions of a part from each other; one that is flown again replaces its rows
 CONDITION = ("preset", "scenario", "condition", "n_robots")
 # Other sizes than those it was trained with

@@ -19,7 +19,16 @@ from typing import Any
 from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
 from quad_swarm.world.presets import PRESETS
 from quad_swarm.world.scenarios import SCENARIOS
-from studies.swarm.protocol import QUICK_STAGES, STAGES, fly_validation, in_stages, progress, replace_rows, world
+from studies.swarm.protocol import (
+    PRESETS_TESTED,
+    QUICK_STAGES,
+    STAGES,
+    fly_validation,
+    in_stages,
+    progress,
+    replace_rows,
+    world,
+)
 
 DISTANCES = (0.62, 0.65, 0.7, 0.8, 0.9, 1.05, 1.2, 1.5)
 LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
@@ -110,7 +119,7 @@ def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], qui
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS))
+    parser.add_argument("--preset", nargs="+", default=PRESETS_TESTED, choices=list(PRESETS))
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
     parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
     parser.add_argument("--family", nargs="+", default=list(families()), choices=list(families()))
