@@ -175,7 +175,7 @@ def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
 
 def interval(values: Sequence[float]) -> float:
     """:return: half of the 95 % interval of the mean, by Student's t"""
-    from scipy.stats import t  # type: ignore[import-untyped]
+    from scipy.stats import t
 
     return float(t.ppf(0.975, len(values) - 1)) * stdev(values) / len(values) ** 0.5 if len(values) > 1 else np.nan
 

@@ -65,6 +65,10 @@ def _replay(argv: list[str]) -> int:
     return _hand_over("replays", argv)
 
 
+def _identify(argv: list[str]) -> int:
+    return _hand_over("identifiers", argv)
+
+
 def _hand_over(group: str, argv: list[str]) -> int:
     """
     Call what a package offers for its environment; without --env the only one that is offered for.
@@ -207,6 +211,12 @@ COMMANDS: dict[str, Command] = {
         "make a page that replays an episode in three dimensions",
         f"  {PROG} replay --env ENV --policy latest:logs --out replay.html",
         "replays",
+    ),
+    "identify": Command(
+        _identify,
+        "fit the model of an environment's vehicle to a simulator",
+        f"  {PROG} identify --env ENV --plant SIMULATOR:VEHICLE --out vehicle.yml",
+        "identifiers",
     ),
     "bench": Command(
         _bench,

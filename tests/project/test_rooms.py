@@ -16,7 +16,8 @@ SOURCES = {"sb3_maddpg": ROOT / "sb3_maddpg", "quad_swarm": ROOT / "envs" / "qua
 ROOMS = {
     "": set(),
     "planner": {""},
-    "world": {"", "planner"},
+    "plants": {""},
+    "world": {"", "planner", "plants"},
     "task": {"", "planner", "world"},
     "interfaces": {"", "planner", "world", "task"},
     "evaluation": {"", "planner", "world", "task"},

@@ -107,6 +107,7 @@ def add_policy_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--world", nargs="+", default=[], metavar="NAME=VALUE", help="fields of SwarmConfig, e.g. noise.wind=1"
     )
+    parser.add_argument("--plant", help="what is flown: model (default), or a simulator's vehicle: crazyflow:cf21B_500")
     parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="imported first: own scenarios and rules")
     parser.add_argument(
         "--algo",
@@ -129,7 +130,7 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
             raise unknown_name("scenario", name, SCENARIOS)
     models = {policy: trained_in(load_model(policy, args.algo)) for policy in args.policy if is_model(policy)}
     args.preset = args.preset or _preset_of(models)
-    config = make_config(args.preset, _parse_world(args.world), n_robots=args.n_robots)
+    config = make_config(args.preset, _parse_world(args.world), n_robots=args.n_robots, plant=args.plant)
     for policy, trained in models.items():
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, this is {args.preset!r}", file=sys.stderr)

@@ -12,8 +12,10 @@ from pydantic import Field, PositiveInt
 
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.planner import PlannerConfig
+from quad_swarm.plants.base import MODEL, parse_plant
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.validation import Length, PositiveLength, checked, replaced
+from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.scenarios import ScenarioSpace
 
@@ -41,6 +43,8 @@ class SwarmConfig:
     :param noise: disturbances of the flight
     :param sensing: errors of the estimated states
     :param radio: how plans travel
+    :param plant: what is flown: "model" is the planner's model (with the disturbances), "crazyflow:cf21B_500" a vehicle
+        of that simulator, see `quad_swarm.plants`
     :param mismatch: by up to this share each vehicle's parameters differ from the planner's model, drawn evenly for
         each robot, parameter and episode
     :param clock_skew: the latest time, as a share of a step, after the beginning of a step at which a robot's new input
@@ -64,6 +68,7 @@ class SwarmConfig:
     noise: ProcessNoise = field(default_factory=ProcessNoise)
     sensing: SensingError = field(default_factory=SensingError)
     radio: Radio = field(default_factory=Radio)
+    plant: str = MODEL
     mismatch: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
@@ -84,6 +89,11 @@ class SwarmConfig:
             raise ValueError(
                 f"planner.dt={planner.dt}: steps must not exceed {longest:.2g} s, "
                 "the stability limit of the integration of the quadrotor's fastest response"
+            )
+        if parse_plant(self.plant)[0] != MODEL and self.mismatch:
+            raise ValueError(
+                f"mismatch={self.mismatch}: only the vehicles of our own model can be varied, those of "
+                f"plant={self.plant!r} are unlike it anyway: set it to 0"
             )
         fastest = longest * (1 - self.mismatch)
         if planner.dt / self.substeps > fastest:
@@ -148,7 +158,8 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
     """A preset with some of its fields replaced.
 
     The planner's separation follows the radius: where only the radius is given, the planner keeps as much beyond twice
-    the radius as the preset does.
+    the radius as the preset does. ``quadrotor`` may be a name of `VEHICLES` or the path of a vehicle file. With a
+    foreign ``plant`` there is no ``mismatch`` unless given, which is refused.
 
     :param preset: a name of `PRESETS`
     :param world: fields of `SwarmConfig`; nested ones take a mapping of what to replace in them
@@ -164,6 +175,10 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
         with contextlib.suppress(TypeError, ValueError, OverflowError):  # no number: the check of the fields says so
             separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
             changes = {**changes, "planner": {**planner, "separation": separation}}
+    if isinstance(vehicle := changes.get("quadrotor"), str):
+        changes = {**changes, "quadrotor": load_vehicle(vehicle)}
+    if changes.get("plant", MODEL) != MODEL:
+        changes = {"mismatch": 0.0, **changes}
     return replaced(base, changes)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
-from quad_swarm.quadrotor import POSITION, VELOCITY, QuadrotorModel
+from quad_swarm.plants import make_plant
+from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, advance, answered, other_indices, resampled
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
@@ -72,7 +73,7 @@ class Swarm:
         self.config = config
         self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_robots, solver)
         n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
-        self._vehicle = QuadrotorModel(config.quadrotor, dt / config.substeps) if config.substeps > 1 else None
+        self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
         self.state = np.zeros((n_swarms, n, 9))
         self.goal = np.zeros((n_swarms, n, 3))
         self.chance = Realisation(config, n_swarms)
@@ -163,6 +164,7 @@ class Swarm:
         for plans in self._earlier:
             plans[swarm] = self.plans[swarm, ..., POSITION]
         self._u[swarm] = 0.0
+        self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
             self.chance.reset(swarm, noise_seed)
 
@@ -170,6 +172,7 @@ class Swarm:
         """Drop all but the given swarms (mask)."""
         self.state, self.goal, self._u = self.state[swarms], self.goal[swarms], self._u[swarms]
         self.chance.keep(swarms)
+        self._plant.keep(swarms)
         for beliefs in {self.beliefs, self.presumed_beliefs}:
             beliefs.keep(swarms)
         self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
@@ -181,6 +184,7 @@ class Swarm:
         part.beliefs = copy(self.beliefs)
         part.presumed_beliefs = part.beliefs if self.presumed_beliefs is self.beliefs else copy(self.presumed_beliefs)
         part.chance = copy(self.chance)
+        part._plant = self._plant.fork()
         part.keep(swarms)
         return part
 
@@ -240,10 +244,9 @@ class Swarm:
         """Move the robots by a step; their positions before it and after each sub-step, (E, n, 3) each (m)."""
         chance, before, planned = self.chance, self._u, self._plans.u[:, 0].reshape(self._u.shape)
         positions = [self.pos.copy()]
-        vehicle = self._vehicle or self.planner.model
         for k in range(self.config.substeps):
             self._u = planned if chance.start is None else np.where((chance.start <= k)[..., None], planned, before)
-            self.state = vehicle.step(self.state, self._u, chance.air, chance.factors)
+            self.state = self._plant.step(self.state, self._u, chance.air, chance.factors)
             positions.append(self.pos)
         if self.config.is_random:
             kicks = chance.advance()

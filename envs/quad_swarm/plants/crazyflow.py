@@ -1,0 +1,142 @@
+"""Crazyflow (Schuck, Rath et al., arXiv:2606.01478): identified Crazyflie and Holybro vehicles, 500 Hz, vectorised.
+
+Its vehicles take attitudes and a thrust. The climb rate that our robots command is held by a proportional loop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import warnings
+from copy import copy
+
+import numpy as np
+
+with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    warnings.simplefilter("ignore")  # of optional parts that are not needed here
+    logging.getLogger("jax").setLevel(logging.ERROR)
+    # Crazyflow first: it has to be imported before SciPy
+    from crazyflow.control import Control
+    from crazyflow.drones import Drone
+    from crazyflow.dynamics import Dynamics
+    from crazyflow.sim import Sim
+import jax.numpy as jnp
+import mujoco
+from scipy.spatial.transform import Rotation
+
+from quad_swarm.quadrotor import ATTITUDE, POSITION, VELOCITY, QuadrotorParams
+
+_FREQUENCY = 500  # Hz
+_CLIMB_GAIN = 3.0  # 1/s, of the loop that makes a thrust of a climb rate
+_GRAVITY = 9.81
+_MAX_THRUST = 1.8  # of the weight
+# Above the simulator's floor, which it would rest on: our workspace has none
+_ALTITUDE = 100.0
+
+
+class CrazyflowPlant:
+    """See `Plant`. Swarms that were dropped stay in the simulation, so that nothing is compiled anew.
+
+    :param vehicle: a drone of crazyflow; Holybro's has second-order attitude dynamics, the others first principles
+    :param params: whose drag says how wind pushes the vehicle
+    :param dt: length of a sub-step (s), a multiple of 2 ms
+    :param n_swarms: number of swarms E
+    :param n_robots: number of robots in a swarm
+    :raises ValueError: the sub-step is no multiple of 2 ms
+    """
+
+    def __init__(self, vehicle: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int):
+        self._n_steps = round(dt * _FREQUENCY)
+        if self._n_steps < 1 or abs(self._n_steps / _FREQUENCY - dt) > 1e-9:
+            raise ValueError(f"crazyflow moves in steps of {1000 / _FREQUENCY:.0f} ms: a sub-step of {dt} s is none.")
+        dynamics = Dynamics.so_rpy if vehicle == "hb_x500" else Dynamics.first_principles
+        mujoco.set_mju_user_warning(lambda message: None)  # how it copies a drone is not the user's concern
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self._sim = Sim(
+                n_worlds=n_swarms,
+                n_drones=n_robots,
+                drone=Drone(vehicle),
+                dynamics=dynamics,
+                control=Control.attitude,
+                freq=_FREQUENCY,
+                attitude_freq=_FREQUENCY,
+            )
+        params_of_drone = self._sim.data.params
+        self._mass = _number(params_of_drone.mass)
+        # Force of the rotors by the thrust that is commanded, which identified dynamics scale: offset (N) and slope
+        self._thrust = (0.0, 1.0)
+        if dynamics == Dynamics.so_rpy:
+            self._thrust = (_number(params_of_drone.acc_coef), _number(params_of_drone.cmd_f_coef))
+        self._drag = np.array([params.drag_x, params.drag_y])
+        self._kept = np.arange(n_swarms)
+        self._data = self._sim.data
+
+    def place(self, swarm: int, state: np.ndarray) -> None:
+        """See `Plant`."""
+        k, states = int(self._kept[swarm]), self._data.states
+        default = self._sim.default_data.states
+        hover = self._hover_rotors()
+        self._data = self._data.replace(
+            states=states.replace(
+                pos=states.pos.at[k].set(state[:, POSITION] + [0, 0, _ALTITUDE]),
+                vel=states.vel.at[k].set(state[:, VELOCITY]),
+                quat=states.quat.at[k].set(Rotation.from_euler("xyz", state[:, ATTITUDE]).as_quat()),
+                ang_vel=states.ang_vel.at[k].set(default.ang_vel[k]),
+                rotor_vel=states.rotor_vel.at[k].set(hover),
+            )
+        )
+
+    def _hover_rotors(self) -> float:
+        """Speed of a rotor that carries its share of the weight; 0 where the dynamics know none."""
+        coefficients = getattr(self._sim.data.params, "rpm2thrust", None)
+        if coefficients is None:
+            return 0.0
+        a, b, c = (float(value) for value in np.asarray(coefficients).reshape(-1, 3)[0])
+        return float((-b + np.sqrt(b * b - 4 * c * (a - self._mass * _GRAVITY / 4))) / (2 * c))
+
+    def keep(self, swarms: np.ndarray) -> None:
+        """See `Plant`."""
+        self._kept = self._kept[swarms]
+
+    def fork(self) -> CrazyflowPlant:
+        """See `Plant`; JAX's arrays never change."""
+        return copy(self)
+
+    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray, factors: np.ndarray | None) -> np.ndarray:
+        """See `Plant`."""
+        if not len(self._kept):
+            return state.copy()
+        states = self._data.states
+        shape = states.pos.shape[:2]
+        cos_tilt = np.cos(state[..., 6]) * np.cos(state[..., 7])
+        climb = _GRAVITY + _CLIMB_GAIN * (u[..., 2] - state[..., 5])
+        force_up = self._mass * np.clip(climb / np.maximum(cos_tilt, 0.5), 0.0, _MAX_THRUST * _GRAVITY)
+        offset, slope = self._thrust
+        controls = np.zeros((*shape, 4), dtype=np.float32)
+        controls[..., 3] = (self._mass * _GRAVITY - offset) / slope
+        # The yaw that is held is the one that the robot has, turned by what its rate makes of it in the sub-step.
+        yaw = state[..., 8] + u[..., 3] * self._n_steps / _FREQUENCY
+        controls[self._kept] = np.stack([u[..., 0], u[..., 1], yaw, (force_up - offset) / slope], axis=-1)
+        force = np.zeros((*shape, 3), dtype=np.float32)
+        force[self._kept, :, :2] = self._mass * self._drag * air
+        pos, vel = np.array(states.pos), np.array(states.vel)
+        pos[self._kept], vel[self._kept] = state[..., POSITION] + [0, 0, _ALTITUDE], state[..., VELOCITY]
+        self._sim.data = self._data.replace(
+            states=states.replace(pos=jnp.asarray(pos), vel=jnp.asarray(vel), force=jnp.asarray(force))
+        )
+        self._sim.attitude_control(jnp.asarray(controls))
+        self._sim.step(self._n_steps)
+        self._data = self._sim.data
+        states = self._data.states
+        after = np.zeros_like(state)
+        after[..., POSITION] = np.asarray(states.pos)[self._kept] - [0, 0, _ALTITUDE]
+        after[..., VELOCITY] = np.asarray(states.vel)[self._kept]
+        quaternions = np.asarray(states.quat)[self._kept].reshape(-1, 4)
+        after[..., ATTITUDE] = Rotation.from_quat(quaternions).as_euler("xyz").reshape(*state.shape[:2], 3)
+        return after
+
+
+def _number(value: object) -> float:
+    return float(np.asarray(value).ravel()[0])

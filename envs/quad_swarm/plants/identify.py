@@ -1,0 +1,122 @@
+"""Identify a vehicle: step responses of a plant, and the planner's model that comes closest to them.
+
+``sb3-maddpg identify --plant crazyflow:cf21B_500 --out crazyflie.yml`` prints the parameters with what they leave over,
+and writes a vehicle file that worlds take as ``vehicle``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+from quad_swarm.plants.base import make_plant
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams
+
+EXAMPLES = "  sb3-maddpg identify --plant crazyflow:cf21B_500 --out crazyflie.yml"
+
+DT = 0.01  # s
+SECONDS = 3.0
+HELD = 2.0  # s, after which an input goes back to zero
+TILTS = (-0.3, -0.15, 0.15, 0.3)  # rad
+CLIMBS = (-1.0, -0.5, 0.5, 1.0)  # m/s
+# Usual sizes of what is fitted, by which errors are weighed: attitudes of 0.1 rad count as much as speeds of 1 m/s
+_SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1])
+
+
+class Identification(NamedTuple):
+    """What was found.
+
+    :param params: of the model
+    :param attitude_rms: what the model leaves over of roll and pitch, root mean square (deg)
+    :param attitude_max: the largest error (deg)
+    :param velocity_rms: the same of the velocities (m/s)
+    :param velocity_max: the largest error (m/s)
+    """
+
+    params: QuadrotorParams
+    attitude_rms: float
+    attitude_max: float
+    velocity_rms: float
+    velocity_max: float
+
+
+def experiment() -> np.ndarray:
+    """Inputs of the step responses, one robot each: roll, pitch and climb rate, (T, robots, 4)."""
+    steps = [(axis, size) for axis, sizes in enumerate((TILTS, TILTS, CLIMBS)) for size in sizes]
+    u = np.zeros((round(SECONDS / DT), len(steps), 4))
+    for robot, (axis, size) in enumerate(steps):
+        u[: round(HELD / DT), robot, axis] = size
+    return u
+
+
+def identify(plant: str) -> Identification:
+    """Fit the planner's model to step responses of a plant, roll, pitch and climb rate for both signs and two sizes.
+
+    :param plant: see `parse_plant`
+    :raises ValueError: unknown plant
+    """
+    u = experiment()
+    count = u.shape[1]
+    params = QuadrotorParams()
+    flown = make_plant(plant, params, DT, 1, count)
+    states = [np.zeros((1, count, 9))]
+    states[0][0, :, 0] = 10.0 * np.arange(count)
+    flown.place(0, states[0][0])
+    still = np.zeros((1, count, 2))
+    for inputs in u:
+        states.append(flown.step(states[-1], inputs[None], still, None))
+    measured = np.concatenate(states[1:])[..., 3:8]
+
+    model = QuadrotorModel(params, DT)
+
+    def predicted(factors: np.ndarray) -> np.ndarray:
+        x, path = states[0][0], []
+        for inputs in u:
+            x = model.step(x, inputs, None, np.broadcast_to(factors, (count, len(factors))))
+            path.append(x[:, 3:8])
+        return np.array(path)
+
+    from scipy.optimize import least_squares  # only now: some simulators have to be imported before SciPy
+
+    fit = least_squares(
+        lambda factors: ((predicted(factors) - measured) / _SCALE).ravel(),
+        np.ones(len(VEHICLE_PARAMETERS)),
+        bounds=(1e-2, 50.0),
+    )
+    error = predicted(fit.x) - measured
+    attitude, velocity = np.degrees(error[..., 3:]), error[..., :3]
+    values = {name: float(getattr(params, name) * f) for name, f in zip(VEHICLE_PARAMETERS, fit.x, strict=True)}
+    return Identification(
+        QuadrotorParams(**values),
+        float(np.sqrt((attitude**2).mean())),
+        float(np.abs(attitude).max()),
+        float(np.sqrt((velocity**2).mean())),
+        float(np.abs(velocity).max()),
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
+    parser.add_argument("--plant", required=True, help="simulator and vehicle, e.g. crazyflow:cf21B_500")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="vehicle file to write, YAML")
+    args = parser.parse_args(argv)
+    found = identify(args.plant)
+    print(f"{'parameter':22}{args.plant:>22}{'bebop2':>10}")
+    for name in VEHICLE_PARAMETERS:
+        print(f"{name:22}{getattr(found.params, name):22.4f}{getattr(QuadrotorParams(), name):10.4f}")
+    print(
+        f"left over: roll and pitch {found.attitude_rms:.2f} deg rms, {found.attitude_max:.2f} at most; "
+        f"velocity {found.velocity_rms:.3f} m/s rms, {found.velocity_max:.3f} at most"
+    )
+    if args.out:
+        values = {name: round(getattr(found.params, name), 4) for name in VEHICLE_PARAMETERS}
+        residuals = {name: round(getattr(found, name), 4) for name in Identification._fields[1:]}
+        text = f"# sb3-maddpg identify --plant {args.plant}\n"
+        args.out.write_text(text + yaml.safe_dump({"parameters": values, "residuals": residuals}, sort_keys=False))
+        print(f"wrote {args.out}")
+    return 0

@@ -1,0 +1,60 @@
+"""Vehicles by name, and vehicle files as ``sb3-maddpg identify`` writes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from quad_swarm.errors import shown, unknown_name
+from quad_swarm.quadrotor import QuadrotorParams
+
+VEHICLES: dict[str, QuadrotorParams] = {
+    # Parrot Bebop 2, the paper's: identified by tud-amr/mrca-mav
+    "bebop2": QuadrotorParams(),
+    # Bitcraze Crazyflie 2.1 Brushless, with our climb loop: sb3-maddpg identify --plant crazyflow:cf21B_500
+    "crazyflie21": QuadrotorParams(
+        drag_x=0.502,
+        drag_y=0.502,
+        roll_gain=1.005,
+        roll_time_constant=0.145,
+        pitch_gain=1.005,
+        pitch_time_constant=0.145,
+        climb_gain=0.856,
+        climb_time_constant=0.299,
+    ),
+    # Holybro X500: sb3-maddpg identify --plant crazyflow:hb_x500
+    "x500": QuadrotorParams(
+        drag_x=0.0142,
+        drag_y=0.0142,
+        roll_gain=0.951,
+        roll_time_constant=0.2,
+        pitch_gain=0.951,
+        pitch_time_constant=0.2,
+        climb_gain=1.0,
+        climb_time_constant=0.328,
+    ),
+}
+
+
+def load_vehicle(name: str) -> QuadrotorParams:
+    """The parameters of a vehicle.
+
+    :param name: of `VEHICLES`, or the path of a vehicle file (``.yml``)
+    :raises ValueError: unknown name, or a file that holds something else
+    :raises OSError: the file cannot be read
+    """
+    if not name.endswith((".yml", ".yaml")):
+        if name not in VEHICLES:
+            raise unknown_name("vehicle", name, [*VEHICLES, "FILE.yml"])
+        return VEHICLES[name]
+    try:
+        content: Any = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
+        values = content["parameters"]
+        return QuadrotorParams(**values)
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError) as error:
+        raise ValueError(
+            f"{name} is no vehicle file ({shown(str(error))}): `sb3-maddpg identify --out` writes one, with the "
+            "vehicle's values under `parameters`."
+        ) from None

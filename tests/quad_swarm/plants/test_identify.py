@@ -1,0 +1,33 @@
+"""What is identified is what is flown."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.plants.identify import DT, experiment, identify, main
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorParams
+from quad_swarm.vehicles import VEHICLES, load_vehicle
+
+
+def test_steps_in_every_direction_come_back_to_zero():
+    u = experiment()
+    assert u.shape == (round(3.0 / DT), 12, 4)
+    assert (np.abs(u[0]).max(axis=1) > 0).all()
+    assert not u[-1].any()
+    np.testing.assert_allclose(u.sum(axis=1)[0], 0, atol=1e-12)  # as far one way as the other
+
+
+def test_our_own_model_is_found_again():
+    found = identify("model")
+    for name in VEHICLE_PARAMETERS:
+        assert getattr(found.params, name) == pytest.approx(getattr(QuadrotorParams(), name), rel=1e-3)
+    assert max(found[1:]) < 1e-3
+
+
+def test_a_vehicle_file_is_written_that_worlds_take(tmp_path, capsys):
+    pytest.importorskip("mujoco", reason="the extra `plants` is not installed")
+    path = tmp_path / "vehicle.yml"
+    assert main(["--plant", "crazyflow:cf21B_500", "--out", str(path)]) == 0
+    assert "left over: roll and pitch" in capsys.readouterr().out
+    found = load_vehicle(str(path))
+    for name in VEHICLE_PARAMETERS:
+        assert getattr(found, name) == pytest.approx(getattr(VEHICLES["crazyflie21"], name), rel=0.02)
