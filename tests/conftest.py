@@ -6,7 +6,6 @@ import shutil
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before anything imports SciPy: crazyflow needs it
 
 
 @pytest.fixture(scope="session")

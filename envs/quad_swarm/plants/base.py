@@ -92,13 +92,6 @@ def make_plant(name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_r
     simulator, vehicle = parse_plant(name)
     if simulator == MODEL:
         return ModelPlant(QuadrotorModel(params, dt))
-    try:
-        from quad_swarm.plants.crazyflow import CrazyflowPlant
-    except ImportError as error:
-        raise ImportError(f"plant={name!r} needs the simulator: pip install 'sb3-maddpg[plants]' ({error}).") from error
-    except RuntimeError as error:
-        raise ImportError(
-            f"plant={name!r}: crazyflow must be imported before SciPy, or SCIPY_ARRAY_API=1 be set in the environment "
-            "when Python starts."
-        ) from error
-    return CrazyflowPlant(vehicle, params, dt, n_swarms, n_robots)
+    from quad_swarm.plants.remote import RemotePlant
+
+    return RemotePlant(simulator, vehicle, params, dt, n_swarms, n_robots)

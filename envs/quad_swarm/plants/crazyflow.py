@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import mujoco
 from scipy.spatial.transform import Rotation
 
-from quad_swarm.quadrotor import ATTITUDE, POSITION, VELOCITY, QuadrotorParams
+from quad_swarm.quadrotor import ATTITUDE, POSITION, VELOCITY
 
 _FREQUENCY = 500  # Hz
 _CLIMB_GAIN = 3.0  # 1/s, of the loop that makes a thrust of a climb rate
@@ -36,17 +36,19 @@ _ALTITUDE = 100.0
 
 
 class CrazyflowPlant:
-    """See `Plant`. Swarms that were dropped stay in the simulation, so that nothing is compiled anew.
+    """A `Plant`, but for the factors that only our own model has.
+
+    Swarms that were dropped stay in the simulation, so that nothing is compiled anew.
 
     :param vehicle: a drone of crazyflow; Holybro's has second-order attitude dynamics, the others first principles
-    :param params: whose drag says how wind pushes the vehicle
+    :param drag: along x and y, which says how wind pushes the vehicle (1/s)
     :param dt: length of a sub-step (s), a multiple of 2 ms
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
     :raises ValueError: the sub-step is no multiple of 2 ms
     """
 
-    def __init__(self, vehicle: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int):
+    def __init__(self, vehicle: str, drag: tuple[float, float], dt: float, n_swarms: int, n_robots: int):
         self._n_steps = round(dt * _FREQUENCY)
         if self._n_steps < 1 or abs(self._n_steps / _FREQUENCY - dt) > 1e-9:
             raise ValueError(f"crazyflow moves in steps of {1000 / _FREQUENCY:.0f} ms: a sub-step of {dt} s is none.")
@@ -63,13 +65,13 @@ class CrazyflowPlant:
                 freq=_FREQUENCY,
                 attitude_freq=_FREQUENCY,
             )
-        params_of_drone = self._sim.data.params
-        self._mass = _number(params_of_drone.mass)
+        drone = self._sim.data.params
+        self._mass = _number(drone.mass)
         # Force of the rotors by the thrust that is commanded, which identified dynamics scale: offset (N) and slope
         self._thrust = (0.0, 1.0)
         if dynamics == Dynamics.so_rpy:
-            self._thrust = (_number(params_of_drone.acc_coef), _number(params_of_drone.cmd_f_coef))
-        self._drag = np.array([params.drag_x, params.drag_y])
+            self._thrust = (_number(drone.acc_coef), _number(drone.cmd_f_coef))
+        self._drag = np.array(drag)
         self._kept = np.arange(n_swarms)
         self._data = self._sim.data
 
@@ -104,7 +106,7 @@ class CrazyflowPlant:
         """See `Plant`; JAX's arrays never change."""
         return copy(self)
 
-    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray, factors: np.ndarray | None) -> np.ndarray:
+    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray) -> np.ndarray:
         """See `Plant`."""
         if not len(self._kept):
             return state.copy()

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
+from scipy.optimize import least_squares
 
 from quad_swarm.plants.base import make_plant
 from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams
@@ -79,8 +80,6 @@ def identify(plant: str) -> Identification:
             x = model.step(x, inputs, None, np.broadcast_to(factors, (count, len(factors))))
             path.append(x[:, 3:8])
         return np.array(path)
-
-    from scipy.optimize import least_squares  # only now: some simulators have to be imported before SciPy
 
     fit = least_squares(
         lambda factors: ((predicted(factors) - measured) / _SCALE).ravel(),

@@ -1,0 +1,98 @@
+"""A simulator in a process of its own: its threads, its memory and what it asks of other libraries stay there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from multiprocessing import Pipe
+from typing import Any
+
+import numpy as np
+
+from quad_swarm.quadrotor import QuadrotorParams
+
+
+class _Server:
+    """The process, started at the first call. It ends with this one, however that ends."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._connection, there = Pipe()
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        command = [sys.executable, "-m", "quad_swarm.plants.server", str(there.fileno())]
+        self.process = subprocess.Popen(command, pass_fds=[there.fileno()], env=environment, stdin=subprocess.DEVNULL)
+        there.close()
+
+    def call(self, *message: Any) -> Any:
+        """What the process answers.
+
+        :raises ValueError: and `ImportError`, as the process did
+        :raises RuntimeError: the process died
+        """
+        with self._lock:
+            try:
+                self._connection.send(message)
+                answer = self._connection.recv()
+            except (EOFError, OSError) as error:
+                code = self.process.wait()
+                raise RuntimeError(f"The simulator's process ended with {code}; its messages stand above.") from error
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+_servers: dict[int, _Server] = {}
+
+
+def _server() -> _Server:
+    """This process' server; a fork of the process starts its own."""
+    server = _servers.get(os.getpid())
+    if server is None or server.process.poll() is not None:
+        server = _servers[os.getpid()] = _Server()
+    return server
+
+
+class RemotePlant:
+    """See `Plant`: one that another process flies.
+
+    :param simulator: one of `SIMULATORS`
+    :param vehicle: one of its vehicles
+    :param params: see `make_plant`
+    :param dt: length of a sub-step (s)
+    :param n_swarms: number of swarms E
+    :param n_robots: number of robots in a swarm
+    :raises ValueError: what the simulator refuses
+    :raises ImportError: it is not installed
+    """
+
+    def __init__(self, simulator: str, vehicle: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int):
+        self._server = _server()
+        drag = (params.drag_x, params.drag_y)
+        self._number = self._server.call("make", None, simulator, vehicle, drag, dt, n_swarms, n_robots)
+
+    def place(self, swarm: int, state: np.ndarray) -> None:
+        """See `Plant`."""
+        self._server.call("place", self._number, swarm, np.array(state))
+
+    def keep(self, swarms: np.ndarray) -> None:
+        """See `Plant`."""
+        self._server.call("keep", self._number, np.array(swarms))
+
+    def fork(self) -> RemotePlant:
+        """See `Plant`."""
+        fork = object.__new__(RemotePlant)
+        fork._server, fork._number = self._server, self._server.call("fork", self._number)
+        return fork
+
+    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray, factors: np.ndarray | None) -> np.ndarray:
+        """See `Plant`."""
+        return self._server.call("step", self._number, state, u, np.array(air))
+
+    def __del__(self) -> None:
+        if hasattr(self, "_number") and self._server.process.poll() is None:
+            try:
+                self._server.call("drop", self._number)
+            except (RuntimeError, AttributeError, TypeError):  # at the end of the interpreter
+                return
