@@ -49,6 +49,18 @@ def event(drift: float) -> Rule:
     return lambda view: (view.drift > drift) | (view.age >= view.horizon)
 
 
+def push(distance: float) -> Rule:
+    """Event-triggered, and decided by who is asked: gets the plan of whoever's plan, anywhere over the horizon, is more
+    than ``distance`` (m) away from what that robot takes the other to predict of it."""
+
+    def rule(view: View) -> np.ndarray:
+        presumed = view.presumed(range(view.horizon)).believed
+        off = length(view.plan[:, :, None] + view.own_pos[:, :, None, None] - presumed).max(axis=-1)
+        return view.of_the_other(off > distance)
+
+    return rule
+
+
 def stale(age: float) -> Rule:
     """Asks again when the newest plan was made at least ``age`` steps ago or is no longer believed."""
     return lambda view: (view.age >= age) | ~view.prediction.remembers
@@ -74,6 +86,7 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
     "cpa": (cpa, ("DIST", "LOOKAHEAD")),
     "soon": (soon, ("TIME",)),
     "event": (event, ("EPS",)),
+    "push": (push, ("EPS",)),
     "stale": (stale, ("STEPS",)),
     "plan": (plan, ("DIST",)),
     "random": (random, ("P",)),

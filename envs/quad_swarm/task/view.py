@@ -89,10 +89,14 @@ class View:
 
         :param stages: which of the next N steps, from 0 on; `Prediction.believed` holds no others
         """
-        beliefs = self._swarm.beliefs
         presumed = self._swarm.presume()
         presumed = presumed._replace(believed=presumed.believed.take(stages, axis=-2))
-        return Prediction(*(field[:, beliefs.others, beliefs.reverse] for field in presumed))
+        return Prediction(*(self.of_the_other(field) for field in presumed))
+
+    def of_the_other(self, field: np.ndarray) -> np.ndarray:
+        """What each of the others has about this robot, of something that robots have about others, (E, n, n - 1,
+        ...)."""
+        return field[:, self._swarm.beliefs.others, self._swarm.beliefs.reverse]
 
     @property
     def age(self) -> np.ndarray:

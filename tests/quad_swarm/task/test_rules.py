@@ -109,3 +109,19 @@ def test_plan_looks_at_the_own_plan():
     assert near[0, 0, 0] < 1.5
     assert np.array_equal(parse_rule("plan:1.5")(View(swarm)), near < 1.5)
     assert not parse_rule("plan:0.1")(View(swarm)).any()
+
+
+def test_push_sends_what_has_left_what_the_others_were_told():
+    swarm = Swarm(make_config("paper", n_robots=3), 1)
+    starts = np.array([[-2.0, 0, 1], [2.0, 2, 1], [2.0, -2, 1]])
+    swarm.reset(0, starts, np.array([[2.0, 0, 1], [2.0, 2, 1], [2.0, -2, 1]]))
+    asked = np.zeros((1, 3, 2), bool)
+    for _ in range(3):
+        swarm.step(asked)
+    # Robot 0 sets off, which a constant velocity does not tell; the others rest.
+    pushed = parse_rule("push:0.1")(View(swarm))
+    assert pushed[0].tolist() == [[False, False], [True, False], [True, False]]
+    asked[0, 1, 0] = True
+    swarm.step(asked)
+    assert parse_rule("push:0.1")(View(swarm))[0].tolist() == [[False, False], [False, False], [True, False]]
+    assert not parse_rule("push:9")(View(swarm)).any()
