@@ -1,0 +1,93 @@
+"""What the disturbed worlds are like under rules that nobody tuned.
+
+``python -m studies.swarm.flight_world [PART ...]`` flies its parts.
+
+``world``: no and full communication in `flight` and `flight-hard`. ``delays``: full communication with answers one, two
+and three steps late, with and without the right of way. ``plants``: margins and models in foreign physics. All on a set
+of episodes that nothing was chosen on. JSON: one row for each condition with the keys of `summarise`, and part,
+scenario, policy and what was changed in the world.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.world.presets import make_config
+from studies.swarm.protocol import DATA, NAMES, WORLDS, absolute_path, condition, progress, replace_rows
+
+SWAPS = ("symmetric_swap", "asymmetric_swap")
+PARTS = {"world": 1000, "delays": 4000, "plants": 1000}
+QUICK = 10
+
+
+class Job(NamedTuple):
+    """A condition.
+
+    :param part: of this study
+    :param preset: the world
+    :param changed: what is changed in it
+    :param scenario: the scenario
+    :param policy: a rule
+    """
+
+    part: str
+    preset: str
+    changed: dict[str, Any]
+    scenario: str
+    policy: str
+
+
+def jobs(part: str) -> Iterator[Job]:
+    """The conditions of a part."""
+    if part == "world":
+        for preset, name, policy in itertools.product(("flight", "flight-hard"), NAMES, ("none", "full")):
+            yield Job(part, preset, {}, name, policy)
+    elif part == "delays":
+        for delay, right_of_way, name in itertools.product((1, 2, 3), (0.0, 0.3), SWAPS):
+            changed = {"radio": {"delay": delay, "jitter": 0}, "planner": {"right_of_way": right_of_way}}
+            yield Job(part, "flight", changed, name, "full")
+    else:
+        separations, vehicles = (0.6, 0.65, 0.72, 0.8), ("bebop2", "crazyflie21")
+        for vehicle, separation, name, policy in itertools.product(vehicles, separations, SWAPS, ("none", "full")):
+            changed = {"plant": "crazyflow:cf21B_500", "quadrotor": vehicle, "planner": {"separation": separation}}
+            yield Job(part, "flight", changed, name, policy)
+
+
+def fly(job: Job, episodes: int) -> dict[str, Any]:
+    """The row of a condition."""
+    config = make_config(job.preset, job.changed)
+    ((_, rows),) = fly_all([condition(job.policy, job.scenario, config)], episodes, WORLDS).items()
+    return {**job._asdict(), "set": WORLDS, **summarise(rows, config)}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each condition")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=absolute_path, default=DATA / "flight_world.json", metavar="FILE")
+    args = parser.parse_args()
+    with make_pool(args.jobs) as pool:
+        for part in args.parts or PARTS:
+            work = list(jobs(part))
+            episodes = [QUICK if args.quick else PARTS[part]] * len(work)
+            table = list(progress(pool.map(fly, work, episodes), part, len(work)))
+            for row in table:
+                print(
+                    f"{row['preset']:12} {row['changed'] or ''!s:60} {row['scenario']:16} {row['policy']:5} "
+                    f"{row['collisions']:5}/{row['episodes']} at steps {row['collisions_at_steps']:5} "
+                    f"arrived {row['arrived']:5} steps {row['steps_to_arrival'] or float('nan'):6.1f} "
+                    f"closest {row['min_separation_continuous']:.3f} m",
+                    flush=True,
+                )
+            replace_rows(args.json, table, ("part",))
+
+
+if __name__ == "__main__":
+    main()
