@@ -121,7 +121,9 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
     told = " or ".join(dict.fromkeys(_told(each["msg"]) for each in errors))
     name = ".".join((*path, *(str(part) for part in place)))
     if errors[0]["type"] == "value_error" and not isinstance(value, (tuple, list)):
-        return ValueError(f"{told}.")  # from `__post_init__`, which names the fields that do not go together
+        return ValueError(
+            told if told.endswith(("?", ".")) else f"{told}."
+        )  # from `__post_init__`, which names the fields that do not go together
     if errors[0]["type"] == "missing":  # of a tuple
         name, told = name.rpartition(".")[0], "it has too few entries"
     return ValueError(f"{name}={shown(value)}: {told}.")

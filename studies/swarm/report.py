@@ -28,7 +28,7 @@ from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from studies.swarm.protocol import DATA, EARLIER, OF_TEAM, ROOT, absolute_path, best_rules, condition, models, progress
 
-PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "swarm_learning.md", ROOT / "README.md")
+PAGES = tuple(ROOT / page for page in ("docs/results.md", "docs/swarm_learning.md", "docs/flight.md", "README.md"))
 IMAGES = ROOT / "docs" / "images"
 NAMES = list(SCENARIOS)[::-1]
 Rows = list[dict[str, Any]]
@@ -308,6 +308,26 @@ def unseen_table(rows: Rows) -> str:
     return table(["preset", "scenario", "policy", "collisions, 95 %", "against full (points)", "requests"], lines)
 
 
+def worlds_table(rows: Rows, part: str) -> str:
+    """Rules that nobody tuned in the disturbed worlds: contact at any time, and what was changed in them."""
+    lines = []
+    for row in rows:
+        if row["part"] == part:
+            steps = row["steps_to_arrival"]
+            line = [row["preset"], changes(row["changed"]), row["scenario"].replace("_", " "), f"`{row['policy']}`"]
+            line += [rate(row), str(row["collisions_at_steps"]), f"{row['min_separation_quantiles']['0.01']:.2f}"]
+            lines.append([*line, f"{row['arrived']}/{row['episodes']}", "-" if steps is None else f"{steps:.1f}"])
+    head = ["world", "changed", "scenario", "policy", "collisions, 95 %", "at steps", "closest, 1 % quantile (m)"]
+    return table([*head, "arrived", "steps"], lines) if lines else "Not flown yet."
+
+
+def changes(changed: Any, path: str = "") -> str:
+    """Nested fields as they are written on the command line."""
+    if isinstance(changed, dict):
+        return ", ".join(changes(value, f"{path}.{name}" if path else name) for name, value in changed.items()) or "-"
+    return f"{path}={changed:g}" if isinstance(changed, (int, float)) else f"{path}={changed}"
+
+
 def reference_table(rows: Rows, *names: str) -> str:
     """Collisions and requests of another learner by what it was flown with."""
     lines = []
@@ -478,7 +498,7 @@ def main() -> None:
     args = parser.parse_args()
     os.chdir(ROOT)
     names = "rules test sweep robustness unseen teams asking interventions ppo counterfactual training counts quadrants"
-    rows = {name: read_rows(args.data / f"{name}.json") for name in [*names.split(), "checkpoints"]}
+    rows = {name: read_rows(args.data / f"{name}.json") for name in [*names.split(), "checkpoints", "flight_world"]}
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
     blocks = {
         "targets": targets(test),
@@ -503,6 +523,9 @@ def main() -> None:
         "ppo": reference_table(rows["ppo"], "price", "threshold"),
         "counterfactual": reference_table(rows["counterfactual"], "price"),
         "training": training_table(rows["training"]),
+        "world": worlds_table(rows["flight_world"], "world"),
+        "delays": worlds_table(rows["flight_world"], "delays"),
+        "plants": worlds_table(rows["flight_world"], "plants"),
     }
     flown = {
         preset: flights(models(preset)[0], best_rules(preset)["symmetric_swap"], preset)

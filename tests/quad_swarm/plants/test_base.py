@@ -25,8 +25,9 @@ def test_names(name, parsed):
     [("crazyflo", "Did you mean 'crazyflow'"), ("crazyflow:cf21B", "Did you mean 'cf21B_500'"), ("model:x", "'model'")],
 )
 def test_unknown_names_are_refused_before_anything_is_built(name, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as error:
         make_config("flight", plant=name)
+    assert not str(error.value).endswith("?.")
 
 
 def test_our_own_model_is_the_model():
