@@ -11,6 +11,9 @@ from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import StepReport
 
 
+_NO_PLAN = int(BeliefSource.CONSTANT_VELOCITY)
+
+
 def exchange_bytes(config: SwarmConfig) -> int:
     """Size of a request and its answer."""
     return REQUEST_BYTES + plan_bytes(config.planner.horizon)
@@ -110,9 +113,9 @@ class EpisodeStatistics:
         self.steps_counted += counted
         self.requests += counted * n_requests
         self.peak_requests = np.maximum(self.peak_requests, counted * n_requests)
-        used = counted[:, None, None] & (report.belief_source != BeliefSource.CONSTANT_VELOCITY)
-        self.plans_used += used.sum(axis=(1, 2))
-        self.plan_ages += (used * report.plan_age).sum(axis=(1, 2))
+        used = report.belief_source.reshape(len(counted), -1) != _NO_PLAN
+        self.plans_used += counted * used.sum(axis=1)
+        self.plan_ages += counted * (used * report.plan_age.reshape(used.shape)).sum(axis=1)
         self.requests_flown += n_requests
         self.path_length += counted * report.moved.mean(axis=1)
         self.collided |= collided

@@ -13,6 +13,7 @@ import numpy as np
 
 from quad_swarm.errors import unknown_name
 from quad_swarm.geometry import length
+from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import advance
 from quad_swarm.world.presets import SwarmConfig
@@ -61,9 +62,11 @@ class PaperObservation:
         return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
-        view = View(swarm)
-        flat = (*view.own_pos.shape[:2], -1)
-        parts = (view.own_vel, view.goal, view.pos.reshape(flat), view.vel.reshape(flat))
+        estimate, (others_pos, others_vel) = swarm.estimate(), swarm.observe()
+        pos, vel = estimate[..., POSITION], estimate[..., VELOCITY]
+        flat = (*pos.shape[:2], -1)
+        relative_pos, relative_vel = others_pos - pos[:, :, None], others_vel - vel[:, :, None]
+        parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
         return (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
 
 

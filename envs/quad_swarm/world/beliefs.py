@@ -17,6 +17,9 @@ import numpy as np
 from quad_swarm.geometry import length
 
 
+_FEW = 600  # numbers, below which arranging them takes longer than what is saved
+
+
 class BeliefSource(IntEnum):
     """Where a believed trajectory comes from."""
 
@@ -38,6 +41,8 @@ def reverse_indices(n_robots: int) -> np.ndarray:
 
 def constant_velocity(pos: np.ndarray, vel: np.ndarray, horizon: int, dt: float) -> np.ndarray:
     """Positions at the next ``horizon`` steps if the velocity stayed: (..., 3), (..., 3) -> (..., N, 3) (m)."""
+    if pos.size < _FEW:
+        return pos[..., None, :] + (dt * np.arange(1, horizon + 1))[:, None] * vel[..., None, :]
     # Stages and coordinates as one axis: numpy is slow along three numbers
     trajectory = np.tile(vel, horizon)
     trajectory *= np.repeat(dt * np.arange(1, horizon + 1), 3)

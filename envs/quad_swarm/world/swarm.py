@@ -233,12 +233,11 @@ class Swarm:
             later = start / self.config.substeps
             x = self.planner.model.ahead(x, self._u, later * self.config.planner.dt)
             believed = resampled(believed, np.broadcast_to(later[..., None], believed.shape[:3]))
-        return Problems(
-            x=x.reshape(-1, 9),
-            goal=self.goal.reshape(-1, 3),
-            others=believed.reshape(-1, *believed.shape[2:]),
-            announced=(source != BeliefSource.CONSTANT_VELOCITY).reshape(-1, source.shape[2]),
-        )
+        announced = None
+        if self.config.planner.right_of_way:
+            announced = (source != BeliefSource.CONSTANT_VELOCITY).reshape(-1, source.shape[2])
+        others = believed.reshape(-1, *believed.shape[2:])
+        return Problems(x.reshape(-1, 9), self.goal.reshape(-1, 3), others, announced=announced)
 
     def _fly(self) -> list[np.ndarray]:
         """Move the robots by a step; their positions before it and after each sub-step, (E, n, 3) each (m)."""
@@ -259,12 +258,15 @@ class Swarm:
         i, j = self._pairs
         before, pos = positions[0], positions[-1]
         apart = [each[:, i] - each[:, j] for each in positions]
-        start, end = np.stack(apart[:-1]), np.stack(apart[1:])
+        if len(apart) == 2:
+            start, end = apart[0][None], apart[1][None]
+        else:
+            start, end = np.stack(apart[:-1]), np.stack(apart[1:])
         # Closest point of the segments from start to end to the origin.
         change = end - start
         along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
         closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
-        separation, separation_continuous = np.sqrt(_dot(end[-1], end[-1])), np.sqrt(_dot(closest, closest)).min(axis=0)
+        separation, separation_continuous = np.sqrt(_dot(end[-1], end[-1])), np.sqrt(_dot(closest, closest).min(axis=0))
         limit = 2 * self.config.radius - self.config.collision_tolerance
         shape = self.state.shape[:2]
         return StepReport(

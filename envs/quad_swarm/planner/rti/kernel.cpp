@@ -163,17 +163,23 @@ class LaneGroup {
       for (int i = 0; i < 3; i++) goal_[i][q] = static_cast<T>(batch.goal[problem * 3 + i]);
       const double* u = u_guess + problem * N * INPUT_STRIDE;
       const double* others = batch.others + problem * N_OTHERS * N * 3;
-      const double* clearance = batch.clearance ? batch.clearance + problem * N_OTHERS * N : nullptr;
       for (int k = 0; k < N; k++) {
         Stage<V>& s = stages_[k];
         for (int i = 0; i < NU; i++) s.u[i][q] = static_cast<T>(u[k * INPUT_STRIDE + i]);
-        for (int j = 0; j < N_OTHERS; j++) {
+        for (int j = 0; j < N_OTHERS; j++)
           for (int i = 0; i < 3; i++) s.others[j][i][q] = static_cast<T>(others[(j * N + k) * 3 + i]);
-          s.clearance[j][q] = clearance ? static_cast<T>(clearance[j * N + k]) : T(0);
-        }
       }
     }
-    for (int k = 0; k < N; k++) limit_inputs(stages_[k].u);
+    for (int k = 0; k < N; k++) {
+      limit_inputs(stages_[k].u);
+      for (int j = 0; j < N_OTHERS; j++) {
+        stages_[k].clearance[j] = V{};
+        if (batch.clearance)
+          for (int q = 0; q < W; q++)
+            stages_[k].clearance[j][q] =
+                static_cast<T>(batch.clearance[(problems[q < count ? q : count - 1] * N_OTHERS + j) * N + k]);
+      }
+    }
   }
 
   static void limit_inputs(V* u) {
