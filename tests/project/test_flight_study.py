@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from quad_swarm.evaluation.rows import read_rows, write_rows
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
-from studies.swarm import flight_world, report, tune_flight
+from studies.swarm import flight_world, fly_flight, report, tune_flight
 from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TEST, NAMES, TEST, VALIDATION, WORLDS
 
 
@@ -57,3 +58,28 @@ def test_conditions_fill_their_tables(tmp_path: Path):
     assert "radio.delay=3, radio.jitter=0, planner.right_of_way=0.3" in table
     assert "3/3" in table
     assert report.worlds_table(rows, "plants") == "Not flown yet."
+
+
+def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown(tmp_path, monkeypatch):
+    monkeypatch.setattr(fly_flight, "DATA", tmp_path)
+    with pytest.raises(ValueError, match="holds no safe rule"):
+        fly_flight.best_rule()
+    rules = [
+        {"setting": setting, "scenario": name, "safe": safe, "request_share": share}
+        for setting, safe, share in (("plan:0.8", True, 0.03), ("cpa:0.8:1", True, 0.02), ("plan:0.7", False, 0.01))
+        for name in NAMES
+    ]
+    write_rows(tmp_path / "flight_rules.json", rules)
+    assert fly_flight.best_rule() == "cpa:0.8:1"
+    assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
+    monkeypatch.setattr(fly_flight, "NAMES", NAMES[:1])
+    monkeypatch.setattr(fly_flight, "tuned_models", list)
+    monkeypatch.setattr("sys.argv", ["", "--quick", "--jobs", "1", "--n-robots", "4", "--json", f"{tmp_path}/f.json"])
+    fly_flight.main()
+    rows = read_rows(tmp_path / "f.json")
+    assert {(row["n_robots"], row["policy"], len(row["outcomes"])) for row in rows} == {
+        (4, policy, fly_flight.QUICK) for policy in ("full", "none", "cpa:0.8:1")
+    }
+    monkeypatch.setattr(fly_flight, "fly", None)
+    fly_flight.main()
+    assert read_rows(tmp_path / "f.json") == rows

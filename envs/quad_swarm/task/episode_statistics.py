@@ -10,7 +10,6 @@ from quad_swarm.world.messages import REQUEST_BYTES, plan_bytes
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import StepReport
 
-
 _NO_PLAN = int(BeliefSource.CONSTANT_VELOCITY)
 
 

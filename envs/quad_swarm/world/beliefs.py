@@ -16,7 +16,6 @@ import numpy as np
 
 from quad_swarm.geometry import length
 
-
 _FEW = 600  # numbers, below which arranging them takes longer than what is saved
 
 

@@ -1,0 +1,102 @@
+"""Fly the sealed test set of `flight`: ``python -m studies.swarm.fly_flight [--n-robots ...] [--quick] [--json F]``.
+
+Full and no communication, the best rule with one setting, and all models with theirs, each in every scenario; what the
+file already holds is not flown again. Who flies is read from ``flight_rules.json`` and ``flight_thresholds.json``,
+which `studies.swarm.tune_flight` writes: commit these first. JSON: one row for each condition with the keys of
+`summarise`, its episodes' outcomes as text (1: a collision) for paired comparisons, and scenario, policy, n_robots.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import Any, NamedTuple
+
+from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.rows import read_rows
+from studies.swarm.protocol import (
+    DATA,
+    FLIGHT_TEST,
+    NAMES,
+    ROOT,
+    absolute_path,
+    condition,
+    known_rows,
+    models,
+    progress,
+    replace_rows,
+    world,
+)
+from studies.swarm.tune_flight import PRESET, SWAPS
+
+# Episodes of each condition by the number of robots
+EPISODES = {8: 12000, 4: 4000, 12: 4000, 16: 4000}
+QUICK = 10
+
+
+class Job(NamedTuple):
+    """A condition."""
+
+    n_robots: int
+    scenario: str
+    policy: str
+    episodes: int
+
+
+def best_rule() -> str:
+    """The rule that is safe in all scenarios with the fewest requests in both swaps."""
+    shares: dict[str, list[float]] = {}
+    for row in known_rows(DATA / "flight_rules.json"):
+        if row["safe"] and row["scenario"] in SWAPS:
+            shares.setdefault(row["setting"], []).append(row["request_share"])
+    if not shares:
+        raise ValueError(
+            f"{DATA / 'flight_rules.json'} holds no safe rule: run `studies.swarm.tune_flight rules` first."
+        )
+    return min(shares, key=lambda rule: sum(shares[rule]))
+
+
+def tuned_models() -> list[str]:
+    """The models with their thresholds; those that have none that is safe fly with their own."""
+    safe = {row["family"]: row["setting"] for row in known_rows(DATA / "flight_thresholds.json") if row["safe"]}
+    return [safe.get(path, path) for path in models("flight")]
+
+
+def jobs(sizes: list[int], quick: bool) -> list[Job]:
+    """All conditions, the most robots last."""
+    policies = ["full", "none", best_rule(), *tuned_models()]
+    return [
+        Job(n, name, policy, QUICK if quick else EPISODES[n])
+        for n in sorted(sizes)
+        for policy in policies
+        for name in NAMES
+    ]
+
+
+def fly(job: Job) -> dict[str, Any]:
+    """The row of a condition."""
+    config = world(PRESET, job.n_robots)
+    ((_, rows),) = fly_all([condition(job.policy, job.scenario, config)], job.episodes, FLIGHT_TEST).items()
+    outcomes = "".join("1" if row["collided"] else "0" for row in rows)
+    return {"preset": PRESET, "set": FLIGHT_TEST, **job._asdict(), **summarise(rows, config), "outcomes": outcomes}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--n-robots", nargs="+", type=int, default=list(EPISODES), choices=list(EPISODES))
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each condition")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=absolute_path, default=DATA / "flight.json", metavar="FILE")
+    args = parser.parse_args()
+    os.chdir(ROOT)
+    keys = ("n_robots", "scenario", "policy")
+    flown = {tuple(row[key] for key in keys) for row in read_rows(args.json)}
+    work = [job for job in jobs(args.n_robots, args.quick) if (job.n_robots, job.scenario, job.policy) not in flown]
+    with make_pool(args.jobs) as pool:
+        for row in progress(pool.map(fly, work), "flight", len(work)):
+            replace_rows(args.json, [row], keys)
+
+
+if __name__ == "__main__":
+    main()
