@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy, deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ class RewardConfig:
     :param request: w_c, taken for each request
     :param near_miss: not in the paper: taken in each step for each pair closer than ``near_miss_distance``, in full at
         ``near_miss_width`` less than that and in proportion before; a signal that is less rare than collisions
-    :param near_miss_distance: see there (m)
+    :param near_miss_distance: see there (m); None: what the planner keeps
     :param near_miss_width: see there (m)
     :param near_miss_ahead: count also how close the two come by their plans within so many further steps
     :param near_miss_narrowing: by how much ``near_miss_distance`` is less for the last of those steps, in proportion
@@ -40,7 +40,7 @@ class RewardConfig:
     collision: NonNegativeFloat = 150.0
     request: NonNegativeFloat = 0.1
     near_miss: NonNegativeFloat = 0.0
-    near_miss_distance: PositiveFloat = 0.6
+    near_miss_distance: PositiveFloat | None = None
     near_miss_width: PositiveFloat = 0.01
     near_miss_ahead: Annotated[int, Field(ge=0, le=1000)] = 0
     near_miss_narrowing: NonNegativeFloat = 0.0
@@ -105,6 +105,8 @@ class RequestTask:
             )
         self.swarm = swarm
         self.sampler = sampler
+        if reward.near_miss_distance is None:
+            reward = replace(reward, near_miss_distance=swarm.config.planner.separation)
         self.reward = reward
         self.max_steps = swarm.config.max_steps if max_steps is None else max_steps
         if continuous_collisions is None:
@@ -200,10 +202,11 @@ class RequestTask:
 
     def _near_misses(self, separation: np.ndarray) -> np.ndarray:
         """How near each miss is, 0 to 1, (E, n, n - 1)."""
-        reward, ahead = self.reward, self.reward.near_miss_ahead
-        shortfall = reward.near_miss_distance - separation
+        reward, ahead, distance = self.reward, self.reward.near_miss_ahead, self.reward.near_miss_distance
+        assert distance is not None  # filled in above
+        shortfall = distance - separation
         if ahead:
-            limits = reward.near_miss_distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
+            limits = distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
             planned = (limits - self.swarm.planned_separation(ahead)).max(axis=-1)
             shortfall = np.maximum(shortfall, planned)
         return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0)

@@ -1,6 +1,7 @@
 """Hand-made rules for whom to ask: the baselines of Sec. V-C and stronger ones.
 
 A rule maps what the robots of E swarms know to requests. To add one, write the function and name it in `RULES`.
+A length may be given in separations: "cpa:1.1s:1.5" asks at 1.1 times what the planner keeps.
 "&" joins rules of which both must want to ask, "|" rules of which one is enough; "&" binds tighter.
 """
 
@@ -78,6 +79,9 @@ def random(probability: float) -> Rule:
     return lambda view: np.stack([rng.random(view.pos.shape[1:-1]) < probability for rng in view.rngs])
 
 
+# Arguments in metres, or, with an "s", in the distances that the planner keeps.
+_LENGTHS = ("EPS", "DIST")
+
 # Name -> (factory, names of its arguments).
 RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
     "none": (none, ()),
@@ -114,10 +118,18 @@ def _parse_one(text: str) -> Rule:
         raise unknown_name("rule", name, RULES)
     factory, arguments = RULES[name]
     usage = ":".join((name, *arguments))
+    relative = [value.endswith("s") for value in values]
     try:
-        numbers = [float(value) for value in values]
+        numbers = [float(value.removesuffix("s")) for value in values]
     except ValueError:
         raise ValueError(f"Rule {text!r}: its arguments must be numbers; write {usage}.") from None
     if len(numbers) != len(arguments) or not all(np.isfinite(number) and number >= 0 for number in numbers):
         raise ValueError(f"Rule {text!r} takes {len(arguments)} finite non-negative arguments; write {usage}.")
-    return factory(*numbers)
+    lengths = [argument in _LENGTHS for argument in arguments]
+    if any(scaled and not length for scaled, length in zip(relative, lengths, strict=True)):
+        raise ValueError(f"Rule {text!r}: only lengths ({', '.join(_LENGTHS)}) can be given in separations, as 1.2s.")
+    if not any(relative):
+        return factory(*numbers)
+    return lambda view: factory(*(n * view.separation if r else n for n, r in zip(numbers, relative, strict=True)))(
+        view
+    )

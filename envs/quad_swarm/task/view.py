@@ -25,6 +25,7 @@ class View:
         self.rngs = rngs
         self.memory = swarm.config.memory
         self.horizon = swarm.config.planner.horizon
+        self.separation = swarm.config.planner.separation
 
     @cached_property
     def _observed(self) -> tuple[np.ndarray, np.ndarray]:

@@ -198,3 +198,9 @@ def test_episodes_may_end_at_arrival():
     env.reset(options={"starts": line, "goals": line})
     *_, terminated, truncated, info = env.step(np.array([0, 0]))
     assert (terminated, truncated, info["is_success"]) == (True, False, True)
+
+
+def test_near_misses_begin_at_what_the_planner_keeps_unless_said():
+    for world, distance in (({}, 0.6), ({"planner": {"separation": 0.8}}, 0.8), ({"radius": 0.1}, 0.2)):
+        assert make_task(reward={"near_miss": 1}, world=world).reward.near_miss_distance == pytest.approx(distance)
+    assert make_task(reward={"near_miss": 1, "near_miss_distance": 0.7}).reward.near_miss_distance == 0.7

@@ -125,3 +125,14 @@ def test_push_sends_what_has_left_what_the_others_were_told():
     swarm.step(asked)
     assert parse_rule("push:0.1")(View(swarm))[0].tolist() == [[False, False], [False, False], [True, False]]
     assert not parse_rule("push:9")(View(swarm)).any()
+
+
+def test_lengths_may_be_given_in_separations():
+    swarm = Swarm(make_config("paper", n_robots=2, radius=0.1), 1)
+    assert View(swarm).separation == pytest.approx(0.2)
+    for distance, asks in ((0.29, True), (0.31, False)):
+        swarm.reset(0, np.array([[0, 0, 1], [distance, 0, 1]]), np.array([[0, 0, 1], [distance, 0, 1]]))
+        assert parse_rule("distance:1.5s")(View(swarm)).all() == asks
+        assert parse_rule("distance:1.5s&cpa:9:2|distance:0.01")(View(swarm)).all() == asks
+    with pytest.raises(ValueError, match="only lengths"):
+        parse_rule("stale:3s")
