@@ -130,6 +130,8 @@ def _parse_one(text: str) -> Rule:
         raise ValueError(f"Rule {text!r}: only lengths ({', '.join(_LENGTHS)}) can be given in separations, as 1.2s.")
     if not any(relative):
         return factory(*numbers)
-    return lambda view: factory(*(n * view.separation if r else n for n, r in zip(numbers, relative, strict=True)))(
-        view
-    )
+
+    def rule(view: View) -> np.ndarray:
+        return factory(*(n * view.separation if r else n for n, r in zip(numbers, relative, strict=True)))(view)
+
+    return rule
