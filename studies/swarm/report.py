@@ -310,14 +310,24 @@ def unseen_table(rows: Rows) -> str:
 
 def worlds_table(rows: Rows, part: str) -> str:
     """Rules that nobody tuned in the disturbed worlds: contact at any time, and what was changed in them."""
+    chosen = [row for row in rows if row["part"] == part]
+    alike = not any(row["changed"] for row in chosen)
     lines = []
-    for row in rows:
-        if row["part"] == part:
-            steps = row["steps_to_arrival"]
-            line = [row["preset"], changes(row["changed"]), row["scenario"].replace("_", " "), f"`{row['policy']}`"]
-            line += [rate(row), str(row["collisions_at_steps"]), f"{row['min_separation_quantiles']['0.01']:.2f}"]
-            lines.append([*line, f"{row['arrived']}/{row['episodes']}", "-" if steps is None else f"{steps:.1f}"])
-    head = ["world", "changed", "scenario", "policy", "collisions, 95 %", "at steps", "closest, 1 % quantile (m)"]
+    for row in chosen:
+        steps = row["steps_to_arrival"]
+        line = [row["preset"]] if alike else [row["preset"], changes(row["changed"])]
+        line += [row["scenario"].replace("_", " "), f"`{row['policy']}`"]
+        line += [rate(row), str(row["collisions_at_steps"]), f"{row['min_separation_quantiles']['0.01']:.2f}"]
+        lines.append([*line, f"{row['arrived']}/{row['episodes']}", "-" if steps is None else f"{steps:.1f}"])
+    head = [
+        "world",
+        *([] if alike else ["changed"]),
+        "scenario",
+        "policy",
+        "collisions, 95 %",
+        "at steps",
+        "closest, 1 % quantile (m)",
+    ]
     return table([*head, "arrived", "steps"], lines) if lines else "Not flown yet."
 
 
