@@ -64,7 +64,7 @@ results: install  ## fly everything that docs/results.md says again: tuned rules
 results-quick: install  ## the same with few episodes and rules, into $(LOGS)/results
 	$(STUDY).tune_rules --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json
 	$(STUDY).fly_tests --quick --jobs $(JOBS) --out $(LOGS)/results
-	$(STUDY).flight_world --quick --jobs $(JOBS) --json $(LOGS)/results/flight_world.json
+	$(STUDY).flight_world world delays --quick --jobs $(JOBS) --json $(LOGS)/results/flight_world.json
 	$(STUDY).ppo --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json
 	$(STUDY).counterfactual --forks 10 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/counterfactual.json
 	$(STUDY).report --data $(LOGS)/results --pages $(LOGS)/results --images $(LOGS)/results

@@ -156,6 +156,16 @@ def _approach(pair: PairView) -> np.ndarray:
     return np.concatenate([pair.closeness(distance), times], axis=-1)
 
 
+def _side(pair: PairView) -> np.ndarray:
+    """On which side the other would pass with constant velocities, which the mirrored frame hides: it matters where the
+    planner keeps to a right of way."""
+    pos, vel = pair.view.pos, pair.view.vel
+    speed = np.hypot(vel[..., 0], vel[..., 1])
+    # Positive: the other is to the left of where the robot goes relative to it, as it should be.
+    miss = (vel[..., 1] * pos[..., 0] - vel[..., 0] * pos[..., 1]) / np.maximum(speed, 1e-6)
+    return np.stack([pair.side, np.tanh(miss / 0.2), np.tanh(miss)], axis=-1)
+
+
 def _memory(pair: PairView) -> np.ndarray:
     """The plan received last: its age, how far off it is, and where it departs from a constant velocity."""
     view = pair.view
@@ -227,6 +237,7 @@ def _critic(pair: PairView) -> np.ndarray:
 GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
     "state": _state,
     "approach": _approach,
+    "side": _side,
     "memory": _memory,
     "plan": _plan,
     "told": _told,

@@ -96,3 +96,19 @@ def test_the_paper_s_observation_is_the_default():
 def test_an_unknown_group_is_refused():
     with pytest.raises(ValueError, match="Did you mean 'memory'"):
         QuadSwarmEnv(observation="state+memmory")
+
+
+def test_the_side_on_which_the_other_would_pass_is_seen_although_the_frame_is_mirrored():
+    config = make_config("paper", n_robots=2)
+    observation = make_observation(config, "side")
+    columns = observation.layout["neighbours"][0]
+    seen = []
+    for lateral in (0.5, -0.5):
+        swarm = Swarm(config, 1)
+        swarm.reset(0, np.array([[0.0, 0, 1], [4, lateral, 1]]), np.zeros((2, 3)))
+        swarm.state[0, :, 3] = [1.0, -1.0]
+        seen.append(observation(swarm)[0][:, columns])
+    left, right = seen
+    # To the left of where they go, or to the right: for both robots alike
+    assert (left[:, 1:] > 0.4).all()
+    np.testing.assert_allclose(left[:, 1:], -right[:, 1:], atol=1e-6)
