@@ -50,7 +50,7 @@ from toys import SMALL
 
 SEED = 0
 SECONDS = 20  # a case that takes longer hangs
-MEMORY = 6 << 30
+MEMORY = 4 << 30  # that a case may take
 CLEAR = (ValueError, OSError, ImportError, gymnasium.error.Error)
 PACKAGES = [str(Path(package.__file__).parent) for package in (sb3_maddpg, quad_swarm)]
 VERDICTS = ("clear", "works", "foreign", "raw", "hang", "silent")
@@ -118,6 +118,12 @@ def _is_readable(text: str) -> bool:
     return "\n" not in text and len(text) <= LONGEST and "integer string conversion" not in text
 
 
+def address_space() -> int:
+    """What this process, with all that other tests have loaded, takes already (bytes)."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[0]) * resource.getpagesize() if statm.exists() else 0
+
+
 def judge_apart(case: Case, seconds: float = SECONDS) -> Verdict:
     """Run a case in a process and a folder of its own."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -134,7 +140,8 @@ def _judge_in(folder: str, case: Case, seconds: float) -> Verdict:
         for descriptor in (0, 1, 2):
             os.dup2(devnull, descriptor)
         os.chdir(folder)
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        limit = address_space() + MEMORY
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         verdict = judge(case)
         os.write(writer, json.dumps([verdict.kind, verdict.told[:3000]]).encode())
         os._exit(0)
