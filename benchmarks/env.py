@@ -75,7 +75,7 @@ def attach_timers(task: RequestTask) -> dict[str, list[float]]:
     for name, owner, method in [
         ("solve", task.swarm.planner, "plan"),
         ("beliefs", task.swarm.beliefs, "update"),
-        ("dynamics", task.swarm.planner.model, "step"),
+        ("dynamics", task.swarm._plant, "step"),
         ("observation", task, "observe"),
         ("info", task, "info"),
         ("reset", task, "reset"),
