@@ -1,5 +1,7 @@
 """The study of the disturbed worlds: its conditions, and that one setting has to do everywhere."""
 
+from concurrent.futures import Executor, Future
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -31,24 +33,65 @@ def test_every_condition_is_a_world_and_none_is_named_twice(part):
         make_config(job.preset, job.changed)
 
 
-def test_a_rule_has_to_be_safe_in_every_scenario(monkeypatch):
+class Inline(Executor):
+    """Runs what it is given at once, in this process."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@pytest.fixture
+def flown(monkeypatch):
+    """All flights of who collides in every fifth episode of `random` if bad, and asks for as much as is its name."""
     flown = []
 
     def fly(policies, preset, scenario, episodes, n_robots=None, skip=0):
-        flown.append((policies[0], scenario, skip, episodes))
-        collides = policies[0] == "bad" and scenario == "random"
-        return {policies[0]: [{"collided": collides and k % 5 == 0} for k in range(skip, episodes)]}
+        (policy,) = policies
+        flown.append((policy, scenario, skip, episodes))
+        collides = policy.startswith("bad") and scenario == "random"
+        requests = float(policy.split()[-1]) if " " in policy else 1.0
+        return {policy: [{"collided": collides and k % 5 == 0, "requests": requests} for k in range(skip, episodes)]}
 
     monkeypatch.setattr(tune_flight, "fly_validation", fly)
-    trial = tune_flight.Trial(quick=False)
-    assert trial.safe("good", {})
-    assert not trial.safe("bad", {})
-    # Full communication is flown once, in every scenario and piece by piece.
-    assert [one[2:] for one in flown if one[:2] == ("full", "random")] == [
-        (0, 100), (100, 250), (250, 500), (500, 1000), (1000, 2000), (2000, 4000)
-    ]  # fmt: skip
+    monkeypatch.setattr(tune_flight, "summarise", lambda rows, config: {"request_share": rows[0]["requests"]})
+    return flown
+
+
+FULL = {name: [{"collided": False}] * tune_flight.STAGES[-1] for name in NAMES}
+
+
+def test_a_rule_has_to_be_safe_in_every_scenario(flown):
+    assert tune_flight.try_out("good", {}, FULL, tune_flight.STAGES)[1]
+    assert not tune_flight.try_out("bad", {}, FULL, tune_flight.STAGES)[1]
+    # Piece by piece, in every scenario
+    stages = [0, *tune_flight.STAGES]
+    assert [one[2:] for one in flown if one[:2] == ("good", "random")] == list(pairwise(stages))
     assert {one[1] for one in flown if one[0] == "good"} == set(NAMES)
-    assert max(one[3] for one in flown if one[0] == "bad") == 100, "without hope it is not flown on"
+    assert max(one[3] for one in flown if one[0] == "bad") == stages[1], "without hope it is not flown on"
+
+
+def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypatch):
+    families = {"one": ["good 0.4", "bad 0.1", "good 0.3"], "two": ["bad 0.35", "good 0.2"]}
+    monkeypatch.setattr(tune_flight, "families", lambda: families)
+    table = tune_flight.tune_rules(Inline(), 1, FULL, tune_flight.STAGES, quick=False)
+    assert {row["setting"]: row["safe"] for row in table} == {
+        "bad 0.1": False, "good 0.2": True, "good 0.3": None, "bad 0.35": None, "good 0.4": None
+    }  # fmt: skip
+    assert {row["setting"] for row in table if row["family"] == "two"} == {"bad 0.35", "good 0.2"}
+    assert max(episodes for policy, *_, episodes in flown if policy == "good 0.4") == tune_flight.STAGES[0]
+
+
+def test_thresholds_are_tried_from_the_highest_on(flown, monkeypatch):
+    monkeypatch.setattr(tune_flight, "THRESHOLDS", (0.9, 0.8, 0.7))
+    table = tune_flight.tune_thresholds("model.zip", FULL, tune_flight.STAGES)
+    assert {row["setting"] for row in table if row["safe"]} == {"model.zip@0.9"} == {row["setting"] for row in table}
+    table = tune_flight.tune_thresholds("bad.zip", FULL, tune_flight.STAGES)
+    assert [row["setting"] for row in table if row["scenario"] == "random"] == [
+        "bad.zip@0.9", "bad.zip@0.8", "bad.zip@0.7"
+    ]  # fmt: skip
+    assert not any(row["safe"] for row in table)
 
 
 def test_conditions_fill_their_tables(tmp_path: Path):
