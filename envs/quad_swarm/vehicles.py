@@ -35,6 +35,29 @@ VEHICLES: dict[str, QuadrotorParams] = {
         climb_gain=1.0,
         climb_time_constant=0.328,
     ),
+    # AscTec Hummingbird: sb3-maddpg identify --plant rotorpy:hummingbird
+    "hummingbird": QuadrotorParams(
+        drag_x=0.486,
+        drag_y=0.486,
+        roll_gain=1.005,
+        roll_time_constant=0.0888,
+        pitch_gain=1.005,
+        pitch_time_constant=0.0887,
+        climb_gain=0.774,
+        climb_time_constant=0.255,
+    ),
+    # A racer of the 250 mm class: drag as identified by Faessler, Franchi and Scaramuzza (RA-L 2018, 610 g); attitude
+    # and climb are ours, as fast as rate loops of such vehicles are.
+    "racer250": QuadrotorParams(
+        drag_x=0.544,
+        drag_y=0.386,
+        roll_gain=1.0,
+        roll_time_constant=0.05,
+        pitch_gain=1.0,
+        pitch_time_constant=0.05,
+        climb_gain=1.0,
+        climb_time_constant=0.2,
+    ),
 }
 
 

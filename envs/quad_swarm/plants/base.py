@@ -13,6 +13,7 @@ MODEL = "model"
 # Simulators and the vehicles that each of them knows, the first one by default
 SIMULATORS: dict[str, tuple[str, ...]] = {
     "crazyflow": ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
+    "rotorpy": ("crazyflie", "crazyfliebrushless", "hummingbird"),
 }
 
 

@@ -1,6 +1,6 @@
 """Crazyflow (Schuck, Rath et al., arXiv:2606.01478): identified Crazyflie and Holybro vehicles, 500 Hz, vectorised.
 
-Its vehicles take attitudes and a thrust. The climb rate that our robots command is held by a proportional loop.
+Its vehicles take attitudes and a thrust.
 """
 
 from __future__ import annotations
@@ -25,12 +25,10 @@ import jax.numpy as jnp
 import mujoco
 from scipy.spatial.transform import Rotation
 
+from quad_swarm.plants.attitude_commands import GRAVITY, thrust, yaw
 from quad_swarm.quadrotor import ATTITUDE, POSITION, VELOCITY
 
 _FREQUENCY = 500  # Hz
-_CLIMB_GAIN = 3.0  # 1/s, of the loop that makes a thrust of a climb rate
-_GRAVITY = 9.81
-_MAX_THRUST = 1.8  # of the weight
 # Above the simulator's floor, which it would rest on: our workspace has none
 _ALTITUDE = 100.0
 
@@ -96,7 +94,7 @@ class CrazyflowPlant:
         if coefficients is None:
             return 0.0
         a, b, c = (float(value) for value in np.asarray(coefficients).reshape(-1, 3)[0])
-        return float((-b + np.sqrt(b * b - 4 * c * (a - self._mass * _GRAVITY / 4))) / (2 * c))
+        return float((-b + np.sqrt(b * b - 4 * c * (a - self._mass * GRAVITY / 4))) / (2 * c))
 
     def keep(self, swarms: np.ndarray) -> None:
         """See `Plant`."""
@@ -112,15 +110,12 @@ class CrazyflowPlant:
             return state.copy()
         states = self._data.states
         shape = states.pos.shape[:2]
-        cos_tilt = np.cos(state[..., 6]) * np.cos(state[..., 7])
-        climb = _GRAVITY + _CLIMB_GAIN * (u[..., 2] - state[..., 5])
-        force_up = self._mass * np.clip(climb / np.maximum(cos_tilt, 0.5), 0.0, _MAX_THRUST * _GRAVITY)
+        force_up = self._mass * thrust(state, u)
         offset, slope = self._thrust
         controls = np.zeros((*shape, 4), dtype=np.float32)
-        controls[..., 3] = (self._mass * _GRAVITY - offset) / slope
-        # The yaw that is held is the one that the robot has, turned by what its rate makes of it in the sub-step.
-        yaw = state[..., 8] + u[..., 3] * self._n_steps / _FREQUENCY
-        controls[self._kept] = np.stack([u[..., 0], u[..., 1], yaw, (force_up - offset) / slope], axis=-1)
+        controls[..., 3] = (self._mass * GRAVITY - offset) / slope
+        heading = yaw(state, u, self._n_steps / _FREQUENCY)
+        controls[self._kept] = np.stack([u[..., 0], u[..., 1], heading, (force_up - offset) / slope], axis=-1)
         force = np.zeros((*shape, 3), dtype=np.float32)
         force[self._kept, :, :2] = self._mass * self._drag * air
         pos, vel = np.array(states.pos), np.array(states.vel)

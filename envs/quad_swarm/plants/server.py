@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import sys
 from multiprocessing.connection import Connection
 from typing import Any
 
+from quad_swarm.plants.base import SIMULATORS
+
 
 def make(simulator: str, vehicle: str, *arguments: Any) -> Any:
     """A plant in this process."""
-    if simulator != "crazyflow":
+    if simulator not in SIMULATORS:
         raise ValueError(f"No adapter for the simulator {simulator!r}.")
     try:
-        from quad_swarm.plants.crazyflow import CrazyflowPlant
+        adapter = getattr(importlib.import_module(f"quad_swarm.plants.{simulator}"), f"{simulator.capitalize()}Plant")
     except ImportError as error:
         raise ImportError(
             f"plant='{simulator}:{vehicle}' needs the simulator: pip install 'sb3-maddpg[plants]' ({error})."
         ) from None
-    return CrazyflowPlant(vehicle, *arguments)
+    return adapter(vehicle, *arguments)
 
 
 def serve(connection: Connection) -> None:

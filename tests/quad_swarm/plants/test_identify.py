@@ -23,11 +23,14 @@ def test_our_own_model_is_found_again():
     assert max(found[1:]) < 1e-3
 
 
-def test_a_vehicle_file_is_written_that_worlds_take(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("plant", "vehicle"), [("crazyflow:cf21B_500", "crazyflie21"), ("rotorpy:hummingbird", "hummingbird")]
+)
+def test_a_vehicle_file_is_written_that_worlds_take(plant, vehicle, tmp_path, capsys):
     pytest.importorskip("mujoco", reason="the extra `plants` is not installed")
     path = tmp_path / "vehicle.yml"
-    assert main(["--plant", "crazyflow:cf21B_500", "--out", str(path)]) == 0
+    assert main(["--plant", plant, "--out", str(path)]) == 0
     assert "left over: roll and pitch" in capsys.readouterr().out
     found = load_vehicle(str(path))
     for name in VEHICLE_PARAMETERS:
-        assert getattr(found, name) == pytest.approx(getattr(VEHICLES["crazyflie21"], name), rel=0.02)
+        assert getattr(found, name) == pytest.approx(getattr(VEHICLES[vehicle], name), rel=0.02)
