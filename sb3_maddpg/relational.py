@@ -30,6 +30,8 @@ class ObservationLayout(TypedDict, total=False):
     - ``acts_on_neighbours``: the action falls into equal parts, one for each neighbour;
     - ``critic``: for each neighbour further columns that critics read and actors do not, because no agent knows them
       when it acts;
+    - ``action_mask``: for each neighbour a column that is positive where the agent may act on it, for binary actions on
+      neighbours; elsewhere the action is 0;
     - ``complete``: every neighbour is always there. Otherwise one whose columns are all zero is absent.
 
     Columns that lie side by side, neighbour after neighbour, are read fastest.
@@ -40,6 +42,7 @@ class ObservationLayout(TypedDict, total=False):
     who: Sequence[Sequence[int]]
     acts_on_neighbours: bool
     critic: Sequence[Sequence[int]]
+    action_mask: Sequence[int]
     complete: bool
 
 
@@ -52,16 +55,27 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
     if not {"own", "neighbours"} <= set(layout) <= set(ObservationLayout.__annotations__):
         raise ValueError(
             f"observation_layout has entries {sorted(layout)}, but needs `own` and `neighbours`, and beside them knows "
-            "`who`, `acts_on_neighbours`, `critic` and `complete` only."
+            "`who`, `acts_on_neighbours`, `critic`, `action_mask` and `complete` only."
         )
     neighbours = layout["neighbours"]
     hidden = layout.get("critic", [[]] * len(neighbours))
-    used = [*layout["own"], *chain(*neighbours, *hidden)]
+    mask = layout.get("action_mask", [0] * len(neighbours))
+    used = [*layout["own"], *chain(*neighbours, *hidden), *mask]
     alike = len({len(columns) for columns in neighbours}) == len({len(columns) for columns in hidden}) == 1
-    if not alike or len(hidden) != len(neighbours) or not all(0 <= column < team.obs_dim for column in used):
+    if (
+        not alike
+        or not len(hidden) == len(mask) == len(neighbours)
+        or not all(0 <= column < team.obs_dim for column in used)
+    ):
         raise ValueError(
             f"observation_layout={dict(layout)}: every neighbour needs as many columns as the next, each from 0 to "
             f"{team.obs_dim - 1}."
+        )
+    binary = all(isinstance(space, spaces.MultiBinary) for space in team.action_spaces)
+    if "action_mask" in layout and not (binary and layout.get("acts_on_neighbours")):
+        raise ValueError(
+            "observation_layout: `action_mask` is for MultiBinary actions on neighbours, and the actions are "
+            f"{team.action_spaces[0]}, acts_on_neighbours={layout.get('acts_on_neighbours', False)}."
         )
     who = layout.get("who") or _others(team.n_agents)
     if {len(row) for row in who} != {len(neighbours)} or len(who) != team.n_agents:
@@ -107,6 +121,7 @@ class NeighbourViews(nn.Module):
         self.complete = layout.get("complete", False)
         self.own = _Columns([list(layout["own"])])
         self.neighbours = _Columns(neighbours)
+        self.mask = _Columns([[column] for column in layout["action_mask"]]) if "action_mask" in layout else None
         back = [[who[j].index(i) if i in who[j] else -1 for j in row] for i, row in enumerate(who)]
         for name, table in (("neighbour_indices", who), ("reverse_indices", back)):
             self.register_buffer(name, th.tensor(table, dtype=th.long), persistent=False)
@@ -229,6 +244,9 @@ class PairNet(nn.Module):
         return hidden.reshape(*shape, hidden.shape[-1])
 
 
+_NEVER = -120.0  # a logit whose probability is 0 in single precision
+
+
 class PairActor(Actor):
     """
     One actor for all agents that looks at its neighbours one by one; permutation-equivariant, and the same for any
@@ -260,7 +278,10 @@ class PairActor(Actor):
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
         hidden, pool = self.net.encode(th.cat([each, neighbours], dim=-1), present)
         if self.on_neighbours:
-            return self.net.head(hidden.add_(self.net.extra(0, own).unsqueeze(-2))).flatten(-2)
+            logits = self.net.head(hidden.add_(self.net.extra(0, own).unsqueeze(-2)))
+            if self.views.mask is not None:
+                logits = logits.masked_fill(self.views.mask(obs) <= 0, _NEVER)
+            return logits.flatten(-2)
         return self.net.head(self.net.of_pool(pool) + self.net.extra(0, own) + self.net.of_pair.bias)
 
     def single(self, agent: int) -> nn.Module:

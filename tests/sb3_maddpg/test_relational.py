@@ -163,7 +163,7 @@ def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
     [
         (None, "PairPolicy has to know .*`observation_layout`"),
         ({"own": [0]}, r"has entries \['own'\], but needs `own` and `neighbours`"),
-        ({**LAYOUT, "owns": [0]}, "`critic` and `complete` only"),
+        ({**LAYOUT, "owns": [0]}, "`action_mask` and `complete` only"),
         ({**LAYOUT, "own": [10]}, "each from 0 to 9"),
         ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "as many columns as the next"),
         ({**LAYOUT, "neighbours": []}, "as many columns as the next"),
@@ -174,6 +174,17 @@ def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
 def test_a_layout_that_does_not_fit_is_refused(layout, message):
     with pytest.raises(ValueError, match=message):
         policy(layout=layout)
+
+
+@pytest.mark.parametrize("space", [ACTIONS["continuous"], ACTIONS["categorical"]])
+def test_only_binary_actions_on_neighbours_are_masked(space):
+    with pytest.raises(ValueError, match="`action_mask` is for MultiBinary actions on neighbours"):
+        policy(space, {**LAYOUT, "action_mask": [6, 7, 8, 9]})
+    with pytest.raises(ValueError, match="acts_on_neighbours=False"):
+        policy(layout={**BY_ITSELF, "action_mask": [6, 7, 8, 9]})
+    for columns in ([6, 7, 8], [6, 7, 8, 10]):
+        with pytest.raises(ValueError, match="each from 0 to 9"):
+            policy(layout={**LAYOUT, "action_mask": columns})
 
 
 def test_spaces_that_do_not_fit_are_refused():
@@ -195,3 +206,22 @@ def test_parameters_that_are_put_in_place_are_used():
         critic.modules_of_nets[index] = deepcopy(critic.modules_of_nets[0])
     first, second = critic(obs, actions)
     assert th.equal(first, second)
+
+
+def test_what_is_masked_is_never_done_and_teaches_the_actor_nothing():
+    masked = {**LAYOUT, "action_mask": [6, 7, 8, 9]}
+    built = policy(layout=masked)
+    obs, _ = batch(built)
+    allowed = (obs[..., 6:10] > 0).repeat_interleave(2, dim=-1)
+    assert 0.2 < allowed.float().mean() < 0.8
+    logits = built.actor.logits(obs)
+    assert not logits.sigmoid()[~allowed].any()
+    plain = policy(layout=LAYOUT)
+    plain.load_state_dict(built.state_dict())
+    assert th.equal(plain.actor.logits(obs)[allowed], logits[allowed]), "what is allowed is as without a mask"
+    for deterministic in (True, False):
+        assert not built.actions.act(logits, deterministic=deterministic)[~allowed].any()
+    gradients = th.autograd.grad((logits * ~allowed).sum(), list(built.actor.parameters()))
+    assert not any(gradient.any() for gradient in gradients)
+    alone = built.actor.single(0)
+    assert th.equal(alone(obs[:, 0]), logits[:, 0])

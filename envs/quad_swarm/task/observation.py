@@ -35,7 +35,8 @@ class Observation(Protocol):
     @property
     def layout(self) -> dict[str, Any]:
         """Which columns are about the robot itself and which about each of the others: `own`, `neighbours`,
-        `acts_on_neighbours`, and `critic`, those about each of the others that no robot knows when it decides."""
+        `acts_on_neighbours`, `critic`, those about each of the others that no robot knows when it decides, and
+        `action_mask`, whom it may ask."""
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
         """What every robot observes, (E, n, size) float32."""
@@ -106,6 +107,8 @@ _MAGNIFICATIONS = np.array([0.05, 0.2, 1.0])
 _SPEED = 1.5
 # Stages of a trajectory that are looked at, out of 1..N, as fractions of N.
 _STAGES = (0.2, 0.5, 1.0)
+# Of what the planner keeps: plans that come nearer than this are about to be changed by each other.
+_CONFLICT = 1.1
 
 
 def _stages(horizon: int) -> list[int]:
@@ -212,6 +215,12 @@ def _told(pair: PairView) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
+def _mask(pair: PairView) -> np.ndarray:
+    """Whom there is any use in asking: who comes near the own plan, as far as is known."""
+    view = pair.view
+    return view.plan_separation.min(axis=-1, keepdims=True) < _CONFLICT * view.separation
+
+
 def _critic(pair: PairView) -> np.ndarray:
     """What no robot knows: how wrong the two are about each other, and how close their plans are."""
     view, stages = pair.view, _stages(pair.horizon)
@@ -241,6 +250,7 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
     "memory": _memory,
     "plan": _plan,
     "told": _told,
+    "mask": _mask,
     "critic": _critic,
 }
 
@@ -273,6 +283,8 @@ class PairObservation:
         blocks = np.arange(6, self.size).reshape(self.config.n_robots - 1, -1)
         seen, hidden = blocks[:, : self._seen], blocks[:, self._seen :]
         layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True, "complete": True}
+        if "mask" in self.groups:
+            layout["action_mask"] = seen[:, -1].tolist()  # the last group that robots see
         return layout | ({"critic": hidden.tolist()} if hidden.size else {})
 
     def __call__(self, swarm: Swarm) -> np.ndarray:

@@ -28,6 +28,7 @@ class RewardConfig:
     :param request: w_c, taken for each request
     :param near_miss: not in the paper: taken in each step for each pair closer than ``near_miss_distance``, in full at
         ``near_miss_width`` less than that and in proportion before; a signal that is less rare than collisions
+    :param near_miss_exponent: of that proportion: above 1, a slight miss weighs less and one that almost touches more
     :param near_miss_distance: see there (m); None: what the planner keeps
     :param near_miss_width: see there (m)
     :param near_miss_ahead: count also how close the two come by their plans within so many further steps
@@ -42,6 +43,7 @@ class RewardConfig:
     near_miss: NonNegativeFloat = 0.0
     near_miss_distance: PositiveFloat | None = None
     near_miss_width: PositiveFloat = 0.01
+    near_miss_exponent: Annotated[float, Field(ge=1, le=10)] = 1.0
     near_miss_ahead: Annotated[int, Field(ge=0, le=1000)] = 0
     near_miss_narrowing: NonNegativeFloat = 0.0
 
@@ -209,7 +211,7 @@ class RequestTask:
             limits = distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
             planned = (limits - self.swarm.planned_separation(ahead)).max(axis=-1)
             shortfall = np.maximum(shortfall, planned)
-        return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0)
+        return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0) ** reward.near_miss_exponent
 
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """The last step for `info`: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""

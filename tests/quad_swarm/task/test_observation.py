@@ -6,6 +6,7 @@ import pytest
 from quad_swarm import QuadSwarmEnv
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.observation import GROUPS, PairObservation, PaperObservation, make_observation
+from quad_swarm.task.view import View
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -112,3 +113,12 @@ def test_the_side_on_which_the_other_would_pass_is_seen_although_the_frame_is_mi
     # To the left of where they go, or to the right: for both robots alike
     assert (left[:, 1:] > 0.4).all()
     np.testing.assert_allclose(left[:, 1:], -right[:, 1:], atol=1e-6)
+
+
+def test_the_mask_names_those_who_come_near_the_own_plan():
+    observation, swarm = make_observation(CONFIG, EVERYTHING + "+mask"), flown()
+    mask = observation(swarm)[..., observation.layout["action_mask"]]
+    near = View(swarm).plan_separation.min(axis=-1) < 1.1 * CONFIG.planner.separation
+    assert np.array_equal(mask, near)
+    assert 0 < near.mean() < 1
+    assert "action_mask" not in make_observation(CONFIG, EVERYTHING).layout

@@ -167,6 +167,18 @@ def test_near_misses_cost_in_proportion():
         assert -info["reward_terms"]["near_miss"] == pytest.approx(cost, abs=0.3)
 
 
+def test_an_exponent_makes_slight_misses_weigh_less():
+    costs = {}
+    for exponent in (1.0, 2.0):
+        weights = {"near_miss": 1.0, "near_miss_distance": 0.8, "near_miss_width": 0.2, "near_miss_exponent": exponent}
+        env = QuadSwarmEnv(n_robots=2, reward=weights)
+        line = np.array([[0, 0, 1.0], [0.75, 0, 1.0]])
+        env.reset(options={"starts": line, "goals": line})
+        costs[exponent] = -env.step(np.array([1, 1]))[-1]["reward_terms"]["near_miss"]
+    assert 0 < costs[1.0] < 0.5
+    assert costs[2.0] == pytest.approx(costs[1.0] ** 2)
+
+
 def test_near_misses_may_look_ahead_along_the_plans():
     weights = {"near_miss": 1.0, "near_miss_distance": 0.6, "near_miss_width": 0.3}
     costs = []
