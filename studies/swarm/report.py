@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from quad_swarm.evaluation.flight import Flight, fly
+from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.figures.colours import colour_of
@@ -331,6 +332,64 @@ def worlds_table(rows: Rows, part: str) -> str:
     return table([*head, "arrived", "steps"], lines) if lines else "Not flown yet."
 
 
+def against(row: dict[str, Any], rival: dict[str, Any]) -> Comparison:
+    """Who collides in which of the same episodes."""
+    pairs = [[{"collided": letter == "1"} for letter in one["outcomes"]] for one in (row, rival)]
+    return Comparison.of(*pairs)
+
+
+def flight_groups(rows: Rows) -> Iterator[tuple[int, str, dict[str, dict[str, Any]]]]:
+    """Of the sealed flights of `flight`: number of robots, scenario, and the rows by policy."""
+    for n_robots in sorted({row["n_robots"] for row in rows}):
+        for name in NAMES:
+            here = {r["policy"]: r for r in rows if (r["n_robots"], r["scenario"]) == (n_robots, name)}
+            if "full" in here:
+                yield n_robots, name, here
+
+
+def rule_of(here: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
+    """The row of the tuned rule, if it was flown."""
+    return next((row for policy, row in here.items() if not is_model(policy) and policy not in ("none", "full")), None)
+
+
+def flight_table(rows: Rows) -> str:
+    """All policies in `flight`, in teams of all sizes."""
+    lines = []
+    for n_robots, name, here in flight_groups(rows):
+        rule = rule_of(here)
+        for policy, row in here.items():
+            low, high = against(row, here["full"]).interval
+            sign = "**" if high < SAFETY_MARGIN else ""
+            difference = "-" if policy == "full" else f"{sign}[{100 * low:+.2f}, {100 * high:+.2f}]{sign}"
+            ratio = f"{row['request_share'] / rule['request_share']:.0%}" if rule else "-"
+            steps = row["steps_to_arrival"]
+            line = [str(n_robots), name.replace("_", " "), label(policy), rate(row), str(row["collisions_at_steps"])]
+            line += [difference, f"{row['request_share']:.2%}", ratio, f"{row['bytes_per_second']:.0f}"]
+            lines.append([*line, f"{row['arrived']}/{row['episodes']}", "-" if steps is None else f"{steps:.1f}"])
+    head = ["robots", "scenario", "policy", "collisions, 95 %", "at steps", "against full (points)", "requests"]
+    return table([*head, "of the rule's", "B/s", "arrived", "steps"], lines)
+
+
+def flight_targets(rows: Rows) -> str:
+    """In how many scenarios each policy is as safe as full communication in `flight`, and its requests."""
+    lines: dict[tuple[int, str], list[Any]] = {}
+    for n_robots, name, here in flight_groups(rows):
+        rule = rule_of(here)
+        for policy, row in here.items():
+            if rule is None or policy in ("none", "full"):
+                continue
+            safe, ratios = lines.setdefault((n_robots, policy), [[], {}])
+            safe.append(against(row, here["full"]).as_safe())
+            ratios[name] = f"{row['request_share']:.2%} ({row['request_share'] / rule['request_share']:.0%})"
+    return table(
+        ["robots", "policy", "as safe as full in", *(name.replace("_", " ") for name in NAMES)],
+        [
+            [str(n), label(policy), f"{sum(safe)} of {len(safe)}", *(ratios.get(name, "-") for name in NAMES)]
+            for (n, policy), (safe, ratios) in lines.items()
+        ],
+    )
+
+
 def changes(changed: Any, path: str = "") -> str:
     """Nested fields as they are written on the command line."""
     if isinstance(changed, dict):
@@ -508,7 +567,10 @@ def main() -> None:
     args = parser.parse_args()
     os.chdir(ROOT)
     names = "rules test sweep robustness unseen teams asking interventions ppo counterfactual training counts quadrants"
-    rows = {name: read_rows(args.data / f"{name}.json") for name in [*names.split(), "checkpoints", "flight_world"]}
+    rows = {
+        name: read_rows(args.data / f"{name}.json")
+        for name in [*names.split(), "checkpoints", "flight", "flight_world"]
+    }
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
     blocks = {
         "targets": targets(test),
@@ -533,6 +595,8 @@ def main() -> None:
         "ppo": reference_table(rows["ppo"], "price", "threshold"),
         "counterfactual": reference_table(rows["counterfactual"], "price"),
         "training": training_table(rows["training"]),
+        "flight": flight_table(rows["flight"]),
+        "flight targets": flight_targets(rows["flight"]),
         "world": worlds_table(rows["flight_world"], "world"),
         "delays": worlds_table(rows["flight_world"], "delays"),
         "plants": worlds_table(rows["flight_world"], "plants"),

@@ -103,6 +103,23 @@ def test_conditions_fill_their_tables(tmp_path: Path):
     assert report.worlds_table(rows, "plants") == "Not flown yet."
 
 
+def test_the_tables_of_the_sealed_flights_compare_with_full_and_the_rule():
+    def row(policy: str, collisions: int, share: float) -> dict:
+        figures = {"n_robots": 8, "scenario": "random", "policy": policy, "request_share": share, "episodes": 4000}
+        figures |= {"outcomes": "1" * collisions + "0" * (4000 - collisions), "collisions": collisions}
+        figures |= {"collision_low": 0.0, "collision_high": 0.01, "collisions_at_steps": 0, "bytes_per_second": 9.0}
+        return figures | {"steps_to_arrival": None, "arrived": 4000 - collisions}
+
+    rows = [row("full", 0, 1.0), row("none", 900, 0.0), row("plan:0.8", 2, 0.02), row("a/x_seed1.zip@0.9", 3, 0.01)]
+    lines = report.flight_table(rows).splitlines()[2:]
+    assert [line.split(" | ")[5].startswith("**") for line in lines] == [False, False, True, True]
+    assert [line.split(" | ")[7] for line in lines] == ["5000%", "0%", "100%", "50%"]
+    summary = report.flight_targets(rows).splitlines()[2:]
+    assert len(summary) == 2
+    assert "x, seed 1, δ = 0.9 | 1 of 1 | - | - | - | 1.00% (50%)" in summary[1]
+    assert report.flight_table([]) == report.flight_targets([]) == "Not flown yet."
+
+
 def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown(tmp_path, monkeypatch):
     monkeypatch.setattr(fly_flight, "DATA", tmp_path)
     with pytest.raises(ValueError, match="holds no safe rule"):
