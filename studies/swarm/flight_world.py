@@ -5,7 +5,8 @@
 ``world``: no and full communication in `flight` and `flight-hard`. ``delays``: full communication with answers one, two
 and three steps late, with and without the right of way. ``plants``: margins and models in foreign physics. All on a set
 of episodes that nothing was chosen on. JSON: one row for each condition with the keys of `summarise`, and part,
-scenario, policy and what was changed in the world.
+scenario, policy and what was changed in the world. The rule and the model of ``plants`` are those that
+`studies.swarm.tune_flight` chose; what is known of that part is not flown again.
 """
 
 from __future__ import annotations
@@ -17,10 +18,14 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
+from studies.swarm.fly_flight import best_rule, tuned_models
 from studies.swarm.protocol import DATA, NAMES, WORLDS, absolute_path, condition, progress, replace_rows
+from studies.swarm.tune_flight import SWAPS
 
-SWAPS = ("symmetric_swap", "asymmetric_swap")
+# What the planner keeps in the part `plants`: contact is at 0.6 m
+SEPARATIONS = (0.6, 0.65, 0.72, 0.8)
 PARTS = {"world": 1000, "delays": 4000, "plants": 1000}
 QUICK = 10
 
@@ -52,17 +57,19 @@ def jobs(part: str) -> Iterator[Job]:
             changed = {"radio": {"delay": delay, "jitter": 0}, "planner": {"right_of_way": right_of_way}}
             yield Job(part, "flight", changed, name, "full")
     else:
-        separations, vehicles = (0.6, 0.65, 0.72, 0.8), ("bebop2", "crazyflie21")
-        for vehicle, separation, name, policy in itertools.product(vehicles, separations, SWAPS, ("none", "full")):
-            changed = {"plant": "crazyflow:cf21B_500", "quadrotor": vehicle, "planner": {"separation": separation}}
-            yield Job(part, "flight", changed, name, policy)
+        policies = ("none", "full", best_rule(), tuned_models()[0])
+        identified = {"crazyflow:cf21B_500": "crazyflie21", "rotorpy:hummingbird": "hummingbird"}
+        for plant, separation, name, policy in itertools.product(identified, SEPARATIONS, SWAPS, policies):
+            for vehicle in ("bebop2", identified[plant]):
+                changed = {"plant": plant, "quadrotor": vehicle, "planner": {"separation": separation}}
+                yield Job(part, "flight", changed, name, policy)
 
 
 def fly(job: Job, episodes: int) -> dict[str, Any]:
     """The row of a condition."""
     config = make_config(job.preset, job.changed)
     ((_, rows),) = fly_all([condition(job.policy, job.scenario, config)], episodes, WORLDS).items()
-    return {**job._asdict(), "set": WORLDS, **summarise(rows, config)}
+    return {**job._asdict(), "condition": str(job), "set": WORLDS, **summarise(rows, config)}
 
 
 def main() -> None:
@@ -75,10 +82,11 @@ def main() -> None:
     args = parser.parse_args()
     with make_pool(args.jobs) as pool:
         for part in args.parts or PARTS:
-            work = list(jobs(part))
+            known = {row.get("condition") for row in read_rows(args.json)} if part == "plants" else set()
+            work = [job for job in jobs(part) if str(job) not in known]
             episodes = [QUICK if args.quick else PARTS[part]] * len(work)
-            table = list(progress(pool.map(fly, work, episodes), part, len(work)))
-            for row in table:
+            for row in progress(pool.map(fly, work, episodes), part, len(work)):
+                replace_rows(args.json, [row], ("part", "condition"))
                 print(
                     f"{row['preset']:12} {row['changed'] or ''!s:60} {row['scenario']:16} {row['policy']:5} "
                     f"{row['collisions']:5}/{row['episodes']} at steps {row['collisions_at_steps']:5} "
@@ -86,7 +94,6 @@ def main() -> None:
                     f"closest {row['min_separation_continuous']:.3f} m",
                     flush=True,
                 )
-            replace_rows(args.json, table, ("part",))
 
 
 if __name__ == "__main__":

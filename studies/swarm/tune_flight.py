@@ -44,11 +44,11 @@ def families() -> dict[str, list[str]]:
     """The rules of each family."""
     product = itertools.product
     cpas = [f"cpa:{d}:{t}" for d, t in product((0.72, 0.75, 0.78, 0.8, 0.85, 0.9), (0.75, 1, 1.5, 2))]
-    plans = [f"plan:0.{d}" for d in range(72, 81)]
+    plans = [f"plan:0.{d}" for d in range(68, 82)]
     return {
         "plan and stale": [f"{plan}&stale:{k}" for plan, k in product(plans, range(5, 13))],
         "plan, soon and stale": [
-            f"{plan}&soon:{t}&stale:{k}" for plan, t, k in product(plans[2::2], (0.5, 0.7, 0.9), (4, 6, 8, 10))
+            f"{plan}&soon:{t}&stale:{k}" for plan, t, k in product(plans[2::2], (0.5, 0.8, 1.2), (4, 6, 8, 10))
         ],
         "cpa and stale": [f"{cpa}&stale:{k}" for cpa, k in product(cpas, (6, 8, 10))],
         "cpa and event": [f"{cpa}&event:{e}" for cpa, e in product(cpas[::2], (0.03, 0.05, 0.1))],
