@@ -27,7 +27,7 @@ from studies.swarm.protocol import (
     replace_rows,
     world,
 )
-from studies.swarm.tune_flight import PRESET, SWAPS
+from studies.swarm.tune_flight import OWN_SWAPS, PRESET
 
 # Episodes of each condition by the number of robots
 EPISODES = {8: 12000, 4: 4000, 12: 4000, 16: 4000}
@@ -44,10 +44,10 @@ class Job(NamedTuple):
 
 
 def best_rule() -> str:
-    """The rule that is safe in all scenarios with the fewest requests in both swaps."""
+    """The rule that is safe everywhere with the fewest requests in both swaps of eight robots."""
     shares: dict[str, list[float]] = {}
     for row in known_rows(DATA / "flight_rules.json"):
-        if row["safe"] and row["scenario"] in SWAPS:
+        if row["safe"] and (row["n_robots"], row["scenario"]) in OWN_SWAPS:
             shares.setdefault(row["setting"], []).append(row["request_share"])
     if not shares:
         raise ValueError(

@@ -1,11 +1,11 @@
-"""Tune rules and models in the world of `flight` with one setting for everything, on the validation set.
+"""Tune rules and models in the world of `flight` with one setting for all scenarios and sizes, on the validation set.
 
 ``python -m studies.swarm.tune_flight rules|thresholds [MODEL.zip ...] [--quick] [--json F]``. A rule, or a threshold of
-a model, is safe if it is as safe as full communication in every scenario (`STANDARD`). All rules fly a few episodes of
-both swaps, which tell their requests there; then they are tried from the cheapest on, in stages of more and more
-episodes, until one is safe. A model's thresholds are tried from the highest on. JSON: one row for each setting and
-scenario with the keys of `summarise` over the episodes that it flew, and family, setting, safe (None: not tried, since
-a cheaper one is safe).
+a model, is safe if it is as safe as full communication, to within `SAFETY_MARGIN`, in every scenario and with every
+number of robots. All rules fly a few episodes of both swaps with eight robots, which tell their requests there; then
+they are tried from the cheapest on, in stages of more and more episodes, until one is safe. A model's thresholds are
+tried from the highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
+over the episodes that it flew, and family, setting, safe (None: not tried, since a cheaper one is safe).
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from studies.swarm.protocol import (
     NAMES,
     QUICK_STAGES,
-    Standard,
     fly_validation,
     hopeless,
     progress,
@@ -31,13 +30,20 @@ from studies.swarm.protocol import (
     world,
 )
 
-Flown = dict[str, Rows]  # figures by scenario
+Cell = tuple[int, str]  # number of robots, scenario
+Flown = dict[Cell, Rows]
 
 PRESET = "flight"
 SWAPS = ("symmetric_swap", "asymmetric_swap")
+# Cells in which all are tuned, those first where most goes wrong; and the episodes that decide
+SIZES = {8: 4000, 16: 2000, 12: 2000, 4: 2000}
+CELLS: list[Cell] = [
+    *itertools.product(SIZES, SWAPS),
+    *itertools.product(SIZES, [name for name in NAMES if name not in SWAPS]),
+]
+OWN_SWAPS = [cell for cell in CELLS if cell[0] == 8 and cell[1] in SWAPS]
 STAGES = (50, 100, 250, 500, 1000, 2000, 4000)
-STANDARD = Standard(SAFETY_MARGIN, 4000)
-THRESHOLDS = (0.98, 0.965, 0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7, 0.65, 0.6, 0.55, 0.5)
+THRESHOLDS = (0.99, 0.98, 0.965, *(round(0.95 - 0.025 * k, 3) for k in range(11)), 0.65, 0.6, 0.55, 0.5, 0.4, 0.3)
 
 
 def families() -> dict[str, list[str]]:
@@ -68,52 +74,61 @@ def families() -> dict[str, list[str]]:
     }
 
 
-def fly(policy: str, scenario: str, episodes: int, known: Rows | None = None) -> Rows:
+def fly(policy: str, cell: Cell, episodes: int, known: Rows | None = None) -> Rows:
     """A policy's figures of the first episodes, of which some are known."""
-    rows = list(known or [])
+    rows, (n_robots, name) = list(known or []), cell
     if episodes > len(rows):
-        rows += fly_validation([policy], PRESET, scenario, episodes, skip=len(rows))[policy]
+        rows += fly_validation([policy], PRESET, name, episodes, n_robots, skip=len(rows))[policy]
     return rows
 
 
-def try_out(policy: str, flown: Flown, full: Flown, stages: Sequence[int]) -> tuple[Flown, bool]:
-    """Fly a policy in more and more episodes as long as it may be as safe as full communication in every scenario.
+def last(cell: Cell, stages: Sequence[int]) -> int:
+    """Episodes that decide in a cell."""
+    return min(SIZES[cell[0]], stages[-1])
 
-    :param flown: its figures by scenario, as far as they are known
-    :param full: those of full communication, of as many episodes as the last stage has
+
+def try_out(policy: str, flown: Flown, full: Flown, stages: Sequence[int]) -> tuple[Flown, bool]:
+    """Fly a policy in more and more episodes as long as it may be as safe as full communication in every cell.
+
+    :param flown: its figures, as far as they are known
+    :param full: those of full communication, of as many episodes as decide
     :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
     """
     flown = dict(flown)
-    for episodes in stages:
-        for name in (*SWAPS, *(name for name in NAMES if name not in SWAPS)):
-            flown[name] = fly(policy, name, episodes, flown.get(name))
-            comparison = Comparison.of(flown[name][:episodes], full[name][:episodes])
-            if hopeless(comparison, STANDARD.margin):
-                return flown, False
-            if episodes >= STANDARD.enough and not comparison.as_safe(STANDARD.margin):
-                return flown, False
+    for stage, cell in itertools.product(stages, CELLS):
+        episodes = min(stage, last(cell, stages))
+        flown[cell] = fly(policy, cell, episodes, flown.get(cell))
+        comparison = Comparison.of(flown[cell][:episodes], full[cell][:episodes])
+        if hopeless(comparison, SAFETY_MARGIN):
+            return flown, False
+        if episodes >= SIZES[cell[0]] and not comparison.as_safe(SAFETY_MARGIN):
+            return flown, False
     return flown, True
 
 
 def rows_of(family: str, setting: str, flown: Flown, safe: bool | None) -> list[dict[str, Any]]:
     """The rows of a setting."""
     keys = {"preset": PRESET, "family": family, "setting": setting, "safe": safe}
-    return [keys | {"scenario": name} | summarise(rows, world(PRESET)) for name, rows in flown.items() if rows]
+    return [
+        keys | {"n_robots": n_robots, "scenario": name} | summarise(rows, world(PRESET, n_robots))
+        for (n_robots, name), rows in flown.items()
+        if rows
+    ]
 
 
 def share(flown: Flown) -> float:
-    """Mean share of requests in both swaps."""
-    return sum(summarise(flown[name], world(PRESET))["request_share"] for name in SWAPS) / len(SWAPS)
+    """Mean share of requests in both swaps of eight robots."""
+    return sum(summarise(flown[cell], world(PRESET))["request_share"] for cell in OWN_SWAPS) / len(OWN_SWAPS)
 
 
 def tune_rules(pool: Executor, jobs: int, full: Flown, stages: Sequence[int], quick: bool) -> list[dict[str, Any]]:
     """The rows of all rules: as many as there are processes are tried at once, the cheapest first."""
     family_of = {rule: family for family, rules in families().items() for rule in rules[:: 12 if quick else 1]}
     screened: dict[str, Flown] = {rule: {} for rule in family_of}
-    for name in SWAPS:
-        work = pool.map(fly, screened, [name] * len(screened), [stages[0]] * len(screened))
-        for rule, rows in zip(screened, progress(work, name, len(screened)), strict=True):
-            screened[rule][name] = rows
+    for cell in OWN_SWAPS:
+        work = pool.map(fly, screened, [cell] * len(screened), [stages[0]] * len(screened))
+        for rule, rows in zip(screened, progress(work, cell[1], len(screened)), strict=True):
+            screened[rule][cell] = rows
     waiting = sorted(screened, key=lambda rule: share(screened[rule]))
     running: dict[Future[tuple[Flown, bool]], str] = {}
     safe: dict[str, bool] = {}
@@ -124,8 +139,18 @@ def tune_rules(pool: Executor, jobs: int, full: Flown, stages: Sequence[int], qu
         for done in wait(running, return_when=FIRST_COMPLETED).done:
             rule = running.pop(done)
             screened[rule], safe[rule] = done.result()
-            print(f"{rule:45} {share(screened[rule]):.2%} {'safe' if safe[rule] else 'not safe'}", flush=True)
+            print(f"{rule:45} {share(screened[rule]):.2%} {verdict(screened[rule], full, safe[rule])}", flush=True)
     return [row for rule in screened for row in rows_of(family_of[rule], rule, screened[rule], safe.get(rule))]
+
+
+def verdict(flown: Flown, full: Flown, safe: bool) -> str:
+    """Where a setting turned out not to be safe."""
+    if safe:
+        return "safe"
+    excess = {c: sum(a["collided"] - b["collided"] for a, b in zip(flown[c], full[c], strict=False)) for c in flown}
+    cell = max(excess, key=lambda cell: excess[cell])
+    collisions = sum(bool(row["collided"]) for row in flown[cell])
+    return f"{collisions} of {len(flown[cell])} in {cell[1]} of {cell[0]}"
 
 
 def tune_thresholds(path: str, full: Flown, stages: Sequence[int]) -> list[dict[str, Any]]:
@@ -134,10 +159,9 @@ def tune_thresholds(path: str, full: Flown, stages: Sequence[int]) -> list[dict[
     for threshold in THRESHOLDS:
         flown, safe = try_out(f"{path}@{threshold:g}", {}, full, stages)
         table += rows_of(path, f"{path}@{threshold:g}", flown, safe)
+        print(f"{path} {threshold:g} {share(flown):.2%} {verdict(flown, full, safe)}", flush=True)
         if safe:
-            print(f"{path} {threshold:g} {share(flown):.2%}", flush=True)
-            return table
-    print(f"{path}: no threshold is as safe as full communication", flush=True)
+            break
     return table
 
 
@@ -154,11 +178,11 @@ def main() -> None:
         parser.error("name the models whose thresholds are to be tuned")
     stages = QUICK_STAGES if args.quick else STAGES
     with make_pool(args.jobs) as pool:
-        work = pool.map(fly, ["full"] * len(NAMES), NAMES, [stages[-1]] * len(NAMES))
+        work = pool.map(fly, ["full"] * len(CELLS), CELLS, [last(cell, stages) for cell in CELLS])
         full = {
             # All that is compared; each process gets a copy.
-            name: [{"collided": row["collided"]} for row in rows]
-            for name, rows in zip(NAMES, progress(work, "full", len(NAMES)), strict=True)
+            cell: [{"collided": row["collided"]} for row in rows]
+            for cell, rows in zip(CELLS, progress(work, "full", len(CELLS)), strict=True)
         }
         if args.what == "rules":
             table = tune_rules(pool, args.jobs, full, stages, args.quick)

@@ -1,5 +1,6 @@
 """The study of the disturbed worlds: its conditions, and that one setting has to do everywhere."""
 
+import itertools
 from concurrent.futures import Executor, Future
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +27,9 @@ def test_every_rule_can_be_read(family):
 
 
 @pytest.mark.parametrize("part", flight_world.PARTS)
-def test_every_condition_is_a_world_and_none_is_named_twice(part):
+def test_every_condition_is_a_world_and_none_is_named_twice(part, monkeypatch):
+    monkeypatch.setattr(flight_world, "best_rule", lambda: "plan:0.8&stale:8")
+    monkeypatch.setattr(flight_world, "tuned_models", lambda: ["model.zip@0.9"])
     work = list(flight_world.jobs(part))
     assert len({str(job) for job in work}) == len(work) >= 12
     for job in work:
@@ -44,13 +47,13 @@ class Inline(Executor):
 
 @pytest.fixture
 def flown(monkeypatch):
-    """All flights of who collides in every fifth episode of `random` if bad, and asks for as much as is its name."""
+    """All flights. Who is bad collides in every fifth episode of `random` of sixteen; numbers in names are requests."""
     flown = []
 
     def fly(policies, preset, scenario, episodes, n_robots=None, skip=0):
         (policy,) = policies
-        flown.append((policy, scenario, skip, episodes))
-        collides = policy.startswith("bad") and scenario == "random"
+        flown.append((policy, (n_robots, scenario), skip, episodes))
+        collides = policy.startswith("bad") and (n_robots, scenario) == (16, "random")
         requests = float(policy.split()[-1]) if " " in policy else 1.0
         return {policy: [{"collided": collides and k % 5 == 0, "requests": requests} for k in range(skip, episodes)]}
 
@@ -59,17 +62,19 @@ def flown(monkeypatch):
     return flown
 
 
-FULL = {name: [{"collided": False}] * tune_flight.STAGES[-1] for name in NAMES}
+FULL = {cell: [{"collided": False}] * tune_flight.STAGES[-1] for cell in tune_flight.CELLS}
 
 
-def test_a_rule_has_to_be_safe_in_every_scenario(flown):
+def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     assert tune_flight.try_out("good", {}, FULL, tune_flight.STAGES)[1]
     assert not tune_flight.try_out("bad", {}, FULL, tune_flight.STAGES)[1]
     # Piece by piece, in every scenario
     stages = [0, *tune_flight.STAGES]
-    assert [one[2:] for one in flown if one[:2] == ("good", "random")] == list(pairwise(stages))
-    assert {one[1] for one in flown if one[0] == "good"} == set(NAMES)
+    assert [one[2:] for one in flown if one[:2] == ("good", (8, "random"))] == list(pairwise(stages))
+    assert [one[2:] for one in flown if one[:2] == ("good", (16, "random"))] == list(pairwise(stages))[:-1]
+    assert {one[1] for one in flown if one[0] == "good"} == set(itertools.product((4, 8, 12, 16), NAMES))
     assert max(one[3] for one in flown if one[0] == "bad") == stages[1], "without hope it is not flown on"
+    assert tune_flight.CELLS[0] == (8, "symmetric_swap")
 
 
 def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypatch):
@@ -88,7 +93,7 @@ def test_thresholds_are_tried_from_the_highest_on(flown, monkeypatch):
     table = tune_flight.tune_thresholds("model.zip", FULL, tune_flight.STAGES)
     assert {row["setting"] for row in table if row["safe"]} == {"model.zip@0.9"} == {row["setting"] for row in table}
     table = tune_flight.tune_thresholds("bad.zip", FULL, tune_flight.STAGES)
-    assert [row["setting"] for row in table if row["scenario"] == "random"] == [
+    assert [row["setting"] for row in table if (row["n_robots"], row["scenario"]) == (16, "random")] == [
         "bad.zip@0.9", "bad.zip@0.8", "bad.zip@0.7"
     ]  # fmt: skip
     assert not any(row["safe"] for row in table)
@@ -125,7 +130,7 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
     with pytest.raises(ValueError, match="holds no safe rule"):
         fly_flight.best_rule()
     rules = [
-        {"setting": setting, "scenario": name, "safe": safe, "request_share": share}
+        {"setting": setting, "n_robots": 8, "scenario": name, "safe": safe, "request_share": share}
         for setting, safe, share in (("plan:0.8", True, 0.03), ("cpa:0.8:1", True, 0.02), ("plan:0.7", False, 0.01))
         for name in NAMES
     ]
