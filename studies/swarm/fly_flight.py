@@ -1,8 +1,8 @@
 """Fly the sealed test set of `flight`: ``python -m studies.swarm.fly_flight [--n-robots ...] [--quick] [--json F]``.
 
 Full and no communication, the best rule with one setting, and all models with theirs, each in every scenario; what the
-file already holds is not flown again. Who flies is read from ``flight_rules.json`` and ``flight_thresholds.json``,
-which `studies.swarm.tune_flight` writes: commit these first. JSON: one row for each condition with the keys of
+file already holds is not flown again. Who flies is read from ``flight_tuning.json``, which `studies.swarm.tune_flight`
+writes: commit it first. JSON: one row for each condition with the keys of
 `summarise`, its episodes' outcomes as text (1: a collision) for paired comparisons, and scenario, policy, n_robots.
 """
 
@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
     DATA,
@@ -27,7 +29,7 @@ from studies.swarm.protocol import (
     replace_rows,
     world,
 )
-from studies.swarm.tune_flight import OWN_SWAPS, PRESET
+from studies.swarm.tune_flight import FULL, OWN_SWAPS, PRESET
 
 # Episodes of each condition by the number of robots
 EPISODES = {8: 12000, 4: 4000, 12: 4000, 16: 4000}
@@ -43,22 +45,27 @@ class Job(NamedTuple):
     episodes: int
 
 
+def tuned() -> Iterator[dict[str, Any]]:
+    """The rows of all settings that are safe, but for full communication."""
+    return (row for row in known_rows(DATA / "flight_tuning.json") if row["safe"] and row["family"] != FULL)
+
+
 def best_rule() -> str:
     """The rule that is safe everywhere with the fewest requests in both swaps of eight robots."""
     shares: dict[str, list[float]] = {}
-    for row in known_rows(DATA / "flight_rules.json"):
-        if row["safe"] and (row["n_robots"], row["scenario"]) in OWN_SWAPS:
+    for row in tuned():
+        if not is_model(row["setting"]) and (row["n_robots"], row["scenario"]) in OWN_SWAPS:
             shares.setdefault(row["setting"], []).append(row["request_share"])
     if not shares:
         raise ValueError(
-            f"{DATA / 'flight_rules.json'} holds no safe rule: run `studies.swarm.tune_flight rules` first."
+            f"{DATA / 'flight_tuning.json'} holds no safe rule: run `studies.swarm.tune_flight rules` first."
         )
     return min(shares, key=lambda rule: sum(shares[rule]))
 
 
 def tuned_models() -> list[str]:
     """The models with their thresholds; those that have none that is safe fly with their own."""
-    safe = {row["family"]: row["setting"] for row in known_rows(DATA / "flight_thresholds.json") if row["safe"]}
+    safe = {row["family"]: row["setting"] for row in tuned()}
     return [safe.get(path, path) for path in models("flight")]
 
 

@@ -5,7 +5,8 @@ a model, is safe if it is as safe as full communication, to within `SAFETY_MARGI
 number of robots. All rules fly a few episodes of both swaps with eight robots, which tell their requests there; then
 they are tried from the cheapest on, in stages of more and more episodes, until one is safe. A model's thresholds are
 tried from the highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
-over the episodes that it flew, and family, setting, safe (None: not tried, since a cheaper one is safe).
+over the episodes that it flew, and family, setting, safe (None: not tried, since a cheaper one is safe). What the
+table has is not flown again.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
+from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
+    DATA,
     NAMES,
     QUICK_STAGES,
     fly_validation,
@@ -30,8 +33,17 @@ from studies.swarm.protocol import (
     world,
 )
 
+FULL = "full"
 Cell = tuple[int, str]  # number of robots, scenario
 Flown = dict[Cell, Rows]
+
+
+class Setting(NamedTuple):
+    """A rule of a family, or a model with a threshold, whose family is the model."""
+
+    family: str
+    name: str
+
 
 PRESET = "flight"
 SWAPS = ("symmetric_swap", "asymmetric_swap")
@@ -121,26 +133,66 @@ def share(flown: Flown) -> float:
     return sum(summarise(flown[cell], world(PRESET))["request_share"] for cell in OWN_SWAPS) / len(OWN_SWAPS)
 
 
-def tune_rules(pool: Executor, jobs: int, full: Flown, stages: Sequence[int], quick: bool) -> list[dict[str, Any]]:
-    """The rows of all rules: as many as there are processes are tried at once, the cheapest first."""
-    family_of = {rule: family for family, rules in families().items() for rule in rules[:: 12 if quick else 1]}
-    screened: dict[str, Flown] = {rule: {} for rule in family_of}
-    for cell in OWN_SWAPS:
-        work = pool.map(fly, screened, [cell] * len(screened), [stages[0]] * len(screened))
-        for rule, rows in zip(screened, progress(work, cell[1], len(screened)), strict=True):
-            screened[rule][cell] = rows
-    waiting = sorted(screened, key=lambda rule: share(screened[rule]))
-    running: dict[Future[tuple[Flown, bool]], str] = {}
-    safe: dict[str, bool] = {}
-    while running or (waiting and True not in safe.values()):
-        while waiting and len(running) < jobs and True not in safe.values():
-            rule = waiting.pop(0)
-            running[pool.submit(try_out, rule, screened[rule], full, stages)] = rule
+def fly_full(pool: Executor, path: Path, stages: Sequence[int]) -> Flown:
+    """Who collides under full communication in the episodes that decide; what the table has is not flown again."""
+    known = {(row["n_robots"], row["scenario"]): row["outcomes"] for row in read_rows(path) if row["family"] == FULL}
+    missing = [cell for cell in CELLS if len(known.get(cell, "")) < last(cell, stages)]
+    work = pool.map(fly, [FULL] * len(missing), missing, [last(cell, stages) for cell in missing])
+    for cell, rows in zip(missing, progress(work, FULL, len(missing)), strict=True):
+        known[cell] = "".join("1" if row["collided"] else "0" for row in rows)
+        (line,) = rows_of(FULL, FULL, {cell: rows}, True)
+        replace_rows(path, [line | {"outcomes": known[cell]}], ("preset", "setting", "n_robots", "scenario"))
+    return {cell: [{"collided": letter == "1"} for letter in known[cell]] for cell in CELLS}
+
+
+def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool) -> list[Setting]:
+    """All rules, those with the fewest requests in both swaps of eight robots first."""
+    rules = [Setting(family, rule) for family, rules in families().items() for rule in rules[:: 12 if quick else 1]]
+    known: dict[str, list[float]] = {}
+    for row in read_rows(path):
+        if (row["n_robots"], row["scenario"]) in OWN_SWAPS:
+            known.setdefault(row["setting"], []).append(row["request_share"])
+    work = [(rule, cell) for rule in rules if len(known.get(rule.name, [])) < len(OWN_SWAPS) for cell in OWN_SWAPS]
+    flown = pool.map(fly, [rule.name for rule, _ in work], [cell for _, cell in work], [stages[0]] * len(work))
+    lines = []
+    for (rule, cell), rows in zip(work, progress(flown, "requests", len(work)), strict=True):
+        lines += rows_of(*rule, {cell: rows}, None)
+        known.setdefault(rule.name, []).append(lines[-1]["request_share"])
+    replace_rows(path, lines, ("preset", "setting"))
+    return sorted(rules, key=lambda rule: sum(known[rule.name]))
+
+
+def tune(
+    pool: Executor, jobs: int, ladders: list[list[Setting]], full: Flown, stages: Sequence[int], path: Path
+) -> None:
+    """Try the settings of each ladder from the first on until one is safe, and put them into the table; what it has
+    decided is not tried again.
+
+    :param jobs: how many are tried at once, of one ladder if there is only one
+    """
+    decided = {row["setting"]: row["safe"] for row in read_rows(path) if row["safe"] is not None}
+    running: dict[Future[tuple[Flown, bool]], Setting] = {}
+
+    def following() -> Setting | None:
+        busy = {setting.name for setting in running.values()}
+        ladders.sort(key=lambda ladder: len(busy & {setting.name for setting in ladder}))
+        for ladder in ladders:
+            if not any(decided.get(setting.name) for setting in ladder):
+                for setting in ladder:
+                    if setting.name not in decided and setting.name not in busy:
+                        return setting
+        return None
+
+    while True:
+        while len(running) < jobs and (setting := following()):
+            running[pool.submit(try_out, setting.name, {}, full, stages)] = setting
+        if not running:
+            return
         for done in wait(running, return_when=FIRST_COMPLETED).done:
-            rule = running.pop(done)
-            screened[rule], safe[rule] = done.result()
-            print(f"{rule:45} {share(screened[rule]):.2%} {verdict(screened[rule], full, safe[rule])}", flush=True)
-    return [row for rule in screened for row in rows_of(family_of[rule], rule, screened[rule], safe.get(rule))]
+            setting = running.pop(done)
+            flown, decided[setting.name] = done.result()
+            replace_rows(path, rows_of(*setting, flown, decided[setting.name]), ("preset", "setting"))
+            print(f"{setting.name:50} {share(flown):.2%} {verdict(flown, full, decided[setting.name])}", flush=True)
 
 
 def verdict(flown: Flown, full: Flown, safe: bool) -> str:
@@ -153,18 +205,6 @@ def verdict(flown: Flown, full: Flown, safe: bool) -> str:
     return f"{collisions} of {len(flown[cell])} in {cell[1]} of {cell[0]}"
 
 
-def tune_thresholds(path: str, full: Flown, stages: Sequence[int]) -> list[dict[str, Any]]:
-    """The rows of a model."""
-    table = []
-    for threshold in THRESHOLDS:
-        flown, safe = try_out(f"{path}@{threshold:g}", {}, full, stages)
-        table += rows_of(path, f"{path}@{threshold:g}", flown, safe)
-        print(f"{path} {threshold:g} {share(flown):.2%} {verdict(flown, full, safe)}", flush=True)
-        if safe:
-            break
-    return table
-
-
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -172,25 +212,18 @@ def main() -> None:
     parser.add_argument("models", nargs="*", metavar="MODEL.zip")
     parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--json", type=Path, default=DATA / "flight_tuning.json", metavar="FILE")
     args = parser.parse_args()
     if args.what == "thresholds" and not args.models:
         parser.error("name the models whose thresholds are to be tuned")
     stages = QUICK_STAGES if args.quick else STAGES
     with make_pool(args.jobs) as pool:
-        work = pool.map(fly, ["full"] * len(CELLS), CELLS, [last(cell, stages) for cell in CELLS])
-        full = {
-            # All that is compared; each process gets a copy.
-            cell: [{"collided": row["collided"]} for row in rows]
-            for cell, rows in zip(CELLS, progress(work, "full", len(CELLS)), strict=True)
-        }
+        full = fly_full(pool, args.json, stages)
         if args.what == "rules":
-            table = tune_rules(pool, args.jobs, full, stages, args.quick)
+            ladders = [by_requests(pool, args.json, stages, args.quick)]
         else:
-            flown = pool.map(tune_thresholds, args.models, [full] * len(args.models), [stages] * len(args.models))
-            table = [row for rows in progress(flown, "thresholds", len(args.models)) for row in rows]
-    if args.json:
-        replace_rows(args.json, table, ("preset", "family"))
+            ladders = [[Setting(path, f"{path}@{t:g}") for t in THRESHOLDS] for path in args.models]
+        tune(pool, args.jobs, ladders, full, stages, args.json)
 
 
 if __name__ == "__main__":

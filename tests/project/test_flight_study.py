@@ -62,7 +62,7 @@ def flown(monkeypatch):
     return flown
 
 
-FULL = {cell: [{"collided": False}] * tune_flight.STAGES[-1] for cell in tune_flight.CELLS}
+FULL: tune_flight.Flown = {cell: [{"collided": False}] * tune_flight.STAGES[-1] for cell in tune_flight.CELLS}
 
 
 def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
@@ -77,26 +77,45 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     assert tune_flight.CELLS[0] == (8, "symmetric_swap")
 
 
-def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypatch):
+def settings(path: Path) -> dict[str, bool | None]:
+    return {row["setting"]: row["safe"] for row in read_rows(path)}
+
+
+def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypatch, tmp_path):
     families = {"one": ["good 0.4", "bad 0.1", "good 0.3"], "two": ["bad 0.35", "good 0.2"]}
     monkeypatch.setattr(tune_flight, "families", lambda: families)
-    table = tune_flight.tune_rules(Inline(), 1, FULL, tune_flight.STAGES, quick=False)
-    assert {row["setting"]: row["safe"] for row in table} == {
-        "bad 0.1": False, "good 0.2": True, "good 0.3": None, "bad 0.35": None, "good 0.4": None
-    }  # fmt: skip
-    assert {row["setting"] for row in table if row["family"] == "two"} == {"bad 0.35", "good 0.2"}
-    assert max(episodes for policy, *_, episodes in flown if policy == "good 0.4") == tune_flight.STAGES[0]
+    path, stages = tmp_path / "tuning.json", tune_flight.STAGES
+    rules = tune_flight.by_requests(Inline(), path, stages, quick=False)
+    assert [rule.name for rule in rules] == ["bad 0.1", "good 0.2", "good 0.3", "bad 0.35", "good 0.4"]
+    tune_flight.tune(Inline(), 1, [rules], FULL, stages, path)
+    expected = {"bad 0.1": False, "good 0.2": True, "good 0.3": None, "bad 0.35": None, "good 0.4": None}
+    assert settings(path) == expected
+    assert {row["setting"] for row in read_rows(path) if row["family"] == "two"} == {"bad 0.35", "good 0.2"}
+    assert max(episodes for policy, *_, episodes in flown if policy == "good 0.4") == stages[0]
+    # Neither what was screened nor what was decided is flown again.
+    flown.clear()
+    assert tune_flight.by_requests(Inline(), path, stages, quick=False) == rules
+    tune_flight.tune(Inline(), 1, [rules], FULL, stages, path)
+    assert not flown
+    assert settings(path) == expected
 
 
-def test_thresholds_are_tried_from_the_highest_on(flown, monkeypatch):
-    monkeypatch.setattr(tune_flight, "THRESHOLDS", (0.9, 0.8, 0.7))
-    table = tune_flight.tune_thresholds("model.zip", FULL, tune_flight.STAGES)
-    assert {row["setting"] for row in table if row["safe"]} == {"model.zip@0.9"} == {row["setting"] for row in table}
-    table = tune_flight.tune_thresholds("bad.zip", FULL, tune_flight.STAGES)
-    assert [row["setting"] for row in table if (row["n_robots"], row["scenario"]) == (16, "random")] == [
-        "bad.zip@0.9", "bad.zip@0.8", "bad.zip@0.7"
-    ]  # fmt: skip
-    assert not any(row["safe"] for row in table)
+def test_thresholds_are_tried_from_the_highest_on_each_model_by_itself(flown, tmp_path):
+    ladders = [
+        [tune_flight.Setting(path, f"{path}@{threshold}") for threshold in (0.9, 0.8)] for path in ("a.zip", "bad.zip")
+    ]
+    tune_flight.tune(Inline(), 1, ladders, FULL, tune_flight.STAGES, tmp_path / "t.json")
+    assert settings(tmp_path / "t.json") == {"a.zip@0.9": True, "bad.zip@0.9": False, "bad.zip@0.8": False}
+
+
+def test_full_communication_is_flown_once(flown, tmp_path):
+    stages = (5, 10)
+    full = tune_flight.fly_full(Inline(), tmp_path / "t.json", stages)
+    assert {len(rows) for rows in full.values()} == {10}
+    assert {one[1] for one in flown} == set(tune_flight.CELLS)
+    flown.clear()
+    assert tune_flight.fly_full(Inline(), tmp_path / "t.json", stages) == full
+    assert not flown
 
 
 def test_conditions_fill_their_tables(tmp_path: Path):
@@ -130,11 +149,11 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
     with pytest.raises(ValueError, match="holds no safe rule"):
         fly_flight.best_rule()
     rules = [
-        {"setting": setting, "n_robots": 8, "scenario": name, "safe": safe, "request_share": share}
+        {"family": setting, "setting": setting, "n_robots": 8, "scenario": name, "safe": safe, "request_share": share}
         for setting, safe, share in (("plan:0.8", True, 0.03), ("cpa:0.8:1", True, 0.02), ("plan:0.7", False, 0.01))
         for name in NAMES
     ]
-    write_rows(tmp_path / "flight_rules.json", rules)
+    write_rows(tmp_path / "flight_tuning.json", rules)
     assert fly_flight.best_rule() == "cpa:0.8:1"
     assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
     monkeypatch.setattr(fly_flight, "NAMES", NAMES[:1])
