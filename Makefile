@@ -56,6 +56,9 @@ results: install  ## fly everything that docs/results.md says again: tuned rules
 	$(STUDY).tune_thresholds studies/swarm/data/any_seed*.zip --n-robots $(TEAMS) --jobs $(JOBS) \
 		--json studies/swarm/data/thresholds.json --write
 	$(STUDY).fly_tests --jobs $(JOBS)
+	$(STUDY).tune_flight rules --jobs $(JOBS)
+	$(STUDY).tune_flight thresholds studies/swarm/data/flight_seed*.zip --jobs $(JOBS)
+	$(STUDY).fly_flight --jobs $(JOBS)
 	$(STUDY).flight_world --jobs $(JOBS)
 	$(STUDY).ppo --models $(LOGS) --json studies/swarm/data/ppo.json
 	$(STUDY).counterfactual --models $(LOGS) --json studies/swarm/data/counterfactual.json
