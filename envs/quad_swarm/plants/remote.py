@@ -43,14 +43,15 @@ class _Server:
         return answer
 
 
-_servers: dict[int, _Server] = {}
+_servers: dict[tuple[int, str], _Server] = {}
 
 
-def _server() -> _Server:
-    """This process' server; a fork of the process starts its own."""
-    server = _servers.get(os.getpid())
+def _server(simulator: str) -> _Server:
+    """This process' server for a simulator: they do not bear each other's libraries. A fork starts its own."""
+    key = os.getpid(), simulator
+    server = _servers.get(key)
     if server is None or server.process.poll() is not None:
-        server = _servers[os.getpid()] = _Server()
+        server = _servers[key] = _Server()
     return server
 
 
@@ -68,7 +69,7 @@ class RemotePlant:
     """
 
     def __init__(self, simulator: str, vehicle: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int):
-        self._server = _server()
+        self._server = _server(simulator)
         drag = (params.drag_x, params.drag_y)
         self._number = self._server.call("make", None, simulator, vehicle, drag, dt, n_swarms, n_robots)
 

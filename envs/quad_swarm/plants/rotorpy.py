@@ -32,7 +32,7 @@ class RotorpyPlant:
     """
 
     def __init__(self, vehicle: str, drag: tuple[float, float], dt: float, n_swarms: int, n_robots: int):
-        th.set_num_threads(1)  # small matrices: threads are thirty times slower
+        th.set_num_threads(1)  # small matrices, over which threads only wait for each other
         params = importlib.import_module(f"rotorpy.vehicles.{vehicle}_params").quad_params
         self._n_steps = math.ceil(dt / _PERIOD - 1e-9)
         self._dt = dt

@@ -45,4 +45,9 @@ def test_plants_that_are_gone_are_dropped():
     del plant
     gc.collect()
     with pytest.raises(ValueError, match=f"no plant {number}"):
-        _server().call("fork", number)
+        _server("crazyflow").call("fork", number)
+
+
+def test_each_simulator_has_a_process_of_its_own():
+    assert _server("crazyflow") is _server("crazyflow")
+    assert _server("crazyflow").process.pid != _server("rotorpy").process.pid
