@@ -599,6 +599,7 @@ def main() -> None:
         "flight targets": flight_targets(rows["flight"]),
         "world": worlds_table(rows["flight_world"], "world"),
         "delays": worlds_table(rows["flight_world"], "delays"),
+        "delay check": worlds_table(rows["flight_world"], "delay_check"),
         "plants": worlds_table(rows["flight_world"], "plants"),
     }
     flown = {

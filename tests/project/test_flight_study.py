@@ -5,13 +5,24 @@ from concurrent.futures import Executor, Future
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from quad_swarm.evaluation.rows import read_rows, write_rows
+from quad_swarm.geometry import length
+from quad_swarm.quadrotor import POSITION
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
-from studies.swarm import flight_world, fly_flight, report, tune_flight
+from quad_swarm.world.scenarios import ScenarioSampler
+from studies.swarm import delay_check, flight_world, fly_flight, report, tune_flight
 from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TEST, NAMES, TEST, VALIDATION, WORLDS
+
+CALM = {
+    "noise": {"vel": 0, "attitude": 0, "wind": 0, "gust": 0},
+    "sensing": {"pos": 0, "vel": 0, "attitude": 0, "others_pos": 0, "others_vel": 0},
+    "mismatch": 0,
+    "clock_skew": 0,
+}
 
 
 def test_sets_of_episodes_are_apart():
@@ -119,12 +130,38 @@ def test_full_communication_is_flown_once(flown, tmp_path):
 
 
 def test_conditions_fill_their_tables(tmp_path: Path):
-    jobs = [next(flight_world.jobs("world")), list(flight_world.jobs("delays"))[-1]]
+    jobs = [
+        next(flight_world.jobs("world")),
+        *(list(flight_world.jobs(part))[-1] for part in ("delays", "delay_check")),
+    ]
     rows = [flight_world.fly(job, 3) for job in jobs]
+    assert "delay check" in report.worlds_table(rows, "delay_check")
     table = report.worlds_table(rows, "delays")
     assert "radio.delay=3, radio.jitter=0, planner.right_of_way=0.3" in table
     assert "3/3" in table
     assert report.worlds_table(rows, "plants") == "Not flown yet."
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_plans_that_passed_the_delay_check_never_come_near_each_other(delay):
+    config = make_config("flight", CALM | {"n_robots": 6, "radio": {"loss": 0, "delay": delay, "jitter": 0}})
+    swarm = delay_check.DelayCheckedSwarm(config, 2, clearance=0.65)
+    for k in range(2):
+        swarm.reset(k, *ScenarioSampler("symmetric_swap", 6, config.space).sample(np.random.default_rng(k))[1:])
+    committed = 0
+    for _ in range(200):
+        swarm.step(np.ones((2, 6, 5), dtype=bool))
+        pos = swarm.plans[..., POSITION]
+        committed += bool((length(pos[:, :, -1] - pos[:, :, 0]) > 0.5).any())
+        apart = length(pos[:, swarm.beliefs.others] - pos[:, :, None])
+        assert apart.min() > 0.65 - 1e-9
+    assert committed > 30
+    assert length(swarm.pos - swarm.goal).max() < 1.0
+
+
+def test_a_delay_check_needs_a_longest_delay():
+    with pytest.raises(ValueError, match=r"radio\.jitter=1"):
+        delay_check.DelayCheckedSwarm(make_config("flight"), 1, clearance=0.62)
 
 
 def test_the_tables_of_the_sealed_flights_compare_with_full_and_the_rule():

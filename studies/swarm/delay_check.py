@@ -1,0 +1,193 @@
+"""A delay check in the manner of RMADER (Kondo et al. 2023), as a baseline against late plans.
+
+A robot flies a committed plan, which ends at rest. Meanwhile it plans on from where it will be in a while, announces
+the candidate beside what it is committed to, and commits to it only if nothing that arrives until then comes near it.
+What others announced is never touched, so that two robots cannot both act on what the other has given up. Unlike
+there: plans of the same solver as elsewhere instead of splines, compared at the planner's stages; a linear feedback
+keeps the vehicle to its plan; robots and steps share one clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from quad_swarm.evaluation.evaluation import Rows
+from quad_swarm.evaluation.flight import fly_steps
+from quad_swarm.geometry import length
+from quad_swarm.planner import Plans, Problems, make_planner
+from quad_swarm.quadrotor import N_INPUTS, POSITION, QuadrotorModel
+from quad_swarm.task.request_task import RequestTask, RewardConfig
+from quad_swarm.world.beliefs import BeliefSource, advance, resampled
+from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import StepReport, Swarm
+from studies.swarm.protocol import LINGER
+
+COMMITTED, CANDIDATE = 0, 1
+_CHUNK = 100  # episodes that are flown at once
+
+
+class DelayCheckedSwarm(Swarm):
+    """Robots that broadcast what they are committed to and what they would like to fly next, and check it.
+
+    :param config: the world; answers are late by ``radio.delay`` steps, without jitter
+    :param n_swarms: number of swarms E
+    :param clearance: least distance between a candidate and what others announced (m)
+    :param solver: see `make_planner`
+    """
+
+    def __init__(self, config: SwarmConfig, n_swarms: int, clearance: float, solver: str = "rti"):
+        if config.radio.jitter:
+            raise ValueError(f"radio.jitter={config.radio.jitter}: the check waits for the longest delay, set it to 0.")
+        super().__init__(config, n_swarms, solver)
+        n, horizon = config.n_robots, config.planner.horizon
+        # Each of the others counts twice, as committed and as it would like to fly
+        self.planner = make_planner(config.planner, config.quadrotor, 2 * n - 1, solver)
+        self.clearance = clearance
+        self.wait = 1 + config.radio.delay  # steps until everybody knows of a candidate, and its robot of theirs
+        self._stages = 2 * horizon + self.wait  # of a plan that ends at rest, from now on
+        self._feedback = _feedback(self.planner.model)
+        # From now on, (E, n, committed or candidate, ...): a plan, and braking to rest
+        self._x = np.zeros((n_swarms, n, 2, self._stages + 1, 9))
+        self._inputs = np.zeros((n_swarms, n, 2, self._stages, N_INPUTS))
+        self._pending = np.zeros((n_swarms, n), dtype=np.int64)  # steps until a candidate is flown, 0: none
+        self._known = np.zeros((n_swarms, n, n - 1, 2, self._stages + 1, 3))
+        self._sent: list[np.ndarray] = []
+
+    def keep(self, swarms: np.ndarray) -> None:
+        super().keep(swarms)
+        for name in ("_x", "_inputs", "_pending", "_known"):
+            setattr(self, name, getattr(self, name)[swarms])
+        self._sent = [sent[swarms] for sent in self._sent]
+
+    def reset(self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
+        super().reset(swarm, starts, goals, noise_seed)
+        self._x[swarm] = self.state[swarm][:, None, None]
+        self._inputs[swarm] = 0.0
+        self._pending[swarm] = 0
+        self._known[swarm] = self.pos[swarm][self.beliefs.others][:, :, None, None]
+        self._sent = [self._announced() for _ in range(self.wait)]
+
+    def _announced(self) -> np.ndarray:
+        """What robots broadcast: positions from now on, by the steps' clock, (E, n, 2, stages + 1, 3)."""
+        pos = self._x[..., POSITION]
+        start = self.chance.start
+        return pos if start is None else resampled(pos, -np.repeat(start[..., None], 2, 2) / self.config.substeps)
+
+    def _receive(self, requests: np.ndarray) -> np.ndarray:
+        """Take in what arrives.
+
+        :return: what each robot knows of the others, as of when its own input acts, (E, n, n - 1, 2, stages + 1, 3)
+        """
+        self._sent = [advance(sent) for sent in self._sent]
+        arriving, _ = self.chance.arrivals(requests, self.beliefs.others)
+        newest = self._sent[0][:, self.beliefs.others]
+        self._known = np.where(arriving[..., None, None, None], newest, advance(self._known))
+        start = self.chance.start
+        if start is None:
+            return self._known
+        return resampled(
+            self._known, np.broadcast_to((start / self.config.substeps)[..., None, None], self._known.shape[:4])
+        )
+
+    def _comes_near(self, known: np.ndarray) -> np.ndarray:
+        """Whose candidate comes near something that is known of another, (E, n) bool."""
+        own = self._x[:, :, None, None, CANDIDATE, :, POSITION]
+        return length(own - known)[..., 1:].min(axis=(2, 3, 4)) < self.clearance
+
+    def step(self, requests: np.ndarray) -> StepReport:
+        for field in (self._x, self._inputs):
+            field[..., :-1, :] = field[..., 1:, :].copy()
+        self._inputs[..., -1, :] = 0.0
+        known = self._receive(requests)
+
+        waiting = self._pending > 0
+        dropped = waiting & self._comes_near(known)
+        self._pending[waiting] -= 1
+        accepted = waiting & ~dropped & (self._pending == 0)
+        self._take(accepted, COMMITTED, CANDIDATE)
+        self._pending[dropped] = 0
+        self._take(dropped, CANDIDATE, COMMITTED)
+        self._plan(self._pending == 0, known)
+
+        self._sent = [*self._sent[1:], self._announced()]
+        x, start = self.estimate(), self.chance.start
+        if start is not None:
+            x = self.planner.model.ahead(x, self._u, start / self.config.substeps * self.config.planner.dt)
+        inputs = self._inputs[:, :, COMMITTED].copy()
+        inputs[:, :, 0] += (self._x[:, :, COMMITTED, 0] - x) @ self._feedback.T
+        limits = [self.config.planner.max_tilt] * 2 + [self.config.planner.max_climb_rate, 0.0]
+        inputs[:, :, 0] = np.clip(inputs[:, :, 0], -np.array(limits), limits)
+        horizon, count = self.config.planner.horizon, self._pending.size
+        flown, none = self._x[:, :, COMMITTED, : horizon + 1], np.zeros(count, dtype=np.int64)
+        self._plans = Plans(
+            flown.reshape(count, horizon + 1, 9).copy(),
+            inputs.reshape(count, -1, N_INPUTS)[:, :horizon],
+            none,
+            none,
+            none,
+        )
+        source = np.full(requests.shape, BeliefSource.REQUESTED)
+        return self._report(self._fly(), source, 0.0)
+
+    def _take(self, who: np.ndarray, to: int, what: int) -> None:
+        self._x[who, to], self._inputs[who, to] = self._x[who, what], self._inputs[who, what]
+
+    def _plan(self, who: np.ndarray, known: np.ndarray) -> None:
+        """Let some robots plan on from where they will be after the wait, and keep what passes their own check."""
+        if not who.any():
+            return
+        horizon, wait = self.config.planner.horizon, self.wait
+        x = self._x[who, COMMITTED]
+        others = known[who][..., wait + 1 : wait + 1 + horizon, :].reshape(len(x), -1, horizon, 3)
+        problems = Problems(x[:, wait], self.goal[who], others, announced=np.ones(others.shape[:2], dtype=bool))
+        last = slice(wait - 1, wait + horizon)
+        none = np.zeros(len(x), dtype=np.int64)
+        inputs = self._inputs[who, COMMITTED]
+        plans = self.planner.plan(problems, Plans(x[:, last], inputs[:, last][:, :horizon], none, none, none))
+        tail = self.planner.braking_inputs(plans.x[:, -1])
+        rest = self.planner.model.rollout(plans.x[:, -1], tail)
+        self._x[who, CANDIDATE] = np.concatenate([x[:, :wait], plans.x, rest[:, 1:]], axis=1)
+        self._inputs[who, CANDIDATE] = np.concatenate([inputs[:, :wait], plans.u, tail], axis=1)
+        refused = who & self._comes_near(known)
+        self._take(refused, CANDIDATE, COMMITTED)
+        self._pending[who & ~refused] = wait
+
+
+def _feedback(model: QuadrotorModel) -> np.ndarray:
+    """Gain (4, 9) of a linear-quadratic regulator about hover."""
+    eye, zero = np.eye(9), np.zeros((9, 9))
+    a = (model.step(1e-4 * eye, zero[:, :4]) / 1e-4).T
+    b = (model.step(zero[:4], 1e-4 * np.eye(4)) / 1e-4).T
+    cost, weight = np.diag([10.0] * 3 + [1.0] * 3 + [0.1] * 3), np.diag([1.0] * 4)
+    value = cost
+    for _ in range(500):
+        gain = np.linalg.solve(weight + b.T @ value @ b, b.T @ value @ a)
+        value = cost + a.T @ value @ (a - b @ gain)
+    return gain
+
+
+def fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequence[int]) -> Rows:
+    """Figures of episodes with the check, see `run_episodes`.
+
+    :param episodes: seeds
+    """
+    chunks = [episodes[k : k + _CHUNK] for k in range(0, len(episodes), _CHUNK)]
+    return [row for chunk in chunks for row in _fly(config, scenario, clearance, chunk)]
+
+
+def _fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequence[int]) -> Rows:
+    swarm = DelayCheckedSwarm(config, len(episodes), clearance)
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space)
+    task = RequestTask(swarm, sampler, RewardConfig(), end_at_collision=False)
+    rngs = [np.random.default_rng(seed) for seed in episodes]
+    for k, rng in enumerate(rngs):
+        task.reset(k, rng)
+    everybody = np.ones((1, config.n_robots, config.n_robots - 1), dtype=bool)
+    rows: dict[int, dict[str, Any]] = {}
+    for step in fly_steps(lambda task, _: everybody.repeat(task.swarm.n_swarms, 0), task, rngs, LINGER):
+        rows |= {int(step.episodes[k]): task.statistics.row(int(k)) for k in np.flatnonzero(step.over)}
+    return [rows[k] for k in range(len(episodes))]
