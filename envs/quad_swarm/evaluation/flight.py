@@ -155,6 +155,8 @@ class Flight:
     :param goal: goals, (n, 3), world frame (m)
     :param requests: who asked whom in each step, (T, n, n - 1) bool
     :param other_requests: whom a second rule would have asked in each step, which was not executed, (T, n, n - 1) bool
+    :param min_separation: smallest distance between two robots at the start and in each step: at any time of it where
+        the world's collisions are continuous, else after it, (T + 1,) (m)
     """
 
     config: SwarmConfig
@@ -163,6 +165,7 @@ class Flight:
     goal: np.ndarray
     requests: np.ndarray
     other_requests: np.ndarray
+    min_separation: np.ndarray
 
     @property
     def n_robots(self) -> int:
@@ -206,9 +209,8 @@ class Flight:
 
     @cached_property
     def collision(self) -> int | None:
-        """The first step after which two robots collide; None if they never do."""
-        limit = 2 * self.config.radius - self.config.collision_tolerance
-        colliding = (self.separation[1:] < limit).any(axis=(1, 2))
+        """The first step with, or after which there is, a collision, as the world counts them; None without any."""
+        colliding = self.min_separation[1:] < 2 * self.config.radius - self.config.collision_tolerance
         return int(colliding.argmax()) + 1 if colliding.any() else None
 
     def closest_pair(self, step: int) -> tuple[int, int]:
@@ -237,10 +239,15 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         other_requests.append(rule(View(task.swarm, other_rngs))[0])
         return policy(task, rngs)
 
+    closest: list[float] = []
     for step in fly_steps(recorded, task, rngs, condition.linger):
+        report = step.outcome.report
+        closest.append((report.min_separation_continuous if task.continuous_collisions else report.min_separation)[0])
         requests.append(step.requests[0])
         state.append(task.swarm.state[0].copy())
         plans.append(task.swarm.plans[0].copy())
         goal = task.swarm.goal[0].copy()
-    arrays = map(np.array, (state, plans, goal, requests, other_requests))
+    start = state[0][:, POSITION]
+    closest.insert(0, length(start[other_indices(len(start))] - start[:, None]).min())
+    arrays = map(np.array, (state, plans, goal, requests, other_requests, closest))
     return Flight(condition.config, *arrays)

@@ -72,7 +72,7 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
         "plans": flight.plans[: end + 1, ..., POSITION].round(_DIGITS).tolist(),
         "goals": flight.goal.round(_DIGITS).tolist(),
         "requests": [[[int(a), int(others[a, k])] for a, k in np.argwhere(step)] for step in flight.requests[:end]],
-        "separation": flight.separation[: end + 1].min(axis=(1, 2)).round(_DIGITS).tolist(),
+        "separation": flight.min_separation[: end + 1].round(_DIGITS).tolist(),
         "collision": flight.collision is not None and flight.collision <= end,
     }
 

@@ -99,6 +99,19 @@ def test_a_flight_knows_its_arrival_its_collision_and_its_closest_pair():
     gap = np.linalg.norm(crash.pos[crash.collision, i] - crash.pos[crash.collision, j])
     assert gap == pytest.approx(crash.separation[crash.collision].min())
     assert gap < 0.599 <= crash.separation[crash.collision - 1].min()
+    assert crash.min_separation == pytest.approx(crash.separation.min(axis=(1, 2)))
     distance, time = crash.closest_approach
     assert (distance <= crash.separation + 1e-12).all()
     assert (time >= 0).all()
+
+
+def test_contact_between_steps_is_a_collision_of_a_flight_where_the_world_says_so():
+    brushes = make_config("flight", {"planner": {"separation": 0.6}})
+    flights = [fly(Condition("none", "symmetric_swap", brushes, solver="rti"), 0, number) for number in range(4)]
+    for flight in flights:
+        at_steps = flight.separation.min(axis=(1, 2))
+        assert (flight.min_separation <= at_steps + 1e-12).all()
+        assert flight.collision == 1 + (flight.min_separation[1:] < 0.599).argmax()
+    assert any(
+        (flight.min_separation < 0.599).sum() > (flight.separation.min(axis=(1, 2)) < 0.599).sum() for flight in flights
+    )
