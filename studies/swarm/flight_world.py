@@ -4,8 +4,9 @@
 
 ``world``: no and full communication in `flight` and `flight-hard`. ``delays``: full communication with answers one, two
 and three steps late, with and without the right of way. ``delay_check``: the same with the baseline of
-`studies.swarm.delay_check`. ``plants``: margins and models in foreign physics. All on a set of episodes that nothing
-was chosen on. JSON: one row for each condition with the keys of `summarise`, and part, scenario, policy and what was
+`studies.swarm.delay_check`. ``paper``: four robots with the paper's settings, trained in `flight`, over whole episodes
+as the paper counts. ``plants``: margins and models in foreign physics. All on a set of episodes that nothing was chosen
+on. JSON: one row for each condition with the keys of `summarise`, and part, scenario, policy and what was
 changed in the world. The rule and the model of ``plants`` are those that `studies.swarm.tune_flight` chose; what is
 known of that part is not flown again.
 """
@@ -16,6 +17,7 @@ import argparse
 import itertools
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
@@ -24,12 +26,12 @@ from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
 from studies.swarm import delay_check
 from studies.swarm.fly_flight import best_rule, tuned_models
-from studies.swarm.protocol import DATA, NAMES, WORLDS, absolute_path, condition, progress, replace_rows
+from studies.swarm.protocol import DATA, DBCP, NAMES, WORLDS, absolute_path, condition, models, progress, replace_rows
 from studies.swarm.tune_flight import SWAPS
 
 # What the planner keeps in the part `plants`: contact is at 0.6 m
 SEPARATIONS = (0.6, 0.65, 0.72, 0.8)
-PARTS = {"world": 1000, "delays": 4000, "delay_check": 1000, "plants": 1000}
+PARTS = {"world": 1000, "delays": 4000, "delay_check": 1000, "paper": 1000, "plants": 1000}
 # What the delay check keeps: of 0.62, 0.66 and 0.7 m that with the fewest collisions in validation episodes
 CLEARANCE = 0.62
 DELAY_CHECK = f"full, delay check at {CLEARANCE} m"
@@ -63,6 +65,9 @@ def jobs(part: str) -> Iterator[Job]:
         for delay, right_of_way, name in itertools.product((1, 2, 3), (0.0, 0.3), SWAPS):
             changed = {"radio": {"delay": delay, "jitter": 0}, "planner": {"right_of_way": right_of_way}}
             yield Job(part, "flight", changed, name, policy)
+    elif part == "paper":
+        for policy, name in itertools.product(("full", DBCP, "none", *models("faithful_flight")), NAMES):
+            yield Job(part, "flight", {"n_robots": 4}, name, policy)
     else:
         policies = ("none", "full", best_rule(), tuned_models()[0])
         identified = {"crazyflow:cf21B_500": "crazyflie21", "rotorpy:hummingbird": "hummingbird"}
@@ -79,7 +84,10 @@ def fly(job: Job, episodes: int) -> dict[str, Any]:
         first = first_episode(WORLDS)
         rows = delay_check.fly(config, job.scenario, CLEARANCE, range(first, first + episodes))
     else:
-        ((_, rows),) = fly_all([condition(job.policy, job.scenario, config)], episodes, WORLDS).items()
+        flown = condition(job.policy, job.scenario, config)
+        if job.part == "paper":
+            flown = replace(flown, linger=None)
+        ((_, rows),) = fly_all([flown], episodes, WORLDS).items()
     return {**job._asdict(), "condition": str(job), "set": WORLDS, **summarise(rows, config)}
 
 

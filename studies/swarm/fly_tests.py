@@ -28,6 +28,7 @@ from quad_swarm.world.presets import SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, Scenario, ScenarioSpace
 from studies.swarm.protocol import (
     DATA,
+    DBCP,
     EARLIER,
     NAMES,
     PRESETS_TESTED,
@@ -51,7 +52,7 @@ QUICK = 20
 # A threshold with which there are collisions to look at
 RECKLESS = 0.6
 # The rule that the paper compares with, and the simplest one that is better
-DBCP, CPA = "distance:4", "cpa:0.7:1.5"
+CPA = "cpa:0.7:1.5"
 # What tells the conditions of a part from each other; one that is flown again replaces its rows
 CONDITION = ("preset", "scenario", "condition", "n_robots")
 # Other sizes than those it was trained with

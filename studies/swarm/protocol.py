@@ -34,6 +34,8 @@ PRESETS_TESTED = ("paper", "dense")
 VALIDATION, EARLIER, EARLIER_TEAMS, TEST = 1, 2, 3, 4
 # Of the disturbed worlds: the sealed test set of policies (nobody has flown it), and one for what needs no tuning.
 FLIGHT_TEST, WORLDS = 6, 7
+# The paper's hand-made rule
+DBCP = "distance:4"
 # Steps flown on after arrival.
 LINGER = 10
 STAGES, QUICK_STAGES = (30, 100, 250, 500, 1000, 2000, 4000, 12000), (10, 20)

@@ -166,8 +166,9 @@ def counts_table(rows: Rows) -> str:
             continue
         full, dbcp = here["full"], here["distance:4"]
         groups = {"`full`": [full], "4-DBCP (`distance:4`)": [dbcp], "`none`": [here["none"]]}
-        groups["the paper's settings, ten seeds"] = [r for k, r in here.items() if "faithful" in k]
-        groups["own recipe, five seeds"] = [r for k, r in here.items() if "/paper_seed" in k]
+        for what, pattern in {"the paper's settings": "/faithful_", "own recipe": "/paper_seed"}.items():
+            if members := [row for policy, row in here.items() if pattern in policy]:
+                groups[f"{what}, {len(members)} seeds"] = members
         for what, members in groups.items():
             episode = [r["requests_flown"] / r["episodes"] for r in members]
             lines.append(
@@ -600,6 +601,7 @@ def main() -> None:
         "world": worlds_table(rows["flight_world"], "world"),
         "delays": worlds_table(rows["flight_world"], "delays"),
         "delay check": worlds_table(rows["flight_world"], "delay_check"),
+        "paper flight": counts_table([row for row in rows["flight_world"] if row["part"] == "paper"]),
         "plants": worlds_table(rows["flight_world"], "plants"),
     }
     flown = {
