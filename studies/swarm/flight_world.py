@@ -30,7 +30,7 @@ from studies.swarm.protocol import DATA, DBCP, NAMES, WORLDS, absolute_path, con
 from studies.swarm.tune_flight import SWAPS
 
 # What the planner keeps in the part `plants`: contact is at 0.6 m
-SEPARATIONS = (0.6, 0.65, 0.72, 0.8)
+SEPARATIONS = (0.6, 0.65, 0.7, 0.8)
 PARTS = {"world": 1000, "delays": 4000, "delay_check": 1000, "paper": 1000, "plants": 1000}
 # What the delay check keeps: of 0.62, 0.66 and 0.7 m that with the fewest collisions in validation episodes
 CLEARANCE = 0.62

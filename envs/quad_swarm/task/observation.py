@@ -109,7 +109,7 @@ _SPEED = 1.5
 _STAGES = (0.2, 0.5, 1.0)
 # Of what the planner keeps: plans that come no nearer than this are hardly changed by each other. 1.1 is enough for
 # eight robots; in a crowd of sixteen it leaves twice as many collisions.
-_CONFLICT = 1.4
+_CONFLICT = 1.8
 
 
 def _stages(horizon: int) -> list[int]:

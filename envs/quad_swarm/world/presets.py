@@ -118,7 +118,7 @@ _SMALL_ROOM = ScenarioSpace(half_width=3.0, circle_radius=(2.5, 3.0), sector_rad
 # the source of each level.
 _FLIGHT = SwarmConfig(
     n_robots=8,
-    planner=PlannerConfig(horizon=20, dt=0.05, separation=0.72, max_tilt=math.radians(20.0), right_of_way=0.3),
+    planner=PlannerConfig(horizon=20, dt=0.05, separation=0.8, max_tilt=math.radians(20.0), right_of_way=0.3),
     space=_SMALL_ROOM,
     max_steps=200,
     substeps=5,
