@@ -58,13 +58,13 @@ class Inline(Executor):
 
 @pytest.fixture
 def flown(monkeypatch):
-    """All flights. Who is bad collides in every fifth episode of `random` of sixteen; numbers in names are requests."""
+    """All flights. Who is bad collides in every fifth asymmetric swap of sixteen; numbers in names are requests."""
     flown = []
 
     def fly(policies, preset, scenario, episodes, n_robots=None, skip=0):
         (policy,) = policies
         flown.append((policy, (n_robots, scenario), skip, episodes))
-        collides = policy.startswith("bad") and (n_robots, scenario) == (16, "random")
+        collides = policy.startswith("bad") and (n_robots, scenario) == (16, "asymmetric_swap")
         requests = float(policy.split()[-1]) if " " in policy else 1.0
         return {policy: [{"collided": collides and k % 5 == 0, "requests": requests} for k in range(skip, episodes)]}
 
@@ -82,8 +82,9 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     # Piece by piece, in every scenario
     stages = [0, *tune_flight.STAGES]
     assert [one[2:] for one in flown if one[:2] == ("good", (8, "random"))] == list(pairwise(stages))
-    assert [one[2:] for one in flown if one[:2] == ("good", (16, "random"))] == list(pairwise(stages))[:-1]
-    assert {one[1] for one in flown if one[0] == "good"} == set(itertools.product((4, 8, 12, 16), NAMES))
+    assert [one[2:] for one in flown if one[:2] == ("good", (16, "symmetric_swap"))] == list(pairwise(stages))[:-1]
+    swaps = itertools.product((4, 8, 12, 16), ("symmetric_swap", "asymmetric_swap"))
+    assert {one[1] for one in flown if one[0] == "good"} == {*swaps, *((8, name) for name in NAMES)}
     assert max(one[3] for one in flown if one[0] == "bad") == stages[1], "without hope it is not flown on"
     assert tune_flight.CELLS[0] == (8, "symmetric_swap")
 
