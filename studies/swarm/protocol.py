@@ -32,7 +32,7 @@ PRESETS_TESTED = ("paper", "dense")
 # first flown on EARLIER (four and eight robots), which had a say in how thresholds are tuned, and on EARLIER_TEAMS. So
 # the tables of today are flown on TEST, which was sealed before. The analyses beside the tables still fly EARLIER.
 VALIDATION, EARLIER, EARLIER_TEAMS, TEST = 1, 2, 3, 4
-# Of the disturbed worlds: the sealed test set of policies (nobody has flown it), and one for what needs no tuning, which
+# Of the disturbed worlds: the sealed test set of policies (nobody has flown it), and one for what needs no tuning. That
 # was set 7 until the planner's separation changed.
 FLIGHT_TEST, WORLDS = 6, 8
 # The paper's hand-made rule
