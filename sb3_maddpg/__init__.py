@@ -12,6 +12,7 @@ from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.pretrained_models import pretrained
 from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.typed_json import allow_in_files
 
 __version__ = version("sb3-maddpg")
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "PrioritizedTeamReplayBuffer",
     "TeamEnv",
     "TeamReplayBuffer",
+    "allow_in_files",
     "check_team_env",
     "pretrained",
 ]

@@ -22,7 +22,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.vec_env import (
     VecEnv,
@@ -40,17 +40,20 @@ from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
     FILE_FORMAT,
     as_damage,
+    attributes,
     check_attributes,
-    check_file,
+    check_members,
     check_path,
     optimizer_not_finite,
     optimizer_problem,
+    read_data,
 )
 from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
+from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, shown, suggest
 from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TrainingArguments, validated
 
@@ -358,6 +361,12 @@ class MADDPG(OffPolicyAlgorithm):
             if name not in (known := arguments_of(self.policy_class)):
                 raise ValueError(suggest("argument in policy_kwargs", name, known - NOT_POLICY_KWARGS))
         self._check_replay_buffer_arguments()
+        if self.env is not None:  # better now than after the training
+            for name in ("policy_class", "replay_buffer_class", "learning_rate", "temperature", "policy_kwargs"):
+                try:
+                    encode(getattr(self, name), name)
+                except ValueError as error:
+                    warnings.warn(str(error), stacklevel=2)
 
     def _check_replay_buffer_arguments(self) -> None:
         buffer = self.replay_buffer_class
@@ -723,16 +732,25 @@ class MADDPG(OffPolicyAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        trust: bool = False,
         **kwargs,
     ) -> SelfMADDPG:
+        """
+        SB3's ``load``, which runs no code that the file holds unless it is told to.
+
+        :param trust: load pickled values too, of files written by versions before 0.2 or by ``save(pickle=True)``
+        :raises ValueError: no model of this algorithm, a damaged one, or pickled values without ``trust``
+        """
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
         if env is not None:
             env = cls._wrap_env(env)
         with as_damage(path):
-            check_file(path, cls.__name__, {base.__name__ for base in algorithms})
+            data = read_data(path, cls.__name__, {base.__name__ for base in algorithms})
+            values = attributes(data, path, trust, custom_objects or {})
             with _remedy_for_other_team():
-                model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+                model = super().load(path, env, device, values, print_system_info, force_reset, **kwargs)
             check_attributes(model, path)
+        model.file_format = FILE_FORMAT
         return model
 
     def save(
@@ -740,19 +758,36 @@ class MADDPG(OffPolicyAlgorithm):
         path: str | pathlib.Path | io.BufferedIOBase,
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
+        pickle: bool = False,
     ) -> None:
         """
-        SB3's ``save``, whole or not at all: a file that was there stays until the new one is complete.
+        SB3's ``save``, whole or not at all: a file that was there stays until the new one is complete. The file holds
+        JSON and weights, and nothing that runs code when it is loaded.
 
-        :raises ValueError: a parameter is not finite, which nothing could be done with
+        :param pickle: write as SB3 does, pickling what is no JSON; such a file needs ``load(trust=True)``
+        :raises ValueError: a parameter is not finite, which nothing could be done with, or an attribute cannot be
+            written as JSON, such as a function as a schedule
         """
         check_path(path)
         if problem := self._not_finite(self.get_parameters()):
             raise ValueError(f"This model cannot be saved: {problem}")
+        write = super().save if pickle else self._save_without_pickle
         if not isinstance(path, (str, os.PathLike)):
-            return super().save(path, exclude, include)
+            return write(path, exclude, include)
         with atomic_write(path, suffix="zip") as file:
-            super().save(file, exclude, include)  # type: ignore[arg-type]
+            write(file, exclude, include)  # type: ignore[arg-type]
+
+    def _save_without_pickle(
+        self,
+        file: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None,
+        include: Iterable[str] | None,
+    ) -> None:
+        """What ``BaseAlgorithm.save`` does, with values as JSON that says their types."""
+        left_out = {*(exclude or ()), *self._excluded_save_params()} - {*(include or ())}
+        left_out |= {name.split(".")[0] for name in self._get_torch_save_params()[0]}
+        data = {key: encode(value, key) for key, value in vars(self).items() if key not in left_out}
+        save_to_zip_file(file, data=data, params=self.get_parameters(), pytorch_variables={})
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
@@ -766,6 +801,7 @@ class MADDPG(OffPolicyAlgorithm):
         if not isinstance(load_path_or_dict, dict):
             check_path(load_path_or_dict)
             with as_damage(load_path_or_dict):
+                check_members(load_path_or_dict)
                 parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
         before: Any = deepcopy(self.get_parameters())
         try:

@@ -10,17 +10,24 @@ import pathlib
 import traceback
 import zipfile
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.save_util import open_path
 
+from sb3_maddpg.typed_json import decode
 from sb3_maddpg.utils import shown
 
-# Raised whenever an older model's networks would be read wrongly
-FILE_FORMAT = 2
+# Raised whenever older versions could not read the file
+FILE_FORMAT = 3
+_READABLE_FORMATS = (2, 3)  # in the first of these, values are pickled
+_WEIGHTS = ("policy.pth", "actor.optimizer.pth", "critic.optimizer.pth", "pytorch_variables.pth")
+_MEMBERS = {"data", *_WEIGHTS, "_stable_baselines3_version", "system_info.txt"}
+_MOST_DATA = 2**24  # bytes of the member `data`
+_MOST_TIMES_LARGER = 50  # than on disk: members are not compressed
+_PICKLED = ":serialized:"
 # Attributes in files that are neither arguments, which have their checks, nor made anew
 _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
     (int,): (
@@ -52,39 +59,106 @@ def check_path(path: Any) -> None:
         raise ValueError(f"{shown(path)} is neither a path nor a file.")
 
 
-def check_file(path: str | pathlib.Path | io.BufferedIOBase, algorithm: str, readable: set[str]) -> None:
+def read_data(path: str | pathlib.Path | io.BufferedIOBase, algorithm: str, readable: set[str]) -> dict[str, Any]:
     """
-    Refuse a model of another algorithm or of another format, before anything in it is unpickled.
+    The attributes in a model's file as they are written. Refuses what is no such file, or too large to be one, before
+    anything in it is taken for anything.
 
     :param path: of the file, or the file
     :param algorithm: that is to load it
     :param readable: algorithms whose files it can load
-    :raises ValueError: another algorithm or format
+    :return: values as JSON, see ``attributes``
+    :raises ValueError: another algorithm or format, or members that no such file has
+    """
+
+    def check(data: dict[str, Any]) -> None:
+        written_by = data.get("algorithm")
+        if written_by is not None and written_by not in list(readable):
+            raise ValueError(f"{path} holds a model of {written_by}: load it with `{written_by}.load`.")
+        if written_by is None and "policy_regularization" not in data:
+            raise ValueError(f"{path} holds a model of another algorithm than {algorithm}.")
+        if data.get("file_format", 1) not in _READABLE_FORMATS:
+            raise ValueError(
+                f"{path} has format {data.get('file_format', 1)}, this version of sb3-maddpg reads format "
+                f"{FILE_FORMAT}: install the version that wrote it, or train again."
+            )
+
+    return check_members(path, check)
+
+
+def check_members(
+    path: str | pathlib.Path | io.BufferedIOBase, check: Callable[[dict[str, Any]], None] = lambda data: None
+) -> dict[str, Any]:
+    """
+    Refuse a file with members that no model has, or larger ones, before any is read.
+
+    :param path: of the file, or the file
+    :param check: raises where its attributes are no model's
+    :return: the attributes as they are written
+    :raises ValueError: no zip file, or such a member
     """
     check_path(path)
     file = open_path(path, "r", verbose=0, suffix="zip")
-    if not zipfile.is_zipfile(file):
-        return  # SB3 says what is wrong
-    with zipfile.ZipFile(file) as archive:
-        data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
-    if isinstance(path, (str, os.PathLike)):
-        file.close()
-    else:
-        file.seek(0)
-    if not isinstance(data, dict):
+    try:
+        if not zipfile.is_zipfile(file):
+            raise ValueError(f"{path} is no zip file, and a model is one.")
+        with zipfile.ZipFile(file) as archive:
+            _check_sizes(path, archive)
+            names = archive.namelist()
+            data = json.loads(archive.read("data")) if "data" in names else {}
+            if not isinstance(data, dict):
+                raise ValueError(
+                    f"{path} is damaged: its `data` holds a {type(data).__name__} instead of a model's attributes."
+                )
+            check(data)
+            if strange := {name for name in names if name not in _MEMBERS or names.count(name) > 1}:
+                raise ValueError(f"{path} has members that no model has, or has twice: {shown(sorted(strange))}.")
+            for name in {*_WEIGHTS} & {*names}:
+                with archive.open(name) as member, zipfile.ZipFile(member) as weights:
+                    _check_sizes(f"{path}: {name}", weights)
+    finally:
+        if isinstance(path, (str, os.PathLike)):
+            file.close()
+        else:
+            file.seek(0)
+    return data
+
+
+def _check_sizes(path: Any, archive: zipfile.ZipFile) -> None:
+    """Refuse members that would be much larger in memory than in the archive."""
+    file = cast("io.BufferedIOBase", archive.fp)
+    here = file.tell()
+    size = file.seek(0, os.SEEK_END)
+    file.seek(here)
+    for member in archive.infolist():
+        most = _MOST_DATA if member.filename == "data" else _MOST_TIMES_LARGER * size
+        if member.file_size > most or member.compress_size > size:
+            raise ValueError(f"{path} is too large to be a model: its {member.filename} has {member.file_size} bytes.")
+
+
+def attributes(data: dict[str, Any], path: Any, trust: bool, given: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    The values of a model's attributes.
+
+    :param data: see ``read_data``
+    :param path: of the file, for a message
+    :param trust: leave pickled values to Stable-Baselines3, which runs what they hold
+    :param given: what is taken instead of the file's
+    :return: values by name, but for those that are pickled
+    :raises ValueError: a pickled value, or one that cannot be read
+    """
+    pickled = {key for key, value in data.items() if isinstance(value, dict) and _PICKLED in value} - set(given)
+    if pickled and not trust:
         raise ValueError(
-            f"{path} is damaged: its `data` holds a {type(data).__name__} instead of a model's attributes."
+            f"{path} holds pickled values ({', '.join(sorted(pickled))}), which may run any code when they are loaded. "
+            "If you trust whoever wrote it, load it with `trust=True` (on the command line `--trust`), or make a file "
+            f"without any of it: `sb3-maddpg convert {path} NEW.zip --trust`."
         )
-    written_by = data.get("algorithm")
-    if written_by is not None and written_by not in list(readable):
-        raise ValueError(f"{path} holds a model of {written_by}: load it with `{written_by}.load`.")
-    if written_by is None and "policy_regularization" not in data:
-        raise ValueError(f"{path} holds a model of another algorithm than {algorithm}.")
-    if data.get("file_format", 1) != FILE_FORMAT:
-        raise ValueError(
-            f"{path} has format {data.get('file_format', 1)}, this version of sb3-maddpg reads format "
-            f"{FILE_FORMAT}: install the version that wrote it, or train again."
-        )
+    return {
+        key: given[key] if key in given else decode(value, f"{path}: {key}")
+        for key, value in data.items()
+        if key not in pickled
+    }
 
 
 @contextmanager

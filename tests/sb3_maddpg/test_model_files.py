@@ -11,7 +11,7 @@ from stable_baselines3 import PPO, TD3
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
-from sb3_maddpg.model_files import FILE_FORMAT, check_file, optimizer_not_finite
+from sb3_maddpg.model_files import FILE_FORMAT, optimizer_not_finite, read_data
 from sb3_maddpg.team_tasks import OwnBit
 
 
@@ -25,16 +25,17 @@ def assert_equal_state(a: dict, b: dict) -> None:
         assert th.equal(x, y) if isinstance(x, th.Tensor) else x == y
 
 
-def test_what_is_no_archive_is_left_to_sb3(tmp_path):
+def test_what_is_no_archive_is_refused(tmp_path):
     path = tmp_path / "model.zip"
     path.write_bytes(b"no archive")
-    check_file(path, "MADDPG", {"MADDPG"})
+    with pytest.raises(ValueError, match="is no zip file"):
+        MADDPG.load(path)
 
 
 def test_a_stream_can_be_read_after_the_check(tmp_path):
     learned().save(tmp_path / "model.zip")
     stream = io.BytesIO((tmp_path / "model.zip").read_bytes())
-    check_file(stream, "MADDPG", {"MADDPG"})
+    read_data(stream, "MADDPG", {"MADDPG"})
     assert stream.tell() == 0
     with zipfile.ZipFile(stream) as archive:
         assert json.loads(archive.read("data"))["file_format"] == FILE_FORMAT
@@ -89,7 +90,7 @@ def test_a_file_of_another_format_is_refused(tmp_path, changes):
     model.save(tmp_path / "model.zip")
     path = rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes)
     written = changes["file_format"] or 1
-    with pytest.raises(ValueError, match=rf"other\.zip has format {written}, .* reads format 2: install the version"):
+    with pytest.raises(ValueError, match=rf"other\.zip has format {written}, .* reads format 3: install the version"):
         MADDPG.load(path)
     same = MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "same.zip"))
     assert_equal_state(same.get_parameters(), model.get_parameters())

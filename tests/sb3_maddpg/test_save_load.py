@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.team_tasks import OtherBit, OwnBit
@@ -32,7 +33,8 @@ def assert_equal_state(a: dict, b: dict) -> None:
 def test_a_loaded_model_is_the_saved_one(tmp_path, share):
     kwargs = {"net_arch": [8], "share_actor": share, "share_critic": share, "threshold": 0.3}
     noise = {"exploration_noise": (0.3, 0.1), "n_steps": 3}
-    model = learned(policy_kwargs=kwargs, estimator="score", max_grad_norm=None, temperature=lambda x: x + 0.1, **noise)
+    temperature = LinearSchedule(1.1, 0.1, 1.0)
+    model = learned(policy_kwargs=kwargs, estimator="score", max_grad_norm=None, temperature=temperature, **noise)
     model.curriculum_level = 2
     model.save(tmp_path / "model")
     loaded = MADDPG.load(tmp_path / "model.zip")
@@ -45,7 +47,7 @@ def test_a_loaded_model_is_the_saved_one(tmp_path, share):
     names = ("estimator", "max_grad_norm", "buffer_size", "num_timesteps", "_n_updates", "curriculum_level", "n_steps")
     for name in (*names, "noise_std", "policy_kwargs", "replay_buffer_kwargs"):
         assert getattr(loaded, name) == getattr(model, name)
-    assert loaded.temperature(0.5) == 0.6
+    assert loaded.temperature(0.5) == temperature(0.5)
     assert loaded.policy.threshold == 0.3
 
 
@@ -113,6 +115,8 @@ def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path):
 
     model.policy_kwargs = {"activation_fn": Unwritable()}
     with pytest.raises(OSError, match="disk full"):
+        model.save(tmp_path / "model", pickle=True)
+    with pytest.raises(ValueError, match=r"policy_kwargs=.*Unwritable.* cannot be saved"):
         model.save(tmp_path / "model")
     assert (tmp_path / "model.zip").read_bytes() == before
     model.replay_buffer.device = Unwritable()

@@ -1,0 +1,337 @@
+"""Values of models as JSON that says their types: to read it runs no code, and imports nothing that a file names."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common import buffers, noise, torch_layers, utils
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+from sb3_maddpg.team import CategoricalActions, MixedActions, TeamObservation
+from sb3_maddpg.utils import shown, suggest
+
+Json = Any
+_TYPE = "$"
+_DEEPEST = 50
+_LARGEST_ARRAY = 10**7  # numbers, of a space's bounds for example
+
+_Class = TypeVar("_Class", bound=type)
+_allowed: dict[str, type] = {}
+# Instances of these are written as their attributes
+_PLAIN_OBJECTS = (
+    utils.ConstantSchedule,
+    utils.LinearSchedule,
+    utils.FloatSchedule,
+    noise.NormalActionNoise,
+    noise.OrnsteinUhlenbeckActionNoise,
+    noise.VectorizedActionNoise,
+)
+
+
+def allow_in_files(cls: _Class) -> _Class:
+    """
+    Let model files name a class of yours: a policy, a replay buffer, a feature extractor, a schedule. Whoever loads
+    the file has to have done so too. Packages name modules that do it by an entry point of the group
+    ``sb3_maddpg.allowed_in_files``. Also a decorator.
+
+    :param cls: the class; of instances, such as schedules, the attributes are written
+    :raises ValueError: no class, or one that its module does not know by its name
+    """
+    if not isinstance(cls, type) or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
+        raise ValueError(
+            f"{shown(cls)} cannot be named in files: give a class that stands at the top of a module which both who "
+            "saves and who loads can import."
+        )
+    _allowed[_name(cls)] = cls
+    return cls
+
+
+def encode(value: Any, name: str) -> Json:
+    """
+    :param value: of a model
+    :param name: what it is, for a message
+    :return: the same in JSON's types
+    :raises ValueError: no such thing can be written
+    """
+    return _encode(value, name, 0)
+
+
+def decode(value: Json, name: str) -> Any:
+    """
+    :param value: what ``encode`` made, or anything
+    :param name: what it is, for a message
+    :return: the value
+    :raises ValueError: it names an unknown type or class, or holds what that type cannot be made of
+    """
+    try:
+        return _decode(value, 0)
+    except (
+        TypeError,
+        KeyError,
+        AttributeError,
+        AssertionError,
+        OverflowError,
+        binascii.Error,
+        RecursionError,
+    ) as error:
+        raise ValueError(f"{name} is damaged ({type(error).__name__}: {shown(str(error))}).") from error
+    except ValueError as error:
+        raise ValueError(f"{name} is damaged: {error}") from error
+
+
+def _name(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+@cache
+def _built_in() -> dict[str, type]:
+    """The classes that files may name beside those of users: what models are made of."""
+    from sb3_maddpg import buffers as own_buffers
+    from sb3_maddpg import policies, relational
+
+    classes = [
+        *_PLAIN_OBJECTS,
+        *(one for module in (policies, relational) for one in vars(module).values() if _is_public_class(one, module)),
+        *(one for one in vars(own_buffers).values() if _is_public_class(one, own_buffers)),
+        *(one for one in vars(buffers).values() if isinstance(one, type) and issubclass(one, buffers.BaseBuffer)),
+        *(getattr(th.nn.modules.activation, one) for one in th.nn.modules.activation.__all__),
+        *(one for one in vars(th.optim).values() if isinstance(one, type) and issubclass(one, th.optim.Optimizer)),
+        *(getattr(torch_layers, one) for one in ("FlattenExtractor", "NatureCNN", "CombinedExtractor")),
+        RMSpropTFLike,
+        *(np.float32, np.float64),  # of action noise
+    ]
+    return {_name(one): one for one in classes}
+
+
+def _is_public_class(value: Any, module: Any) -> bool:
+    return isinstance(value, type) and value.__module__ == module.__name__ and not value.__name__.startswith("_")
+
+
+@cache
+def _load_entry_points() -> None:
+    for offer in entry_points(group="sb3_maddpg.allowed_in_files"):
+        offer.load()
+
+
+def _known_class(cls: type) -> bool:
+    _load_entry_points()
+    return cls in (_built_in().get(_name(cls)), _allowed.get(_name(cls)))
+
+
+def _class_of(name: Any) -> type:
+    _load_entry_points()
+    known = _built_in() | _allowed
+    if not isinstance(name, str) or name not in known:
+        raise ValueError(
+            f"{suggest('class', name, known) if isinstance(name, str) else f'{shown(name)} is no class.'} A class of "
+            "your own needs `sb3_maddpg.allow_in_files` before the file is read."
+        )
+    return known[name]
+
+
+class _Codec(NamedTuple):
+    """How values of a type are written and read. Both take a function for the parts."""
+
+    type: type
+    write: Callable[[Any, Callable[[Any], Json]], dict[str, Json]]
+    read: Callable[[Mapping[str, Json], Callable[[Json], Any]], Any]
+
+
+def _write_array(array: np.ndarray, part: Callable[[Any], Json]) -> dict[str, Json]:
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"has an array of {array.dtype}, which is no number")
+    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    header = {"dtype": array.dtype.str.lstrip("<>=|"), "shape": list(array.shape)}
+    first = little.ravel()[:1]
+    if array.size > 1 and little.tobytes() == first.tobytes() * array.size:
+        little = first
+        header["repeated"] = True
+    return header | {"base64": base64.b64encode(little.tobytes()).decode()}
+
+
+def _read_array(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> np.ndarray:
+    dtype, shape = np.dtype(f"<{entry['dtype']}"), entry["shape"]
+    if dtype.kind not in "biuf":
+        raise ValueError(f"it has an array of {shown(entry['dtype'])}")
+    if not all(isinstance(length, int) and length >= 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
+        raise ValueError(f"it has an array of shape {shown(shape)}, more than {_LARGEST_ARRAY} numbers or none at all")
+    values = np.frombuffer(base64.b64decode(entry["base64"], validate=True), dtype)
+    if entry.get("repeated", False):
+        (value,) = values
+        return np.full(shape, value, dtype.newbyteorder("="))
+    return values.reshape(shape).astype(dtype.newbyteorder("="))
+
+
+def _write_box(space: spaces.Box, part: Callable[[Any], Json]) -> dict[str, Json]:
+    return {"low": part(space.low), "high": part(space.high)}
+
+
+def _read_box(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> spaces.Box:
+    low, high = part(entry["low"]), part(entry["high"])
+    return spaces.Box(low, high, dtype=low.dtype.type)
+
+
+def _write_team(space: TeamObservation, part: Callable[[Any], Json]) -> dict[str, Json]:
+    return {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim} | _write_box(
+        space, part
+    )
+
+
+def _read_team(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamObservation:
+    box, lengths, length = _read_box(entry, part), entry["lengths"], entry["state"]
+    own = max(lengths)
+    agents = {
+        name: spaces.Box(box.low[row, :columns], box.high[row, :columns], dtype=np.float32)
+        for row, (name, columns) in enumerate(zip(entry["names"], lengths, strict=True))
+    }
+    low, high = (bound[:, own:].ravel()[:length] for bound in (box.low, box.high))
+    space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None)
+    if space.shape != box.shape:
+        raise ValueError(f"it has a team's observation of shape {box.shape} instead of {space.shape}")
+    return space
+
+
+def _attributes_of(value: Any, part: Callable[[Any], Json]) -> dict[str, Json]:
+    return {"class": _name(type(value)), "attributes": {key: part(one) for key, one in vars(value).items()}}
+
+
+def _object_of(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> Any:
+    cls = _class_of(entry["class"])
+    if issubclass(cls, (th.nn.Module, th.optim.Optimizer, buffers.BaseBuffer)):
+        raise ValueError(f"it has an instance of {cls.__name__}")
+    made = cls.__new__(cls)
+    vars(made).update({str(key): part(one) for key, one in entry["attributes"].items()})
+    return made
+
+
+def _agent_spaces(space: MixedActions | CategoricalActions, part: Callable[[Any], Json]) -> dict[str, Json]:
+    return {"agents": [part(one) for one in space.agent_spaces]}
+
+
+# A type stands before those that it inherits from
+_CODECS: dict[str, _Codec] = {
+    "tuple": _Codec(tuple, lambda v, part: {"items": [*map(part, v)]}, lambda e, part: tuple(map(part, e["items"]))),
+    "deque": _Codec(
+        deque,
+        lambda v, part: {"items": [*map(part, v)], "maxlen": v.maxlen},
+        lambda e, part: deque(map(part, e["items"]), e["maxlen"]),
+    ),
+    "dict": _Codec(
+        dict,
+        lambda v, part: {"items": [[part(key), part(one)] for key, one in v.items()]},
+        lambda e, part: {part(key): part(one) for key, one in e["items"]},
+    ),
+    "array": _Codec(np.ndarray, _write_array, _read_array),
+    "number": _Codec(
+        np.generic, lambda v, part: _write_array(np.asarray(v), part), lambda e, part: _read_array(e, part)[()]
+    ),
+    "float": _Codec(float, lambda v, part: {"value": str(v)}, lambda e, part: float(e["value"])),
+    "TeamObservation": _Codec(TeamObservation, _write_team, _read_team),
+    "MixedActions": _Codec(MixedActions, _agent_spaces, lambda e, part: MixedActions([*map(part, e["agents"])])),
+    "CategoricalActions": _Codec(
+        CategoricalActions, _agent_spaces, lambda e, part: CategoricalActions([*map(part, e["agents"])])
+    ),
+    "Box": _Codec(spaces.Box, _write_box, _read_box),
+    "Discrete": _Codec(
+        spaces.Discrete,
+        lambda v, part: {"n": int(v.n), "start": int(v.start)},
+        lambda e, part: spaces.Discrete(e["n"], start=e["start"]),
+    ),
+    "MultiDiscrete": _Codec(
+        spaces.MultiDiscrete,
+        lambda v, part: {"nvec": part(v.nvec), "start": part(v.start)},
+        lambda e, part: spaces.MultiDiscrete(part(e["nvec"]), start=part(e["start"])),
+    ),
+    "MultiBinary": _Codec(
+        spaces.MultiBinary,
+        lambda v, part: {"n": part(v.n if isinstance(v.n, int) else list(map(int, v.shape)))},
+        lambda e, part: spaces.MultiBinary(_sizes(e["n"])),
+    ),
+    "Dict": _Codec(
+        spaces.Dict,
+        lambda v, part: {"spaces": [[key, part(one)] for key, one in v.spaces.items()]},
+        lambda e, part: spaces.Dict([(key, part(one)) for key, one in e["spaces"]]),
+    ),
+    "Tuple": _Codec(
+        spaces.Tuple,
+        lambda v, part: {"spaces": [*map(part, v.spaces)]},
+        lambda e, part: spaces.Tuple([*map(part, e["spaces"])]),
+    ),
+    "dtype": _Codec(th.dtype, lambda v, part: {"name": str(v)}, lambda e, part: _torch_dtype(e["name"])),
+}
+
+
+def _sizes(n: Any) -> Any:
+    if math.prod(n if isinstance(n, list) else [n]) > _LARGEST_ARRAY:
+        raise ValueError(f"it has a space of {shown(n)} bits")
+    return n
+
+
+def _torch_dtype(name: str) -> th.dtype:
+    dtype = getattr(th, name.removeprefix("torch."), None)
+    if not isinstance(dtype, th.dtype):
+        raise ValueError(f"{shown(name)} is no type of PyTorch")
+    return dtype
+
+
+def _encode(value: Any, name: str, depth: int) -> Json:
+    def part(one: Any) -> Json:
+        return _encode(one, name, depth + 1)
+
+    if depth > _DEEPEST:
+        raise ValueError(f"{name} cannot be saved: it is nested more than {_DEEPEST} levels deep.")
+    if value is None or type(value) in (bool, int, str) or (type(value) is float and math.isfinite(value)):
+        return value
+    if type(value) is list:
+        return [part(one) for one in value]
+    if type(value) is dict and all(isinstance(key, str) for key in value) and _TYPE not in value:
+        return {key: part(one) for key, one in value.items()}
+    if isinstance(value, TrainFreq):
+        return {_TYPE: "TrainFreq", "frequency": value.frequency, "unit": value.unit.value}
+    if isinstance(value, type) and _known_class(value):
+        return {_TYPE: "class", "name": _name(value)}
+    for kind, codec in _CODECS.items():
+        if isinstance(value, codec.type):
+            return {_TYPE: kind} | codec.write(value, part)
+    if _known_class(type(value)) and not isinstance(value, (th.nn.Module, th.optim.Optimizer)):
+        return {_TYPE: "object"} | _attributes_of(value, part)
+    raise ValueError(
+        f"{name}={shown(value)} cannot be saved: a {type(value).__name__} is neither a number, an array, a space nor "
+        "of a class that files may name. Name the class with `sb3_maddpg.allow_in_files`, leave it out with "
+        f"`save(path, exclude=[{name!r}])`, or write what runs code when it is loaded: `save(path, pickle=True)`."
+    )
+
+
+def _decode(value: Json, depth: int) -> Any:
+    def part(one: Json) -> Any:
+        return _decode(one, depth + 1)
+
+    if depth > _DEEPEST:
+        raise ValueError(f"it is nested more than {_DEEPEST} levels deep")
+    if isinstance(value, list):
+        return [part(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    if _TYPE not in value:
+        return {key: part(one) for key, one in value.items()}
+    kind = value[_TYPE]
+    if kind == "TrainFreq":
+        return TrainFreq(value["frequency"], TrainFrequencyUnit(value["unit"]))
+    if kind == "class":
+        return _class_of(value["name"])
+    if kind == "object":
+        return _object_of(value, part)
+    if not isinstance(kind, str) or kind not in _CODECS:
+        raise ValueError(suggest("type", kind, [*_CODECS, "TrainFreq", "class", "object"]))
+    return _CODECS[kind].read(value, part)
