@@ -732,13 +732,14 @@ class MADDPG(OffPolicyAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
-        trust: bool = False,
+        trust: bool | None = None,
         **kwargs,
     ) -> SelfMADDPG:
         """
         SB3's ``load``, which runs no code that the file holds unless it is told to.
 
-        :param trust: load pickled values too, of files written by versions before 0.2 or by ``save(pickle=True)``
+        :param trust: load pickled values too, which run code: of files written by version 0.1 or ``save(pickle=True)``;
+            None: as the environment variable ``SB3_MADDPG_TRUST`` says, 1 for yes
         :raises ValueError: no model of this algorithm, a damaged one, or pickled values without ``trust``
         """
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)

@@ -28,6 +28,8 @@ _MEMBERS = {"data", *_WEIGHTS, "_stable_baselines3_version", "system_info.txt"}
 _MOST_DATA = 2**24  # bytes of the member `data`
 _MOST_TIMES_LARGER = 50  # than on disk: members are not compressed
 _PICKLED = ":serialized:"
+# What --trust on the command line sets, for the processes that it starts too
+TRUST_VARIABLE = "SB3_MADDPG_TRUST"
 # Attributes in files that are neither arguments, which have their checks, nor made anew
 _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
     (int,): (
@@ -136,19 +138,27 @@ def _check_sizes(path: Any, archive: zipfile.ZipFile) -> None:
             raise ValueError(f"{path} is too large to be a model: its {member.filename} has {member.file_size} bytes.")
 
 
-def attributes(data: dict[str, Any], path: Any, trust: bool, given: Mapping[str, Any]) -> dict[str, Any]:
+def trusted(trust: bool | None) -> bool:
+    """
+    :param trust: whether files may run code; None: as the environment variable ``SB3_MADDPG_TRUST`` says, 1 for yes
+    :return: whether they may
+    """
+    return os.environ.get(TRUST_VARIABLE) == "1" if trust is None else trust
+
+
+def attributes(data: dict[str, Any], path: Any, trust: bool | None, given: Mapping[str, Any]) -> dict[str, Any]:
     """
     The values of a model's attributes.
 
     :param data: see ``read_data``
     :param path: of the file, for a message
-    :param trust: leave pickled values to Stable-Baselines3, which runs what they hold
+    :param trust: leave pickled values to Stable-Baselines3, which runs what they hold, see ``trusted``
     :param given: what is taken instead of the file's
     :return: values by name, but for those that are pickled
     :raises ValueError: a pickled value, or one that cannot be read
     """
     pickled = {key for key, value in data.items() if isinstance(value, dict) and _PICKLED in value} - set(given)
-    if pickled and not trust:
+    if pickled and not trusted(trust):
         raise ValueError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), which may run any code when they are loaded. "
             "If you trust whoever wrote it, load it with `trust=True` (on the command line `--trust`), or make a file "

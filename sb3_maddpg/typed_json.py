@@ -301,6 +301,8 @@ def _encode(value: Any, name: str, depth: int) -> Json:
         return {_TYPE: "TrainFreq", "frequency": value.frequency, "unit": value.unit.value}
     if isinstance(value, type) and _known_class(value):
         return {_TYPE: "class", "name": _name(value)}
+    if _name(type(value)) == "rl_zoo3.utils.SimpleLinearSchedule":  # in older files; to read it would take rl_zoo3
+        value = utils.LinearSchedule(value.initial_value, 0.0, 1.0)
     for kind, codec in _CODECS.items():
         if isinstance(value, codec.type):
             return {_TYPE: kind} | codec.write(value, part)

@@ -13,7 +13,10 @@ from typing import NamedTuple
 
 import gymnasium
 
-from sb3_maddpg.cli.options import PROG, common_options, import_packages
+from sb3_maddpg.cli.options import PROG, check_writable, common_options, import_packages
+from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.model_files import TRUST_VARIABLE
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.utils import suggest
 
@@ -33,7 +36,8 @@ where it ended. Values of --env-kwargs and -params are written as in Python or Y
 --env PACKAGE/MODULE is a PettingZoo environment (MODULE for a file in the present folder); its --env-kwargs are those
 of its parallel_env, `state:true` for critics that read the global state, and `wrappers` by SuperSuit. There, --algo
 ppo, a2c, dqn, sac or td3 trains one policy whose parameters all agents share. Where a command takes a model's zip,
-`latest:LOGDIR` is the newest one there and `pretrained:NAME` a pretrained one."""
+`latest:LOGDIR` is the newest one there and `pretrained:NAME` a pretrained one. --trust, with any command, loads files
+that may run code: models of earlier versions and of other algorithms."""
 
 
 class Command(NamedTuple):
@@ -158,6 +162,25 @@ def _pretrained(argv: list[str]) -> int:
     return 0
 
 
+def _convert(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog=f"{PROG} convert",
+        description="Write a model's file anew, as this version does: without anything that runs code when it is "
+        "loaded. To read an older file runs what it holds, hence --trust.",
+    )
+    parser.add_argument("old", type=Path, metavar="OLD.zip")
+    parser.add_argument("new", type=Path, metavar="NEW.zip")
+    parser.add_argument("--algo", choices=sorted(_OWN), default="maddpg", help="whose model it is (%(default)s)")
+    args = parser.parse_args(argv)
+    check_writable(args.new)
+    _OWN[args.algo].load(args.old, device="cpu").save(args.new)
+    print(f"wrote {args.new}")
+    return 0
+
+
+_OWN = {"maddpg": MADDPG, "matd3": MATD3}
+
+
 def _headline(readme: Path) -> str:
     """The first sentence of a model's README, without Markdown; a colon ends it too."""
     text = " ".join(readme.read_text().split("\n\n")[0].split()) if readme.is_file() else ""
@@ -223,6 +246,11 @@ COMMANDS: dict[str, Command] = {
         "measure how fast a recipe trains on this machine, and where the time goes",
         f"  {PROG} bench --env mpe2/simple_spread_v3 --n-timesteps 20000",
     ),
+    "convert": Command(
+        _convert,
+        "write a model's file anew, without anything that runs code when it is loaded",
+        f"  {PROG} convert old.zip new.zip --trust",
+    ),
     "pretrained": Command(
         _pretrained,
         "list, show or copy the pretrained models of the installed packages",
@@ -258,6 +286,9 @@ def main(argv: list[str] | None = None) -> int:
     # What a package offers for its environment may have such an option, rl_zoo3 has none
     if command not in ("evaluate", "replay"):
         rest = [word for word in rest if word != "--debug"]
+    if "--trust" in rest:
+        os.environ[TRUST_VARIABLE] = "1"
+        rest = [word for word in rest if word != "--trust"]
     if {"-h", "--help"} & set(rest):
         print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
     try:
