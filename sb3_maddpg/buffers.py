@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg.team import InfoKey, Team, heads_of
-from sb3_maddpg.utils import all_finite, not_finite_at
+from sb3_maddpg.utils import all_finite, not_finite_at, shown
 from sb3_maddpg.validation import PriorityArguments, ReplayBufferArguments, validated
 
 
@@ -104,6 +104,19 @@ class TeamReplayBuffer(ReplayBuffer):
     :param n_pairs: number of neighbours of an agent with a reward of their own, 0 if there are no such rewards
     :raises ValueError: spaces that describe no team, or an argument out of its range
     """
+
+    _ARGUMENTS: ClassVar[tuple[str, ...]] = (
+        "buffer_size",
+        "observation_space",
+        "action_space",
+        "n_envs",
+        "optimize_memory_usage",
+        "handle_timeout_termination",
+        "n_steps",
+        "gamma",
+        "n_pairs",
+    )
+    _COUNTERS: ClassVar[tuple[str, ...]] = ("pos", "full", "all_active", "n_added")
 
     def __init__(
         self,
@@ -210,6 +223,45 @@ class TeamReplayBuffer(ReplayBuffer):
             records = np.zeros((self.buffer_size, self.n_envs), records.dtype)
             records[: len(self.records)] = self.records
         self._use(records)
+
+    def contents(self) -> tuple[dict[str, Any], dict[str, Any], dict[str, np.ndarray]]:
+        """
+        What makes the same buffer again: ``cls(**arguments)``, then ``restore(counters, arrays)``.
+
+        :return: arguments but for the device, counters, and arrays, of which as much as is in use
+        """
+        # Without next_observations the last of them stands one further
+        used = self.records[: self.size() + int(self.optimize_memory_usage)]
+        arguments = {name: getattr(self, name) for name in self._ARGUMENTS}
+        arguments["buffer_size"] *= self.n_envs  # SB3 keeps the rows
+        counters = {name: getattr(self, name) for name in self._COUNTERS}
+        return arguments, counters, {name: used[name] for name in self.records.dtype.names or ()}
+
+    def restore(self, counters: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        """
+        :param counters: see ``contents``
+        :param arrays: see ``contents``
+        :raises ValueError: not those of a buffer with these arguments, or numbers that are not finite
+        """
+        if set(counters) != set(self._COUNTERS):
+            raise ValueError(f"A {type(self).__name__} has the counters {self._COUNTERS}, not {tuple(counters)}.")
+        for name, value in counters.items():
+            default = getattr(self, name)
+            if type(value) is not type(default) or not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"The replay buffer's {name} is {shown(value)}.")
+            setattr(self, name, value)
+        names = self.records.dtype.names or ()
+        rows = self.size() + int(self.optimize_memory_usage)
+        if self.pos >= self.buffer_size:
+            raise ValueError(f"The replay buffer's pos is {self.pos}, but it has {self.buffer_size} rows.")
+        for name in names:
+            array, own = arrays.get(name), self.records[name][:rows]
+            if array is None or (array.shape, array.dtype) != (own.shape, own.dtype):
+                given = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
+                raise ValueError(f"The replay buffer's {name} are {given}, not {own.dtype} of shape {own.shape}.")
+            if not all_finite(array):
+                raise ValueError(f"The replay buffer's {name} hold NaN or infinity.")
+            own[...] = array
 
     def reset(self) -> None:
         super().reset()
@@ -492,6 +544,9 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     :param kwargs: see ``TeamReplayBuffer``
     """
 
+    _ARGUMENTS = (*TeamReplayBuffer._ARGUMENTS, "alpha", "beta", "epsilon")
+    _COUNTERS = (*TeamReplayBuffer._COUNTERS, "largest_priority", "new_rows")
+
     def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.5, epsilon: float = 0.01, **kwargs: Any):
         given = validated(PriorityArguments, alpha=alpha, beta=beta, epsilon=epsilon)
         self.alpha, self.beta, self.epsilon = given["alpha"], given["beta"], given["epsilon"]
@@ -503,6 +558,19 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         self.priorities = SumTree(self.buffer_size * self.n_envs)
         self.largest_priority = 1.0
         self.new_rows = 0
+
+    def contents(self) -> tuple[dict[str, Any], dict[str, Any], dict[str, np.ndarray]]:
+        arguments, counters, arrays = super().contents()
+        return arguments, counters, {**arrays, "priorities": self.priorities.values[: self.size() * self.n_envs]}
+
+    def restore(self, counters: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        super().restore(counters, arrays)
+        given = arrays.get("priorities")
+        if given is None or (given.shape, given.dtype) != ((self.size() * self.n_envs,), np.dtype(float)):
+            raise ValueError(f"The replay buffer has no priorities of {self.size() * self.n_envs} transitions.")
+        if not (np.isfinite(given).all() and (given >= 0).all()):
+            raise ValueError("The replay buffer has priorities that are negative, NaN or infinite.")
+        self.priorities.set(np.arange(len(given)), given)
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         super().add(*args, **kwargs)
@@ -554,7 +622,7 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
                 f"The critics' error is {errors[~np.isfinite(errors)][0]}: the critics diverged. Choose a lower "
                 "learning_rate, or smaller rewards."
             )
-        self.largest_priority = max(self.largest_priority, largest)
+        self.largest_priority = max(self.largest_priority, float(largest))
         self.priorities.set(indices, priorities)
 
 
@@ -568,6 +636,11 @@ class SumTree:
     def __init__(self, size: int):
         self.depth = max(size - 1, 0).bit_length()
         self.sums = np.zeros(2 << self.depth)  # the total at 1, children of i at 2 i and 2 i + 1, priorities last
+
+    @property
+    def values(self) -> np.ndarray:
+        """All priorities, and zeros behind them."""
+        return self.sums[1 << self.depth :]
 
     def set(self, indices: np.ndarray, values: np.ndarray | float) -> None:
         """

@@ -34,6 +34,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_maddpg.actions import Continuous
 from sb3_maddpg.agent_policy import AgentPolicy
+from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import record_metrics
 from sb3_maddpg.estimators import ESTIMATORS
@@ -47,6 +48,7 @@ from sb3_maddpg.model_files import (
     optimizer_not_finite,
     optimizer_problem,
     read_data,
+    trusted,
 )
 from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
@@ -840,17 +842,35 @@ class MADDPG(OffPolicyAlgorithm):
                 return f"{problem}. The training diverged: go back to an earlier file and lower the learning_rate."
         return None
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+        trust: bool | None = None,
+    ) -> None:
         """
-        SB3's ``load_replay_buffer``.
+        SB3's ``load_replay_buffer``, which runs no code that the file holds unless it is told to.
 
-        :raises ValueError: a buffer of another kind, team or number of environments; the present one stays then
+        :param trust: load a pickled buffer, which runs code, as version 0.1 and other algorithms write it, see ``load``
+        :raises ValueError: a buffer of another kind, team or number of environments, or a pickled one without
+            ``trust``; the present one stays then
         """
         check_path(path)
+        if isinstance(path, (str, os.PathLike)) and not pathlib.Path(path).suffix:
+            path = f"{path}.pkl"  # as SB3 does
         present = self.replay_buffer
         try:
             with as_damage(path, "replay buffer"):
-                super().load_replay_buffer(path, truncate_last_traj)
+                if is_buffer_file(path):
+                    self.replay_buffer = read_buffer(path, self.device)
+                elif trusted(trust):
+                    super().load_replay_buffer(path, truncate_last_traj)
+                else:
+                    raise ValueError(
+                        f"{path} is no replay buffer that this version writes. If it is a pickled one, it may run any "
+                        "code when it is loaded: where you trust whoever wrote it, load it with `trust=True` (on the "
+                        "command line `--trust`)."
+                    )
             self._check_replay_buffer(self.replay_buffer, path)
         except BaseException:
             self.replay_buffer = present
@@ -875,11 +895,19 @@ class MADDPG(OffPolicyAlgorithm):
                 )
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        The replay buffer as JSON and arrays. The file is called ``.pkl`` unless its name says otherwise, since that is
+        where rl_zoo3 looks for it, but nothing in it is pickled.
+
+        :raises ValueError: there is none, or it is of a class that files may not name, see ``allow_in_files``
+        """
         check_path(path)
+        if not isinstance(self.replay_buffer, TeamReplayBuffer):
+            raise ValueError("There is no replay buffer to save.")
         if not isinstance(path, (str, os.PathLike)):
-            return super().save_replay_buffer(path)
+            return write_buffer(self.replay_buffer, path)
         with atomic_write(path, suffix="pkl") as file:
-            super().save_replay_buffer(file)  # type: ignore[arg-type]
+            write_buffer(self.replay_buffer, file)  # type: ignore[arg-type]
 
     def _excluded_save_params(self) -> list[str]:
         # The last observations of many environments are larger than the networks, and loading begins new episodes

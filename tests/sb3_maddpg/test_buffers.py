@@ -1,7 +1,10 @@
 """Per-agent rewards and ends, sums of n rewards and the storage of the replay buffer."""
 
 import copy
+import io
 import pickle
+import zipfile
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer, TeamReplayBuffer
+from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import SumTree
 from sb3_maddpg.team_tasks import OwnBit
 
@@ -246,15 +250,28 @@ def test_rewards_are_normalised_before_they_are_summed():
     assert np.allclose(sample.pair_rewards, 0 + 0.5 * 2 + 0.25 * 2)
 
 
+def through_pickle(memory: TeamReplayBuffer) -> tuple[TeamReplayBuffer, int]:
+    data = pickle.dumps(memory)
+    return pickle.loads(data), len(data)
+
+
+def through_file(memory: TeamReplayBuffer) -> tuple[TeamReplayBuffer, int]:
+    file = io.BytesIO()
+    write_buffer(memory, file)
+    assert is_buffer_file(file)
+    with patch("pickle.loads", side_effect=AssertionError), patch("pickle.load", side_effect=AssertionError):
+        return read_buffer(file, "cpu"), len(file.getvalue())
+
+
 @pytest.mark.parametrize("kwargs", [{}, {"optimize_memory_usage": True, "handle_timeout_termination": False}])
 @pytest.mark.parametrize("size", [8, 100_000])
-def test_a_pickled_buffer_holds_what_is_filled_and_goes_on(kwargs, size):
+@pytest.mark.parametrize("through", [through_pickle, through_file])
+def test_a_saved_buffer_holds_what_is_filled_and_goes_on(kwargs, size, through):
     memory = buffer(size, **kwargs)
     for index in range(11):
         add(memory, index, agent_active=[True, index != 5, True])
-    data = pickle.dumps(memory)
-    assert len(data) < 20_000
-    other = pickle.loads(data)
+    other, length = through(memory)
+    assert length < 20_000
     for name in ("observations", "actions", "agent_rewards", "agent_active", "dones", "timeouts", "records"):
         assert np.array_equal(getattr(memory, name), getattr(other, name))
         assert np.shares_memory(getattr(other, name), other.records)
@@ -367,14 +384,17 @@ def test_a_row_without_its_observation_is_not_replayed():
     assert set(memory.sample(8).observations[:, 0, 0].tolist()) == {7.0}
 
 
-def test_priorities_are_saved_with_the_buffer():
+@pytest.mark.parametrize("through", [through_pickle, through_file])
+def test_priorities_are_saved_with_the_buffer(through):
     memory = prioritized()
     with pytest.raises(ValueError, match="buffer is empty"):
         memory.sample(1)
     for index in range(3):
         add(memory, index)
     memory.update_priorities(np.arange(3), np.array([0.0, 9.0, 3.0]))
-    again = pickle.loads(pickle.dumps(memory))
+    add(memory, 3)
+    again, _ = through(memory)
+    assert np.array_equal(again.priorities.sums, memory.priorities.sums)
     set_random_seed(0)
     first = memory.sample(32).indices
     set_random_seed(0)
@@ -531,3 +551,53 @@ def test_priorities_and_discounts_are_numbers(name):
     for value in ("x", None, [1]):
         with pytest.raises(ValueError, match=f"{name}=.* must be "):
             PrioritizedTeamReplayBuffer(10, spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(4), **{name: value})
+
+
+class Unnamed(TeamReplayBuffer):
+    """A buffer of somebody else's."""
+
+
+def test_a_buffer_of_ones_own_class_has_to_be_allowed():
+    with pytest.raises(ValueError, match=r"class=.*Unnamed.* cannot be saved"):
+        write_buffer(Unnamed(4, buffer().observation_space, buffer().action_space), io.BytesIO())
+
+
+@pytest.mark.parametrize(
+    ("member", "change", "message"),
+    [
+        ("buffer.json", lambda b: b"[]", "no replay buffer of format 1"),
+        ("buffer.json", lambda b: b.replace(b'"pos": 3', b'"pos": 8'), "pos is 8"),
+        ("buffer.json", lambda b: b.replace(b'"pos": 3', b'"pos": -1'), "pos is -1"),
+        ("buffer.json", lambda b: b.replace(b'"pos": 3', b'"pos": 2'), r"of shape \(3, .*not .*of shape \(2, "),
+        ("buffer.json", lambda b: b.replace(b'"full": false', b'"full": 0'), "full is 0"),
+        ("buffer.json", lambda b: b.replace(b'"pos": 3, ', b""), "has the counters"),
+        ("buffer.json", lambda b: b.replace(b"PrioritizedTeamReplayBuffer", b"ReplayBuffer"), "Unknown class"),
+        (
+            "buffer.json",
+            lambda b: b.replace(b"sb3_maddpg.buffers.Prior", b"stable_baselines3.common.buffers.X"),
+            "Unknown",
+        ),
+        ("priorities.npy", lambda b: b[:-8], "priorities.npy has 144 bytes"),
+        ("priorities.npy", lambda b: b[:-8] + np.float64(-1).tobytes(), "negative"),
+        ("numbers.npy", lambda b: b[:-4] + np.float32(np.nan).tobytes(), "numbers hold NaN or infinity"),
+        ("actions.npy", lambda b: b.replace(b"(3, ", b"(9999999999, "), "not an array of"),
+        ("actions.npy", lambda b: b.replace(b"'|i1'", b"'|O' "), r"not an array of|object"),
+        ("actions.npy", lambda b: b"", "magic"),
+    ],
+)
+def test_a_spoilt_file_of_a_buffer_is_refused(member, change, message):
+    memory = prioritized()
+    for index in range(3):
+        add(memory, index)
+    memory.sample(2)
+    written, spoilt = io.BytesIO(), io.BytesIO()
+    write_buffer(memory, written)
+    with zipfile.ZipFile(written) as old, zipfile.ZipFile(spoilt, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == member:
+                assert change(content) != content
+                content = change(content)
+            new.writestr(name, content)
+    with pytest.raises(ValueError, match=message):
+        read_buffer(spoilt, "cpu")
