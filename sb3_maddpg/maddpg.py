@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import math
 import os
@@ -11,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from operator import attrgetter
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, Literal, TypeVar, cast, get_args
 
 import gymnasium
 import numpy as np
@@ -60,6 +61,7 @@ from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, shown, su
 from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TrainingArguments, validated
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
+Lean = Literal["actor", "critic"]
 
 # Arguments of policies that the algorithm gives itself
 NOT_POLICY_KWARGS = {"observation_space", "action_space", "lr_schedule"}
@@ -243,6 +245,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.action_cost: np.ndarray | None = None
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
+        self.lean: Lean | None = None  # what the file holds that this was loaded from
         self.algorithm = type(self).__name__
         self.file_format = FILE_FORMAT
 
@@ -672,6 +675,10 @@ class MADDPG(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfMADDPG:
         given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
+        if self.lean is not None:
+            missing = "the optimizers' state" if self.lean == "critic" else "critics and the optimizers' state"
+            warnings.warn(f"This model was saved without {missing}, which begin anew.", stacklevel=2)
+            self.lean = None
         super().learn(
             total_timesteps=math.ceil(given["total_timesteps"]),
             callback=given["callback"],
@@ -762,19 +769,25 @@ class MADDPG(OffPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
         pickle: bool = False,
+        lean: Lean | None = None,
     ) -> None:
         """
         SB3's ``save``, whole or not at all: a file that was there stays until the new one is complete. The file holds
         JSON and weights, and nothing that runs code when it is loaded.
 
         :param pickle: write as SB3 does, pickling what is no JSON; such a file needs ``load(trust=True)``
+        :param lean: leave out what only training needs: ``"actor"`` keeps the actors alone, a tenth of the file,
+            ``"critic"`` the critics too, and neither keeps target networks or the optimizers' state. A training that
+            goes on from such a file makes anew what is missing
         :raises ValueError: a parameter is not finite, which nothing could be done with, or an attribute cannot be
             written as JSON, such as a function as a schedule
         """
         check_path(path)
+        if lean is not None and (lean not in get_args(Lean) or pickle):
+            raise ValueError(f"lean={shown(lean)}, pickle={pickle}: lean is one of {get_args(Lean)}, without pickle.")
         if problem := self._not_finite(self.get_parameters()):
             raise ValueError(f"This model cannot be saved: {problem}")
-        write = super().save if pickle else self._save_without_pickle
+        write = super().save if pickle else functools.partial(self._save_without_pickle, lean=lean)
         if not isinstance(path, (str, os.PathLike)):
             return write(path, exclude, include)
         with atomic_write(path, suffix="zip") as file:
@@ -785,12 +798,33 @@ class MADDPG(OffPolicyAlgorithm):
         file: str | pathlib.Path | io.BufferedIOBase,
         exclude: Iterable[str] | None,
         include: Iterable[str] | None,
+        lean: Lean | None,
     ) -> None:
         """What ``BaseAlgorithm.save`` does, with values as JSON that says their types."""
         left_out = {*(exclude or ()), *self._excluded_save_params()} - {*(include or ())}
         left_out |= {name.split(".")[0] for name in self._get_torch_save_params()[0]}
+        parameters = self.get_parameters()
+        if lean is not None:
+            kept = ("actor.", "critic.")[: 1 + (lean == "critic")]
+            weights = cast("dict[str, th.Tensor]", parameters["policy"])
+            parameters = {"policy": {name: one for name, one in weights.items() if name.startswith(kept)}}
+            left_out |= {"ep_info_buffer", "ep_success_buffer", "_last_episode_starts"}
         data = {key: encode(value, key) for key, value in vars(self).items() if key not in left_out}
-        save_to_zip_file(file, data=data, params=self.get_parameters(), pytorch_variables={})
+        save_to_zip_file(file, data=data | {"lean": lean}, params=parameters, pytorch_variables={})
+
+    def _with_what_is_missing(self, parameters: dict[str, Any], lean: Lean) -> dict[str, Any]:
+        """The parameters of a lean file, with target networks like the networks, and this model's where it has none."""
+        given, own = parameters.get("policy", {}), self.get_parameters()
+        weights: dict[str, th.Tensor] = dict(own["policy"])
+        for name in weights:
+            source = name.replace("_target.", ".", 1)
+            if source.startswith("actor.") or lean == "critic":
+                if source not in given:
+                    raise UnusableParametersError(f"These parameters cannot be used: they have no {source}.")
+                weights[name] = given[source]
+            else:
+                weights[name] = weights[source]
+        return {**own, "policy": weights}
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
@@ -800,14 +834,16 @@ class MADDPG(OffPolicyAlgorithm):
 
         :raises ValueError: parameters that are not finite or fit other networks; nothing has changed then
         """
-        parameters = cast(dict[str, Any], load_path_or_dict)
+        parameters, lean = cast(dict[str, Any], load_path_or_dict), self.lean
         if not isinstance(load_path_or_dict, dict):
             check_path(load_path_or_dict)
             with as_damage(load_path_or_dict):
-                check_members(load_path_or_dict)
+                lean = check_members(load_path_or_dict).get("lean")
                 parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
         before: Any = deepcopy(self.get_parameters())
         try:
+            if lean is not None and "actor.optimizer" not in parameters:
+                parameters = self._with_what_is_missing(parameters, lean)
             if problem := self._not_finite(parameters):
                 raise UnusableParametersError(f"These parameters cannot be used: {problem}")
             for name, state in parameters.items():

@@ -46,7 +46,7 @@ _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
     (int, float): ("_current_progress_remaining", "start_time"),
     (bool,): ("use_sde", "use_sde_at_warmup"),
     (int, type(None)): ("seed",),
-    (str, type(None)): ("tensorboard_log",),
+    (str, type(None)): ("tensorboard_log", "lean"),
     (dict, type(None)): ("env_spec",),
     (deque, type(None)): ("ep_info_buffer", "ep_success_buffer"),
 }
@@ -157,7 +157,7 @@ def attributes(data: dict[str, Any], path: Any, trust: bool | None, given: Mappi
     :return: values by name, but for those that are pickled
     :raises ValueError: a pickled value, or one that cannot be read
     """
-    pickled = {key for key, value in data.items() if isinstance(value, dict) and _PICKLED in value} - set(given)
+    pickled = _pickled(data) - set(given)
     if pickled and not trusted(trust):
         raise ValueError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), which may run any code when they are loaded. "
@@ -169,6 +169,43 @@ def attributes(data: dict[str, Any], path: Any, trust: bool | None, given: Mappi
         for key, value in data.items()
         if key not in pickled
     }
+
+
+def _pickled(data: dict[str, Any]) -> set[str]:
+    """:return: the names of what Stable-Baselines3 would unpickle"""
+    return {key for key, value in data.items() if isinstance(value, dict) and _PICKLED in value}
+
+
+def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[str, Any]) -> None:
+    """
+    :param path: of a model of any algorithm of Stable-Baselines3, or the file
+    :param given: values that are taken instead of the file's
+    :raises ValueError: it holds others that would be unpickled
+    """
+    file = open_path(path, "r", verbose=0, suffix="zip")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
+    finally:
+        if isinstance(path, (str, os.PathLike)):
+            file.close()
+        else:
+            file.seek(0)
+    if pickled := _pickled(data) - set(given):
+        raise ValueError(
+            f"{path} holds pickled values ({', '.join(sorted(pickled))}), as the files of most algorithms do. They may "
+            "run any code when they are loaded: if you trust whoever wrote it, give --trust."
+        )
+
+
+def refuse_pickled_file(path: Any) -> None:
+    """
+    :param path: of a file that is nothing but a pickle
+    :raises ValueError: in any case
+    """
+    raise ValueError(
+        f"{path} is a pickle, which may run any code when it is loaded: if you trust whoever wrote it, give --trust."
+    )
 
 
 @contextmanager

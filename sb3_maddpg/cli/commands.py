@@ -6,22 +6,24 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import gymnasium
+import yaml
 
 from sb3_maddpg.cli.options import PROG, check_writable, common_options, import_packages
-from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.matd3 import MATD3
-from sb3_maddpg.model_files import TRUST_VARIABLE
+from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.utils import suggest
 
 # Mistakes in what the user gave, and what the system refuses. Their messages say what to do, so one line is enough.
-USER_ERRORS = (ValueError, OSError, AssertionError, ImportError, gymnasium.error.Error)
+USER_ERRORS = (ValueError, OSError, AssertionError, ImportError, gymnasium.error.Error, yaml.YAMLError)
 
 DESCRIPTION = """\
 Multi-agent reinforcement learning with MADDPG and MATD3 for Stable-Baselines3.
@@ -99,6 +101,10 @@ def _hand_over(group: str, argv: list[str]) -> int:
         if known.algo not in ALGOS:
             raise ValueError(suggest("algorithm", known.algo, ALGOS))
         algorithm = ALGOS[known.algo]
+        if not issubclass(algorithm, MADDPG) and not trusted(None):
+            for word in rest:
+                if Path(path := word.partition("@")[0]).suffix == ".zip" and Path(path).is_file():
+                    refuse_pickled(path, {})
         rest += ["--algo", f"{algorithm.__module__}:{algorithm.__qualname__}"]
     return main(rest)
 
@@ -171,9 +177,10 @@ def _convert(argv: list[str]) -> int:
     parser.add_argument("old", type=Path, metavar="OLD.zip")
     parser.add_argument("new", type=Path, metavar="NEW.zip")
     parser.add_argument("--algo", choices=sorted(_OWN), default="maddpg", help="whose model it is (%(default)s)")
+    parser.add_argument("--lean", choices=get_args(Lean), help="keep only the actors, or the critics too")
     args = parser.parse_args(argv)
     check_writable(args.new)
-    _OWN[args.algo].load(args.old, device="cpu").save(args.new)
+    _OWN[args.algo].load(args.old, device="cpu").save(args.new, lean=args.lean)
     print(f"wrote {args.new}")
     return 0
 
@@ -273,6 +280,19 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@contextmanager
+def _trust() -> Iterator[None]:
+    """Load files that may run code, in this process and in those that it starts."""
+    before = os.environ.get(TRUST_VARIABLE)
+    os.environ[TRUST_VARIABLE] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop(TRUST_VARIABLE)
+        if before is not None:
+            os.environ[TRUST_VARIABLE] = before
+
+
 def main(argv: list[str] | None = None) -> int:
     """
     :param argv: arguments, those of the command line by default
@@ -286,13 +306,12 @@ def main(argv: list[str] | None = None) -> int:
     # What a package offers for its environment may have such an option, rl_zoo3 has none
     if command not in ("evaluate", "replay"):
         rest = [word for word in rest if word != "--debug"]
-    if "--trust" in rest:
-        os.environ[TRUST_VARIABLE] = "1"
-        rest = [word for word in rest if word != "--trust"]
+    trusts, rest = "--trust" in rest, [word for word in rest if word != "--trust"]
     if {"-h", "--help"} & set(rest):
         print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
     try:
-        return COMMANDS[command].run(rest)
+        with _trust() if trusts else nullcontext():
+            return COMMANDS[command].run(rest)
     except USER_ERRORS as error:
         if debug:
             raise

@@ -33,6 +33,7 @@ from sb3_maddpg.cli.literals import StoreValues
 from sb3_maddpg.cli.options import PROG, common_options, import_packages
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.recipes import LengthOption, check_options
+from sb3_maddpg.cli.safety import no_code_from_files
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.utils import suggest
@@ -55,7 +56,8 @@ def _call(function: Callable[[], Any], command: str, argv: list[str]) -> None:
     """rl_zoo3's commands read ``sys.argv`` and have no other way in."""
     saved, sys.argv = sys.argv, [f"{PROG} {command}", *argv]
     try:
-        function()
+        with no_code_from_files():
+            function()
     finally:
         sys.argv = saved
 
@@ -104,7 +106,8 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
         name = EnvironmentName(known.env)
         exp_id = known.exp_id or get_latest_run_id(str(Path(known.folder, known.algo)), name)
         run = Path(known.folder, known.algo, f"{name}_{exp_id}" if exp_id > 0 else "")
-        hyperparams, _ = get_saved_hyperparams(str(run / name))
+        with no_code_from_files():
+            hyperparams, _ = get_saved_hyperparams(str(run / name))
         env_kwargs = {**hyperparams.get("env_kwargs", {}), **known.env_kwargs}
         rest += ["--env", known.env]
         # rl_zoo3 reads these values as Python; its own merging forgets some of them

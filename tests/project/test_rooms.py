@@ -125,3 +125,10 @@ def test_the_guide_names_every_room():
     rooms = {f"envs/quad_swarm/{room}/" for room in ROOMS if room}
     assert {"sb3_maddpg/", "sb3_maddpg/cli/", "envs/quad_swarm/", *rooms} <= paths
     assert all((ROOT / path).is_dir() for path in paths)
+
+
+def test_every_package_is_in_the_wheel():
+    text = (ROOT / "pyproject.toml").read_text()
+    listed = set(re.findall(r'"([\w.]+)"', text.partition("\npackages = [")[2].partition("]")[0]))
+    on_disk = {name for name, path in ALL.items() if path.name == "__init__.py"}
+    assert listed == on_disk | {"sb3_maddpg.zoo_configs"}

@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+from hashlib import sha256
+from importlib.resources import files
 
 import gymnasium
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from quad_swarm.evaluation import Condition, run_episodes, summarise
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG, pretrained
+from sb3_maddpg.model_files import refuse_pickled
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 
 # Model -> world, and for numbers of robots the largest share of requests in the symmetric swap: 1.3 times its own.
@@ -22,6 +25,15 @@ SHIPPED = {
 
 def test_every_shipped_model_is_tested():
     assert list(pretrained_models()) == sorted(SHIPPED)
+
+
+def test_shipped_models_are_the_recorded_files_and_hold_no_pickle():
+    sums = files("quad_swarm.models").joinpath("SHA256SUMS").read_text().splitlines()
+    recorded = {name: digest for digest, name in (line.split() for line in sums)}
+    paths = {f"{name}/model.zip": folder / "model.zip" for name, folder in pretrained_models().items()}
+    assert {name: sha256(path.read_bytes()).hexdigest() for name, path in paths.items()} == recorded
+    for path in paths.values():
+        refuse_pickled(path, {})
 
 
 @pytest.mark.parametrize(("name", "n_robots"), [(name, n) for name, (_, most) in SHIPPED.items() for n in most])

@@ -300,3 +300,40 @@ def test_a_truncated_replay_buffer_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"buffer\.pkl is no replay buffer that this version writes"):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is present
+
+
+@pytest.mark.parametrize("lean", ["actor", "critic"])
+def test_a_lean_file_acts_the_same_and_trains_on_from_what_it_has(tmp_path, lean):
+    model = learned()
+    model.save(tmp_path / "whole")
+    model.save(tmp_path / "lean", lean=lean)
+    with zipfile.ZipFile(tmp_path / "lean.zip") as archive:
+        assert "actor.optimizer.pth" not in archive.namelist()
+    assert (tmp_path / "lean.zip").stat().st_size < 0.6 * (tmp_path / "whole.zip").stat().st_size
+    loaded = MADDPG.load(tmp_path / "lean", env=OwnBit())
+    assert loaded.lean == lean
+    assert np.array_equal(model.predict(OBS, deterministic=True)[0], loaded.predict(OBS, deterministic=True)[0])
+    assert_equal_state(loaded.actor.state_dict(), loaded.actor_target.state_dict())
+    assert_equal_state(loaded.critic.state_dict(), loaded.critic_target.state_dict())
+    same = all(map(th.equal, model.critic.parameters(), loaded.critic.parameters()))
+    assert same == (lean == "critic")
+    with pytest.warns(UserWarning, match="saved without .*optimizers' state, which begin anew"):
+        loaded.learn(60)
+    assert loaded.lean is None
+    other = MADDPG("MlpPolicy", OwnBit(), **{**SMALL, "seed": 5})
+    other.set_parameters(tmp_path / "lean.zip")
+    assert np.array_equal(model.predict(OBS, deterministic=True)[0], other.predict(OBS, deterministic=True)[0])
+
+
+def test_lean_is_one_of_two_and_needs_the_actor(tmp_path):
+    model = learned()
+    for wrong in ({"lean": "actors"}, {"lean": "actor", "pickle": True}, {"lean": True}):
+        with pytest.raises(ValueError, match="lean is one of"):
+            model.save(tmp_path / "model", **wrong)
+    model.save(tmp_path / "model", lean="actor")
+    with zipfile.ZipFile(tmp_path / "model.zip") as old, zipfile.ZipFile(tmp_path / "other.zip", "w") as new:
+        for name in old.namelist():
+            changed = json.dumps({**json.loads(old.read("data")), "lean": "critic"}).encode()
+            new.writestr(name, changed if name == "data" else old.read(name))
+    with pytest.raises(ValueError, match=r"they have no critic\."):
+        MADDPG.load(tmp_path / "other")

@@ -139,10 +139,12 @@ def test_an_algorithm_for_single_agents_is_trained_and_watched(capsys, algo, env
         assert found["timesteps"][0] == 120  # agents' steps
         assert found["results"].shape[1] == n_agents  # an episode of all agents
     capsys.readouterr()
-    assert main(["enjoy", *argv, "-n", "60", "--no-render"]) == 0
+    assert main(["enjoy", *argv, "-n", "60", "--no-render"]) == 2
+    assert "holds pickled values" in capsys.readouterr().err
+    assert main(["enjoy", *argv, "-n", "60", "--no-render", "--trust"]) == 0
     assert "Mean episode length: " in capsys.readouterr().out
     if algo == "a2c":
-        assert main(["record", *argv, "-n", "5"]) == 0
+        assert main(["record", *argv, "-n", "5", "--trust"]) == 0
         (video,) = Path("logs").rglob("*.mp4")
         assert video.stat().st_size > 500
         model = A2C.load(path)

@@ -1,0 +1,104 @@
+"""``VecNormalize`` whose statistics are JSON in files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_maddpg.model_files import as_damage, trusted
+from sb3_maddpg.typed_json import decode, encode
+from sb3_maddpg.utils import atomic_write
+
+_FORMAT = "VecNormalize 1"
+_SETTINGS = (
+    "training",
+    "norm_obs",
+    "norm_reward",
+    "clip_obs",
+    "clip_reward",
+    "gamma",
+    "epsilon",
+    "norm_obs_keys",
+)
+_MOST_BYTES = 2**28
+
+
+class SafeVecNormalize(VecNormalize):
+    """
+    SB3's ``VecNormalize``, saved as JSON instead of a pickle and loaded without running code.
+
+    :param args: see ``VecNormalize``
+    :param kwargs: see ``VecNormalize``
+    """
+
+    def save(self, save_path: str) -> None:
+        """
+        :param save_path: of the file, which appears whole or not at all
+        """
+        rms = self.obs_rms if self.norm_obs else {}
+        data = {
+            "format": _FORMAT,
+            "settings": {name: getattr(self, name) for name in _SETTINGS},
+            "obs_rms": {key: _moments(one) for key, one in rms.items()} if isinstance(rms, dict) else _moments(rms),
+            "ret_rms": _moments(self.ret_rms),
+        }
+        with atomic_write(save_path, suffix="pkl") as file:
+            file.write(json.dumps({key: encode(value, key) for key, value in data.items()}).encode())
+
+    @staticmethod
+    def load(load_path: str, venv: VecEnv, trust: bool | None = None) -> VecNormalize:
+        """
+        :param load_path: of a file that ``save`` wrote
+        :param venv: to wrap
+        :param trust: load a pickled file, which runs code, as Stable-Baselines3 writes it; None: as the environment
+            variable ``SB3_MADDPG_TRUST`` says, 1 for yes
+        :raises ValueError: another content, statistics of other observations, or a pickle without ``trust``
+        """
+        path = Path(load_path)
+        with path.open("rb") as file:
+            start = file.read(1)
+        with as_damage(path, "statistics"):
+            if start != b"{":
+                if trusted(trust):
+                    return VecNormalize.load(load_path, venv)
+                raise ValueError(
+                    f"{path} holds no statistics that this version writes. If they are pickled, they may run any code "
+                    "when they are loaded: where you trust whoever wrote them, load them with `trust=True` (on the "
+                    "command line `--trust`)."
+                )
+            if path.stat().st_size > _MOST_BYTES:
+                raise ValueError(f"{path} is too large to hold statistics.")
+            data = json.loads(path.read_bytes())
+            if data.get("format") != _FORMAT:
+                raise ValueError(f"{path} has format {data.get('format')}, this version of sb3-maddpg reads {_FORMAT}.")
+            settings = decode(data["settings"], f"{path}: settings")
+            found = SafeVecNormalize(venv, **{name: settings[name] for name in _SETTINGS})
+            if isinstance(found.obs_rms if found.norm_obs else None, dict):
+                for key, one in found.obs_rms.items():
+                    _set_moments(one, data["obs_rms"][key], f"{path}: {key}")
+            elif found.norm_obs:
+                _set_moments(found.obs_rms, data["obs_rms"], f"{path}: obs_rms")  # type: ignore[arg-type]
+            _set_moments(found.ret_rms, data["ret_rms"], f"{path}: ret_rms")
+        return found
+
+
+def _moments(rms: RunningMeanStd) -> dict[str, Any]:
+    return {"mean": np.asarray(rms.mean), "var": np.asarray(rms.var), "count": float(rms.count)}
+
+
+def _set_moments(rms: RunningMeanStd, data: Any, name: str) -> None:
+    mean, var, count = (decode(data[key], f"{name}: {key}") for key in ("mean", "var", "count"))
+    for array in (mean, var):
+        if not isinstance(array, np.ndarray) or array.shape != np.shape(rms.mean):
+            raise ValueError(
+                f"{name} has the shape {np.shape(array)}, the environment's is {np.shape(rms.mean)}: these are the "
+                "statistics of other observations."
+            )
+    if not (np.isfinite(mean).all() and np.isfinite(var).all() and (var >= 0).all() and 0 < count < np.inf):
+        raise ValueError(f"{name} holds NaN, infinity or a negative variance.")
+    rms.mean, rms.var, rms.count = mean.astype(np.float64), var.astype(np.float64), float(count)
