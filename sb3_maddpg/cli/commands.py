@@ -281,6 +281,26 @@ def _parser() -> argparse.ArgumentParser:
 
 
 @contextmanager
+def _present_folder(words: list[str]) -> Iterator[None]:
+    """
+    Import from the present folder if ``--gym-packages`` or ``--env`` names a module that lies there, and only then:
+    what a recipe names is never taken from wherever the user happens to be.
+
+    :param words: arguments of the command
+    """
+    known, _ = common_options().parse_known_args(words)
+    here = Path.cwd()
+    tops = {re.split(r"[./]", name)[0] for name in (*known.gym_packages, known.env or "")} - {""}
+    asked = any((here / f"{top}.py").is_file() or (here / top).is_dir() for top in tops)
+    before = sys.path.copy()
+    sys.path[:] = [path for path in before if path not in ("", str(here))] + [str(here)] * asked
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
+@contextmanager
 def _trust() -> Iterator[None]:
     """Load files that may run code, in this process and in those that it starts."""
     before = os.environ.get(TRUST_VARIABLE)
@@ -298,8 +318,6 @@ def main(argv: list[str] | None = None) -> int:
     :param argv: arguments, those of the command line by default
     :return: exit status, 2 for a mistake in what the user gave
     """
-    if not {"", os.getcwd()} & set(sys.path):  # the script does not see what lies here, `python -m` does
-        sys.path.append(os.getcwd())
     arguments = _parser().parse_args(argv)
     command, rest = arguments.command, arguments.arguments
     debug = arguments.debug or "--debug" in rest
@@ -310,7 +328,7 @@ def main(argv: list[str] | None = None) -> int:
     if {"-h", "--help"} & set(rest):
         print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
     try:
-        with _trust() if trusts else nullcontext():
+        with _present_folder(rest), _trust() if trusts else nullcontext():
             return COMMANDS[command].run(rest)
     except USER_ERRORS as error:
         if debug:

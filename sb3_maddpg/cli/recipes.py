@@ -342,6 +342,9 @@ def policy_class(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | 
     return name if isinstance(name, type) else None
 
 
+_OF_WHICH = "Its package must be installed, or named by --gym-packages where it lies in the present folder."
+
+
 def _replay_buffer(name: str) -> type[ReplayBuffer]:
     """The replay buffer that a recipe names by a dotted path, or as rl_zoo3's recipes do."""
     if name == "HerReplayBuffer":
@@ -351,7 +354,7 @@ def _replay_buffer(name: str) -> type[ReplayBuffer]:
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Give the dotted path of a class, "
-            "such as sb3_maddpg.PrioritizedTeamReplayBuffer."
+            f"such as sb3_maddpg.PrioritizedTeamReplayBuffer. {_OF_WHICH}"
         ) from error
 
 
@@ -366,7 +369,7 @@ def _check_callable(key: str, name: str) -> None:
     try:
         found = get_class_by_name(name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{key}: {name} in the recipe cannot be imported ({error}).") from error
+        raise ValueError(f"{key}: {name} in the recipe cannot be imported ({error}). {_OF_WHICH}") from error
     if not callable(found):
         raise ValueError(f"{key}: {name} in the recipe is no class. Give the dotted path of one.")
 

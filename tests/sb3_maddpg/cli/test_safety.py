@@ -98,3 +98,18 @@ def test_a_model_of_another_algorithm_needs_trust(tmp_path, monkeypatch, capsys)
     assert main(["enjoy", *argv, "-n", "20", "--no-render"]) == 2
     assert "holds pickled values" in capsys.readouterr().err
     assert not Path("caught").exists()
+
+
+def test_a_recipe_names_nothing_of_the_present_folder_unless_asked(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend("")  # as `python -m` does
+    Path("lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\nMine = dict\n")
+    recipe = {"n_timesteps": 60, "policy": "MlpPolicy", "buffer_size": 500, "callback": [{"lurking.Mine": {}}]}
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": recipe}))
+    argv = ["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1"]
+    assert main(argv) == 2
+    assert not Path("caught").exists()
+    assert "lurking.Mine in the recipe cannot be imported" in (told := capsys.readouterr().err)
+    assert "--gym-packages" in told
+    main([*argv, "--gym-packages", "lurking"])
+    assert Path("caught").exists()
