@@ -8,6 +8,7 @@ from sb3_maddpg.callbacks import CurriculumCallback, DashboardCallback, MetricsC
 from sb3_maddpg.env_checker import check_team_env
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.normalization import SafeVecNormalize
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.pretrained_models import pretrained
@@ -25,6 +26,7 @@ __all__ = [
     "MetricsCallback",
     "PairPolicy",
     "PrioritizedTeamReplayBuffer",
+    "SafeVecNormalize",
     "TeamEnv",
     "TeamReplayBuffer",
     "allow_in_files",

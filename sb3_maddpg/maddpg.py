@@ -747,7 +747,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         SB3's ``load``, which runs no code that the file holds unless it is told to.
 
-        :param trust: load pickled values too, which run code: of files written by version 0.1 or ``save(pickle=True)``;
+        :param trust: load pickled values too, which run code: of older files and of those written by ``save(pickle=True)``;
             None: as the environment variable ``SB3_MADDPG_TRUST`` says, 1 for yes
         :raises ValueError: no model of this algorithm, a damaged one, or pickled values without ``trust``
         """
@@ -887,7 +887,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         SB3's ``load_replay_buffer``, which runs no code that the file holds unless it is told to.
 
-        :param trust: load a pickled buffer, which runs code, as version 0.1 and other algorithms write it, see ``load``
+        :param trust: load a pickled buffer, which runs code, as older versions and other algorithms write it, see ``load``
         :raises ValueError: a buffer of another kind, team or number of environments, or a pickled one without
             ``trust``; the present one stays then
         """

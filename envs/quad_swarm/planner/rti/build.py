@@ -84,7 +84,7 @@ def build(model: str, precision: str) -> Path:
     if _is_whole(library):
         return library
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         _remove_leftovers(directory)
         # In the cache's own file system, so that the finished library appears there in one step.
         with tempfile.TemporaryDirectory(dir=directory, prefix="building-", ignore_cleanup_errors=True) as folder:
@@ -100,7 +100,7 @@ def build(model: str, precision: str) -> Path:
                 os.replace(checksum, _checksum_file(library))
     except OSError as error:
         raise BuildError(
-            f"cannot write to the cache {directory} ({error.strerror or error}); "
+            f"cannot write to the cache {directory} ({error.strerror or error}), or what lies there is another user's; "
             "name a writable directory in QUAD_SWARM_CACHE"
         ) from error
     return library
@@ -141,8 +141,11 @@ def _checksum_file(library: Path) -> Path:
 
 
 def _is_whole(library: Path) -> bool:
-    """Whether the library is there and has the checksum with which it was made."""
+    """Whether the library is there, has the checksum with which it was made, and was put there by this user or the
+    system's: it is code that will run."""
     try:
+        if hasattr(os, "getuid") and library.stat().st_uid not in (os.getuid(), 0):
+            return False
         expected = _checksum_file(library).read_text(encoding="utf-8")
         return hashlib.sha256(library.read_bytes()).hexdigest() == expected.strip()
     except (OSError, UnicodeDecodeError):

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import pickle
 import shutil
+import stat
 import subprocess
 import sys
 import warnings
@@ -198,6 +199,15 @@ def test_a_damaged_library_is_compiled_again(damage, stub_compiler):
     assert build_module.build("model", "float32") == library
     assert library.read_bytes() == content
     assert build_module._is_whole(library)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_library_of_another_user_is_not_loaded(stub_compiler, monkeypatch):
+    library = build_module.build("model", "float32")
+    assert stat.S_IMODE(library.parent.stat().st_mode) & 0o022 == 0
+    owner = library.stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    assert build_module._is_whole(library) == (owner == 0), "of the system's user, or of nobody that is known"
 
 
 @pytest.mark.parametrize("kind", ["absent", "misnamed", "failing"])
