@@ -12,6 +12,7 @@ from pydantic import PositiveInt
 
 from quad_swarm.errors import unknown_name
 from quad_swarm.interfaces.shared import TaskAttributes, checked_options, checked_seed, need_reset, request_matrices
+from quad_swarm.states import generator_of, generator_state, like
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import checked_arguments
 
@@ -174,6 +175,25 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         if self.render_mode == "human":
             self.render()
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
+
+    def state_dict(self) -> dict[str, Any]:
+        """All of the present state, plain numbers and arrays, see `load_state_dict`."""
+        return {
+            "task": self.task.state_dict(),
+            "requests": self._requests.copy(),
+            "is_reset": self._is_reset,
+            "generator": generator_state(self.np_random),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what `state_dict` of an environment with the same arguments gave, bit for bit.
+
+        :raises ValueError: the state of another environment
+        """
+        self.task.load_state_dict(state["task"])
+        self._requests = like(self._requests, state["requests"], "requests")
+        self._is_reset = bool(state["is_reset"])
+        self.np_random = generator_of(state["generator"])
 
     def render(self) -> Any:
         """The present step as an image, (480, 640, 3) uint8; in the mode "human" it is shown in a window instead.

@@ -57,6 +57,15 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         self.agents = list(self.possible_agents)
         return self._rows(observation), {agent: dict(info) for agent in self.agents}
 
+    def state_dict(self) -> dict[str, Any]:
+        """See `QuadSwarmEnv.state_dict`."""
+        return {"team": self.team.state_dict(), "agents": list(self.agents), "is_reset": self._is_reset}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `QuadSwarmEnv.load_state_dict`."""
+        self.team.load_state_dict(state["team"])
+        self.agents, self._is_reset = list(state["agents"]), bool(state["is_reset"])
+
     def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
         """See `QuadSwarmEnv.step`; once the episode is over there are no agents left, and all five are empty.
 

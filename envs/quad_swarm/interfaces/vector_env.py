@@ -14,6 +14,7 @@ from pydantic import Field
 
 from quad_swarm.errors import shown
 from quad_swarm.interfaces.shared import TaskAttributes, checked_options, checked_seed, need_reset, request_matrices
+from quad_swarm.states import generator_of, generator_state
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import checked_arguments
 
@@ -95,6 +96,20 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
             observations = observations.copy()
             observations[done] = self.task.observe(done)
         return observations, outcome.reward, outcome.terminated, outcome.truncated, infos
+
+    def state_dict(self) -> dict[str, Any]:
+        """All of the present state, plain numbers and arrays, see `load_state_dict`."""
+        return {"task": self.task.state_dict(), "generators": [generator_state(rng) for rng in self._rngs]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what `state_dict` of an environment with the same arguments gave, bit for bit.
+
+        :raises ValueError: the state of another environment
+        """
+        if len(state["generators"]) not in (0, self.num_envs):
+            raise ValueError(f"The state is of {len(state['generators'])} swarms, these are {self.num_envs}.")
+        self.task.load_state_dict(state["task"])
+        self._rngs = [generator_of(one) for one in state["generators"]]
 
     def render(self) -> Any:
         """Refused: the vector environment draws nothing.

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from quad_swarm.planner import PlanStatus
+from quad_swarm.states import like
 from quad_swarm.world.beliefs import BeliefSource
 from quad_swarm.world.messages import REQUEST_BYTES, plan_bytes
 from quad_swarm.world.presets import SwarmConfig
@@ -99,6 +102,15 @@ class EpisodeStatistics:
         """Drop all but the given swarms (mask)."""
         for name in self._START:
             setattr(self, name, getattr(self, name)[swarms])
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """All figures by name."""
+        return {name: getattr(self, name).copy() for name in self._START}
+
+    def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on from what `state_dict` gave."""
+        for name in self._START:
+            setattr(self, name, like(getattr(self, name), state[name], name))
 
     def add(self, report: StepReport, n_requests: np.ndarray, collided: np.ndarray) -> None:
         """Count one step.

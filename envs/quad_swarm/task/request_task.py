@@ -166,6 +166,25 @@ class RequestTask:
         fork.scenario = list(self.scenario)
         return fork
 
+    def state_dict(self) -> dict[str, Any]:
+        """All of the present state, see `Swarm.state_dict`."""
+        return {
+            "swarm": self.swarm.state_dict(),
+            "statistics": self.statistics.state_dict(),
+            "scenario": list(self.scenario),
+            "level": self.sampler.level,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state_dict` of the same task gave, bit for bit.
+
+        :raises ValueError: the state of another task
+        """
+        self.swarm.load_state_dict(state["swarm"])
+        self.statistics.load_state_dict(state["statistics"])
+        self.scenario = list(state["scenario"])
+        self.sampler.set_level(state["level"])
+
     def observe(self, swarms: np.ndarray | None = None) -> np.ndarray:
         """What every robot observes, (E, n, observation_size) float32; of some swarms only if there is a mask."""
         return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))

@@ -9,12 +9,14 @@ ascending order.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from quad_swarm.geometry import length
+from quad_swarm.states import like
 
 _FEW = 600  # numbers, below which arranging them takes longer than what is saved
 
@@ -134,6 +136,19 @@ class Beliefs:
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (indices or mask)."""
         self._remembered, self._age = self._remembered[swarms], self._age[swarms]
+        self._known = None
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """What is remembered, see `load_state_dict`."""
+        return {"remembered": self._remembered.copy(), "age": self._age.copy()}
+
+    def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on from what `state_dict` gave.
+
+        :raises ValueError: the state of other teams
+        """
+        self._remembered = like(self._remembered, state["remembered"], "remembered plans")
+        self._age = like(self._age, state["age"], "ages of plans")
         self._known = None
 
     def predict(self, pos: np.ndarray, vel: np.ndarray) -> Prediction:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from copy import copy, deepcopy
+from typing import Any
 
 import numpy as np
 
 from quad_swarm.quadrotor import N_STATES, VEHICLE_PARAMETERS
+from quad_swarm.states import generator_of, generator_state, like
 from quad_swarm.world.presets import SwarmConfig
 
 OUTAGE_WITHIN = 5.0  # s, of an episode: when robots stop answering
@@ -98,6 +101,20 @@ class Realisation:
             setattr(fork, name, getattr(self, name).copy())
         fork._rngs = deepcopy(self._rngs)
         return fork
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is drawn and what draws on, see `load_state_dict`."""
+        arrays = {name.lstrip("_"): getattr(self, name).copy() for name in self._ARRAYS}
+        return {**arrays, "generators": [generator_state(rng) for rng in self._rngs]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state_dict` gave.
+
+        :raises ValueError: the state of other teams
+        """
+        for name in self._ARRAYS:
+            setattr(self, name, like(getattr(self, name), state[name.lstrip("_")], name.lstrip("_")))
+        self._rngs = [generator_of(one) for one in state["generators"]]
 
     def estimate(self, state: np.ndarray) -> np.ndarray:
         """Where robots take themselves to be, (E, n, 9)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -11,7 +12,9 @@ import numpy as np
 from quad_swarm.errors import shown
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
+from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
+from quad_swarm.states import like
 from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, advance, answered, other_indices, resampled
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
@@ -193,6 +196,47 @@ class Swarm:
         fork = self.part(np.ones(self.n_swarms, dtype=bool))
         fork.chance = self.chance.fork()
         return fork
+
+    def state_dict(self) -> dict[str, Any]:
+        """All of the present state, see `load_state_dict`: plain numbers and arrays.
+
+        :raises ValueError: a foreign simulator flies, whose state nobody can read
+        """
+        if self.config.plant != MODEL:
+            raise ValueError(f"plant={self.config.plant!r} keeps its state to itself: only plant={MODEL!r} tells it.")
+        presumed = None if self.presumed_beliefs is self.beliefs else self.presumed_beliefs.state_dict()
+        return {
+            "state": self.state.copy(),
+            "goal": self.goal.copy(),
+            "input": self._u.copy(),
+            "plans": {name: field.copy() for name, field in self._plans._asdict().items()},
+            "earlier": [plans.copy() for plans in self._earlier],
+            "beliefs": self.beliefs.state_dict(),
+            "presumed_beliefs": presumed,
+            "chance": self.chance.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state_dict` of a swarm of the same world gave, bit for bit.
+
+        :raises ValueError: the state of other swarms
+        """
+        self.state = like(self.state, state["state"], "state")
+        self.goal = like(self.goal, state["goal"], "goal")
+        self._u = like(self._u, state["input"], "input")
+        plans = state["plans"]
+        self._plans = Plans(
+            **{name: like(one, plans[name], f"plans.{name}") for name, one in self._plans._asdict().items()}
+        )
+        if len(state["earlier"]) != len(self._earlier):
+            raise ValueError(f"The state holds {len(state['earlier'])} earlier plans, this world {len(self._earlier)}.")
+        self._earlier = [
+            like(mine, one, "earlier plans") for mine, one in zip(self._earlier, state["earlier"], strict=True)
+        ]
+        self.beliefs.load_state_dict(state["beliefs"])
+        if self.presumed_beliefs is not self.beliefs:
+            self.presumed_beliefs.load_state_dict(state["presumed_beliefs"])
+        self.chance.load_state_dict(state["chance"])
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let every robot ask, plan and fly for one step.
