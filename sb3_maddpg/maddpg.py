@@ -747,8 +747,8 @@ class MADDPG(OffPolicyAlgorithm):
         """
         SB3's ``load``, which runs no code that the file holds unless it is told to.
 
-        :param trust: load pickled values too, which run code: of older files and of those written by ``save(pickle=True)``;
-            None: as the environment variable ``SB3_MADDPG_TRUST`` says, 1 for yes
+        :param trust: load pickled values too, which run code, of older files and those of ``save(pickle=True)``; None:
+            as the environment variable ``SB3_MADDPG_TRUST`` says, 1 for yes
         :raises ValueError: no model of this algorithm, a damaged one, or pickled values without ``trust``
         """
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
@@ -887,7 +887,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         SB3's ``load_replay_buffer``, which runs no code that the file holds unless it is told to.
 
-        :param trust: load a pickled buffer, which runs code, as older versions and other algorithms write it, see ``load``
+        :param trust: load a pickled buffer, which runs code, as older versions write it, see ``load``
         :raises ValueError: a buffer of another kind, team or number of environments, or a pickled one without
             ``trust``; the present one stays then
         """

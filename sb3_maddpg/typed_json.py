@@ -15,6 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common import buffers, noise, torch_layers, utils
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
@@ -24,6 +25,7 @@ from sb3_maddpg.utils import shown, suggest
 Json = Any
 _TYPE = "$"
 _DEEPEST = 50
+_SMALL = 64  # numbers that stay in the JSON where larger arrays may stand outside
 _LARGEST_ARRAY = 10**7  # numbers, of a space's bounds for example
 
 _Class = TypeVar("_Class", bound=type)
@@ -33,6 +35,7 @@ _PLAIN_OBJECTS = (
     utils.ConstantSchedule,
     utils.LinearSchedule,
     utils.FloatSchedule,
+    RunningMeanStd,
     noise.NormalActionNoise,
     noise.OrnsteinUhlenbeckActionNoise,
     noise.VectorizedActionNoise,
@@ -57,25 +60,27 @@ def allow_in_files(cls: _Class) -> _Class:
     return cls
 
 
-def encode(value: Any, name: str) -> Json:
+def encode(value: Any, name: str, arrays: dict[str, np.ndarray] | None = None) -> Json:
     """
     :param value: of a model
     :param name: what it is, for a message
+    :param arrays: takes in larger arrays, which the JSON then only names; otherwise it holds them
     :return: the same in JSON's types
     :raises ValueError: no such thing can be written
     """
-    return _encode(value, name, 0)
+    return _encode(value, name, 0, arrays)
 
 
-def decode(value: Json, name: str) -> Any:
+def decode(value: Json, name: str, arrays: Mapping[str, np.ndarray] | None = None) -> Any:
     """
     :param value: what ``encode`` made, or anything
     :param name: what it is, for a message
+    :param arrays: those that ``encode`` took out
     :return: the value
     :raises ValueError: it names an unknown type or class, or holds what that type cannot be made of
     """
     try:
-        return _decode(value, 0)
+        return _decode(value, 0, arrays or {})
     except (
         TypeError,
         KeyError,
@@ -285,9 +290,9 @@ def _torch_dtype(name: str) -> th.dtype:
     return dtype
 
 
-def _encode(value: Any, name: str, depth: int) -> Json:
+def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | None = None) -> Json:
     def part(one: Any) -> Json:
-        return _encode(one, name, depth + 1)
+        return _encode(one, name, depth + 1, arrays)
 
     if depth > _DEEPEST:
         raise ValueError(f"{name} cannot be saved: it is nested more than {_DEEPEST} levels deep.")
@@ -297,6 +302,9 @@ def _encode(value: Any, name: str, depth: int) -> Json:
         return [part(one) for one in value]
     if type(value) is dict and all(isinstance(key, str) for key in value) and _TYPE not in value:
         return {key: part(one) for key, one in value.items()}
+    if arrays is not None and isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.size > _SMALL:
+        arrays[key := str(len(arrays))] = value
+        return {_TYPE: "outside", "key": key}
     if isinstance(value, TrainFreq):
         return {_TYPE: "TrainFreq", "frequency": value.frequency, "unit": value.unit.value}
     if isinstance(value, type) and _known_class(value):
@@ -315,9 +323,9 @@ def _encode(value: Any, name: str, depth: int) -> Json:
     )
 
 
-def _decode(value: Json, depth: int) -> Any:
+def _decode(value: Json, depth: int, arrays: Mapping[str, np.ndarray]) -> Any:
     def part(one: Json) -> Any:
-        return _decode(one, depth + 1)
+        return _decode(one, depth + 1, arrays)
 
     if depth > _DEEPEST:
         raise ValueError(f"it is nested more than {_DEEPEST} levels deep")
@@ -328,6 +336,8 @@ def _decode(value: Json, depth: int) -> Any:
     if _TYPE not in value:
         return {key: part(one) for key, one in value.items()}
     kind = value[_TYPE]
+    if kind == "outside":
+        return arrays[value["key"]]
     if kind == "TrainFreq":
         return TrainFreq(value["frequency"], TrainFrequencyUnit(value["unit"]))
     if kind == "class":
@@ -335,5 +345,5 @@ def _decode(value: Json, depth: int) -> Any:
     if kind == "object":
         return _object_of(value, part)
     if not isinstance(kind, str) or kind not in _CODECS:
-        raise ValueError(suggest("type", kind, [*_CODECS, "TrainFreq", "class", "object"]))
+        raise ValueError(suggest("type", kind, [*_CODECS, "TrainFreq", "class", "object", "outside"]))
     return _CODECS[kind].read(value, part)

@@ -132,8 +132,9 @@ def rows_of(family: str, setting: str, flown: Flown, safe: bool | None) -> list[
 
 
 def share(flown: Flown) -> float:
-    """Mean share of requests in both swaps of eight robots."""
-    return sum(summarise(flown[cell], world(PRESET))["request_share"] for cell in OWN_SWAPS) / len(OWN_SWAPS)
+    """Mean share of requests in the swaps of eight robots, as far as they were flown."""
+    shares = [summarise(flown[cell], world(PRESET))["request_share"] for cell in OWN_SWAPS if cell in flown]
+    return sum(shares) / len(shares)
 
 
 def fly_full(pool: Executor, path: Path, stages: Sequence[int]) -> Flown:

@@ -120,6 +120,10 @@ def test_thresholds_are_tried_from_the_highest_on_each_model_by_itself(flown, tm
     assert settings(tmp_path / "t.json") == {"a.zip@0.9": True, "bad.zip@0.9": False, "bad.zip@0.8": False}
 
 
+def test_requests_are_told_of_rules_that_fail_in_the_first_cell(flown):
+    assert tune_flight.share({tune_flight.OWN_SWAPS[0]: [{"requests": 0.25}]}) == 0.25
+
+
 def test_full_communication_is_flown_once(flown, tmp_path):
     stages = (5, 10)
     full = tune_flight.fly_full(Inline(), tmp_path / "t.json", stages)
