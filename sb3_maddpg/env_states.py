@@ -138,6 +138,7 @@ def _take(owner: Any, state: dict[str, Any]) -> None:
 
 # What is no state, or is told elsewhere
 _NOT_STATE = {"metadata", "render_mode", "spec", "class_attributes", "t_start", "num_envs", "n_envs"}
+_NOT_STATE |= {"model", "parent", "locals", "globals", "logger", "training_env", "eval_env", "callback", "callbacks"}
 
 
 def plain_values(owner: Any) -> dict[str, Any]:
@@ -150,7 +151,7 @@ def plain_values(owner: Any) -> dict[str, Any]:
         if name in _NOT_STATE or isinstance(value, (spaces.Space, type)):
             continue
         try:
-            encode(value, name)
+            encode(value, name, {})
         except ValueError:
             continue
         found[name] = value

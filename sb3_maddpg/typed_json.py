@@ -290,18 +290,8 @@ def _torch_dtype(name: str) -> th.dtype:
     return dtype
 
 
-def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | None = None) -> Json:
-    def part(one: Any) -> Json:
-        return _encode(one, name, depth + 1, arrays)
-
-    if depth > _DEEPEST:
-        raise ValueError(f"{name} cannot be saved: it is nested more than {_DEEPEST} levels deep.")
-    if value is None or type(value) in (bool, int, str) or (type(value) is float and math.isfinite(value)):
-        return value
-    if type(value) is list:
-        return [part(one) for one in value]
-    if type(value) is dict and all(isinstance(key, str) for key in value) and _TYPE not in value:
-        return {key: part(one) for key, one in value.items()}
+def _encode_special(value: Any, arrays: dict[str, np.ndarray] | None) -> Json:
+    """What is written without its parts: arrays that stand outside, classes, and a tuple with a meaning."""
     if arrays is not None and isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.size > _SMALL:
         arrays[key := str(len(arrays))] = value
         return {_TYPE: "outside", "key": key}
@@ -309,6 +299,27 @@ def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | N
         return {_TYPE: "TrainFreq", "frequency": value.frequency, "unit": value.unit.value}
     if isinstance(value, type) and _known_class(value):
         return {_TYPE: "class", "name": _name(value)}
+    return None
+
+
+def _is_json(value: Any) -> bool:
+    return value is None or type(value) in (bool, int, str) or (type(value) is float and math.isfinite(value))
+
+
+def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | None = None) -> Json:
+    def part(one: Any) -> Json:
+        return _encode(one, name, depth + 1, arrays)
+
+    if depth > _DEEPEST:
+        raise ValueError(f"{name} cannot be saved: it is nested more than {_DEEPEST} levels deep.")
+    if _is_json(value):
+        return value
+    if type(value) is list:
+        return [part(one) for one in value]
+    if type(value) is dict and all(isinstance(key, str) for key in value) and _TYPE not in value:
+        return {key: part(one) for key, one in value.items()}
+    if (special := _encode_special(value, arrays)) is not None:
+        return special
     if _name(type(value)) == "rl_zoo3.utils.SimpleLinearSchedule":  # in older files; to read it would take rl_zoo3
         value = utils.LinearSchedule(value.initial_value, 0.0, 1.0)
     for kind, codec in _CODECS.items():

@@ -1,0 +1,484 @@
+"""Checkpoints of a run: all that a training goes on from, bit for bit, and committed whole or not at all.
+
+A checkpoint is a folder ``checkpoint-STEPS`` with the model, the state of everything around it, and the names of the
+segments that hold the replay buffer. Segments lie beside the checkpoints and are written once: a checkpoint adds the
+transitions since the one before. A folder is written under another name, every file of it is synced, a manifest with
+their checksums comes last, and renaming the folder commits it.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import platform
+import random
+import shutil
+import time
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import stable_baselines3 as sb3
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_maddpg.buffers import TeamReplayBuffer
+from sb3_maddpg.env_states import (
+    NoStateError,
+    load_vec_env_state,
+    plain_values,
+    set_plain_values,
+    set_space_generators,
+    space_generators,
+    vec_env_state,
+)
+from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.typed_json import decode, encode
+from sb3_maddpg.utils import shown
+
+_FORMAT = 1
+_PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
+_SEGMENTS = "segments"
+# Called with the name of each moment at which a kill might hurt; tests put something here that kills
+fault: Callable[[str], None] = lambda point: None  # noqa: E731
+_LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
+_LOGGED = ("name_to_value", "name_to_count", "name_to_excluded")
+
+
+class RunCheckpoint(BaseCallback):
+    """
+    Writes checkpoints while a model learns, between rollouts. ``resume`` goes on from the newest.
+
+    :param folder: for the checkpoints, of this run alone
+    :param every: steps from one to the next
+    :param keep: how many of the newest stay
+    :param verbose: 1 says what is written
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], every: int, keep: int = 2, verbose: int = 0):
+        super().__init__(verbose)
+        if every < 1 or keep < 1:
+            raise ValueError(f"every={every}, keep={keep}: both must be at least 1.")
+        self.folder, self.every, self.keep = Path(folder), every, keep
+        self.saved_at = 0
+        self.inexact: str | None = None
+        self._pending: dict[str, Any] | None = None
+        self._segments: list[dict[str, Any]] = []
+
+    def _on_training_start(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for path in self.folder.glob(f"*{_UNFINISHED}"):
+            shutil.rmtree(path, ignore_errors=True)
+        if self._pending is not None:
+            _restore(cast(MADDPG, self.model), _callbacks(self._root()), self._pending)
+            self._pending = None
+        else:
+            self.saved_at = self.model.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps - self.saved_at >= self.every:
+            self.save()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def save(self) -> Path | None:
+        """
+        Write a checkpoint now; only between rollouts is all of one moment.
+
+        :return: its folder, None where the disk is full: then the one before stays
+        """
+        model = cast(MADDPG, self.model)
+        steps = model.num_timesteps
+        self.saved_at = steps
+        started = time.perf_counter()
+        try:
+            segments = self._write_segments(model)
+            state = _state_of(model, _callbacks(self._root()))
+            self.inexact = state["inexact"]
+            target = _commit(self.folder / f"{_PREFIX}{steps:012d}", lambda path: _write(path, model, state, segments))
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            warnings.warn(f"No space for a checkpoint at step {steps}: the last one stays ({error}).", stacklevel=2)
+            for path in self.folder.glob(f"*{_UNFINISHED}"):
+                shutil.rmtree(path, ignore_errors=True)
+            return None
+        self._segments = segments
+        self._tidy()
+        if self.verbose:
+            print(f"Checkpoint at step {steps} in {time.perf_counter() - started:.2f} s: {target}")
+        return target
+
+    def _root(self) -> BaseCallback:
+        root: BaseCallback = self
+        while root.parent is not None:
+            root = root.parent
+        # A CallbackList is no parent of its callbacks, but learn() knows it
+        return self.locals.get("callback", root)
+
+    def _write_segments(self, model: MADDPG) -> list[dict[str, Any]]:
+        """Write the transitions since the last checkpoint, and the one before, whose end may have changed.
+
+        :return: the segments that hold the buffer, the oldest first
+        """
+        buffer = model.replay_buffer
+        assert isinstance(buffer, TeamReplayBuffer)
+        oldest, end = buffer.n_added - buffer.size(), buffer.n_added
+        kept = [one for one in self._segments if one["end"] > oldest and one["end"] <= end]
+        first = max(kept[-1]["end"] - 1 if kept else oldest, oldest)
+        rows = np.arange(first, end + int(buffer.optimize_memory_usage)) % buffer.buffer_size
+        name = f"{first:012d}-{end:012d}.rows"
+        path = self.folder / _SEGMENTS / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        content = buffer.records[rows].tobytes()
+        _write_synced(path, content)
+        _sync_folder(path.parent)
+        return [*kept, {"name": name, "first": first, "end": end, "sha256": hashlib.sha256(content).hexdigest()}]
+
+    def _tidy(self) -> None:
+        """Remove what no checkpoint that stays needs."""
+        folders = _finished(self.folder)
+        for path in folders[: -self.keep]:
+            shutil.rmtree(path, ignore_errors=True)
+        needed: set[str] = set()
+        for path in folders[-self.keep :]:
+            with suppress(OSError, ValueError, KeyError, TypeError):
+                needed |= {one["name"] for one in json.loads((path / "state.json").read_text())["segments"]}
+        for path in (self.folder / _SEGMENTS).glob("*.rows"):
+            if path.name not in needed:
+                path.unlink(missing_ok=True)
+
+
+def resume(
+    folder: str | os.PathLike[str],
+    env: GymEnv,
+    algorithm: type[MADDPG] = MADDPG,
+    every: int | None = None,
+    keep: int = 2,
+    device: th.device | str = "auto",
+) -> tuple[MADDPG, RunCheckpoint] | None:
+    """
+    A model and the callback with which it goes on: ``model.learn(total_timesteps - model.num_timesteps, [callback,
+    ...], reset_num_timesteps=False)``, with an environment and callbacks made as they were for the run.
+
+    :param folder: of the checkpoints
+    :param env: made as for the run
+    :param algorithm: of the run
+    :param every: steps from one checkpoint to the next; as before unless given
+    :param keep: see ``RunCheckpoint``
+    :param device: see ``MADDPG.load``
+    :return: None where there is no whole checkpoint
+    :raises ValueError: another environment than the run's
+    """
+    path = newest(folder)
+    if path is None:
+        return None
+    arrays, state = _read_state(path)
+    plain = decode(state, f"{path}: state", arrays)
+    _compare_fingerprints(plain["fingerprint"])
+    model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
+    callback = RunCheckpoint(folder, every or plain["every"], keep)
+    buffer = model.replay_buffer
+    assert isinstance(buffer, TeamReplayBuffer)
+    _read_segments(Path(folder), buffer, plain["segments"], plain["counters"])
+    buffer.restore(plain["counters"], {**_columns(buffer), **plain["buffer_arrays"]})
+    callback._segments = plain["segments"]
+    callback._pending = plain
+    callback.saved_at = model.num_timesteps
+    return model, callback
+
+
+def newest(folder: str | os.PathLike[str]) -> Path | None:
+    """
+    :param folder: of checkpoints
+    :return: the newest that is whole, with all its segments; one that is not is passed over with a warning
+    """
+    for path in reversed(_finished(Path(folder))):
+        if problem := _damage(path):
+            warnings.warn(f"{path} is passed over: {problem}.", stacklevel=2)
+        else:
+            return path
+    return None
+
+
+@contextmanager
+def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """
+    Keep a folder of checkpoints for this process; the lock ends with it, however it ends.
+
+    :param folder: of the checkpoints
+    :raises ValueError: another process has it
+    """
+    import fcntl
+
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    with (path / "lock").open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.seek(0)
+            raise ValueError(f"{path} is in use by {file.read().strip() or 'another process'}.") from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}")
+        file.flush()
+        yield
+
+
+def digest(model: MADDPG) -> str:
+    """
+    :param model: a model with its replay buffer
+    :return: SHA-256 of parameters, optimizers, replay buffer, counters and random generators
+    """
+    found = hashlib.sha256()
+    for leaf in th.utils._pytree.tree_leaves(model.get_parameters()):
+        found.update(leaf.cpu().numpy().tobytes() if isinstance(leaf, th.Tensor) else repr(leaf).encode())
+    assert isinstance(model.replay_buffer, TeamReplayBuffer)
+    _, counters, arrays = model.replay_buffer.contents()
+    for array in arrays.values():
+        found.update(np.ascontiguousarray(array).tobytes())
+    generators = _random_state()
+    text = json.dumps(encode([counters, model.num_timesteps, model._n_updates, generators], "state"), sort_keys=True)
+    found.update(text.encode())
+    return found.hexdigest()
+
+
+def _state_of(model: MADDPG, callbacks: list[BaseCallback]) -> dict[str, Any]:
+    """All that is not in the model's file."""
+    buffer = model.replay_buffer
+    assert isinstance(buffer, TeamReplayBuffer)
+    _, counters, arrays = buffer.contents()
+    for name in buffer.records.dtype.names or ():  # in the segments
+        del arrays[name]
+    inexact, env = _env_state_or_reason(cast(VecEnv, model.env))
+    states = []
+    for one in callbacks:
+        evaluation = None
+        if isinstance(other := getattr(one, "eval_env", None), VecEnv):
+            reason, evaluation = _env_state_or_reason(other)
+            inexact = inexact or reason
+        values = plain_values(one) if not isinstance(one, RunCheckpoint) else {"n_calls": one.n_calls}
+        states.append({"class": type(one).__name__, "values": values, "eval_env": evaluation})
+    return {
+        "format": _FORMAT,
+        "fingerprint": fingerprint(),
+        "inexact": inexact,
+        "every": next(one.every for one in callbacks if isinstance(one, RunCheckpoint)),
+        "counters": counters,
+        "buffer_arrays": {
+            name: array for name, array in arrays.items() if name not in (buffer.records.dtype.names or ())
+        },
+        "last": {name: getattr(model, name) for name in _LAST},
+        "action_noise": model.action_noise,
+        "random": _random_state(),
+        "spaces": space_generators(model.action_space),
+        "env": env,
+        "callbacks": states,
+        "logger": {name: dict(getattr(model.logger, name)) for name in _LOGGED},
+    }
+
+
+def _env_state_or_reason(env: VecEnv) -> tuple[str | None, dict[str, Any] | None]:
+    try:
+        return None, vec_env_state(env)
+    except NoStateError as error:
+        return str(error), None
+
+
+def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]) -> None:
+    """Everything but the networks and the replay buffer, when learn() has begun."""
+    env = cast(VecEnv, model.env)
+    if state["env"] is None:
+        warnings.warn(
+            f"{state['inexact']} The run goes on with new episodes, and not exactly as it would have.", stacklevel=2
+        )
+        model._last_obs = env.reset()  # type: ignore[assignment]
+        model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
+    else:
+        load_vec_env_state(env, state["env"])
+        for name, value in state["last"].items():
+            setattr(model, name, value)
+    model.action_noise = state["action_noise"]
+    names = [type(one).__name__ for one in callbacks]
+    if names != [one["class"] for one in state["callbacks"]]:
+        written = [one["class"] for one in state["callbacks"]]
+        raise ValueError(f"The run had the callbacks {written}, these are {names}: resume with the same.")
+    for one, saved in zip(callbacks, state["callbacks"], strict=True):
+        set_plain_values(one, saved["values"])
+        if saved["eval_env"] is not None:
+            load_vec_env_state(one.eval_env, saved["eval_env"])  # type: ignore[attr-defined]
+    for name, values in state["logger"].items():
+        getattr(model.logger, name).update(values)
+    set_space_generators(model.action_space, state["spaces"])
+    _set_random_state(state["random"])
+
+
+def _random_state() -> dict[str, Any]:
+    version, numbers, gauss = random.getstate()
+    cuda = [one.numpy() for one in th.cuda.get_rng_state_all()] if th.cuda.is_available() else []
+    return {
+        "python": [version, list(numbers), gauss],
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - what SB3 draws from
+        "torch": th.get_rng_state().numpy(),
+        "cuda": cuda,
+    }
+
+
+def _set_random_state(state: dict[str, Any]) -> None:
+    version, numbers, gauss = state["python"]
+    random.setstate((version, tuple(numbers), gauss))
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    th.set_rng_state(th.from_numpy(state["torch"].copy()))
+    if state["cuda"] and th.cuda.is_available():
+        th.cuda.set_rng_state_all([th.from_numpy(one.copy()) for one in state["cuda"]])
+
+
+def _callbacks(root: BaseCallback) -> list[BaseCallback]:
+    """A callback and all that it calls."""
+    inner: list[BaseCallback | None] = []
+    if isinstance(root, CallbackList):
+        inner = [*root.callbacks]
+    elif isinstance(root, EventCallback):
+        inner = [root.callback, getattr(root, "callback_on_new_best", None)]
+    return [root, *(one for callback in inner if callback is not None for one in _callbacks(callback))]
+
+
+def fingerprint() -> dict[str, str]:
+    """
+    :return: what the bits of a training depend on beside its settings
+    """
+    return {
+        "processor": f"{platform.machine()} {platform.processor()} {th.backends.cpu.get_cpu_capability()}",
+        "system": platform.platform(terse=True),
+        "python": platform.python_version(),
+        "torch": str(th.__version__),
+        "numpy": np.__version__,
+        "stable-baselines3": sb3.__version__,
+        "threads": str(th.get_num_threads()),
+    }
+
+
+def _compare_fingerprints(written: dict[str, str]) -> None:
+    here = fingerprint()
+    differ = [
+        f"{name}: {written.get(name)} then, {value} now" for name, value in here.items() if written.get(name) != value
+    ]
+    if differ:
+        warnings.warn(f"The run goes on, but not bit for bit as it would have: {'; '.join(differ)}.", stacklevel=3)
+
+
+def _columns(buffer: TeamReplayBuffer) -> dict[str, np.ndarray]:
+    used = buffer.records[: buffer.size() + int(buffer.optimize_memory_usage)]
+    return {name: used[name] for name in buffer.records.dtype.names or ()}
+
+
+def _read_segments(
+    folder: Path, buffer: TeamReplayBuffer, segments: list[dict[str, Any]], counters: dict[str, Any]
+) -> None:
+    buffer.pos, buffer.full = counters["pos"], counters["full"]
+    for one in segments:
+        content = (folder / _SEGMENTS / one["name"]).read_bytes()
+        rows = np.frombuffer(content, buffer.records.dtype).reshape(-1, buffer.n_envs)
+        buffer.records[np.arange(one["first"], one["first"] + len(rows)) % buffer.buffer_size] = rows
+
+
+def _write(path: Path, model: MADDPG, state: dict[str, Any], segments: list[dict[str, Any]]) -> None:
+    with (path / "model.zip").open("wb") as file:
+        model.save(file)
+    arrays: dict[str, np.ndarray] = {}
+    text = json.dumps(encode({**state, "segments": segments}, "state", arrays))
+    (path / "state.json").write_text(text)
+    with zipfile.ZipFile(path / "arrays.npz", "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    state = json.loads((path / "state.json").read_text())
+    if not isinstance(state, dict) or state.get("format") != _FORMAT:
+        raise ValueError(f"{path} has format {shown(state.get('format'))}, this version reads {_FORMAT}.")
+    with np.load(path / "arrays.npz", allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}, state
+
+
+def _commit(target: Path, write: Callable[[Path], None]) -> Path:
+    """Write a folder that appears whole or not at all."""
+    unfinished = target.with_name(target.name + _UNFINISHED)
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    fault("begin")
+    write(unfinished)
+    sums = {}
+    for path in sorted(unfinished.iterdir()):
+        fault(f"written {path.name}")
+        _sync(path)
+        sums[path.name] = _sha256(path)
+        fault(f"synced {path.name}")
+    _write_synced(unfinished / _MANIFEST, json.dumps(sums).encode())
+    fault("manifest")
+    _sync_folder(unfinished)
+    fault("folder synced")
+    shutil.rmtree(target, ignore_errors=True)
+    os.rename(unfinished, target)
+    fault("renamed")
+    _sync_folder(target.parent)
+    fault("committed")
+    return target
+
+
+def _damage(path: Path) -> str | None:
+    """What is wrong with a checkpoint."""
+    try:
+        for name, expected in json.loads((path / _MANIFEST).read_text()).items():
+            if _sha256(path / name) != expected:
+                return f"{name} is damaged"
+        for one in json.loads((path / "state.json").read_text())["segments"]:
+            if _sha256(path.parent / _SEGMENTS / one["name"]) != one["sha256"]:
+                return f"segment {one['name']} is damaged"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def _finished(folder: Path) -> list[Path]:
+    found = (path for path in folder.glob(f"{_PREFIX}*") if path.name.removeprefix(_PREFIX).isdigit())
+    return sorted(found, key=lambda path: int(path.name.removeprefix(_PREFIX)))
+
+
+def _sha256(path: Path) -> str:
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(2**20):
+            found.update(block)
+    return found.hexdigest()
+
+
+def _write_synced(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        fault(f"opened {path.name.rpartition('.')[2]}")
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync(path: Path) -> None:
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def _sync_folder(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
