@@ -1,0 +1,285 @@
+"""Checkpoints: a run that is killed at any moment goes on bit for bit."""
+
+import errno
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+
+from quad_swarm import QuadSwarmParallelEnv
+from sb3_maddpg import MADDPG, CurriculumCallback, PrioritizedTeamReplayBuffer, SafeVecNormalize, TeamEnv, checkpoints
+from sb3_maddpg.checkpoints import RunCheckpoint, digest, locked, newest, resume
+from sb3_maddpg.env_states import Replayable
+from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.vec_env import GymnasiumVecEnv
+
+SETTINGS = {"learning_starts": 60, "batch_size": 16, "seed": 0}
+SWARM = {"preset": "flight", "n_robots": 3, "max_steps": 20}
+PAIRS = {**SWARM, "observation": "state+memory+plan+told+mask+critic"}
+
+
+def swarms():
+    return VecMonitor(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=4, **PAIRS)))
+
+
+def curriculum():
+    return gymnasium.make("QuadSwarm-v0", n_robots=2, max_steps=60, scenario="curriculum", end_at_arrival=True)
+
+
+def parallel():
+    return TeamEnv(QuadSwarmParallelEnv(**SWARM))
+
+
+def normalized():
+    return SafeVecNormalize(DummyVecEnv([lambda: Monitor(Replayable(OwnBit()))] * 2))
+
+
+RUNS = {
+    "swarms": (
+        swarms,
+        "PairPolicy",
+        {"replay_buffer_class": PrioritizedTeamReplayBuffer, "n_steps": 3, "train_freq": 1},
+    ),
+    "one swarm": (curriculum, "MlpPolicy", {"train_freq": 7}),
+    "PettingZoo": (parallel, "MlpPolicy", {"train_freq": 5}),
+    "replayed": (lambda: Replayable(OwnBit()), "MlpPolicy", {"train_freq": (1, "episode")}),
+    "normalized": (normalized, "MlpPolicy", {"train_freq": 2}),
+    "memory": (
+        lambda: Replayable(OwnBit()),
+        "MlpPolicy",
+        {
+            "train_freq": 3,
+            "optimize_memory_usage": True,
+            "replay_buffer_kwargs": {"handle_timeout_termination": False},
+        },
+    ),
+}
+STEPS, EVERY = 640, 100
+
+
+class Killed(BaseException):
+    """Nothing catches it, as nothing catches a kill."""
+
+
+def make(name: str, **kwargs) -> MADDPG:
+    env, policy, settings = RUNS[name]
+    if policy == "PairPolicy":
+        settings = {**settings, "policy_kwargs": {"pair_credit": True}}
+    return MADDPG(policy, env(), **{**SETTINGS, "buffer_size": 300, **settings, **kwargs})
+
+
+def evaluated(folder: Path) -> list[BaseCallback]:
+    env = DummyVecEnv([lambda: Monitor(Replayable(OwnBit()))])
+    env.seed(0)
+    evaluation = EvalCallback(env, eval_freq=90, log_path=str(folder), verbose=0)
+    return [RunCheckpoint(folder / "checkpoints", EVERY), evaluation]
+
+
+def go_on(name: str, folder: Path, others: list[BaseCallback] = []) -> MADDPG:  # noqa: B006 - never changed
+    found = resume(folder, RUNS[name][0]())
+    assert found is not None
+    model, callback = found
+    np.random.seed(5)  # noqa: NPY002 - whatever was drawn meanwhile
+    th.manual_seed(5)
+    return model.learn(STEPS - model.num_timesteps, callback=[callback, *others], reset_num_timesteps=False)
+
+
+def kill_at(monkeypatch, point: str, times: int) -> None:
+    """Kill when a fault point is reached for so many times."""
+    left = [times]
+
+    def fault(name: str) -> None:
+        left[0] -= name == point
+        if not left[0]:
+            left[0] = -1
+            raise Killed
+
+    monkeypatch.setattr(checkpoints, "fault", fault)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_resumed_run_ends_as_the_uninterrupted_one(name, tmp_path, monkeypatch):
+    expected = digest(make(name).learn(STEPS, callback=[RunCheckpoint(tmp_path / "a", EVERY)]))
+    assert expected == digest(make(name).learn(STEPS)), "checkpoints change nothing"
+    kill_at(monkeypatch, "committed", 3)
+    with pytest.raises(Killed):
+        make(name).learn(STEPS, callback=[RunCheckpoint(tmp_path / "b", EVERY)])
+    kill_at(monkeypatch, "committed", 2)
+    with pytest.raises(Killed):
+        go_on(name, tmp_path / "b")
+    assert digest(go_on(name, tmp_path / "b")) == expected
+
+
+POINTS = [
+    "opened rows", "begin", "written arrays.npz", "synced model.zip", "written state.json", "opened json", "manifest",
+    "folder synced", "renamed", "committed",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("point", POINTS)
+def test_a_kill_at_any_moment_of_a_commit_loses_nothing_but_that_checkpoint(point, tmp_path, monkeypatch):
+    expected = digest(make("replayed").learn(STEPS))
+    kill_at(monkeypatch, point, 3)
+    with pytest.raises(Killed):
+        make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
+    path = newest(tmp_path)
+    assert path is not None
+    assert int(path.name.rpartition("-")[2]) in (2 * EVERY, 3 * EVERY)
+    assert digest(go_on("replayed", tmp_path)) == expected
+    assert not list(tmp_path.glob("*.unfinished"))
+    assert len(list(tmp_path.glob("checkpoint-*"))) == 2
+
+
+def test_without_the_checkpoint_s_state_a_run_ends_otherwise(tmp_path, monkeypatch):
+    expected = digest(make("replayed").learn(STEPS))
+    kill_at(monkeypatch, "committed", 3)
+    with pytest.raises(Killed):
+        make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
+    monkeypatch.setattr(checkpoints, "_set_random_state", lambda state: None)
+    assert digest(go_on("replayed", tmp_path)) != expected
+
+
+def test_callbacks_go_on_where_they_were(tmp_path, monkeypatch):
+    (whole := tmp_path / "whole").mkdir()
+    make("replayed").learn(STEPS, callback=evaluated(whole))
+    kill_at(monkeypatch, "committed", 4)
+    (parts := tmp_path / "parts").mkdir()
+    with pytest.raises(Killed):
+        make("replayed").learn(STEPS, callback=evaluated(parts))
+    go_on("replayed", parts / "checkpoints", evaluated(parts)[1:])
+    with np.load(whole / "evaluations.npz") as one, np.load(parts / "evaluations.npz") as two:
+        assert len(one["timesteps"]) == 7
+        for name in ("timesteps", "results", "ep_lengths"):
+            assert np.array_equal(one[name], two[name])
+
+
+def test_a_curriculum_goes_on_where_it_was(tmp_path, monkeypatch):
+    def learn(folder: Path) -> MADDPG:
+        return make("one swarm").learn(STEPS, callback=[RunCheckpoint(folder, EVERY), CurriculumCallback(0.1, 3)])
+
+    whole = learn(tmp_path / "a")
+    assert whole.curriculum_level > 0
+    kill_at(monkeypatch, "committed", 4)
+    with pytest.raises(Killed):
+        learn(tmp_path / "b")
+    resumed = go_on("one swarm", tmp_path / "b", [CurriculumCallback(0.1, 3)])
+    assert digest(resumed) == digest(whole)
+    assert resumed.curriculum_level == whole.curriculum_level
+
+
+def test_only_new_transitions_are_written(tmp_path):
+    make("replayed", buffer_size=500).learn(400, callback=[RunCheckpoint(tmp_path, EVERY)])
+    sizes = [path.stat().st_size for path in sorted((tmp_path / "segments").iterdir())]
+    assert len(sizes) == 3
+    row = sizes[0] // 100
+    assert all(abs(size / row - EVERY) < 8 for size in sizes)
+    make("replayed", buffer_size=150).learn(STEPS, callback=[RunCheckpoint(tmp_path / "ring", EVERY)])
+    assert len(list((tmp_path / "ring" / "segments").iterdir())) <= 4, "what the ring has overwritten is removed"
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "missing", "segment"])
+def test_a_damaged_checkpoint_is_passed_over(damage, tmp_path):
+    make("replayed").learn(350, callback=[RunCheckpoint(tmp_path, EVERY)])
+    last = newest(tmp_path)
+    path = last / "arrays.npz"
+    if damage == "segment":
+        path = max((tmp_path / "segments").iterdir())
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(content[: len(content) // 2] if damage == "truncated" else content)
+    with pytest.warns(UserWarning, match="is passed over: .*"):
+        before = newest(tmp_path)
+    assert before is not None
+    assert before < last
+
+
+def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch):
+    expected = digest(make("replayed").learn(STEPS))
+
+    def full(point: str) -> None:
+        if point == "written model.zip" and len(list(tmp_path.glob("checkpoint-*"))) > 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(checkpoints, "fault", full)
+    with pytest.warns(UserWarning, match="No space for a checkpoint at step .*: the last one stays"):
+        model = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
+    assert digest(model) == expected, "the training goes on"
+    assert not list(tmp_path.glob("*.unfinished"))
+    monkeypatch.setattr(checkpoints, "fault", lambda point: None)
+    assert digest(go_on("replayed", tmp_path)) == expected
+
+
+def test_what_tells_no_state_goes_on_with_new_episodes_and_says_so(tmp_path):
+    for env in (lambda: DummyVecEnv([OwnBit]), lambda: SubprocVecEnv([OwnBit], start_method="fork")):
+        model = MADDPG("MlpPolicy", env(), buffer_size=300, train_freq=5, **SETTINGS)
+        callback = RunCheckpoint(tmp_path, EVERY)
+        model.learn(250, callback=[callback])
+        assert callback.inexact
+        model.env.close()
+        resumed, callback = resume(tmp_path, env())
+        with pytest.warns(UserWarning, match="goes on with new episodes, and not exactly as it would have"):
+            resumed.learn(100, callback=[callback], reset_num_timesteps=False)
+        resumed.env.close()
+        shutil.rmtree(tmp_path)
+
+
+def test_another_machine_is_named(tmp_path, monkeypatch):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
+    monkeypatch.setattr(checkpoints, "fingerprint", lambda: {"torch": "3.0"})
+    with pytest.warns(UserWarning, match=r"not bit for bit as it would have: torch:? .* then, 3\.0 now"):
+        resume(tmp_path, Replayable(OwnBit()))
+
+
+def test_other_callbacks_and_other_environments_are_refused(tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    with pytest.raises(ValueError, match=r"The run had the callbacks .* these are .*CurriculumCallback.*: resume with"):
+        model.learn(100, [callback, CurriculumCallback()], reset_num_timesteps=False)
+    model, callback = resume(tmp_path, OwnBit())
+    with pytest.raises(ValueError, match="The state is of a Replayable, this is a OwnBit"):
+        model.learn(100, [callback], reset_num_timesteps=False)
+    assert resume(tmp_path / "nothing", OwnBit()) is None
+    for wrong in ({"every": 0}, {"every": 5, "keep": 0}):
+        with pytest.raises(ValueError, match="both must be at least 1"):
+            RunCheckpoint(tmp_path, **wrong)
+
+
+def test_nothing_in_a_checkpoint_is_a_pickle(tmp_path):
+    make("normalized").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
+    state = json.loads((newest(tmp_path) / "state.json").read_text())
+    assert ":serialized:" not in json.dumps(state)
+    with np.load(newest(tmp_path) / "arrays.npz", allow_pickle=False) as arrays:
+        assert all(arrays[name].dtype.kind in "biuf" for name in arrays.files)
+
+
+def test_two_processes_do_not_write_into_one_folder(tmp_path):
+    program = textwrap.dedent("""
+        import sys
+        from sb3_maddpg.checkpoints import locked
+        with locked(sys.argv[1]):
+            print("locked", flush=True)
+            sys.stdin.read()
+    """)
+    other = subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout.readline() == "locked\n"
+    with pytest.raises(ValueError, match=f"is in use by process {other.pid} on "), locked(tmp_path):
+        pass
+    other.kill()
+    other.wait()
+    with locked(tmp_path):
+        assert "process" in (tmp_path / "lock").read_text()

@@ -1,0 +1,95 @@
+"""States of environments and of what wraps them. That runs go on from them is in test_checkpoints.py."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+
+from sb3_maddpg.env_states import (
+    NoStateError,
+    Replayable,
+    load_vec_env_state,
+    plain_values,
+    set_space_generators,
+    space_generators,
+    vec_env_state,
+)
+from sb3_maddpg.team import MixedActions
+from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.typed_json import decode, encode
+
+
+def vectorized() -> VecMonitor:
+    return VecMonitor(DummyVecEnv([lambda: Monitor(Replayable(gymnasium.make("CartPole-v1")))] * 2))
+
+
+def stepped(env, actions) -> list:
+    return [env.step(action) for action in actions]
+
+
+def test_a_state_goes_through_json_and_brings_back_the_open_episodes():
+    env, actions = vectorized(), np.random.default_rng(0).integers(0, 2, (80, 2))
+    env.seed(3)
+    env.reset()
+    stepped(env, actions[:40])
+    arrays: dict = {}
+    text = json.dumps(encode(vec_env_state(env), "state", arrays))
+    expected = stepped(env, actions[40:])
+    other = vectorized()
+    other.reset()
+    load_vec_env_state(other, decode(json.loads(text), "state", arrays))
+    for one, two in zip(expected, stepped(other, actions[40:]), strict=True):
+        assert all(np.array_equal(x, y) for x, y in zip(one[:3], two[:3], strict=True))
+        for a, b in zip(one[3], two[3], strict=True):
+            assert ("episode" in a) == ("episode" in b)
+            if "episode" in a:
+                assert (a["episode"]["r"], a["episode"]["l"]) == (b["episode"]["r"], b["episode"]["l"])
+    assert any("episode" in info for step in expected for info in step[3])
+
+
+def test_a_replayable_environment_draws_episodes_from_its_seed():
+    env, other = Replayable(gymnasium.make("CartPole-v1")), Replayable(gymnasium.make("CartPole-v1"))
+    first = [env.reset(seed=1)[0], env.reset()[0], env.reset()[0]]
+    again = [other.reset(seed=1)[0], other.reset()[0], other.reset()[0]]
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first[1], first[2])
+    fresh = Replayable(gymnasium.make("CartPole-v1"))
+    fresh.load_state_dict(Replayable(gymnasium.make("CartPole-v1")).state_dict())  # before any reset
+
+
+@pytest.mark.parametrize("make", [lambda: DummyVecEnv([OwnBit]), lambda: SubprocVecEnv([OwnBit], start_method="fork")])
+def test_says_what_tells_no_state(make):
+    env = make()
+    with pytest.raises(NoStateError, match=r"OwnBit has no state_dict\(\)|SubprocVecEnv keeps its environments"):
+        vec_env_state(env)
+    env.close()
+
+
+def test_a_state_of_other_wrappers_is_refused():
+    env = vectorized()
+    env.reset()
+    with pytest.raises(ValueError, match="The state is of a VecMonitor, this is a DummyVecEnv"):
+        load_vec_env_state(env.venv, vec_env_state(env))
+
+
+def test_plain_values_are_those_that_can_be_written():
+    callback = EvalCallback(DummyVecEnv([OwnBit]))
+    values = plain_values(callback)
+    assert {"best_mean_reward", "n_calls", "evaluations_results", "eval_freq"} <= set(values)
+    assert not {"eval_env", "callback", "locals", "logger", "model"} & set(values)
+
+
+def test_generators_of_spaces_and_of_their_parts_go_on():
+    space, other = (MixedActions([spaces.Discrete(9), spaces.Box(-1, 1, (3,))]) for _ in range(2))
+    assert space_generators(space) == [None, None, None]
+    space.seed(0)
+    space.sample()
+    states = space_generators(space)
+    expected = space.sample()
+    set_space_generators(other, states)
+    assert np.array_equal(other.sample(), expected)
