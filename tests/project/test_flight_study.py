@@ -86,7 +86,7 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     swaps = itertools.product((4, 8, 12, 16), ("symmetric_swap", "asymmetric_swap"))
     assert {one[1] for one in flown if one[0] == "good"} == {*swaps, *((8, name) for name in NAMES)}
     assert max(one[3] for one in flown if one[0] == "bad") == stages[1], "without hope it is not flown on"
-    assert tune_flight.CELLS[0] == (8, "symmetric_swap")
+    assert tune_flight.CELLS[0] == (16, "symmetric_swap")
 
 
 def settings(path: Path) -> dict[str, bool | None]:
