@@ -5,8 +5,8 @@ a model, is safe if it is as safe as full communication, to within `SAFETY_MARGI
 number of robots. All rules fly a few episodes of both swaps with eight robots, which tell their requests there; then
 they are tried from the cheapest on, in stages of more and more episodes, until one is safe. A model's thresholds are
 tried from the highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
-over the episodes that it flew, and family, setting, safe (None: not tried, since a cheaper one is safe). What the
-table has is not flown again.
+over the episodes that it flew, and family, setting, safe (None: only its requests are known). What the table has is
+not flown again.
 """
 
 from __future__ import annotations
@@ -134,12 +134,6 @@ def rows_of(family: str, setting: str, flown: Flown, safe: bool | None) -> list[
     ]
 
 
-def share(flown: Flown) -> float:
-    """Mean share of requests in the swaps of eight robots, as far as they were flown."""
-    shares = [summarise(flown[cell], world(PRESET))["request_share"] for cell in OWN_SWAPS if cell in flown]
-    return sum(shares) / len(shares)
-
-
 def fly_full(pool: Executor, path: Path, stages: Sequence[int]) -> Flown:
     """Who collides under full communication in the episodes that decide; what the table has is not flown again."""
     known = {(row["n_robots"], row["scenario"]): row["outcomes"] for row in read_rows(path) if row["family"] == FULL}
@@ -198,8 +192,9 @@ def tune(
         for done in wait(running, return_when=FIRST_COMPLETED).done:
             setting = running.pop(done)
             flown, decided[setting.name] = done.result()
-            replace_rows(path, rows_of(*setting, flown, decided[setting.name]), ("preset", "setting"))
-            print(f"{setting.name:50} {share(flown):.2%} {verdict(flown, full, decided[setting.name])}", flush=True)
+            rows = rows_of(*setting, flown, decided[setting.name])
+            replace_rows(path, rows, ("preset", "setting", "n_robots", "scenario"))
+            print(f"{setting.name:50} {verdict(flown, full, decided[setting.name])}", flush=True)
 
 
 def verdict(flown: Flown, full: Flown, safe: bool) -> str:

@@ -85,7 +85,7 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     assert [one[2:] for one in flown if one[:2] == ("good", (16, "symmetric_swap"))] == list(pairwise(stages))[:-1]
     swaps = itertools.product((4, 8, 12, 16), ("symmetric_swap", "asymmetric_swap"))
     assert {one[1] for one in flown if one[0] == "good"} == {*swaps, *((8, name) for name in NAMES)}
-    assert max(one[3] for one in flown if one[0] == "bad") == stages[1], "without hope it is not flown on"
+    assert max(one[3] for one in flown if one[0] == "bad") == tune_flight.FIRST, "without hope it is not flown on"
     assert tune_flight.CELLS[0] == (16, "symmetric_swap")
 
 
@@ -118,10 +118,6 @@ def test_thresholds_are_tried_from_the_highest_on_each_model_by_itself(flown, tm
     ]
     tune_flight.tune(Inline(), 1, ladders, FULL, tune_flight.STAGES, tmp_path / "t.json")
     assert settings(tmp_path / "t.json") == {"a.zip@0.9": True, "bad.zip@0.9": False, "bad.zip@0.8": False}
-
-
-def test_requests_are_told_of_rules_that_fail_in_the_first_cell(flown):
-    assert tune_flight.share({tune_flight.OWN_SWAPS[0]: [{"requests": 0.25}]}) == 0.25
 
 
 def test_full_communication_is_flown_once(flown, tmp_path):
