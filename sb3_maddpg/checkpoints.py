@@ -15,6 +15,8 @@ import os
 import platform
 import random
 import shutil
+import signal
+import threading
 import time
 import warnings
 import zipfile
@@ -34,6 +36,7 @@ from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.env_states import (
     NoStateError,
     load_vec_env_state,
+    plain_entries,
     plain_values,
     set_plain_values,
     set_space_generators,
@@ -49,6 +52,8 @@ _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
 _SEGMENTS = "segments"
 # Called with the name of each moment at which a kill might hurt; tests put something here that kills
 fault: Callable[[str], None] = lambda point: None  # noqa: E731
+_ROWS = 64  # of a replay buffer, that are written at once
+_SECONDS, _SHARE = 30.0, 100.0  # between checkpoints by time: at least, and as a multiple of what one takes
 _LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 _LOGGED = ("name_to_value", "name_to_count", "name_to_excluded")
 
@@ -57,19 +62,27 @@ class RunCheckpoint(BaseCallback):
     """
     Writes checkpoints while a model learns, between rollouts. ``resume`` goes on from the newest.
 
+    At SIGTERM and SIGHUP, with which clusters and closed terminals end a process, it writes one more and ends the
+    process by that signal; a second one ends it at once.
+
     :param folder: for the checkpoints, of this run alone
-    :param every: steps from one to the next
+    :param every: steps from one to the next; None: by time, each half minute, or more seldom where that takes more than
+        a hundredth of the time
     :param keep: how many of the newest stay
     :param verbose: 1 says what is written
     """
 
-    def __init__(self, folder: str | os.PathLike[str], every: int, keep: int = 2, verbose: int = 0):
+    def __init__(self, folder: str | os.PathLike[str], every: int | None = None, keep: int = 2, verbose: int = 0):
         super().__init__(verbose)
-        if every < 1 or keep < 1:
+        if (every is not None and every < 1) or keep < 1:
             raise ValueError(f"every={every}, keep={keep}: both must be at least 1.")
         self.folder, self.every, self.keep = Path(folder), every, keep
         self.saved_at = 0
+        self._due = time.monotonic() + _SECONDS
+        self._signal: int | None = None
+        self._handlers: dict[int, Any] = {}
         self.inexact: str | None = None
+        self.logger_folder: str | None = None  # of the run that is gone on with
         self._pending: dict[str, Any] | None = None
         self._segments: list[dict[str, Any]] = []
 
@@ -83,8 +96,27 @@ class RunCheckpoint(BaseCallback):
         else:
             self.saved_at = self.model.num_timesteps
 
+        if threading.current_thread() is threading.main_thread():
+            for name in ("SIGTERM", "SIGHUP"):
+                if number := getattr(signal, name, None):
+                    self._handlers[number] = signal.signal(number, self._on_signal)
+
+    def _on_training_end(self) -> None:
+        while self._handlers:
+            signal.signal(*self._handlers.popitem())
+
+    def _on_signal(self, number: int, frame: Any) -> None:
+        if self._signal is not None:
+            _end_by(number)
+        self._signal = number
+
     def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps - self.saved_at >= self.every:
+        if self._signal is not None:
+            self.save()
+            print(f"Ended by {signal.Signals(self._signal).name} at step {self.model.num_timesteps}.", flush=True)
+            _end_by(self._signal)
+        steps = self.model.num_timesteps - self.saved_at
+        if steps >= self.every if self.every is not None else time.monotonic() >= self._due and steps > 0:
             self.save()
 
     def _on_step(self) -> bool:
@@ -112,10 +144,13 @@ class RunCheckpoint(BaseCallback):
             for path in self.folder.glob(f"*{_UNFINISHED}"):
                 shutil.rmtree(path, ignore_errors=True)
             return None
+        finally:
+            taken = time.perf_counter() - started
+            self._due = time.monotonic() + max(_SECONDS, _SHARE * taken)
         self._segments = segments
         self._tidy()
         if self.verbose:
-            print(f"Checkpoint at step {steps} in {time.perf_counter() - started:.2f} s: {target}")
+            print(f"Checkpoint at step {steps} in {taken:.2f} s: {target}")
         return target
 
     def _root(self) -> BaseCallback:
@@ -139,10 +174,17 @@ class RunCheckpoint(BaseCallback):
         name = f"{first:012d}-{end:012d}.rows"
         path = self.folder / _SEGMENTS / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        content = buffer.records[rows].tobytes()
-        _write_synced(path, content)
+        found = hashlib.sha256()
+        with path.open("wb") as file:
+            fault("opened rows")
+            for part in np.array_split(rows, max(len(rows) // _ROWS, 1)):
+                block = buffer.records[part].tobytes()
+                found.update(block)
+                file.write(block)
+            file.flush()
+            os.fsync(file.fileno())
         _sync_folder(path.parent)
-        return [*kept, {"name": name, "first": first, "end": end, "sha256": hashlib.sha256(content).hexdigest()}]
+        return [*kept, {"name": name, "first": first, "end": end, "sha256": found.hexdigest()}]
 
     def _tidy(self) -> None:
         """Remove what no checkpoint that stays needs."""
@@ -187,6 +229,7 @@ def resume(
     _compare_fingerprints(plain["fingerprint"])
     model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
     callback = RunCheckpoint(folder, every or plain["every"], keep)
+    callback.logger_folder = plain["logger_folder"]
     buffer = model.replay_buffer
     assert isinstance(buffer, TeamReplayBuffer)
     _read_segments(Path(folder), buffer, plain["segments"], plain["counters"])
@@ -283,7 +326,8 @@ def _state_of(model: MADDPG, callbacks: list[BaseCallback]) -> dict[str, Any]:
         "spaces": space_generators(model.action_space),
         "env": env,
         "callbacks": states,
-        "logger": {name: dict(getattr(model.logger, name)) for name in _LOGGED},
+        "logger_folder": model.logger.get_dir(),
+        "logger": {name: plain_entries(getattr(model.logger, name)) for name in _LOGGED},
     }
 
 
@@ -320,6 +364,12 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         getattr(model.logger, name).update(values)
     set_space_generators(model.action_space, state["spaces"])
     _set_random_state(state["random"])
+
+
+def _end_by(number: int) -> None:
+    """End this process as the signal would have."""
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
 
 
 def _random_state() -> dict[str, Any]:
@@ -386,9 +436,12 @@ def _read_segments(
 ) -> None:
     buffer.pos, buffer.full = counters["pos"], counters["full"]
     for one in segments:
-        content = (folder / _SEGMENTS / one["name"]).read_bytes()
-        rows = np.frombuffer(content, buffer.records.dtype).reshape(-1, buffer.n_envs)
-        buffer.records[np.arange(one["first"], one["first"] + len(rows)) % buffer.buffer_size] = rows
+        row = one["first"]
+        with (folder / _SEGMENTS / one["name"]).open("rb") as file:
+            while len(rows := np.fromfile(file, buffer.records.dtype, _ROWS * buffer.n_envs)):
+                rows = rows.reshape(-1, buffer.n_envs)
+                buffer.records[np.arange(row, row + len(rows)) % buffer.buffer_size] = rows
+                row += len(rows)
 
 
 def _write(path: Path, model: MADDPG, state: dict[str, Any], segments: list[dict[str, Any]]) -> None:
@@ -465,7 +518,7 @@ def _sha256(path: Path) -> str:
 
 def _write_synced(path: Path, content: bytes) -> None:
     with path.open("wb") as file:
-        fault(f"opened {path.name.rpartition('.')[2]}")
+        fault("opened manifest")
         file.write(content)
         file.flush()
         os.fsync(file.fileno())

@@ -7,7 +7,9 @@ Those of Gymnasium that do not, but always do the same after the same seed and a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -19,6 +21,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.vec_env import GymnasiumVecEnv
+
+_BEFORE = ".before"
 
 
 class NoStateError(ValueError):
@@ -77,7 +81,7 @@ def vec_env_state(env: VecEnv) -> dict[str, Any]:
     :return: its state, see ``load_vec_env_state``
     :raises NoStateError: part of it does not tell its state
     """
-    own = {"class": type(env).__name__, "values": plain_values(env)}
+    own = {"class": type(env).__name__, "values": plain_values(env), **_written(env)}
     if isinstance(env, VecEnvWrapper):
         return {**own, "inner": vec_env_state(env.venv)}
     if isinstance(env, GymnasiumVecEnv):
@@ -112,10 +116,12 @@ def _told(env: Any) -> Any:
 
 def _env_state(env: gymnasium.Env) -> dict[str, Any]:
     own = {"class": type(env).__name__}
+    if isinstance(env, Replayable):  # what it replays goes through the wrappers inside, but not what they keep
+        return {**own, "told": env.state_dict(), "layers": [_layer(one) for one in _layers(env.env)]}
     if "state_dict" in dir(type(env)):
         return {**own, "told": _told(env)}
     if isinstance(env, gymnasium.Wrapper):
-        return {**own, "values": plain_values(env), "inner": _env_state(env.env)}
+        return {**_layer(env), "inner": _env_state(env.env)}
     if isinstance(env, TeamEnv):
         return {**own, "values": plain_values(env), "told": _told(env.parallel_env.unwrapped)}
     return {**own, "told": _told(env)}
@@ -128,12 +134,57 @@ def _load_env_state(env: gymnasium.Env, state: dict[str, Any]) -> None:
     else:
         told: Any = env.parallel_env.unwrapped if isinstance(env, TeamEnv) else env
         told.load_state_dict(state["told"])
+    if isinstance(env, Replayable):
+        for one, layer in zip(_layers(env.env), state["layers"], strict=True):
+            _take(one, layer)
+
+
+def _layers(env: gymnasium.Env) -> list[gymnasium.Env]:
+    """The wrappers around an environment, the outermost first."""
+    return [env, *_layers(env.env)] if isinstance(env, gymnasium.Wrapper) else []
+
+
+def _layer(env: gymnasium.Env) -> dict[str, Any]:
+    return {"class": type(env).__name__, "values": plain_values(env), **_written(env)}
 
 
 def _take(owner: Any, state: dict[str, Any]) -> None:
     if state["class"] != type(owner).__name__:
         raise ValueError(f"The state is of a {state['class']}, this is a {type(owner).__name__}.")
     set_plain_values(owner, state.get("values", {}))
+    if "written" in state and (writer := getattr(owner, "results_writer", None)) is not None:
+        _write_again(Path(writer.file_handler.name), writer.file_handler, state["written"])
+
+
+def _written(monitor: Any) -> dict[str, int]:
+    """How far a monitor's file has come."""
+    writer = getattr(monitor, "results_writer", None)
+    if writer is None:
+        return {}
+    writer.file_handler.flush()
+    return {"written": os.stat(writer.file_handler.fileno()).st_size}
+
+
+def _write_again(path: Path, file: Any, size: int) -> None:
+    """The rows that a monitor had written, which a new one has begun to overwrite, see ``put_aside``."""
+    before = Path(f"{path}{_BEFORE}")
+    if before.is_file():
+        file.seek(0)
+        file.truncate()
+        file.write(before.read_bytes()[:size].decode())
+        file.flush()
+        before.unlink()
+
+
+def put_aside(folder: Path) -> None:
+    """
+    Keep the monitors' files of an earlier part of a run from being overwritten, until its state is loaded.
+
+    :param folder: of the run
+    """
+    for path in folder.glob("*monitor.csv"):
+        if not (before := Path(f"{path}{_BEFORE}")).exists():  # else this part was killed too before it went on
+            path.rename(before)
 
 
 # What is no state, or is told elsewhere
@@ -146,10 +197,19 @@ def plain_values(owner: Any) -> dict[str, Any]:
     :param owner: a wrapper, a callback
     :return: those of its attributes that are plain values, arrays or lists of them, by name
     """
+    kinds = (spaces.Space, type)
+    return plain_entries(
+        {name: value for name, value in vars(owner).items() if name not in _NOT_STATE and not isinstance(value, kinds)}
+    )
+
+
+def plain_entries(values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param values: by name
+    :return: those that can be written to a file
+    """
     found = {}
-    for name, value in vars(owner).items():
-        if name in _NOT_STATE or isinstance(value, (spaces.Space, type)):
-            continue
+    for name, value in values.items():
         try:
             encode(value, name, {})
         except ValueError:
@@ -165,6 +225,16 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
     """
     for name, value in values.items():
         setattr(owner, name, value)
+
+
+def tells_state(env: gymnasium.Env) -> bool:
+    """
+    :param env: an environment, with its wrappers
+    :return: whether it tells its state
+    """
+    inner: Any = env.unwrapped
+    inner = inner.parallel_env.unwrapped if isinstance(inner, TeamEnv) else inner
+    return hasattr(inner, "state_dict") and hasattr(inner, "load_state_dict")
 
 
 def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:

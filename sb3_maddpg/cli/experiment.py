@@ -1,12 +1,16 @@
 """rl_zoo3's experiment manager, with its known faults around environment arguments, resuming and tuning mended."""
 
+import contextlib
 import functools
 import itertools
+import json
+import shutil
 import time
 import warnings
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import optuna
@@ -21,19 +25,22 @@ from sqlalchemy.exc import DBAPIError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback, LogEveryNTimesteps
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule, configure_logger, safe_mean
 from stable_baselines3.common.utils import get_latest_run_id as latest_curve
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from torch.utils.tensorboard import SummaryWriter
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.callbacks import DashboardCallback
+from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
 from sb3_maddpg.cli.literals import format_literal, parse_literal
 from sb3_maddpg.cli.options import PROG, check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
+from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.team import Team
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
@@ -42,6 +49,20 @@ from sb3_maddpg.vec_env import GymnasiumVecEnv
 # fills the screen, and short trainings end before the first.
 TABLES = 100
 FEWEST_STEPS_PER_TABLE = 1000
+
+
+COMMAND_FILE, CHECKPOINTS = "command.json", "checkpoints"
+
+
+class Checkpoints(NamedTuple):
+    """What the command line says about checkpoints."""
+
+    every: int | None
+    """Steps from one to the next, None: by time"""
+    command: dict[str, Any]
+    """With which the run began"""
+    run: Path | None = None
+    """The run's folder, where one is resumed"""
 
 
 class TeamExperimentManager(ExperimentManager):
@@ -65,8 +86,12 @@ class TeamExperimentManager(ExperimentManager):
 
     study: optuna.Study | None = None  # that was searched
 
-    def __init__(self, args: Any, *rest: Any, uuid_str: str = "", **kwargs: Any):
+    def __init__(
+        self, args: Any, *rest: Any, uuid_str: str = "", checkpoints: Checkpoints | None = None, **kwargs: Any
+    ):
         check_options(args)
+        self.checkpoints = checkpoints
+        self.checkpoint: RunCheckpoint | None = None
         super().__init__(args, *rest, **{**kwargs, "uuid_str": uuid_str})
         self.uuid_str = uuid_str
         self.shares_parameters = shares_parameters(ALGOS[self.algo], self.env_name.gym_id)
@@ -148,10 +173,17 @@ class TeamExperimentManager(ExperimentManager):
         """Make the run's folder; a search has none, each trial's log goes to ``--optimization-log-path``."""
         if self.optimize_hyperparameters:
             return
+        if self.checkpoints is not None and self.checkpoints.run is not None:
+            self.save_path, self.params_path = str(self.checkpoints.run), f"{self.checkpoints.run}/{self.env_name}"
+            put_aside(self.checkpoints.run)
+            return
         first = get_latest_run_id(self.log_path, self.env_name) + 1
         self.save_path = str(claim_folder(f"{self.log_path}{self.env_name}", first, self.uuid_str))
         self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
+        if self.checkpoints is not None:
+            with atomic_write(f"{self.save_path}/{COMMAND_FILE}", "json") as file:
+                file.write(json.dumps(self.checkpoints.command).encode())
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
@@ -198,13 +230,37 @@ class TeamExperimentManager(ExperimentManager):
         elif self.own_vec_env and not eval_env:
             agents = GymnasiumVecEnv(gymnasium.make_vec(self.env_name.gym_id, num_envs=n_envs, **self.env_kwargs))
         else:
+            self._make_replayable()
             return super().create_envs(n_envs, eval_env, no_log)
         env = VecMonitor(agents, None if no_log else f"{self.save_path}/0")
         env.seed(self.seed)
         return self._maybe_normalize(env, eval_env)
 
+    def _resume(self, run: Path, env: Any) -> MADDPG:
+        assert self.checkpoints is not None
+        algorithm = cast("type[MADDPG]", ALGOS[self.algo])
+        found = resume(run / CHECKPOINTS, env, algorithm, self.checkpoints.every, device=self.device)
+        if found is None:
+            raise ValueError(f"{run} has no checkpoint that is whole.")
+        model, self.checkpoint = found
+        model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
+        self.n_timesteps -= model.num_timesteps
+        print(f"Resuming {run} at step {model.num_timesteps}")
+        return model
+
+    def _make_replayable(self) -> None:
+        """Where exact checkpoints are asked for, environments that do not tell their state replay their episodes."""
+        if self.checkpoints is None or self.checkpoints.every is None or isinstance(self.env_wrapper, _Replaying):
+            return
+        env = gymnasium.make(self.env_name.gym_id, **self.env_kwargs)
+        if not tells_state(env):
+            self.env_wrapper = _Replaying(self.env_wrapper)
+        env.close()
+
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
         algorithm = ALGOS[self.algo]
+        if self.checkpoints is not None and self.checkpoints.run is not None:
+            return self._resume(self.checkpoints.run, env)
         if hyperparams.get("policy") == "PairPolicy" and issubclass(algorithm, MADDPG):
             trained = algorithm.load(self.trained_agent, device=self.device)
             n_agents = Team.from_spaces(env.observation_space, env.action_space).n_agents
@@ -234,9 +290,16 @@ class TeamExperimentManager(ExperimentManager):
             kwargs["log_interval"] = max(self.log_interval, 0) or None
         elif isinstance(model, OffPolicyAlgorithm):
             kwargs["log_interval"] = None
-            self.callbacks.append(RegularTables(max(self.n_timesteps // TABLES, FEWEST_STEPS_PER_TABLE)))
+            total = self.n_timesteps + (model.num_timesteps if self.checkpoint is not None else 0)
+            self.callbacks.append(RegularTables(max(total // TABLES, FEWEST_STEPS_PER_TABLE)))
+        locks: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+        if self.checkpoints is not None and isinstance(model, MADDPG):
+            folder = Path(self.save_path, CHECKPOINTS)
+            self.checkpoint = self.checkpoint or RunCheckpoint(folder, self.checkpoints.every)
+            self.callbacks.append(self.checkpoint)
+            locks = locked(folder)
         try:
-            with warnings.catch_warnings():
+            with locks, warnings.catch_warnings():
                 # Evaluation goes episode by episode, whatever steps the training
                 warnings.filterwarnings("ignore", "Training and eval env are not of the same type")
                 model.learn(
@@ -256,6 +319,15 @@ class TeamExperimentManager(ExperimentManager):
     def _logger(self, name: str) -> Logger:
         """Tables on the screen, unless a progress bar is there, and curves for TensorBoard."""
         prints = self.verbose > 0 and not self.show_progress
+        if self.checkpoint is not None and self.checkpoint.logger_folder and self.tensorboard_log:
+            logger = configure(self.checkpoint.logger_folder, [*(["stdout"] if prints else []), "tensorboard"])
+            for output in logger.output_formats:
+                if isinstance(output, TensorBoardOutputFormat):  # without what came after the checkpoint
+                    output.writer.close()
+                    output.writer = SummaryWriter(
+                        self.checkpoint.logger_folder, purge_step=self.checkpoint.saved_at + 1
+                    )
+            return logger
         if not self.tensorboard_log or self.continue_training:
             return configure_logger(int(prints), self.tensorboard_log, name, not self.continue_training)
         first = latest_curve(self.tensorboard_log, name) + 1
@@ -351,6 +423,8 @@ class TeamExperimentManager(ExperimentManager):
         :param model: the trained model
         """
         super().save_trained_model(model)
+        if self.checkpoint is not None:
+            shutil.rmtree(self.checkpoint.folder, ignore_errors=True)
         if model.ep_info_buffer:
             rewards = [episode["r"] for episode in model.ep_info_buffer]
             print(f"Mean reward: {safe_mean(rewards):.4g} in the last {len(rewards)} episodes of the training")
@@ -358,6 +432,17 @@ class TeamExperimentManager(ExperimentManager):
         print(f"Logs:        {self.save_path}")
         if self.tensorboard_log:
             print(f"TensorBoard: tensorboard --logdir {self.tensorboard_log}")
+
+
+class _Replaying:
+    """A wrapper of environments for ``make_vec_env``: the recipe's, and ``Replayable`` inside of it."""
+
+    def __init__(self, outer: Callable[[gymnasium.Env], gymnasium.Env] | None):
+        self.outer = outer
+
+    def __call__(self, env: gymnasium.Env) -> gymnasium.Env:
+        env = Replayable(env)
+        return env if self.outer is None else self.outer(env)
 
 
 class RegularTables(LogEveryNTimesteps):

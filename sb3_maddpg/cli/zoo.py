@@ -2,7 +2,9 @@
 
 import argparse
 import difflib
+import functools
 import importlib
+import json
 import os
 import runpy
 import sys
@@ -10,7 +12,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import yaml
@@ -27,8 +29,9 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, get_latest_run_id, get_saved_hyperparams
 
 from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg.checkpoints import newest
 from sb3_maddpg.cli import pettingzoo_ids
-from sb3_maddpg.cli.experiment import TeamExperimentManager
+from sb3_maddpg.cli.experiment import CHECKPOINTS, COMMAND_FILE, Checkpoints, TeamExperimentManager
 from sb3_maddpg.cli.literals import StoreValues
 from sb3_maddpg.cli.options import PROG, common_options, import_packages
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
@@ -75,7 +78,21 @@ def packaged_config(algo: str, env_id: str) -> str | None:
 
 
 def train(argv: list[str]) -> int:
-    """Train as rl_zoo3 does, by the packaged recipe unless another is given."""
+    """Train as rl_zoo3 does, by the packaged recipe unless another is given, with checkpoints."""
+    resuming = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    resuming.add_argument("--checkpoint-every", type=int, metavar="STEPS")
+    resuming.add_argument("--resume", nargs="?", const="", metavar="RUN")
+    resuming.add_argument("-f", "--log-folder", default="logs")
+    asked, argv = resuming.parse_known_args(argv)
+    if asked.resume is None:
+        argv += ["--log-folder", asked.log_folder]
+    if asked.checkpoint_every is not None and asked.checkpoint_every < 0:
+        raise ValueError(f"--checkpoint-every {asked.checkpoint_every}: give a number of steps, or 0 for none.")
+    checkpoints: Checkpoints | None = None
+    if asked.checkpoint_every != 0:
+        checkpoints = Checkpoints(asked.checkpoint_every, {"argv": argv, "every": asked.checkpoint_every})
+    if asked.resume is not None:
+        checkpoints, argv = _resumed(asked, argv)
     parser = common_options()
     parser.add_argument("-conf", "--conf-file")
     known, rest = parser.parse_known_args(argv)
@@ -86,8 +103,35 @@ def train(argv: list[str]) -> int:
     if known.env is not None and known.conf_file is None:
         path = packaged_config(known.algo, known.env)
         argv += ["--conf-file", path] if path is not None else []
-    _call(rl_zoo3.train.train, "train", argv)
+    manager = rl_zoo3.train.ExperimentManager
+    with_checkpoints: Any = functools.partial(cast(Any, manager), checkpoints=checkpoints)
+    rl_zoo3.train.ExperimentManager = with_checkpoints  # type: ignore[misc]
+    try:
+        _call(rl_zoo3.train.train, "train", argv)
+    finally:
+        rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
     return 0
+
+
+def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, list[str]]:
+    """What ``--resume`` goes on with: a run's folder, unless given the newest with checkpoints, and its command."""
+    if argv:
+        raise ValueError(f"--resume goes on with the command of the run: leave out {' '.join(argv)}.")
+    run = Path(asked.resume)
+    if not asked.resume:
+        runs = [path.parent for path in Path(asked.log_folder).glob(f"*/*/{CHECKPOINTS}")]
+        if not runs:
+            raise ValueError(f"--resume: no run in {asked.log_folder} has checkpoints; name its folder.")
+        run = max(runs, key=lambda path: path.stat().st_mtime)
+    try:
+        command = json.loads((run / COMMAND_FILE).read_text())
+        argv, every = [str(word) for word in command["argv"]], command["every"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{run} is no folder of a run with checkpoints ({error}).") from error
+    path = newest(run / CHECKPOINTS)
+    if path is None:
+        raise ValueError(f"{run} has no checkpoint that is whole.")
+    return Checkpoints(asked.checkpoint_every or every, command, run), [*argv, "-i", str(path / "model.zip")]
 
 
 def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:

@@ -1,0 +1,127 @@
+"""Runs of the command line that are killed and resumed end as if nothing had happened."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_maddpg.cli.commands import main
+
+pytest.importorskip("rl_zoo3")
+SWARM = {
+    "n_timesteps": 2400,
+    "n_envs": 4,
+    "vec_env": "gymnasium",
+    "policy": "MlpPolicy",
+    "policy_kwargs": {"net_arch": [16]},
+    "learning_starts": 200,
+    "batch_size": 16,
+    "buffer_size": 1200,
+    "train_freq": 2,
+    "env_kwargs": {"preset": "flight", "n_robots": 3, "max_steps": 20},
+}
+OWN = {"n_timesteps": 6000, "policy": "MlpPolicy", "learning_starts": 200, "batch_size": 16, "buffer_size": 1200}
+RECIPES = {"QuadSwarm-v0": SWARM, "OwnBit-v0": {**OWN, "train_freq": 3, "normalize": "{'norm_reward': False}"}}
+CURVES = ("timesteps", "results", "ep_lengths")
+
+
+def start(words: list[str], folder: Path) -> subprocess.Popen:
+    env = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "sb3_maddpg", "train", *words]
+    return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("logs/*/*/checkpoints/checkpoint-*") if path.name[-1].isdigit())
+
+
+def wait_for(process: subprocess.Popen, count: int, folder: Path, beyond: str = "") -> None:
+    """Until there are so many checkpoints after a name."""
+    end = time.monotonic() + 120
+    while sum(path.name > beyond for path in checkpoints(folder)) < count:
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def results(folder: Path, env_id: str) -> dict:
+    """What a run leaves behind, without the time."""
+    (run,) = folder.glob("logs/maddpg/*_1")
+    with zipfile.ZipFile(run / f"{env_id}.zip") as archive:
+        found = {name: archive.read(name) for name in archive.namelist() if name.endswith(".pth")}
+    with (run / "0.monitor.csv").open() as file:
+        file.readline()
+        found["monitor"] = [(row["r"], row["l"]) for row in csv.DictReader(file)]
+    with np.load(run / "evaluations.npz") as curves:
+        found |= {name: curves[name].tolist() for name in CURVES}
+    found["files"] = sorted(str(path.relative_to(run)) for path in run.rglob("*"))
+    return found
+
+
+@pytest.mark.parametrize("env_id", RECIPES)
+def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    argv = ["--env", env_id, "--conf-file", "r.yml", "--seed", "1", "--checkpoint-every", "300", "--verbose", "0"]
+    argv += ["--eval-freq", "800", "--eval-episodes", "2"]
+    for folder in (whole, parts):
+        folder.mkdir()
+        (folder / "r.yml").write_text(yaml.safe_dump({env_id: RECIPES[env_id]}))
+    uninterrupted = start(argv, whole)
+
+    process = start(argv, parts)
+    wait_for(process, 2, parts)
+    process.kill()
+    process.wait()
+    last = checkpoints(parts)[-1].name
+    process = start(["--resume"], parts)
+    wait_for(process, 1, parts, last)
+    process.send_signal(signal.SIGTERM)
+    output = process.communicate()[0]
+    assert process.returncode == -signal.SIGTERM, output
+    assert "Ended by SIGTERM at step" in output
+    process = start(["--resume"], parts)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    assert "Resuming logs/maddpg/" in output
+
+    assert uninterrupted.communicate() is not None
+    assert uninterrupted.returncode == 0
+    expected, found = results(whole, env_id), results(parts, env_id)
+    assert len(expected["monitor"]) > 20
+    assert len(expected["timesteps"]) >= 3
+    for name, value in expected.items():
+        assert found[name] == value, name
+    assert not any("checkpoint" in name or "before" in name for name in found["files"])
+
+
+def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for argv, message in (
+        (["--resume"], "no run in logs has checkpoints"),
+        (["--resume", "nowhere"], "nowhere is no folder of a run with checkpoints"),
+        (["--resume", "nowhere", "--seed", "3"], "leave out --seed 3"),
+        (["--env", "OwnBit-v0", "--checkpoint-every", "-5"], "--checkpoint-every -5: give a number of steps, or 0"),
+    ):
+        assert main(["train", *argv]) == 2
+        assert message in capsys.readouterr().err
+    Path("run").mkdir()
+    Path("run/command.json").write_text(json.dumps({"argv": [], "every": None}))
+    assert main(["train", "--resume", "run"]) == 2
+    assert "run has no checkpoint that is whole" in capsys.readouterr().err
+
+
+def test_checkpoints_can_be_switched_off(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**OWN, "n_timesteps": 300}}))
+    argv = ["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--verbose", "0"]
+    assert main([*argv, "--checkpoint-every", "0"]) == 0
+    assert not list(Path("logs").rglob("command.json"))
