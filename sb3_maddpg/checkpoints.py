@@ -44,6 +44,7 @@ from sb3_maddpg.env_states import (
     vec_env_state,
 )
 from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.model_files import as_damage
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import shown
 
@@ -91,7 +92,13 @@ class RunCheckpoint(BaseCallback):
         for path in self.folder.glob(f"*{_UNFINISHED}"):
             shutil.rmtree(path, ignore_errors=True)
         if self._pending is not None:
-            _restore(cast(MADDPG, self.model), _callbacks(self._root()), self._pending)
+            try:
+                _restore(cast(MADDPG, self.model), _callbacks(self._root()), self._pending)
+            except (KeyError, TypeError, AttributeError, IndexError) as error:
+                raise ValueError(
+                    f"A checkpoint in {self.folder} is damaged, or of another environment or other callbacks "
+                    f"({type(error).__name__}: {error})."
+                ) from error
             self._pending = None
         else:
             self.saved_at = self.model.num_timesteps
@@ -193,7 +200,7 @@ class RunCheckpoint(BaseCallback):
             shutil.rmtree(path, ignore_errors=True)
         needed: set[str] = set()
         for path in folders[-self.keep :]:
-            with suppress(OSError, ValueError, KeyError, TypeError):
+            with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
                 needed |= {one["name"] for one in json.loads((path / "state.json").read_text())["segments"]}
         for path in (self.folder / _SEGMENTS).glob("*.rows"):
             if path.name not in needed:
@@ -224,19 +231,20 @@ def resume(
     path = newest(folder)
     if path is None:
         return None
-    arrays, state = _read_state(path)
-    plain = decode(state, f"{path}: state", arrays)
-    _compare_fingerprints(plain["fingerprint"])
-    model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
-    callback = RunCheckpoint(folder, every or plain["every"], keep)
-    callback.logger_folder = plain["logger_folder"]
-    buffer = model.replay_buffer
-    assert isinstance(buffer, TeamReplayBuffer)
-    _read_segments(Path(folder), buffer, plain["segments"], plain["counters"])
-    buffer.restore(plain["counters"], {**_columns(buffer), **plain["buffer_arrays"]})
-    callback._segments = plain["segments"]
-    callback._pending = plain
-    callback.saved_at = model.num_timesteps
+    with as_damage(path, "checkpoint"):
+        arrays, state = _read_state(path)
+        plain = decode(state, f"{path}: state", arrays)
+        _compare_fingerprints(plain["fingerprint"])
+        model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
+        callback = RunCheckpoint(folder, every or plain["every"], keep)
+        callback.logger_folder = plain["logger_folder"]
+        buffer = model.replay_buffer
+        assert isinstance(buffer, TeamReplayBuffer)
+        _read_segments(Path(folder), buffer, plain["segments"], plain["counters"])
+        buffer.restore(plain["counters"], {**_columns(buffer), **plain["buffer_arrays"]})
+        callback._segments = plain["segments"]
+        callback._pending = plain
+        callback.saved_at = model.num_timesteps
     return model, callback
 
 
@@ -498,7 +506,7 @@ def _damage(path: Path) -> str | None:
         for one in json.loads((path / "state.json").read_text())["segments"]:
             if _sha256(path.parent / _SEGMENTS / one["name"]) != one["sha256"]:
                 return f"segment {one['name']} is damaged"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return f"{type(error).__name__}: {error}"
     return None
 
