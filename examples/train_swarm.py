@@ -4,6 +4,7 @@ import argparse
 
 import gymnasium
 import torch
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
@@ -33,7 +34,7 @@ model = MADDPG(
     VecMonitor(GymnasiumVecEnv(envs)),
     policy_kwargs={"net_arch": [64, 64], "pair_credit": True},
     threshold_price=(0.001, 0.4),  # all prices at once; the threshold chooses one
-    learning_rate=lambda remaining: 1e-3 * remaining,
+    learning_rate=LinearSchedule(1e-3, 0.0, 1.0),
     gamma=0.95,
     n_steps=5,
     batch_size=64 if quick else 512,

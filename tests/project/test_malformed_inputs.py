@@ -44,7 +44,6 @@ import sb3_maddpg.team_tasks  # registers the tasks
 from faulty import Faulty, trained
 from sb3_maddpg import MADDPG, MATD3, pretrained
 from sb3_maddpg.cli.commands import main as command_line
-from sb3_maddpg.pretrained_models import pretrained_folder
 from sb3_maddpg.utils import shown
 from toys import SMALL
 
@@ -204,7 +203,9 @@ class Files:
         model.save(self.binary)
         self.buffer = folder / "buffer.pkl"
         model.save_replay_buffer(self.buffer)
-        self.pairs = pretrained_folder("quad-swarm-paper") / "model.zip"
+        self.pairs = folder / "pairs.zip"
+        swarm = gymnasium.make("QuadSwarm-v0", n_robots=3, observation="state+plan")
+        MADDPG("PairPolicy", swarm, **QUICK).learn(60).save(self.pairs)
         self.members = {path: _members(path) for path in (self.binary, self.pairs)}
 
     def write(self, members: dict[str, bytes] | bytes) -> Path:

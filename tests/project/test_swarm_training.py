@@ -82,7 +82,7 @@ def test_recipes_can_step_many_swarms_in_one_call(algo, tmp_path, monkeypatch):
     model = (MADDPG if algo == "maddpg" else PPO).load(run / "QuadSwarm-v0.zip")
     assert model.num_timesteps >= 160
     assert model.env_spec["kwargs"] == recipe["env_kwargs"]
-    judge = ["evaluate", "--algo", algo, "--env", "QuadSwarm-v0", "--policy", "none", "latest:logs"]
+    judge = ["evaluate", "--algo", algo, "--env", "QuadSwarm-v0", "--policy", "none", "latest:logs", "--trust"]
     assert zoo([*judge, "--scenario", "random", "--episodes", "1"]) == 0
 
 
