@@ -1,4 +1,4 @@
-"""Short forms of the studies of kills and of damaged files."""
+"""Short forms of the studies of kills, of damaged files and of solvers that fail."""
 
 import subprocess
 import sys
@@ -6,8 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from quad_swarm.evaluation.flight import run_episodes
 from quad_swarm.evaluation.rows import read_rows
+from quad_swarm.world.presets import make_config
+from studies import solver_faults
 from studies.kills import POINTS
+from studies.swarm.protocol import condition
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,3 +39,19 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, seed):
     assert sum(row["count"] for row in rows) == 250
     assert {row["outcome"] for row in rows} == {"refused", "loaded"}
     assert len({row["file"] for row in rows}) == 8
+
+
+@pytest.mark.parametrize("kind", solver_faults.KINDS)
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_a_solver_that_fails_neither_raises_nor_leaves_anything_that_is_not_finite(kind, share):
+    rows = solver_faults.fly("asymmetric_swap", share, kind, range(6))
+    assert len(rows) == 6
+    assert sum(row["planner_failures"] for row in rows) > 0
+    assert sum(row["collided"] for row in rows) <= (0 if share < 0.5 else 6)
+
+
+def test_without_faults_it_is_the_evaluation():
+    one = condition("full", "random", make_config("flight"))
+    expected = run_episodes(one, range(3))
+    for row, same in zip(solver_faults.fly("random", 0.0, "none", range(3)), expected, strict=True):
+        assert {**row, "solve_seconds": 0} == {**same, "solve_seconds": 0}

@@ -1,0 +1,113 @@
+"""Let the planner's solver fail, and see what the swarm does.
+
+``python -m studies.solver_faults [--episodes 1000] [--json F]``. A share of the solves of full communication in
+`flight` fails: reports failure, gives NaN with success or without, or the whole batch raises. Steps have to go on, and
+what leaves them has to be finite. JSON: one row for each share and kind, with the keys of `summarise`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
+from quad_swarm.evaluation.flight import begin, first_episode, fly_steps
+from quad_swarm.evaluation.rows import write_rows
+from quad_swarm.planner import Problems, Solution, Solver
+from quad_swarm.world.presets import make_config
+from studies.swarm.protocol import VALIDATION, condition, progress
+
+KINDS = ("reports failure", "NaN and failure", "NaN and success", "raises")
+SHARES = (0.1, 0.5)
+SCENARIOS = ("symmetric_swap", "asymmetric_swap")
+_BATCH = 100
+
+
+class FailingSolver:
+    """A solver that fails now and then.
+
+    :param solver: the solver
+    :param share: of the problems that fail; of the batches, where it raises
+    :param kind: how, of `KINDS`
+    :param rng: draws which
+    """
+
+    def __init__(self, solver: Solver, share: float, kind: str, rng: np.random.Generator):
+        self.name = solver.name
+        self._solver, self._share, self._kind, self._rng = solver, share, kind, rng
+
+    def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
+        """See `Solver`."""
+        if self._kind == "raises" and self._rng.random() < self._share:
+            raise FloatingPointError("injected")
+        solution = self._solver.solve(problems, x_guess, u_guess)
+        if self._kind == "raises":
+            return solution
+        x, u, success = solution.x.copy(), solution.u.copy(), solution.success.copy()
+        fails = self._rng.random(len(success)) < self._share
+        success[fails] = self._kind == "NaN and success"
+        if self._kind != "reports failure":
+            x[fails, 1:], u[fails, -1] = np.nan, np.inf
+        return solution._replace(x=x, u=u, success=success)
+
+
+def fly(scenario: str, share: float, kind: str, episodes: Sequence[int]) -> Rows:
+    """Figures of episodes, see `run_episodes`.
+
+    :raises FloatingPointError: a state or a plan is not finite
+    """
+    one, rows = condition("full", scenario, make_config("flight")), []
+    for start in range(0, len(episodes), _BATCH):
+        policy, task, rngs = begin(one, episodes[start : start + _BATCH])
+        planner = task.swarm.planner
+        if share:
+            planner.solver = FailingSolver(planner.solver, share, kind, np.random.default_rng(start))
+        found: dict[int, dict[str, Any]] = {}
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "the solver .* raised", RuntimeWarning)
+            for step in fly_steps(policy, task, rngs, one.linger):
+                if not (np.isfinite(task.swarm.state).all() and np.isfinite(task.swarm.plans).all()):
+                    raise FloatingPointError(f"{kind}, {share:.0%}: a state or a plan is not finite.")
+                found |= {int(step.episodes[k]): task.statistics.row(int(k)) for k in np.flatnonzero(step.over)}
+        rows += [found[k] for k in range(len(found))]
+    return rows
+
+
+def row(scenario: str, share: float, kind: str, episodes: int) -> dict[str, Any]:
+    """The row of a condition."""
+    first = first_episode(VALIDATION)
+    flown = fly(scenario, share, kind, range(first, first + episodes))
+    return {"scenario": scenario, "share": share, "kind": kind, **summarise(flown, make_config("flight"))}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    work = [(name, 0.0, "none") for name in SCENARIOS]
+    work += [(name, share, kind) for share in SHARES for kind in KINDS for name in SCENARIOS]
+    rows = []
+    with make_pool(args.jobs) as pool:
+        done = pool.map(row, *zip(*work, strict=True), [args.episodes] * len(work))
+        for one in progress(done, "faults", len(work)):
+            rows.append(one)
+            print(
+                f"{one['scenario']:16} {one['share']:4.0%} {one['kind']:16} collisions {one['collisions']:4}/"
+                f"{one['episodes']}, plans without a solution {one['planner_failures']}",
+                flush=True,
+            )
+    if args.json:
+        write_rows(args.json, rows)
+
+
+if __name__ == "__main__":
+    main()
