@@ -55,7 +55,7 @@ def parse_value(text: str) -> Any:
             raise error
     try:
         return _finite(yaml.safe_load(text))
-    except yaml.YAMLError:
+    except (yaml.YAMLError, RecursionError):
         raise ValueError(f"{text} is neither a list nor a dict, in Python or in YAML") from None
 
 

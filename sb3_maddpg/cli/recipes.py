@@ -225,7 +225,7 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
         raise FileNotFoundError(f"There is no recipe {path}: --conf-file names a YAML file.")
     try:
         recipes = yaml.safe_load(Path(path).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
         raise ValueError(

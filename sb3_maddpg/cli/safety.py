@@ -20,6 +20,12 @@ from sb3_maddpg.normalization import SafeVecNormalize
 class RunLoader(yaml.SafeLoader):
     """Reads the YAML of run folders: plain values, and the one Python type that rl_zoo3 writes."""
 
+    def get_single_data(self) -> Any:
+        try:
+            return super().get_single_data()
+        except RecursionError:
+            raise ValueError(f"{self.name} is nested too deeply to be a run's.") from None
+
 
 def _ordered_dict(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> dict[Any, Any]:
     """rl_zoo3 writes a list of pairs as the argument of OrderedDict."""

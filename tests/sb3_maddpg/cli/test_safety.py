@@ -55,6 +55,11 @@ def test_yaml_calls_nothing(run, capsys, name):
     assert f"{name} names what is no plain value" in capsys.readouterr().err
 
 
+def test_yaml_without_end_is_refused():
+    with pytest.raises(ValueError, match="nested too deeply"):
+        yaml.load("[" * 3000, RunLoader)
+
+
 def test_text_in_a_recipe_of_a_run_is_not_evaluated(run, capsys):
     config = yaml.load((run / "config.yml").read_text(), RunLoader)
     config["normalize"] = "__import__('pathlib').Path('caught').touch()"
