@@ -46,7 +46,7 @@ from sb3_maddpg.env_states import (
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.model_files import as_damage
 from sb3_maddpg.typed_json import decode, encode
-from sb3_maddpg.utils import shown
+from sb3_maddpg.utils import shown, sync_folder
 
 _FORMAT = 1
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
@@ -190,7 +190,7 @@ class RunCheckpoint(BaseCallback):
                 file.write(block)
             file.flush()
             os.fsync(file.fileno())
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
         return [*kept, {"name": name, "first": first, "end": end, "sha256": found.hexdigest()}]
 
     def _tidy(self) -> None:
@@ -264,15 +264,18 @@ def newest(folder: str | os.PathLike[str]) -> Path | None:
 @contextmanager
 def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
     """
-    Keep a folder of checkpoints for this process; the lock ends with it, however it ends.
+    Keep a folder of checkpoints for this process; the lock ends with it, however it ends. Not on Windows.
 
     :param folder: of the checkpoints
     :raises ValueError: another process has it
     """
-    import fcntl
-
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
+    try:
+        import fcntl
+    except ImportError:  # Windows has none
+        yield
+        return
     with (path / "lock").open("a+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -487,12 +490,12 @@ def _commit(target: Path, write: Callable[[Path], None]) -> Path:
         fault(f"synced {path.name}")
     _write_synced(unfinished / _MANIFEST, json.dumps(sums).encode())
     fault("manifest")
-    _sync_folder(unfinished)
+    sync_folder(unfinished)
     fault("folder synced")
     shutil.rmtree(target, ignore_errors=True)
     os.rename(unfinished, target)
     fault("renamed")
-    _sync_folder(target.parent)
+    sync_folder(target.parent)
     fault("committed")
     return target
 
@@ -535,11 +538,3 @@ def _write_synced(path: Path, content: bytes) -> None:
 def _sync(path: Path) -> None:
     with path.open("rb") as file:
         os.fsync(file.fileno())
-
-
-def _sync_folder(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

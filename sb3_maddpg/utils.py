@@ -102,7 +102,7 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, target)
-        _sync_folder(target.parent)
+        sync_folder(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -131,7 +131,7 @@ def _runs(process: int) -> bool:
     return True
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Without it the new name of a file may be gone after a loss of power."""
     if os.name == "nt":  # folders cannot be opened there
         return

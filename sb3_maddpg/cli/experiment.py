@@ -423,7 +423,7 @@ class TeamExperimentManager(ExperimentManager):
         :param model: the trained model
         """
         super().save_trained_model(model)
-        if self.checkpoint is not None:
+        if self.checkpoint is not None and model.num_timesteps >= model._total_timesteps:  # else it was interrupted
             shutil.rmtree(self.checkpoint.folder, ignore_errors=True)
         if model.ep_info_buffer:
             rewards = [episode["r"] for episode in model.ep_info_buffer]

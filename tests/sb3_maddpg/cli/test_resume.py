@@ -125,3 +125,18 @@ def test_checkpoints_can_be_switched_off(tmp_path, monkeypatch):
     argv = ["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--verbose", "0"]
     assert main([*argv, "--checkpoint-every", "0"]) == 0
     assert not list(Path("logs").rglob("command.json"))
+
+
+def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
+    (tmp_path / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3}}))
+    argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "300"]
+    process = start([*argv, "--verbose", "0"], tmp_path)
+    wait_for(process, 1, tmp_path)
+    process.send_signal(signal.SIGINT)
+    output = process.communicate()[0]
+    assert "Interrupted: saving" in output
+    assert checkpoints(tmp_path)
+    process = start(["--resume"], tmp_path)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    assert not checkpoints(tmp_path)
