@@ -2,9 +2,10 @@
 
 ``python -m studies.swarm.tune_flight rules|thresholds [MODEL.zip ...] [--quick] [--json F]``. A rule, or a threshold of
 a model, is safe if it is as safe as full communication, to within `SAFETY_MARGIN`, in every scenario and with every
-number of robots. All rules fly a few episodes of both swaps with eight robots, which tell their requests there; then
-they are tried from the cheapest on, in stages of more and more episodes, until one is safe. A model's thresholds are
-tried from the highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
+number of robots. All rules fly a few episodes of both swaps with eight robots, which tell their requests there; of
+those that fly these alike, one is kept. Then they are tried from the cheapest on, in stages of more and more episodes,
+until one is safe; what can no longer turn out to be safe is not flown on. A model's thresholds are tried from the
+highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
 over the episodes that it flew, and family, setting, safe (None: only its requests are known). What the table has is
 not flown again.
 """
@@ -27,7 +28,6 @@ from studies.swarm.protocol import (
     NAMES,
     QUICK_STAGES,
     fly_validation,
-    hopeless,
     progress,
     replace_rows,
     world,
@@ -56,7 +56,8 @@ CELLS: list[Cell] = [
 ]
 OWN_SWAPS = [cell for cell in CELLS if cell[0] == 8 and cell[1] in SWAPS]
 STAGES = (25, 50, 100, 250, 500, 1000, 2000, 4000)
-FIRST = 100  # episodes of one cell after the other; more only of those that none of them ruled out
+# Episodes of one cell after the other, the hardest and the others; more only of those that none of them ruled out
+FIRST, FIRST_OTHERS = 500, 100
 THRESHOLDS = (0.9, 0.85, *(round(0.8 - 0.025 * k, 3) for k in range(23)), 0.2, 0.15, 0.1, 0.05, 0.02)
 
 
@@ -111,17 +112,25 @@ def try_out(policy: str, flown: Flown, full: Flown, stages: Sequence[int]) -> tu
     :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
     """
     flown = dict(flown)
-    first, later = ([stage for stage in stages if (stage <= FIRST) == early] for early in (True, False))
-    order = [(stage, cell) for cell in CELLS for stage in first] + [(stage, cell) for stage in later for cell in CELLS]
+    first = {cell: [stage for stage in stages if stage <= (FIRST_OTHERS if k else FIRST)] for k, cell in enumerate(CELLS)}
+    order = [(stage, cell) for cell in CELLS for stage in first[cell]]
+    order += [(stage, cell) for stage in stages for cell in CELLS if stage not in first[cell]]
     for stage, cell in order:
-        episodes = min(stage, last(cell, stages))
-        flown[cell] = fly(policy, cell, episodes, flown.get(cell))
-        comparison = Comparison.of(flown[cell][:episodes], full[cell][:episodes])
-        if hopeless(comparison, SAFETY_MARGIN):
-            return flown, False
-        if episodes >= SIZES[cell[0]] and not comparison.as_safe(SAFETY_MARGIN):
+        flown[cell] = fly(policy, cell, min(stage, last(cell, stages)), flown.get(cell))
+        if not may_be_safe(flown[cell], full[cell], SIZES[cell[0]]):
             return flown, False
     return flown, True
+
+
+def may_be_safe(flown: Rows, full: Rows, deciding: int) -> bool:
+    """Whether a policy would be as safe as full communication if it did not collide any more.
+
+    :param flown: its figures of the first episodes
+    :param full: those of full communication, of all
+    :param deciding: how many decide
+    """
+    padded = [[*rows, *[{"collided": False}] * deciding][:deciding] for rows in (flown, full)]
+    return Comparison.of(*padded).as_safe(SAFETY_MARGIN)
 
 
 def rows_of(family: str, setting: str, flown: Flown, safe: bool | None) -> list[dict[str, Any]]:
@@ -147,20 +156,23 @@ def fly_full(pool: Executor, path: Path, stages: Sequence[int]) -> Flown:
 
 
 def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool) -> list[Setting]:
-    """All rules, those with the fewest requests in both swaps of eight robots first."""
+    """The rules, those with the fewest requests in both swaps of eight robots first; one of those that fly alike."""
     rules = [Setting(family, rule) for family, rules in families().items() for rule in rules[:: 12 if quick else 1]]
-    known: dict[str, list[float]] = {}
+    known: dict[str, list[dict[str, Any]]] = {}
     for row in read_rows(path):
         if (row["n_robots"], row["scenario"]) in OWN_SWAPS:
-            known.setdefault(row["setting"], []).append(row["request_share"])
+            known.setdefault(row["setting"], []).append(row)
     work = [(rule, cell) for rule in rules if len(known.get(rule.name, [])) < len(OWN_SWAPS) for cell in OWN_SWAPS]
     flown = pool.map(fly, [rule.name for rule, _ in work], [cell for _, cell in work], [stages[0]] * len(work))
     lines = []
     for (rule, cell), rows in zip(work, progress(flown, "requests", len(work)), strict=True):
         lines += rows_of(*rule, {cell: rows}, None)
-        known.setdefault(rule.name, []).append(lines[-1]["request_share"])
+        known.setdefault(rule.name, []).append(lines[-1])
     replace_rows(path, lines, ("preset", "setting"))
-    return sorted(rules, key=lambda rule: sum(known[rule.name]))
+    rules.sort(key=lambda rule: sum(row["request_share"] for row in known[rule.name]))
+    figures = ("request_share", "requests_flown", "path_length", "min_separation")
+    alike = {repr([[row.get(key) for key in figures] for row in known[rule.name]]): rule for rule in reversed(rules)}
+    return [rule for rule in rules if rule in alike.values()]
 
 
 def tune(
