@@ -17,10 +17,11 @@ import numpy as np
 from quad_swarm.evaluation.evaluation import Rows
 from quad_swarm.evaluation.flight import fly_steps
 from quad_swarm.geometry import length
+from quad_swarm.native.pairs import advance
 from quad_swarm.planner import Plans, Problems, make_planner
 from quad_swarm.quadrotor import N_INPUTS, POSITION, QuadrotorModel
 from quad_swarm.task.request_task import RequestTask, RewardConfig
-from quad_swarm.world.beliefs import BeliefSource, advance, resampled
+from quad_swarm.world.beliefs import BeliefSource, resampled
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm

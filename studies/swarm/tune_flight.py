@@ -112,7 +112,9 @@ def try_out(policy: str, flown: Flown, full: Flown, stages: Sequence[int]) -> tu
     :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
     """
     flown = dict(flown)
-    first = {cell: [stage for stage in stages if stage <= (FIRST_OTHERS if k else FIRST)] for k, cell in enumerate(CELLS)}
+    first = {
+        cell: [stage for stage in stages if stage <= (FIRST_OTHERS if k else FIRST)] for k, cell in enumerate(CELLS)
+    }
     order = [(stage, cell) for cell in CELLS for stage in first[cell]]
     order += [(stage, cell) for stage in stages for cell in CELLS if stage not in first[cell]]
     for stage, cell in order:

@@ -85,7 +85,10 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     assert [one[2:] for one in flown if one[:2] == ("good", (16, "symmetric_swap"))] == list(pairwise(stages))[:-1]
     swaps = itertools.product((4, 8, 12, 16), ("symmetric_swap", "asymmetric_swap"))
     assert {one[1] for one in flown if one[0] == "good"} == {*swaps, *((8, name) for name in NAMES)}
-    hardest, other = ({one[3] for one in flown if one[0] == "bad" and (one[1] == tune_flight.CELLS[0]) == same} for same in (True, False))
+    hardest, other = (
+        {one[3] for one in flown if one[0] == "bad" and (one[1] == tune_flight.CELLS[0]) == same}
+        for same in (True, False)
+    )
     assert max(hardest) == tune_flight.FIRST
     assert max(other) == tune_flight.STAGES[0], "what cannot turn out to be safe is not flown on"
     assert tune_flight.CELLS[0] == (16, "symmetric_swap")

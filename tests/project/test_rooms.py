@@ -15,10 +15,11 @@ SOURCES = {"sb3_maddpg": ROOT / "sb3_maddpg", "quad_swarm": ROOT / "envs" / "qua
 # What a room of quad_swarm may import beside itself. "" are the modules in the package folder: errors, geometry, ...
 ROOMS = {
     "": set(),
-    "planner": {""},
+    "native": {""},
+    "planner": {"", "native"},
     "plants": {""},
-    "world": {"", "planner", "plants"},
-    "task": {"", "planner", "world"},
+    "world": {"", "native", "planner", "plants"},
+    "task": {"", "native", "planner", "world"},
     "interfaces": {"", "planner", "world", "task"},
     "evaluation": {"", "planner", "world", "task"},
     "figures": {"", "planner", "world", "task", "evaluation"},

@@ -6,10 +6,11 @@ import functools
 import warnings
 
 from quad_swarm.errors import unknown_name
+from quad_swarm.native import BuildError
 from quad_swarm.planner.base import Planner, Plans, PlanStatus, Solution, Solver
 from quad_swarm.planner.fatrop import FatropSolver
 from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Problems
-from quad_swarm.planner.rti import BuildError, RtiSolver
+from quad_swarm.planner.rti import RtiSolver
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
 SOLVERS: dict[str, type[FatropSolver] | type[RtiSolver]] = {"rti": RtiSolver, "fatrop": FatropSolver}

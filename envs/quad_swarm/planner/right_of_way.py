@@ -6,8 +6,7 @@ and again. The rules of the air have an answer: each alters its heading to the r
 
 from __future__ import annotations
 
-import numpy as np
-
+from quad_swarm.native import pairs
 from quad_swarm.planner.problem import Problems
 
 _FADE = 1.0  # s before the closest approach, from which on less and less is asked for: then the sides are settled
@@ -25,17 +24,10 @@ def keep_right(problems: Problems, distance: float, dt: float) -> Problems:
     :param distance: how much to grow the others (m)
     :param dt: length of a stage (s)
     """
-    others, known = problems.others, problems.announced
+    known = problems.announced
     if known is None or not known.any():
         return problems
-    velocity = (others[:, :, 1] - others[:, :, 0]) / dt
-    pos = others[:, :, 0] - dt * velocity - problems.x[:, None, :3]
-    vel = velocity - problems.x[:, None, 3:6]
-    speed = np.hypot(vel[..., 0], vel[..., 1])
-    time = -(pos * vel).sum(axis=-1) / np.maximum((vel * vel).sum(axis=-1), 1e-9)
-    grown = distance * known * np.clip(time / _FADE, 0.0, 1.0) * np.clip(speed / _SLOW, 0.0, 1.0)
-    left = np.stack([vel[..., 1], -vel[..., 0], np.zeros_like(speed)], axis=-1) / np.maximum(speed, 1e-9)[..., None]
-    clearance = np.repeat(grown[..., None], others.shape[2], axis=2)
+    others, clearance = pairs.keep_right(problems.x, problems.others, known, distance, dt, _FADE, _SLOW)
     if problems.clearance is not None:
         clearance += problems.clearance
-    return problems._replace(others=others + (grown[..., None] * left)[:, :, None], clearance=clearance)
+    return problems._replace(others=others, clearance=clearance)

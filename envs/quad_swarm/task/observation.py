@@ -7,6 +7,7 @@ of features in a frame that is turned towards the other, and holds nothing that 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,7 +16,6 @@ from quad_swarm.errors import unknown_name
 from quad_swarm.geometry import length
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.view import View
-from quad_swarm.world.beliefs import advance
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import Swarm
 
@@ -179,23 +179,21 @@ def _memory(pair: PairView) -> np.ndarray:
     stages = _stages(pair.horizon)[1:]
     times = pair.dt * (np.array(stages) + 1)
     steady = view.pos[..., None, :] + times[:, None] * (view.vel + view.own_vel[:, :, None])[..., None, :]
-    bend = pair.turn(view.expected.take(stages, axis=-2) - steady)
+    bend = pair.turn(view.expected(stages) - steady)
     return np.concatenate([np.stack([remembers, age, np.exp(2 - view.age), drift], axis=-1), _flat(bend, 3)], axis=-1)
 
 
 def _plan(pair: PairView) -> np.ndarray:
     """The own plan against what is expected of the other."""
     view = pair.view
-    separation = view.plan_separation
-    stages = _stages(pair.horizon)
-    nearest = separation.argmin(axis=-1) / pair.horizon
+    approach, stages = view.plan_approach, _stages(pair.horizon)
     times = pair.dt * (np.array(stages[1:]) + 1)
     bend = view.plan[:, :, stages[1:]] - times[:, None] * view.own_vel[:, :, None]
     bend = np.broadcast_to(bend[:, :, None], (*view.pos.shape[:3], *bend.shape[2:]))
     parts = (
-        pair.closeness(separation.min(axis=-1)),
-        nearest[..., None],
-        pair.closeness(separation[..., -1])[..., 1:],
+        pair.closeness(approach.least),
+        (approach.stage / pair.horizon)[..., None],
+        pair.closeness(approach.last)[..., 1:],
         _flat(pair.turn(bend), 3),
     )
     return np.concatenate(parts, axis=-1)
@@ -219,26 +217,24 @@ def _told(pair: PairView) -> np.ndarray:
 def _mask(pair: PairView) -> np.ndarray:
     """Whom there is any use in asking: who comes near the own plan, as far as is known."""
     view = pair.view
-    return view.plan_separation.min(axis=-1, keepdims=True) < _CONFLICT * view.separation
+    return view.plan_approach.least[..., None] < _CONFLICT * view.separation
 
 
 def _critic(pair: PairView) -> np.ndarray:
     """What no robot knows: how wrong the two are about each other, and how close their plans are."""
     view, stages = pair.view, _stages(pair.horizon)
-    others = pair.swarm.beliefs.others
-    plans = advance(pair.swarm.planned_positions())[:, :, 1:]
-    theirs = plans[:, others] - view.own_pos[:, :, None, None]
-    surprise = theirs - view.expected
+    prediction, others = view.prediction, pair.swarm.beliefs.others
+    certain = replace(prediction, remembered=view.absolute_plans[:, others], remembers=np.ones(view.age.shape, bool))
+    surprise = certain.believed(stages) - view.own_pos[:, :, None, None] - view.expected(stages)
     reverse = pair.swarm.beliefs.reverse  # the other's view of this robot: the same numbers with the two exchanged
-    size = length(surprise)[..., stages]
-    separation = length(view.plan[:, :, None] - theirs)
+    size = length(surprise)
     parts = (
-        np.clip(2 * _flat(pair.turn(surprise.take(stages, axis=-2)), 3), -2, 2),
+        np.clip(2 * _flat(pair.turn(surprise), 3), -2, 2),
         np.tanh(size / 0.1),
         np.tanh(size[:, others, reverse] / 0.1),
-        pair.closeness(separation.min(axis=-1)),
-        pair.closeness(view.plan_separation.min(axis=-1)),
-        view.prediction.remembers[:, others, reverse, None],
+        pair.closeness(certain.approach(view.own_pos, view.plan).least),
+        pair.closeness(view.plan_approach.least),
+        prediction.remembers[:, others, reverse, None],
     )
     return np.concatenate(parts, axis=-1)
 
@@ -290,10 +286,17 @@ class PairObservation:
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
         pair = self._pair(swarm)
-        groups = [GROUPS[name](pair) for name in self.groups if name != "critic" or not self._blank]
-        groups.append(np.zeros((*pair.view.pos.shape[:-1], self._blank)))
-        blocks = np.concatenate(groups, axis=-1, dtype=np.float32)
-        return np.concatenate([_own(pair.view), _flat(blocks, 2)], axis=-1, dtype=np.float32)
+        teams = pair.view.pos.shape[:2]
+        observed = np.zeros((*teams, self.size), dtype=np.float32)
+        observed[..., :6] = _own(pair.view)
+        blocks = observed[..., 6:].reshape(*teams, self.config.n_robots - 1, -1)  # a view
+        column = 0
+        for name in self.groups:
+            if name != "critic" or not self._blank:
+                features = GROUPS[name](pair)
+                blocks[..., column : column + features.shape[-1]] = features
+                column += features.shape[-1]
+        return observed
 
 
 def make_observation(

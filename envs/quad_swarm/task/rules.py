@@ -69,7 +69,7 @@ def stale(age: float) -> Rule:
 
 def plan(distance: float) -> Rule:
     """Asks whoever, as far as is known without asking, comes closer to the own plan than ``distance`` (m)."""
-    return lambda view: view.plan_separation.min(axis=-1) < distance
+    return lambda view: view.plan_approach.least < distance
 
 
 def random(probability: float) -> Rule:

@@ -4,13 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from quad_swarm.geometry import length
+from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.world.beliefs import Prediction, advance
+from quad_swarm.world.beliefs import PlanApproach, Prediction
 from quad_swarm.world.swarm import Swarm
+
+
+class Presumed(NamedTuple):
+    """What each of the others predicts of a robot, as far as that robot can tell; absolute positions.
+
+    :param believed: where it would be at the stages asked for, (E, n, n - 1, stages, 3) (m)
+    :param remembers: whether by a plan, else by a constant velocity, (E, n, n - 1) bool
+    :param age: steps since that plan was made, (E, n, n - 1)
+    :param error: how far off it is by now, (E, n, n - 1) (m)
+    """
+
+    believed: np.ndarray
+    remembers: np.ndarray
+    age: np.ndarray
+    error: np.ndarray
 
 
 class View:
@@ -68,31 +85,34 @@ class View:
     @cached_property
     def current_plans(self) -> np.ndarray:
         """The same from now on, stages 0..N, (E, n, N + 1, 3) (m)."""
-        return advance(self._swarm.planned_positions()) - self.own_pos[:, :, None]
+        return self.absolute_plans - self.own_pos[:, :, None]
+
+    @cached_property
+    def absolute_plans(self) -> np.ndarray:
+        """The same in the world frame, (E, n, N + 1, 3) (m)."""
+        return advance(self._swarm.planned_positions())
 
     @cached_property
     def prediction(self) -> Prediction:
-        """What the robot predicts of those it does not ask, `Prediction`; absolute positions."""
+        """What the robot predicts of those it does not ask; absolute positions."""
         return self._swarm.beliefs.predict(*self._observed)
 
-    @cached_property
-    def expected(self) -> np.ndarray:
-        """Where the others will be at the next N steps as far as the robot knows without asking, (E, n, n - 1, N, 3)
-        (m)."""
-        believed, pos = self.prediction.believed, self.own_pos
-        # Stages and coordinates as one axis: numpy is slow along three numbers
-        relative = believed.reshape(*believed.shape[:3], -1) - np.tile(pos, self.horizon)[:, :, None]
-        return relative.reshape(believed.shape)
+    def expected(self, stages: Sequence[int] | None = None) -> np.ndarray:
+        """Where the others will be as far as the robot knows without asking, (E, n, n - 1, stages, 3) (m).
 
-    def presumed(self, stages: Sequence[int]) -> Prediction:
+        :param stages: which of the next N steps, from 0 on; None: all
+        """
+        return self.prediction.believed(stages) - self.own_pos[:, :, None, None]
+
+    def presumed(self, stages: Sequence[int]) -> Presumed:
         """What each of the others predicts of this robot unless it asks, as far as this robot can tell: it knows what
         it answered, and takes every answer to have arrived.
 
-        :param stages: which of the next N steps, from 0 on; `Prediction.believed` holds no others
+        :param stages: which of the next N steps, from 0 on
         """
         presumed = self._swarm.presume()
-        presumed = presumed._replace(believed=presumed.believed.take(stages, axis=-2))
-        return Prediction(*(self.of_the_other(field) for field in presumed))
+        fields = (presumed.believed(stages), presumed.remembers, presumed.age, presumed.error)
+        return Presumed(*map(self.of_the_other, fields))
 
     def of_the_other(self, field: np.ndarray) -> np.ndarray:
         """What each of the others has about this robot, of something that robots have about others, (E, n, n - 1,
@@ -110,9 +130,9 @@ class View:
         return self.prediction.error
 
     @cached_property
-    def plan_separation(self) -> np.ndarray:
-        """Distances between the robot's plan and what it expects of the others, (E, n, n - 1, N) (m)."""
-        return length(self.plan[:, :, None] - self.expected)
+    def plan_approach(self) -> PlanApproach:
+        """How close the robot's plan comes to what it expects of the others."""
+        return self.prediction.approach(self.own_pos, self.plan)
 
     def approach(self, look_ahead: float) -> tuple[np.ndarray, np.ndarray]:
         """Closest approach if everybody kept the present velocity.

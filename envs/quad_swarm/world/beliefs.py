@@ -9,16 +9,15 @@ ascending order.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
-from quad_swarm.geometry import length
+from quad_swarm.native import pairs
 from quad_swarm.states import like
-
-_FEW = 600  # numbers, below which arranging them takes longer than what is saved
 
 
 class BeliefSource(IntEnum):
@@ -38,23 +37,6 @@ def reverse_indices(n_robots: int) -> np.ndarray:
     """For each robot its own place among the others of each of its others, see `other_indices`: (n, n - 1)."""
     others = other_indices(n_robots)
     return np.array([[row.tolist().index(i) for row in others[others[i]]] for i in range(n_robots)], dtype=np.int64)
-
-
-def constant_velocity(pos: np.ndarray, vel: np.ndarray, horizon: int, dt: float) -> np.ndarray:
-    """Positions at the next ``horizon`` steps if the velocity stayed: (..., 3), (..., 3) -> (..., N, 3) (m)."""
-    if pos.size < _FEW:
-        return pos[..., None, :] + (dt * np.arange(1, horizon + 1))[:, None] * vel[..., None, :]
-    # Stages and coordinates as one axis: numpy is slow along three numbers
-    trajectory = np.tile(vel, horizon)
-    trajectory *= np.repeat(dt * np.arange(1, horizon + 1), 3)
-    trajectory += np.tile(pos, horizon)
-    return trajectory.reshape(*pos.shape[:-1], horizon, 3)
-
-
-def advance(trajectory: np.ndarray) -> np.ndarray:
-    """A trajectory (..., K, 3) seen one step later; its last piece goes on in a straight line."""
-    end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
-    return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
 
 
 def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:
@@ -83,19 +65,52 @@ def answered(arriving: np.ndarray, trajectories: np.ndarray, others: np.ndarray)
     return trajectories[swarms, others[robots, places]]
 
 
-class Prediction(NamedTuple):
-    """What robots predict of the others as long as they do not request their plans.
+class PlanApproach(NamedTuple):
+    """How close a plan comes to what is believed of the others.
 
-    :param believed: positions at the next N steps, (E, n, n - 1, N, 3), world frame (m)
-    :param remembers: whether an earlier plan is believed, else a constant velocity, (E, n, n - 1) bool
-    :param age: steps since the newest plan received was made, N or more: none, (E, n, n - 1)
-    :param error: how far off that plan is by now, (E, n, n - 1) (m)
+    :param least: least distance over the next N steps, (E, n, n - 1) (m)
+    :param stage: at which of them it is reached first, from 0 on, (E, n, n - 1)
+    :param last: distance at the last of them, (E, n, n - 1) (m)
     """
 
-    believed: np.ndarray
+    least: np.ndarray
+    stage: np.ndarray
+    last: np.ndarray
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What robots predict of the others as long as they do not request their plans.
+
+    :param pos: positions of the others, (E, n, n - 1, 3), world frame (m)
+    :param vel: velocities of the others, (E, n, n - 1, 3), world frame (m/s)
+    :param remembered: plans received last, from now on, (E, n, n - 1, N + 1, 3), world frame (m)
+    :param remembers: whether those are believed, else a constant velocity, (E, n, n - 1) bool
+    :param age: steps since the newest plan received was made, N or more: none, (E, n, n - 1)
+    :param error: how far off that plan is by now, (E, n, n - 1) (m)
+    :param dt: length of a stage (s)
+    """
+
+    pos: np.ndarray
+    vel: np.ndarray
+    remembered: np.ndarray
     remembers: np.ndarray
     age: np.ndarray
     error: np.ndarray
+    dt: float
+
+    def believed(self, stages: Sequence[int] | None = None) -> np.ndarray:
+        """Positions at some of the next N steps, 0 is the first; at all of them if None: (E, n, n - 1, stages, 3),
+        world frame (m)."""
+        return pairs.believe(self.pos, self.vel, self.remembered, self.remembers, self.dt, stages)
+
+    def approach(self, own: np.ndarray, plan: np.ndarray) -> PlanApproach:
+        """How close plans come to what is believed.
+
+        :param own: the robots' positions, (E, n, 3), world frame (m)
+        :param plan: their positions at the next N steps relative to that, (E, n, N, 3) (m)
+        """
+        return PlanApproach(*pairs.approach(own, plan, self.pos, self.vel, self.remembered, self.remembers, self.dt))
 
 
 class Beliefs:
@@ -120,8 +135,8 @@ class Beliefs:
         # Remembered positions of now and of the next N steps; age in steps since they were planned, N or more: none.
         self._remembered = np.zeros((*shape, horizon + 1, 3))
         self._age = np.full(shape, horizon, dtype=np.int64)
-        # The last positions, velocities and prediction: who decides predicts first, and the step does so again.
-        self._known: tuple[np.ndarray, np.ndarray, tuple[Prediction, np.ndarray]] | None = None
+        # The last prediction: who decides predicts first, and the step does so again.
+        self._known: Prediction | None = None
 
     @property
     def age(self) -> np.ndarray:
@@ -157,30 +172,38 @@ class Beliefs:
         :param pos: present positions of the others, (E, n, n - 1, 3), world frame (m)
         :param vel: present velocities of the others, (E, n, n - 1, 3), world frame (m/s)
         """
-        return self._predict_once(pos, vel)[0]
-
-    def _predict_once(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Prediction, np.ndarray]:
         known = self._known
-        if known is None or not (np.array_equal(known[0], pos) and np.array_equal(known[1], vel)):
-            known = self._known = (pos.copy(), vel.copy(), self._predict(pos, vel))
-        return known[2]
+        if known is None or not (np.array_equal(known.pos, pos) and np.array_equal(known.vel, vel)):
+            known = self._known = self._predict(pos.copy(), vel.copy())
+        return known
 
-    def _predict(self, pos: np.ndarray, vel: np.ndarray) -> tuple[Prediction, np.ndarray]:
-        """:return: what is believed, and what is remembered, from now on; nothing else holds these arrays"""
-        believed = constant_velocity(pos, vel, self.horizon, self.dt)
-        if not self.memory:
-            never = np.full(self._age.shape, self.horizon)
-            return Prediction(believed, np.zeros(never.shape, bool), never, np.zeros(never.shape)), self._remembered
-        remembered, age = advance(self._remembered), self._age + 1
-        error = length(remembered[..., 0, :] - pos)
-        remembers = (age < self.horizon) & (error <= self.memory)
-        believed[remembers] = remembered[remembers, 1:]
-        return Prediction(believed, remembers, age, error), remembered
+    def _predict(self, pos: np.ndarray, vel: np.ndarray) -> Prediction:
+        if self.memory:
+            remembered, age, error, remembers = pairs.remember(self._remembered, self._age, pos, self.memory)
+        else:
+            remembered, age = self._remembered, np.full(self._age.shape, self.horizon)
+            error, remembers = np.zeros(age.shape), np.zeros(age.shape, dtype=bool)
+        return Prediction(pos, vel, remembered, remembers, age, error, self.dt)
 
     def update(
         self, arriving: np.ndarray, pos: np.ndarray, vel: np.ndarray, received: np.ndarray, age: np.ndarray | int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Believed trajectories after this step's requests.
+        """Believed trajectories after this step's requests; arguments as in `receive`.
+
+        :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
+            1)
+        """
+        prediction = self.predict(pos, vel)
+        believed = prediction.believed()
+        arriving, received = self.receive(arriving, pos, vel, received, age)
+        believed[arriving] = received[:, 1:]
+        unasked = np.where(prediction.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
+        return believed, np.where(arriving, BeliefSource.REQUESTED, unasked)
+
+    def receive(
+        self, arriving: np.ndarray, pos: np.ndarray, vel: np.ndarray, received: np.ndarray, age: np.ndarray | int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Keep what arrives, and let a step pass for what is remembered.
 
         :param arriving: whose plans each robot receives, (E, n, n - 1) bool
         :param pos: present positions of the others, (E, n, n - 1, 3), world frame (m)
@@ -188,28 +211,23 @@ class Beliefs:
         :param received: the plans that arrive, as positions now and at the next N steps, (number of answers, N + 1, 3)
             (m); see `answered`
         :param age: steps since each of them was made, (number of answers,), or one number for all
-        :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
-            1)
+        :return: those of the answers that are newer than what was known: who receives them, and the plans
         """
-        prediction, remembered = self._predict_once(pos, vel)
+        prediction = self.predict(pos, vel)
         if isinstance(age, np.ndarray):
             # An answer may come after one that was made later.
             newer = age <= prediction.age[arriving]
             arriving, received, age = arriving.copy(), received[newer], age[newer]
             arriving[arriving] = newer
-        believed = prediction.believed.copy()
-        believed[arriving] = received[:, 1:]
-        unasked = np.where(prediction.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
-        source = np.where(arriving, BeliefSource.REQUESTED, unasked)
         if self.memory:
-            remembered[arriving] = received
-            self._remembered = remembered
+            self._remembered = prediction.remembered  # nobody else reads it any more
+            self._remembered[arriving] = received
             self._age = prediction.age.copy()
             self._age[arriving] = age
         else:
             self._age = np.where(arriving, _filled(arriving, age), self.horizon)
         self._known = None
-        return believed, source
+        return arriving, received
 
 
 def _filled(where: np.ndarray, values: np.ndarray | int) -> np.ndarray:

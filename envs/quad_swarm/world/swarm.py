@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown
+from quad_swarm.native.pairs import advance, resample
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.states import like
-from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, advance, answered, other_indices, resampled
+from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, other_indices, resampled
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
 
@@ -259,7 +260,7 @@ class Swarm:
         age = 1 + radio.delay
         if self.presumed_beliefs is not self.beliefs:
             presumed = answered(requests, trajectories, others)
-            self.presumed_beliefs.update(requests, *self._seen_by_all(), presumed, age)
+            self.presumed_beliefs.receive(requests, *self._seen_by_all(), presumed, age)
         arriving, lateness = self.chance.arrivals(requests, others)
         received, ages = answered(arriving, trajectories, others), age
         if lateness is not None:
@@ -276,7 +277,7 @@ class Swarm:
         if start is not None:
             later = start / self.config.substeps
             x = self.planner.model.ahead(x, self._u, later * self.config.planner.dt)
-            believed = resampled(believed, np.broadcast_to(later[..., None], believed.shape[:3]))
+            resample(believed, later)
         announced = None
         if self.config.planner.right_of_way:
             announced = (source != BeliefSource.CONSTANT_VELOCITY).reshape(-1, source.shape[2])

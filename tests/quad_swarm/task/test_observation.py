@@ -118,7 +118,7 @@ def test_the_side_on_which_the_other_would_pass_is_seen_although_the_frame_is_mi
 def test_the_mask_names_those_who_come_near_the_own_plan():
     observation, swarm = make_observation(CONFIG, EVERYTHING + "+mask"), flown()
     mask = observation(swarm)[..., observation.layout["action_mask"]]
-    near = View(swarm).plan_separation.min(axis=-1) < 1.8 * CONFIG.planner.separation
+    near = View(swarm).plan_approach.least < 1.8 * CONFIG.planner.separation
     assert np.array_equal(mask, near)
     assert 0 < near.mean() < 1
     assert "action_mask" not in make_observation(CONFIG, EVERYTHING).layout

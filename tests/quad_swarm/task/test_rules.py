@@ -105,7 +105,7 @@ def test_plan_looks_at_the_own_plan():
     swarm.reset(0, np.array([[-1.5, 0, 1], [1.5, 0, 1]]), np.array([[1.5, 0.2, 1], [1.5, 0, 1]]))
     for _ in range(6):
         swarm.step(np.zeros((1, 2, 1), bool))
-    near = View(swarm).plan_separation.min(axis=-1)
+    near = View(swarm).plan_approach.least
     assert near[0, 0, 0] < 1.5
     assert np.array_equal(parse_rule("plan:1.5")(View(swarm)), near < 1.5)
     assert not parse_rule("plan:0.1")(View(swarm)).any()

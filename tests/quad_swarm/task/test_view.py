@@ -62,9 +62,11 @@ def test_plans_are_as_of_now_and_others_are_expected_where_they_head():
     # Nobody asked: the others go on as they fly
     times = swarm.config.planner.dt * np.arange(1, horizon + 1)
     expected = view.pos[0, 0, 0] + times[:, None] * swarm.vel[0, 1]
-    np.testing.assert_allclose(view.expected[0, 0, 0], expected, atol=1e-9)
+    np.testing.assert_allclose(view.expected()[0, 0, 0], expected, atol=1e-9)
     separation = np.linalg.norm(view.plan[0, 0] - expected, axis=-1)
-    np.testing.assert_allclose(view.plan_separation[0, 0, 0], separation, atol=1e-9)
+    assert view.expected([1, 4])[0, 0, 0].tolist() == view.expected()[0, 0, 0, [1, 4]].tolist()
+    near = (separation.min(), separation.argmin(), separation[-1])
+    assert [field[0, 0, 0] for field in view.plan_approach] == pytest.approx(near, abs=1e-9)
 
 
 def test_answers_age_and_drift():

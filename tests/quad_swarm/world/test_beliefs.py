@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
+from quad_swarm.native.pairs import advance
 from quad_swarm.world.beliefs import (
     Beliefs,
     BeliefSource,
-    advance,
     answered,
-    constant_velocity,
     other_indices,
     resampled,
 )
@@ -22,6 +21,10 @@ def straight_plans(pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
     return pos[:, :, None] + times[:, None] * vel[:, :, None]
 
 
+def constant_velocity(pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
+    return pos + DT * np.arange(1, N + 1)[:, None] * vel
+
+
 def update(
     beliefs: Beliefs, asked: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -32,11 +35,6 @@ def update(
 
 def test_other_indices():
     assert other_indices(3).tolist() == [[1, 2], [0, 2], [0, 1]]
-
-
-def test_advance_goes_on_straight():
-    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 1, 0]])
-    assert advance(line).tolist() == [[1, 0, 0], [2, 1, 0], [3, 2, 0]]
 
 
 def test_resampled_goes_on_straight_at_both_ends():
@@ -59,11 +57,6 @@ def test_of_two_answers_the_one_made_later_is_kept():
     assert believed[0, 1, 0].tolist() == moving[1, 1:].tolist()
 
 
-def test_constant_velocity_starts_one_step_ahead():
-    believed = constant_velocity(np.zeros(3), np.array([1.0, 0, -2]), 2, 0.5)
-    assert believed.tolist() == [[0.5, 0, -1], [1, 0, -2]]
-
-
 def test_a_requested_plan_is_shifted_to_now():
     beliefs = Beliefs(1, 2, N, DT, memory=0.0)
     pos = np.array([[[0.0, 0, 1], [3, 0, 1]]])
@@ -73,7 +66,7 @@ def test_a_requested_plan_is_shifted_to_now():
     assert source.ravel().tolist() == [BeliefSource.REQUESTED, BeliefSource.CONSTANT_VELOCITY]
     # Stage k of the belief is stage k + 1 of the plan of one step ago.
     np.testing.assert_allclose(believed[0, 0, 0, : N - 1], plans[0, 1, 2:])
-    np.testing.assert_allclose(believed[0, 1, 0], constant_velocity(pos[0, 0], vel[0, 0], N, DT))
+    np.testing.assert_allclose(believed[0, 1, 0], constant_velocity(pos[0, 0], vel[0, 0]))
 
 
 @pytest.mark.parametrize(("memory", "remembers"), [(0.0, False), (0.3, True)])
@@ -87,7 +80,7 @@ def test_memory_is_a_switch(memory, remembers):
     believed, source = update(beliefs, silent, pos, vel, straight_plans(pos, turning))
     if remembers:
         assert (source == BeliefSource.REMEMBERED).all()
-        np.testing.assert_allclose(believed[0, 0, 0], constant_velocity(pos[0, 1], turning[0, 1], N, DT))
+        np.testing.assert_allclose(believed[0, 0, 0], constant_velocity(pos[0, 1], turning[0, 1]))
     else:
         assert (source == BeliefSource.CONSTANT_VELOCITY).all()
 

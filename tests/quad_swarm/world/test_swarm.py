@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from quad_swarm.native.pairs import advance
 from quad_swarm.planner import PlanStatus
 from quad_swarm.task.view import View
-from quad_swarm.world.beliefs import BeliefSource, advance
+from quad_swarm.world.beliefs import BeliefSource
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -148,11 +149,12 @@ def test_a_robot_knows_what_the_others_believe_of_it():
         swarm.step(rng.random((2, 4, 3)) < 0.3)
     presumed = View(swarm).presumed(range(swarm.config.planner.horizon))
     prediction = swarm.beliefs.predict(*swarm.observe())
+    believed = (prediction.believed(), prediction.remembers, prediction.age, prediction.error)
     assert 0 < presumed.remembers.mean() < 1
     for i, m in np.ndindex(4, 3):
         j = swarm.beliefs.others[i, m]
         mine = swarm.beliefs.others[j].tolist().index(i)
-        for field, of_other in zip(presumed, prediction, strict=True):
+        for field, of_other in zip(presumed, believed, strict=True):
             assert np.array_equal(field[:, i, m], of_other[:, j, mine])
 
 

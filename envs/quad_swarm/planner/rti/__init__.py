@@ -1,6 +1,5 @@
 """Batched real-time iteration: CasADi-generated derivatives, a structured interior-point method, problems in lanes."""
 
-from quad_swarm.planner.rti.build import BuildError
 from quad_swarm.planner.rti.solver import RtiSolver
 
-__all__ = ["BuildError", "RtiSolver"]
+__all__ = ["RtiSolver"]

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from quad_swarm.errors import unknown_name
+from quad_swarm.native.build import build, load
 from quad_swarm.planner.base import Solution
 from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Problems
-from quad_swarm.planner.rti.build import build, load
 from quad_swarm.planner.rti.codegen import generate_model
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams
 
-PRECISIONS = ("float32", "float64")
+# Of the iteration, and the type that it has in C++
+PRECISIONS = {"float32": "float", "float64": "double"}
+_FUNCTION = "quad_swarm_rti"
+_SOURCES = Path(__file__).parent
 
 
 class RtiSolver:
@@ -65,7 +70,8 @@ class RtiSolver:
         """
         if self._kernel is None:
             model = _generated(self.problem.config, self.problem.quadrotor, self.problem.n_others)
-            self._kernel = load(str(build(model, self.precision))).quad_swarm_rti
+            self._kernel = getattr(load(str(build_kernel(model, self.precision)), _FUNCTION), _FUNCTION)
+            self._kernel.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 3, ctypes.c_double]
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """See `Solver.solve`."""
@@ -97,6 +103,16 @@ class RtiSolver:
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"_kernel": None}  # loaded again in the process that needs it
+
+
+def build_kernel(model: str, precision: str) -> Path:
+    """The kernel of a problem, see `build`.
+
+    :param model: the header that `generate_model` wrote
+    :param precision: one of `PRECISIONS`
+    """
+    sources = {name: (_SOURCES / name).read_text(encoding="utf-8") for name in ("lanes.hpp", "kernel.cpp")}
+    return build("rti", "kernel.cpp", {**sources, "model.hpp": model}, [f"REAL={PRECISIONS[precision]}"])
 
 
 @functools.lru_cache(maxsize=64)

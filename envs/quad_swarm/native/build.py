@@ -1,4 +1,4 @@
-"""Compiles the kernel once for each problem and keeps the result in the user's cache."""
+"""Compiles C++ once for each text and machine and keeps the result in the user's cache."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-_SOURCES = Path(__file__).parent
 _SUFFIX = ".dll" if sys.platform == "win32" else ".so"
 # Fused multiplications stand in the source and NaN must stay NaN: nothing here may let the compiler rearrange numbers.
 _FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-fvisibility=hidden")
@@ -25,11 +25,11 @@ _TIMEOUT = 300  # seconds; a compiler that takes longer hangs
 
 
 class BuildError(RuntimeError):
-    """The kernel cannot be compiled here; the message says why and what helps."""
+    """Nothing can be compiled here; the message says why and what helps."""
 
 
 def cache_directory() -> Path:
-    """Where compiled kernels are kept: ``QUAD_SWARM_CACHE``, or the user's cache directory."""
+    """Where compiled libraries are kept: ``QUAD_SWARM_CACHE``, or the user's cache directory."""
     if chosen := os.environ.get("QUAD_SWARM_CACHE"):
         return Path(chosen)
     if sys.platform == "win32":
@@ -58,21 +58,21 @@ def compiler() -> list[str]:
     raise BuildError("no C++ compiler: install g++ or clang++, or name one in CXX")
 
 
-def build(model: str, precision: str) -> Path:
-    """The shared library of a problem, compiled unless the cache has it whole.
+def build(name: str, main: str, sources: Mapping[str, str], defines: Sequence[str] = ()) -> Path:
+    """The shared library of some sources, compiled unless the cache has it whole.
 
     Beside each library stands its checksum: a damaged one is compiled again. Without a compiler that works, a library
     that any compiler made of the same sources on such a machine will do.
 
-    :param model: the header that `generate_model` wrote
-    :param precision: "float32" or "float64"
+    :param name: how the library's file begins
+    :param main: the file that is compiled; it includes the others
+    :param sources: texts by the names of their files
+    :param defines: macros, ``NAME=VALUE``
     :raises BuildError: no compiler, or it fails, or the cache cannot be written
     """
-    options = [*_FLAGS, _native_flag(), f"-DREAL={'float' if precision == 'float32' else 'double'}"]
-    sources = {name: (_SOURCES / name).read_text(encoding="utf-8") for name in ("lanes.hpp", "kernel.cpp")}
-    sources["model.hpp"] = model
+    options = [*_FLAGS, _native_flag(), *(f"-D{define}" for define in defines)]
     directory = cache_directory()
-    name = f"rti-{_digest(*options, _machine(), *sources.values())}"
+    name = f"{name}-{_digest(*options, _machine(), *sources.values())}"
     try:
         command = [*compiler(), *options]
         library = directory / f"{name}-{_digest(*command, _target(tuple(command)))}{_SUFFIX}"
@@ -91,7 +91,7 @@ def build(model: str, precision: str) -> Path:
             for file, text in sources.items():
                 Path(folder, file).write_text(text, encoding="utf-8")
             result = Path(folder, library.name)
-            _run([*command, *_SHARED, str(Path(folder, "kernel.cpp")), "-o", str(result)])
+            _run([*command, *_SHARED, str(Path(folder, main)), "-o", str(result)])
             checksum = Path(folder, _checksum_file(library).name)
             checksum.write_text(hashlib.sha256(result.read_bytes()).hexdigest(), encoding="utf-8")
             # On Windows a library in use cannot be replaced: then another process was faster, and made the same.
@@ -107,21 +107,21 @@ def build(model: str, precision: str) -> Path:
 
 
 @functools.lru_cache(maxsize=64)
-def load(path: str) -> ctypes.CDLL:
-    """A compiled kernel with its types declared; see `kernel.cpp` for what it is given.
+def load(path: str, *functions: str) -> ctypes.CDLL:
+    """A compiled library.
 
+    :param functions: what it must hold
     :raises BuildError: the system does not load it
     """
     try:
         library = ctypes.CDLL(path)
-        function = library.quad_swarm_rti
+        for name in functions:
+            getattr(library, name).restype = None
     except (OSError, AttributeError) as error:
         raise BuildError(
             f"cannot load {path} ({error}); delete that file to have it compiled again, or name a directory from which "
             "libraries may be loaded in QUAD_SWARM_CACHE"
         ) from error
-    function.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 3, ctypes.c_double]
-    function.restype = None
     return library
 
 
@@ -162,7 +162,7 @@ def _remove_leftovers(directory: Path) -> None:
 
 @functools.cache
 def _machine() -> str:
-    """What a compiled kernel is tied to, as far as can be told without a compiler: the system and the processor."""
+    """What a compiled library is tied to, as far as can be told without a compiler: the system and the processor."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             lines = [line for line in file if line.startswith(("flags", "Features", "CPU part"))]

@@ -1,4 +1,4 @@
-"""The kernel as a piece of software: compilers, cache, processes, sanitizers, and the same bits from every build."""
+"""The kernels as pieces of software: compilers, cache, processes, sanitizers, and the same bits from every build."""
 
 import multiprocessing
 import os
@@ -15,6 +15,7 @@ import pytest
 from planning import QUADROTOR, assert_same
 
 from quad_swarm import planner
+from quad_swarm.native import build as build_module
 from quad_swarm.planner import (
     BuildError,
     FatropSolver,
@@ -24,11 +25,11 @@ from quad_swarm.planner import (
     RtiSolver,
     make_planner,
 )
-from quad_swarm.planner.rti import build as build_module
 from quad_swarm.planner.rti.codegen import generate_model
+from quad_swarm.planner.rti.solver import build_kernel
 
 CONFIG = PlannerConfig(horizon=3)
-SOURCES = Path(build_module.__file__).parent
+SOURCES = Path(planner.__file__).parent / "rti"
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +46,7 @@ def compiled(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("QUAD_SWARM_CACHE", str(folder))
         for precision in ("float32", "float64"):
-            build_module.build(generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2)), precision)
+            build_kernel(generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2)), precision)
     return folder
 
 
@@ -80,7 +81,7 @@ def test_compiles_once_for_each_problem(cache):
 def test_every_number_of_the_problem_is_in_the_key(cache, stub_compiler):
     for config in (CONFIG, PlannerConfig(horizon=3, goal_weight=9.0)):
         model = generate_model(OptimalControlProblem(config, QUADROTOR, 1))
-        assert build_module.build(model, "float32").is_file()
+        assert build_kernel(model, "float32").is_file()
     assert len(libraries(cache)) == 2
 
 
@@ -193,17 +194,17 @@ def stub_compiler(monkeypatch) -> None:
     ids=["no library", "a bit", "no checksum"],
 )
 def test_a_damaged_library_is_compiled_again(damage, stub_compiler):
-    library = build_module.build("model", "float32")
+    library = build_kernel("model", "float32")
     content = library.read_bytes()
     damage(library)
-    assert build_module.build("model", "float32") == library
+    assert build_kernel("model", "float32") == library
     assert library.read_bytes() == content
     assert build_module._is_whole(library)
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
 def test_a_library_of_another_user_is_not_loaded(stub_compiler, monkeypatch):
-    library = build_module.build("model", "float32")
+    library = build_kernel("model", "float32")
     assert stat.S_IMODE(library.parent.stat().st_mode) & 0o022 == 0
     owner = library.stat().st_uid
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
@@ -223,12 +224,12 @@ def test_without_a_compiler_the_cache_will_do(kind, filled, tmp_path, monkeypatc
 
 
 def test_a_library_of_another_machine_is_not_used(tmp_path, monkeypatch, stub_compiler):
-    library = build_module.build("model", "float32")
+    library = build_kernel("model", "float32")
     break_compiler("absent", tmp_path, monkeypatch)
-    assert build_module.build("model", "float32") == library
+    assert build_kernel("model", "float32") == library
     monkeypatch.setattr(build_module, "_machine", lambda: "a processor without vectors")
     with pytest.raises(BuildError, match="no C\\+\\+ compiler"):
-        build_module.build("model", "float32")
+        build_kernel("model", "float32")
 
 
 @pytest.mark.parametrize("value", [" ", "'x"])
@@ -243,7 +244,7 @@ def test_folders_of_killed_builds_are_removed(cache, stub_compiler):
     for folder in (old, young):
         folder.mkdir(parents=True)
     os.utime(old, (0, 0))
-    build_module.build("model", "float32")
+    build_kernel("model", "float32")
     assert not old.exists()
     assert young.exists(), "another process may be at work in it"
 

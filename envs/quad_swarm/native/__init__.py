@@ -1,0 +1,5 @@
+"""Compiled code: the compiler and its cache, and what is computed for every pair of robots in every step."""
+
+from quad_swarm.native.build import BuildError
+
+__all__ = ["BuildError"]

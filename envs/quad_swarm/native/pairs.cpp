@@ -1,0 +1,133 @@
+// What is computed for every pair of robots in every step. pairs.py says what, and does the same in NumPy to the last
+// bit: no operation here may change its order.
+//
+// All arrays are contiguous. A trajectory is a row of 3 N numbers, stage by stage; pairs are ordered by the robot, then
+// by the other.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+namespace {
+
+using Integer = std::int64_t;
+using Flag = std::uint8_t;
+
+inline double dot(const double* a, const double* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+inline double distance(const double* a, const double* b) {
+  const double difference[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+  return std::sqrt(dot(difference, difference));
+}
+
+inline double clipped(double value) { return std::min(std::max(value, 0.0), 1.0); }
+
+// A constant velocity at some times, each of which stands three times.
+inline void steady(const double* pos, const double* vel, const std::vector<double>& times, double* to) {
+  for (std::size_t k = 0; k < times.size(); k += 3)
+    for (int i = 0; i < 3; i++) to[k + i] = vel[i] * times[k + i] + pos[i];
+}
+
+}  // namespace
+
+#if defined(_WIN32)
+#define EXPORT extern "C" __declspec(dllexport)
+#else
+#define EXPORT extern "C" __attribute__((visibility("default")))
+#endif
+
+EXPORT void quad_swarm_remember(Integer n_pairs, Integer n_stages, double memory, const double* pos,
+                                const double* remembered, const Integer* age, double* next, Integer* next_age,
+                                double* error, Flag* remembers) {
+  const Integer row = 3 * (n_stages + 1);
+  for (Integer pair = 0; pair < n_pairs; pair++) {
+    const double* from = remembered + row * pair;
+    double* to = next + row * pair;
+    std::memcpy(to, from + 3, (row - 3) * sizeof(double));
+    for (int i = 0; i < 3; i++) to[row - 3 + i] = 2 * from[row - 3 + i] - from[row - 6 + i];
+    error[pair] = distance(to, pos + 3 * pair);
+    next_age[pair] = age[pair] + 1;
+    remembers[pair] = next_age[pair] < n_stages && error[pair] <= memory;
+  }
+}
+
+EXPORT void quad_swarm_believe(Integer n_pairs, Integer n_stages, Integer n_chosen, double dt, const Integer* chosen,
+                               const double* pos, const double* vel, const double* remembered, const Flag* remembers,
+                               double* believed) {
+  std::vector<double> times(3 * n_chosen);
+  for (Integer k = 0; k < 3 * n_chosen; k++) times[k] = dt * static_cast<double>(chosen[k / 3] + 1);
+  for (Integer pair = 0; pair < n_pairs; pair++) {
+    const double* from = remembered + 3 * (n_stages + 1) * pair;
+    double* to = believed + 3 * n_chosen * pair;
+    if (!remembers[pair]) {
+      steady(pos + 3 * pair, vel + 3 * pair, times, to);
+    } else {
+      for (Integer k = 0; k < n_chosen; k++) std::memcpy(to + 3 * k, from + 3 * (chosen[k] + 1), 3 * sizeof(double));
+    }
+  }
+}
+
+EXPORT void quad_swarm_approach(Integer n_robots, Integer n_others, Integer n_stages, double dt, const double* own,
+                                const double* plan, const double* pos, const double* vel, const double* remembered,
+                                const Flag* remembers, double* least, Integer* nearest, double* last) {
+  std::vector<double> times(3 * n_stages), buffer(3 * n_stages), distances(n_stages);
+  for (Integer k = 0; k < 3 * n_stages; k++) times[k] = dt * static_cast<double>(k / 3 + 1);
+  for (Integer robot = 0; robot < n_robots; robot++) {
+    const double *mine = plan + 3 * n_stages * robot, *origin = own + 3 * robot;
+    for (Integer pair = robot * n_others; pair < (robot + 1) * n_others; pair++) {
+      const double* theirs = remembered + 3 * (n_stages + 1) * pair + 3;
+      if (!remembers[pair]) {
+        steady(pos + 3 * pair, vel + 3 * pair, times, buffer.data());
+        theirs = buffer.data();
+      }
+      for (Integer k = 0; k < n_stages; k++) {
+        double between[3];
+        for (int i = 0; i < 3; i++) between[i] = mine[3 * k + i] - (theirs[3 * k + i] - origin[i]);
+        distances[k] = std::sqrt(dot(between, between));
+      }
+      nearest[pair] = std::min_element(distances.begin(), distances.end()) - distances.begin();
+      least[pair] = distances[nearest[pair]];
+      last[pair] = distances[n_stages - 1];
+    }
+  }
+}
+
+EXPORT void quad_swarm_resample(Integer n_robots, Integer n_rows, Integer n_stages, const double* later,
+                                double* trajectories) {
+  for (Integer robot = 0; robot < n_robots; robot++) {
+    for (Integer k = robot * n_rows; k < (robot + 1) * n_rows; k++) {
+      double* row = trajectories + 3 * n_stages * k;
+      const Integer last = 3 * (n_stages - 1);
+      double piece[3];
+      for (int i = 0; i < 3; i++) piece[i] = (row[last + i] - row[last - 3 + i]) * later[robot];
+      for (Integer j = 0; j < last; j++) row[j] += (row[j + 3] - row[j]) * later[robot];
+      for (int i = 0; i < 3; i++) row[last + i] += piece[i];
+    }
+  }
+}
+
+EXPORT void quad_swarm_keep_right(Integer n_robots, Integer n_others, Integer n_stages, double width, double dt,
+                                  double fade, double slow, const double* x, const Flag* known, double* others,
+                                  double* clearance) {
+  for (Integer pair = 0; pair < n_robots * n_others; pair++) {
+    if (!known[pair]) continue;
+    const double* state = x + 9 * (pair / n_others);
+    double* row = others + 3 * n_stages * pair;
+    double pos[3], vel[3];
+    for (int i = 0; i < 3; i++) {
+      const double velocity = (row[3 + i] - row[i]) / dt;
+      pos[i] = row[i] - dt * velocity - state[i];
+      vel[i] = velocity - state[3 + i];
+    }
+    const double speed = std::hypot(vel[0], vel[1]);
+    const double time = -dot(pos, vel) / std::max(dot(vel, vel), 1e-9);
+    const double grown = width * clipped(time / fade) * clipped(speed / slow);
+    const double shift[2] = {grown * (vel[1] / std::max(speed, 1e-9)), grown * (-vel[0] / std::max(speed, 1e-9))};
+    for (Integer k = 0; k < n_stages; k++) {
+      row[3 * k] += shift[0];
+      row[3 * k + 1] += shift[1];
+      clearance[n_stages * pair + k] += grown;
+    }
+  }
+}

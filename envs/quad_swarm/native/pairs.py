@@ -1,0 +1,185 @@
+"""What is computed for every pair of robots in every step: by compiled code where there is a compiler, else by NumPy.
+
+Both give the same numbers to the last bit. ``pairs`` below stands for any leading axes that end with the robots and
+their others; N are the stages of a plan.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from quad_swarm.geometry import length
+from quad_swarm.native.build import BuildError, build, load
+
+_SOURCE = "pairs.cpp"
+_INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+_FUNCTIONS = {
+    "quad_swarm_remember": [_INTEGER, _INTEGER, _REAL, *[_ARRAY] * 7],
+    "quad_swarm_believe": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 6],
+    "quad_swarm_approach": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 9],
+    "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
+    "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
+}
+
+
+@functools.cache
+def compiled() -> ctypes.CDLL | None:
+    """The compiled functions; None where they cannot be compiled, of which the planner warns."""
+    try:
+        text = (Path(__file__).parent / _SOURCE).read_text(encoding="utf-8")
+        library = load(str(build("pairs", _SOURCE, {_SOURCE: text})), *_FUNCTIONS)
+    except BuildError:
+        return None
+    for name, types in _FUNCTIONS.items():
+        getattr(library, name).argtypes = types
+    return library
+
+
+def remember(
+    remembered: np.ndarray, age: np.ndarray, pos: np.ndarray, memory: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Plans received earlier, one step later.
+
+    :param remembered: positions from the last step on, (pairs, N + 1, 3) (m)
+    :param age: steps since they were made, N or more: there is none, (pairs) int64
+    :param pos: where the others are seen now, (pairs, 3) (m)
+    :param memory: how far off a plan may be that is still believed (m)
+    :return: positions from now on, the last piece going on in a straight line; ages; how far off they are (m); and
+        which are believed, bool
+    """
+    n_stages = remembered.shape[-2] - 1
+    if (library := compiled()) is None:
+        later, age = advance(remembered), age + 1
+        error = length(later[..., 0, :] - pos)
+        return later, age, error, (age < n_stages) & (error <= memory)
+    remembered, age, pos = map(np.ascontiguousarray, (remembered, age, pos))
+    later, next_age = np.empty_like(remembered), np.empty_like(age)
+    error, remembers = np.empty(age.shape), np.empty(age.shape, dtype=bool)
+    library.quad_swarm_remember(
+        age.size, n_stages, memory, *_addresses(pos, remembered, age, later, next_age, error, remembers)
+    )
+    return later, next_age, error, remembers
+
+
+def believe(
+    pos: np.ndarray,
+    vel: np.ndarray,
+    remembered: np.ndarray,
+    remembers: np.ndarray,
+    dt: float,
+    stages: Sequence[int] | None = None,
+) -> np.ndarray:
+    """Trajectories that are believed: remembered ones, else those of constant velocities.
+
+    :param pos: positions now, (pairs, 3) (m)
+    :param vel: velocities now, (pairs, 3) (m/s)
+    :param remembered: remembered positions from now on, (pairs, N + 1, 3) (m)
+    :param remembers: which of those are believed, (pairs) bool
+    :param dt: length of a stage (s)
+    :param stages: which of the next N steps, from 0 on; None: all
+    :return: positions, (pairs, stages, 3) (m)
+    """
+    chosen = np.arange(remembered.shape[-2] - 1) if stages is None else np.array(stages, dtype=np.int64)
+    if (library := compiled()) is None:
+        steady = pos[..., None, :] + (dt * (chosen + 1))[:, None] * vel[..., None, :]
+        return np.where(remembers[..., None, None], remembered.take(chosen + 1, axis=-2), steady)
+    arrays = [np.ascontiguousarray(array) for array in (pos, vel, remembered, remembers)]
+    believed = np.empty((*pos.shape[:-1], len(chosen), 3))
+    library.quad_swarm_believe(
+        remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *_addresses(chosen, *arrays, believed)
+    )
+    return believed
+
+
+def approach(
+    own: np.ndarray,
+    plan: np.ndarray,
+    pos: np.ndarray,
+    vel: np.ndarray,
+    remembered: np.ndarray,
+    remembers: np.ndarray,
+    dt: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How close the robots' plans come to what they believe, see there for the other arguments.
+
+    :param own: positions of the robots, (E, n, 3) (m)
+    :param plan: their positions at the next N steps relative to that, (E, n, N, 3) (m)
+    :return: the least distance (m), the first stage at which it is reached, from 0 on, and the distance at the last
+        stage (m), (E, n, n - 1) each
+    """
+    n_stages = plan.shape[-2]
+    if (library := compiled()) is None:
+        expected = believe(pos, vel, remembered, remembers, dt) - own[:, :, None, None]
+        distances = length(plan[:, :, None] - expected)
+        return distances.min(axis=-1), distances.argmin(axis=-1), distances[..., -1]
+    arrays = [np.ascontiguousarray(array) for array in (own, plan, pos, vel, remembered, remembers)]
+    least, last = np.empty(remembers.shape), np.empty(remembers.shape)
+    nearest = np.empty(remembers.shape, dtype=np.int64)
+    n_others = remembers.shape[-1]
+    n_robots = remembers.size // max(n_others, 1)
+    library.quad_swarm_approach(n_robots, n_others, n_stages, dt, *_addresses(*arrays, least, nearest, last))
+    return least, nearest, last
+
+
+def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
+    """See trajectories at later times, in place: linear in between, and the last piece goes on in a straight line.
+
+    :param trajectories: what each robot believes of the others, contiguous, (E, n, n - 1, N, 3) (m)
+    :param later: by how much later, as a share of a step, (E, n) in [0, 1)
+    """
+    if (library := compiled()) is None:
+        pieces = np.diff(trajectories, axis=-2)
+        pieces *= later[..., None, None, None]
+        trajectories[..., :-1, :] += pieces
+        trajectories[..., -1, :] += pieces[..., -1, :]
+        return
+    n_rows, n_stages = trajectories.shape[2:4]
+    later = np.ascontiguousarray(later)
+    library.quad_swarm_resample(later.size, n_rows, n_stages, *_addresses(later, trajectories))
+
+
+def keep_right(
+    x: np.ndarray, others: np.ndarray, known: np.ndarray, width: float, dt: float, fade: float, slow: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Others that have grown to one side, see `quad_swarm.planner.right_of_way`.
+
+    :param x: states of B robots, (B, 9)
+    :param others: positions of their others, (B, m, N, 3) (m)
+    :param known: which others' plans are known, (B, m) bool
+    :param width: by how much they grow (m)
+    :param dt: length of a stage (s)
+    :param fade: time before the closest approach from which on they grow less and less (s)
+    :param slow: closing speed below which they grow less (m/s)
+    :return: where they seem to be then (m), and how much more clearance they need (m), (B, m, N)
+    """
+    if (library := compiled()) is not None:
+        others = np.array(others, dtype=float, order="C")
+        clearance = np.zeros(others.shape[:-1])
+        x, known = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(known)
+        library.quad_swarm_keep_right(
+            *others.shape[:3], width, dt, fade, slow, *_addresses(x, known, others, clearance)
+        )
+        return others, clearance
+    velocity = (others[:, :, 1] - others[:, :, 0]) / dt
+    pos = others[:, :, 0] - dt * velocity - x[:, None, :3]
+    vel = velocity - x[:, None, 3:6]
+    speed = np.hypot(vel[..., 0], vel[..., 1])
+    time = -(pos * vel).sum(axis=-1) / np.maximum((vel * vel).sum(axis=-1), 1e-9)
+    grown = width * known * np.clip(time / fade, 0.0, 1.0) * np.clip(speed / slow, 0.0, 1.0)
+    left = np.stack([vel[..., 1], -vel[..., 0], np.zeros_like(speed)], axis=-1) / np.maximum(speed, 1e-9)[..., None]
+    return others + (grown[..., None] * left)[:, :, None], np.repeat(grown[..., None], others.shape[2], axis=2)
+
+
+def advance(trajectory: np.ndarray) -> np.ndarray:
+    """A trajectory (..., K, 3) seen one step later; its last piece goes on in a straight line."""
+    end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
+    return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
+
+
+def _addresses(*arrays: np.ndarray) -> list[int]:
+    return [array.ctypes.data for array in arrays]

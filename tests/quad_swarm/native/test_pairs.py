@@ -1,0 +1,104 @@
+"""What is computed for pairs: compiled and by NumPy to the same bits, and what it means."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from quad_swarm.native import pairs
+
+DT = 0.1
+
+
+@pytest.fixture(params=["compiled", "numpy"])
+def either(request, monkeypatch) -> None:
+    """Both ways of computing, one after the other."""
+    if request.param == "numpy":
+        monkeypatch.setattr(pairs, "compiled", lambda: None)
+    else:
+        assert pairs.compiled() is not None
+
+
+def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace:
+    """Robots near each other, about half of which remember a plan of each other."""
+    rng = np.random.default_rng(seed)
+    shape = (n_swarms, n, n - 1)
+    pos, vel = rng.normal(size=(*shape, 3)), rng.normal(size=(*shape, 3))
+    remembered = pos[..., None, :] + 0.1 * rng.normal(size=(*shape, horizon + 1, 3)).cumsum(axis=-2)
+    remembered[..., 1, :] = pos + 0.02 * rng.normal(size=pos.shape)
+    return SimpleNamespace(
+        pos=pos,
+        vel=vel,
+        remembered=remembered,
+        age=rng.integers(0, horizon + 2, shape),
+        remembers=rng.random(shape) < 0.5,
+        x=rng.normal(size=(n_swarms * n, 9)),
+        own=rng.normal(size=(n_swarms, n, 3)),
+        plan=rng.normal(size=(n_swarms, n, horizon, 3)).cumsum(axis=-2),
+        later=rng.random((n_swarms, n)),
+    )
+
+
+def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
+    """What all functions make of a scene."""
+    belief = (s.pos, s.vel, s.remembered, s.remembers)
+    resampled = pairs.believe(*belief, DT)
+    others = resampled.reshape(s.x.shape[0], *resampled.shape[2:]).copy()
+    pairs.resample(resampled, s.later)
+    return {
+        "remember": list(pairs.remember(s.remembered, s.age, s.pos, 0.03)),
+        "believe": [pairs.believe(*belief, DT), pairs.believe(*belief, DT, [2, 0])],
+        "approach": list(pairs.approach(s.own, s.plan, *belief, DT)),
+        "resample": [resampled],
+        "keep_right": list(pairs.keep_right(s.x, others, s.remembers.reshape(others.shape[:2]), 0.3, DT, 1.0, 0.5)),
+    }
+
+
+@pytest.mark.parametrize("sizes", [(0, 3, 4), (1, 1, 4), (1, 2, 3), (3, 4, 7), (20, 8, 20)])
+def test_compiled_and_numpy_agree_to_the_last_bit(sizes, monkeypatch):
+    compiled = everything(scene(*sizes))
+    monkeypatch.setattr(pairs, "compiled", lambda: None)
+    for name, arrays in everything(scene(*sizes)).items():
+        for mine, reference in zip(compiled[name], arrays, strict=True):
+            assert mine.dtype == reference.dtype, name
+            assert np.array_equal(mine, reference), name
+
+
+def test_what_is_given_stays_as_it_is_and_may_lie_anyhow(either):
+    s = scene(2, 4, 5)
+    expected = everything(s)
+    strided = SimpleNamespace(**{key: np.asfortranarray(value) for key, value in vars(s).items()})
+    before = {key: value.copy() for key, value in vars(strided).items()}
+    for name, arrays in everything(strided).items():
+        for mine, reference in zip(arrays, expected[name], strict=True):
+            assert np.array_equal(mine, reference), name
+    assert all(np.array_equal(value, before[key]) for key, value in vars(strided).items())
+
+
+def test_advance_goes_on_straight():
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 1, 0]])
+    assert pairs.advance(line).tolist() == [[1, 0, 0], [2, 1, 0], [3, 2, 0]]
+
+
+def test_plans_are_remembered_while_they_fit_and_are_young(either):
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 1, 0]])
+    seen = np.array([[1.0, 0, 0.1], [1.0, 0, 0.3], [1.0, 0, 0]])
+    later, age, error, remembers = pairs.remember(np.tile(line, (3, 1, 1)), np.array([0, 0, 1]), seen, 0.2)
+    assert later[0].tolist() == [[1, 0, 0], [2, 1, 0], [3, 2, 0]]
+    assert age.tolist() == [1, 1, 2]
+    assert error == pytest.approx([0.1, 0.3, 0.0])
+    assert remembers.tolist() == [True, False, False]
+
+
+def test_constant_velocities_start_one_step_ahead(either):
+    pos, vel = np.zeros((1, 1, 1, 3)), np.array([[[[1.0, 0, -2]]]])
+    believed = pairs.believe(pos, vel, np.zeros((1, 1, 1, 3, 3)), np.zeros((1, 1, 1), bool), 0.5)
+    assert believed[0, 0, 0].tolist() == [[0.5, 0, -1], [1, 0, -2]]
+
+
+def test_the_first_of_equally_close_stages_is_named(either):
+    pos, vel = np.array([[[[2.0, 0, 0]]]]), np.zeros((1, 1, 1, 3))
+    plan = np.array([[[[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [0.5, 0, 0]]]])
+    never = np.zeros((1, 1, 1), bool)
+    least, stage, last = pairs.approach(np.zeros((1, 1, 3)), plan, pos, vel, np.zeros((1, 1, 1, 5, 3)), never, DT)
+    assert (least.item(), stage.item(), last.item()) == (1.0, 1, 1.5)
