@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 
 import torch as th
 
-from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.evaluation import make_pool, summarise
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
-from studies.swarm.protocol import EARLIER, NAMES, VALIDATION, condition, progress
+from studies.swarm.protocol import EARLIER, NAMES, VALIDATION, condition, fly_kept, progress
 
 # Checkpoints whose actors are averaged
 LAST = 5
@@ -49,7 +49,7 @@ def fly(path: str, episodes: int, seed: int) -> Flown:
     :param seed: of which set
     """
     config = make_config("paper")
-    flown = fly_all([condition(path, name, config) for name in NAMES], episodes, seed)
+    flown = fly_kept([condition(path, name, config) for name in NAMES], episodes, seed)
     return Flown(path, {one.scenario: summarise(rows, config) for one, rows in flown.items()})
 
 

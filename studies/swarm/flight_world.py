@@ -20,13 +20,24 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.evaluation import make_pool, summarise
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
 from studies.swarm import delay_check
 from studies.swarm.fly_flight import best_rule, tuned_models
-from studies.swarm.protocol import DATA, DBCP, NAMES, WORLDS, absolute_path, condition, models, progress, replace_rows
+from studies.swarm.protocol import (
+    DATA,
+    DBCP,
+    NAMES,
+    WORLDS,
+    absolute_path,
+    condition,
+    fly_kept,
+    models,
+    progress,
+    replace_rows,
+)
 from studies.swarm.tune_flight import SWAPS
 
 # What the planner keeps in the part `plants`: contact is at 0.6 m
@@ -87,7 +98,7 @@ def fly(job: Job, episodes: int) -> dict[str, Any]:
         flown = condition(job.policy, job.scenario, config)
         if job.part == "paper":
             flown = replace(flown, linger=None)
-        ((_, rows),) = fly_all([flown], episodes, WORLDS).items()
+        ((_, rows),) = fly_kept([flown], episodes, WORLDS).items()
     return {**job._asdict(), "condition": str(job), "set": WORLDS, **summarise(rows, config)}
 
 

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.evaluation import make_pool, summarise
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
@@ -23,6 +23,7 @@ from studies.swarm.protocol import (
     ROOT,
     absolute_path,
     condition,
+    fly_kept,
     known_rows,
     models,
     progress,
@@ -83,7 +84,7 @@ def jobs(sizes: list[int], quick: bool) -> list[Job]:
 def fly(job: Job) -> dict[str, Any]:
     """The row of a condition."""
     config = world(PRESET, job.n_robots)
-    ((_, rows),) = fly_all([condition(job.policy, job.scenario, config)], job.episodes, FLIGHT_TEST).items()
+    ((_, rows),) = fly_kept([condition(job.policy, job.scenario, config)], job.episodes, FLIGHT_TEST).items()
     outcomes = "".join("1" if row["collided"] else "0" for row in rows)
     return {"preset": PRESET, "set": FLIGHT_TEST, **job._asdict(), **summarise(rows, config), "outcomes": outcomes}
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.evaluation import make_pool, summarise
 from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, fly_steps
 from quad_swarm.evaluation.inference import Comparison
 from quad_swarm.evaluation.rows import read_rows
@@ -37,6 +37,7 @@ from studies.swarm.protocol import (
     absolute_path,
     best_rules,
     condition,
+    fly_kept,
     models,
     progress,
     replace_rows,
@@ -99,7 +100,7 @@ def compare(job: Job) -> list[dict[str, Any]]:
     :return: a row for each policy, with its paired differences from full communication and from the rule
     """
     policies = list(dict.fromkeys(job.policies))
-    flown = fly_all([condition(policy, job.scenario, job.config) for policy in policies], job.episodes, job.seed)
+    flown = fly_kept([condition(policy, job.scenario, job.config) for policy in policies], job.episodes, job.seed)
     by_name = {one.policy: rows for one, rows in flown.items()}
     table = []
     for policy in policies:
@@ -156,7 +157,7 @@ def counts(episodes: int) -> list[Job]:
 def compare_whole_episodes(job: Job) -> list[dict[str, Any]]:
     """`compare` without an early end: all episodes fly all their steps."""
     conditions = [replace(condition(policy, job.scenario, job.config), linger=None) for policy in job.policies]
-    flown = fly_all(conditions, job.episodes, job.seed)
+    flown = fly_kept(conditions, job.episodes, job.seed)
     return [
         job.keys | {"scenario": job.scenario, "policy": one.policy, "set": job.seed} | summarise(rows, job.config)
         for one, rows in flown.items()
@@ -328,7 +329,7 @@ def intervene(job: Job) -> list[dict[str, Any]]:
     """Fly again what ended in a collision, and let more be asked in the last steps before it."""
     (policy,) = job.policies
     one = condition(policy, job.scenario, job.config)
-    rows = fly_all([one], job.episodes, job.seed)[one]
+    rows = fly_kept([one], job.episodes, job.seed)[one]
     crashes = [(number, *replay(one, job.seed, number)) for number, row in enumerate(rows) if row["collided"]]
     table = []
     for (who, more), steps in itertools.product(INTERVENTIONS.items(), (1, 2, 3, 4, 6, 8, 12)):

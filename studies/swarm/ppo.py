@@ -23,13 +23,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from quad_swarm.evaluation.evaluation import fly_all, summarise
+from quad_swarm.evaluation.evaluation import summarise
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg.vec_env import GymnasiumVecEnv
-from studies.swarm.protocol import ROOT, VALIDATION, condition
+from studies.swarm.protocol import ROOT, VALIDATION, condition, fly_kept
 
 RECIPE = ROOT / "zoo_configs" / "quad_swarm_paper.yml"
 THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 0.7)
@@ -133,7 +133,7 @@ def validate(
     :param keys: of every row
     :return: a row for each value
     """
-    flown = fly_all(list(conditions.values()), episodes, VALIDATION)
+    flown = fly_kept(list(conditions.values()), episodes, VALIDATION)
     rows = []
     for value, one in conditions.items():
         row = {"scenario": one.scenario, what: value} | summarise(flown[one], one.config)

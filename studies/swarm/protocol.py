@@ -6,7 +6,7 @@ Rows are JSON objects, one a line, in ``studies/swarm/data``. How a test set is 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -17,6 +17,7 @@ from quad_swarm.evaluation.evaluation import Rows, fly_all
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.rows import read_rows, write_rows
+from quad_swarm.tasks.journal import default_folder
 from quad_swarm.world.presets import SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -69,13 +70,18 @@ def condition(policy: str, scenario: str, config: SwarmConfig, algo: str = "sb3_
     return Condition(policy, scenario, config, algo=algo, solver="rti", linger=LINGER)
 
 
+def fly_kept(conditions: Sequence[Condition], episodes: int, seed: int, skip: int = 0) -> dict[Condition, Rows]:
+    """`fly_all`, which goes on from its finished pieces if it was killed."""
+    return fly_all(conditions, episodes, seed, skip=skip, journal=default_folder())
+
+
 def fly_validation(
     policies: list[str], preset: str, scenario: str, episodes: int, n_robots: int | None = None, skip: int = 0
 ) -> dict[str, Rows]:
     """:return: for each policy the figures of its validation episodes, without the first ``skip``"""
     config = world(preset, n_robots)
     conditions = [condition(policy, scenario, config) for policy in policies]
-    return {one.policy: rows for one, rows in fly_all(conditions, episodes, VALIDATION, skip=skip).items()}
+    return {one.policy: rows for one, rows in fly_kept(conditions, episodes, VALIDATION, skip).items()}
 
 
 def hopeless(comparison: Comparison, margin: float = SAFETY_MARGIN) -> bool:

@@ -131,8 +131,8 @@ def may_be_safe(flown: Rows, full: Rows, deciding: int) -> bool:
     :param full: those of full communication, of all
     :param deciding: how many decide
     """
-    padded = [[*rows, *[{"collided": False}] * deciding][:deciding] for rows in (flown, full)]
-    return Comparison.of(*padded).as_safe(SAFETY_MARGIN)
+    no_more: Rows = [{"collided": False}] * deciding
+    return Comparison.of([*flown, *no_more][:deciding], [*full, *no_more][:deciding]).as_safe(SAFETY_MARGIN)
 
 
 def rows_of(family: str, setting: str, flown: Flown, safe: bool | None) -> list[dict[str, Any]]:

@@ -16,12 +16,13 @@ SOURCES = {"sb3_maddpg": ROOT / "sb3_maddpg", "quad_swarm": ROOT / "envs" / "qua
 ROOMS = {
     "": set(),
     "native": {""},
+    "tasks": {"", "native"},
     "planner": {"", "native"},
     "plants": {""},
     "world": {"", "native", "planner", "plants"},
     "task": {"", "native", "planner", "world"},
     "interfaces": {"", "planner", "world", "task"},
-    "evaluation": {"", "planner", "world", "task"},
+    "evaluation": {"", "tasks", "planner", "world", "task"},
     "figures": {"", "planner", "world", "task", "evaluation"},
     "models": set(),
 }

@@ -17,6 +17,7 @@ from quad_swarm.evaluation.policies import is_model, load_model, short_name, tra
 from quad_swarm.evaluation.rows import check_writable, write_rows
 from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.task.rules import RULES
+from quad_swarm.tasks.journal import default_folder
 from quad_swarm.world.presets import PRESET_VERSION, PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -198,7 +199,11 @@ def _compare(args: argparse.Namespace) -> None:
         check_writable(args.json, "--json")
     if args.plot:
         check_writable(args.plot / "plot", "--plot")
-    rows = evaluate(conditions, args.episodes, args.seed, args.jobs)
+    try:
+        rows = evaluate(conditions, args.episodes, args.seed, args.jobs, journal=default_folder())
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        raise
     solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name
     common = {"preset": args.preset, "preset_version": PRESET_VERSION, "seed": args.seed, "solver": solver}
     rows = [row | common | ({"world": _parse_world(args.world)} if args.world else {}) for row in rows]

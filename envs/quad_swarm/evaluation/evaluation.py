@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import functools
-import importlib
-import multiprocessing
-import os
 import sys
-import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import as_completed
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,16 +14,15 @@ from tqdm import tqdm
 
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.evaluation.inference import wilson_interval
-from quad_swarm.evaluation.policies import make_policy
+from quad_swarm.evaluation.policies import is_model, make_policy
 from quad_swarm.task.episode_statistics import exchange_bytes
 from quad_swarm.task.rules import RULES
+from quad_swarm.tasks import Journal, Pool
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
 # Fixed, so that neither the batches nor the results depend on the number of processes.
 _CHUNK = 250
-# How often workers that died are replaced before it is the machine's fault
-_POOLS = 3
 # Depths of a collision that are counted apart (m): much of what is deeper than the tolerance of 1 mm is a graze
 DEPTHS = {"1cm": 0.01, "3cm": 0.03}
 
@@ -96,16 +90,19 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
     }
 
 
-def evaluate(conditions: Sequence[Condition], episodes: int, seed: int = 0, jobs: int = 1) -> list[dict[str, Any]]:
+def evaluate(
+    conditions: Sequence[Condition], episodes: int, seed: int = 0, jobs: int = 1, journal: Path | None = None
+) -> list[dict[str, Any]]:
     """Fly ``episodes`` episodes of every condition.
 
     :param conditions: policies in scenarios; one that is named twice is flown once
     :param episodes: number of episodes of each condition
     :param seed: which set of held-out episodes; every condition flies the same
-    :param jobs: processes
+    :param jobs: processes; one that dies costs the piece it was flying alone
+    :param journal: folder in which finished pieces are kept until all are, see `Journal`; None keeps none
     :return: one row a condition, see `summarise` and, where full communication is among the policies, `lost_against`
     """
-    flown = fly_all(conditions, episodes, seed, jobs)
+    flown = fly_all(conditions, episodes, seed, jobs, journal=journal)
     table = []
     for condition, rows in flown.items():
         row = {"policy": condition.policy, "scenario": condition.scenario, **summarise(rows, condition.config)}
@@ -129,7 +126,12 @@ def lost_against(full: Rows, rows: Rows, config: SwarmConfig) -> dict[str, float
 
 
 def fly_all(
-    conditions: Sequence[Condition], episodes: int, seed: int = 0, jobs: int = 1, skip: int = 0
+    conditions: Sequence[Condition],
+    episodes: int,
+    seed: int = 0,
+    jobs: int = 1,
+    skip: int = 0,
+    journal: Path | None = None,
 ) -> dict[Condition, Rows]:
     """`evaluate`, episode by episode: the figures of each, see `EpisodeStatistics`.
 
@@ -143,66 +145,60 @@ def fly_all(
     chunks = [range(first + k, first + min(k + _CHUNK, episodes)) for k in range(skip, episodes, _CHUNK)]
     flown: dict[Condition, Rows] = {condition: [] for condition in conditions}
     work = [(condition, chunk) for condition in flown for chunk in chunks]
-    for (condition, _), rows in zip(work, _run_all(work, jobs), strict=True):
+    for (condition, _), rows in zip(work, _run_all(work, jobs, Journal(journal)), strict=True):
         flown[condition] += rows
     return flown
 
 
-def _run_all(work: Sequence[tuple[Condition, range]], jobs: int) -> Iterable[Rows]:
-    """The figures of each piece of work, in its order."""
-    progress = functools.partial(
-        tqdm, total=len(work), unit="chunk", desc="evaluate", disable=not sys.stderr.isatty(), leave=False
+def _run_all(work: Sequence[tuple[Condition, range]], jobs: int, journal: Journal) -> list[Rows]:
+    """The figures of each piece of work, in its order; what the journal holds of it is not flown again."""
+    keys = [_key(*piece) for piece in work]
+    done: dict[int, Rows] = {k: rows for k, key in enumerate(keys) if (rows := journal.fetch(key)) is not None}
+    left = [k for k in range(len(work)) if k not in done]
+    if done:
+        print(f"{len(done)} of {len(work)} pieces were flown before this run.", file=sys.stderr)
+    progress = tqdm(
+        total=len(work), initial=len(done), unit="piece", desc="evaluate", disable=not sys.stderr.isatty(), leave=False
     )
-    if jobs == 1:
-        return progress(run_episodes(*item) for item in work)
-    done = dict(progress(_run_in_pools(work, jobs)))
+    with progress:
+        for k, rows in _fly(work, left, jobs):
+            journal.keep(keys[k], rows)
+            done[k] = rows
+            progress.update()
+    journal.drop(keys)
     return [done[k] for k in range(len(work))]
 
 
-def _run_in_pools(work: Sequence[tuple[Condition, range]], jobs: int) -> Iterator[tuple[int, Rows]]:
-    """Index and figures of each piece of work as they come. A piece is a function of its seeds alone, so one whose
-    worker died is flown again, with the same result.
-
-    :raises ValueError: workers die again and again
-    """
-    left = set(range(len(work)))
-    for _ in range(_POOLS):
-        with make_pool(jobs) as pool:
-            futures = {pool.submit(run_episodes, *work[k]): k for k in sorted(left)}
-            try:
-                for future in as_completed(futures):
-                    rows = future.result()
-                    left.remove(futures[future])
-                    yield futures[future], rows
-            except BrokenProcessPool:
-                continue
-            return
-    raise ValueError(f"Processes of --jobs {jobs} died {_POOLS} times. Is memory short? Use fewer.")
+def _fly(work: Sequence[tuple[Condition, range]], left: Sequence[int], jobs: int) -> Iterator[tuple[int, Rows]]:
+    """Number and figures of pieces of work as they come."""
+    if jobs == 1 or len(left) < 2:
+        for k in left:
+            yield k, run_episodes(*work[k])
+        return
+    with make_pool(jobs) as pool:
+        futures = {pool.submit(run_episodes, *work[k]): k for k in left}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
 
 
-def make_pool(jobs: int) -> ProcessPoolExecutor:
-    """Processes that fly episodes. They end with their parent, however that ends.
+def _key(condition: Condition, episodes: range) -> str:
+    """What a piece of work is a function of: a policy may be a file, which may change."""
+    packages, files = {"quad_swarm", *_user_modules()}, []
+    if is_model(condition.policy):
+        packages.add(condition.algo.partition(":")[0])
+        files.append(Path(condition.policy.partition("@")[0]))
+    return Journal.key(repr((condition, episodes)), packages, files)
+
+
+def make_pool(jobs: int) -> Pool:
+    """Processes that fly episodes; they know what a user added to the scenarios and rules once its modules are
+    imported there too.
 
     :param jobs: how many
     """
-    # Spawned, not forked: the numerical libraries behind a model hold threads. One thread each, or they fight for the
-    # cores.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # They know what a user added to the scenarios and rules once the modules are imported there too.
+    return Pool(jobs, _user_modules())
+
+
+def _user_modules() -> list[str]:
     added = {function.__module__ for function in (*SCENARIOS.values(), *(make for make, _ in RULES.values()))}
-    return ProcessPoolExecutor(
-        jobs, multiprocessing.get_context("spawn"), _begin_worker, (sorted(added - {"__main__"}),)
-    )
-
-
-def _begin_worker(modules: Sequence[str]) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    for module in modules:
-        importlib.import_module(module)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
+    return sorted(added - {"__main__"})

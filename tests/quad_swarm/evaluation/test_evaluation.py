@@ -6,12 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from quad_swarm.evaluation.evaluation import _run_all, evaluate, fly_all, summarise
+from quad_swarm.evaluation import evaluation
+from quad_swarm.evaluation.evaluation import evaluate, fly_all, summarise
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import make_config
@@ -96,24 +98,67 @@ def killed_once(condition: Condition, episodes: range) -> list[dict[str, float]]
     return run_episodes(condition, episodes)
 
 
-def killed_always(condition: Condition, episodes: range) -> list[dict[str, float]]:
-    os.kill(os.getpid(), signal.SIGKILL)
-    return []
-
-
 def test_pieces_of_a_worker_that_died_are_flown_again(tmp_path, monkeypatch):
     monkeypatch.setenv("MARKER", str(tmp_path / "died"))
-    work = [(condition("none"), range(first_episode(0) + k, first_episode(0) + k + 5)) for k in (0, 5, 10)]
-    one = list(_run_all(work, 1))
-    monkeypatch.setattr("quad_swarm.evaluation.evaluation.run_episodes", killed_once)
-    monkeypatch.setattr("quad_swarm.evaluation.evaluation._CHUNK", 5)
-    two = list(_run_all(work, 2))
+    monkeypatch.setattr(evaluation, "_CHUNK", 5)
+    one = fly_all([condition("none")], 15)
+    monkeypatch.setattr(evaluation, "run_episodes", killed_once)
+    two = fly_all([condition("none")], 15, jobs=2)
     assert (tmp_path / "died").exists()
-    for a, b in zip((r for rows in one for r in rows), (r for rows in two for r in rows), strict=True):
-        assert {**a, "solve_seconds": 0} == {**b, "solve_seconds": 0}
-    monkeypatch.setattr("quad_swarm.evaluation.evaluation.run_episodes", killed_always)
-    with pytest.raises(ValueError, match="died 3 times"):
-        list(_run_all(work, 2))
+    assert untimed(one) == untimed(two)
+
+
+def untimed(flown: dict[Condition, list[dict[str, float]]]) -> list[dict[str, float]]:
+    return [{**row, "solve_seconds": 0.0} for rows in flown.values() for row in rows]
+
+
+class Killed(BaseException):
+    pass
+
+
+def test_finished_pieces_are_not_flown_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluation, "_CHUNK", 5)
+    flown = []
+
+    def dies_after_two(condition: Condition, episodes: range) -> list[dict[str, float]]:
+        if len(flown) == 2:
+            raise Killed
+        flown.append(episodes)
+        return run_episodes(condition, episodes)
+
+    conditions = [condition("none"), condition("full")]
+    monkeypatch.setattr(evaluation, "run_episodes", dies_after_two)
+    with pytest.raises(Killed):
+        fly_all(conditions, 15, journal=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+    damaged = sorted(tmp_path.iterdir())[0]
+    damaged.write_text(damaged.read_text()[:-20])
+
+    again = []
+    monkeypatch.setattr(evaluation, "run_episodes", lambda *piece: (again.append(piece), run_episodes(*piece))[1])
+    rows = fly_all(conditions, 15, journal=tmp_path)
+    assert len(again) == 5, "one was whole"
+    assert "1 of 6 pieces were flown before" in capsys.readouterr().err
+    assert untimed(rows) == untimed(fly_all(conditions, 15))
+    assert not list(tmp_path.iterdir()), "nothing is kept of what is done"
+
+
+def test_pieces_are_told_apart_by_all_that_they_depend_on(tmp_path, monkeypatch):
+    episodes = range(3)
+    model = tmp_path / "model.zip"
+    model.write_bytes(b"a")
+    one = condition("none")
+    conditions = [one, replace(one, policy=str(model)), replace(one, max_steps=3), replace(one, linger=1)]
+    keys = [evaluation._key(each, episodes) for each in conditions]
+    keys.append(evaluation._key(one, range(4)))
+    model.write_bytes(b"b")
+    keys.append(evaluation._key(conditions[1], episodes))
+    monkeypatch.setattr("quad_swarm.tasks.journal._sources", lambda name: "other code")
+    keys.append(evaluation._key(one, episodes))
+    monkeypatch.setattr("quad_swarm.tasks.journal._machine", lambda: "another machine")
+    keys.append(evaluation._key(one, episodes))
+    assert len(set(keys)) == len(keys)
+    assert evaluation._key(one, episodes) == keys[-1]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")

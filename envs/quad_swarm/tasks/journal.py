@@ -1,0 +1,144 @@
+"""Pieces of long work that are finished, kept in files until all are: a run that was killed goes on from there."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from quad_swarm.native.build import cache_directory
+
+_VERSIONS = ("numpy", "torch", "casadi")
+_DAYS = 30  # after which a piece is no longer expected to be fetched
+_SOURCES = (".py", ".cpp", ".hpp")
+
+
+def default_folder() -> Path:
+    """Where pieces are kept: beside the compiled libraries, in the user's cache."""
+    return cache_directory() / "pieces"
+
+
+class Journal:
+    """Values that JSON holds, one a file, by keys that say what they are a function of.
+
+    A value is there whole or not at all. What cannot be written is not kept, with a warning: that costs time alone.
+
+    :param folder: where; None keeps nothing
+    """
+
+    def __init__(self, folder: Path | None):
+        self._folder = folder
+        if folder is not None:
+            _remove_old(folder)
+
+    @staticmethod
+    def key(what: str, packages: Iterable[str], files: Iterable[Path] = ()) -> str:
+        """The key of a piece: of its description, of the code that makes it, and of the machine.
+
+        :param what: all arguments as text
+        :param packages: names of the packages and modules whose sources it depends on
+        :param files: others that it depends on, such as models
+        """
+        digest = hashlib.sha256(what.encode())
+        for part in (*(_sources(name) for name in sorted(set(packages))), *map(_content, files), _machine()):
+            digest.update(b"\0" + part.encode())
+        return digest.hexdigest()[:32]
+
+    def fetch(self, key: str) -> Any:
+        """The value of a piece; None if it is not there."""
+        if self._folder is None:
+            return None
+        try:
+            return json.loads(self._path(key).read_text(encoding="utf-8"))["value"]
+        except (OSError, ValueError, KeyError, TypeError):  # absent, or damaged
+            return None
+
+    def keep(self, key: str, value: Any) -> None:
+        """Write down a piece."""
+        if self._folder is None:
+            return
+        try:
+            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile("w", dir=self._folder, suffix=".part", delete=False) as file:
+                try:
+                    json.dump({"value": value}, file)
+                    file.flush()
+                    os.fsync(file.fileno())
+                    file.close()
+                    os.replace(file.name, self._path(key))
+                except BaseException:
+                    Path(file.name).unlink(missing_ok=True)
+                    raise
+        except OSError as error:
+            warnings.warn(
+                f"Finished pieces cannot be kept in {self._folder} ({error.strerror or error}): a run that is killed "
+                "will begin anew.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            self._folder = None
+
+    def drop(self, keys: Iterable[str]) -> None:
+        """Forget pieces, because what they are part of is done."""
+        if self._folder is not None:
+            for key in keys:
+                with contextlib.suppress(OSError):
+                    self._path(key).unlink()
+
+    def _path(self, key: str) -> Path:
+        assert self._folder is not None
+        return self._folder / f"{key}.json"
+
+
+def _remove_old(folder: Path) -> None:
+    for path in folder.glob("*.*"):
+        with contextlib.suppress(OSError):
+            if time.time() - path.stat().st_mtime > _DAYS * 24 * 3600:
+                path.unlink()
+
+
+@functools.lru_cache(maxsize=64)
+def _sources(name: str) -> str:
+    """Digest of the sources of a package, or of a module that lies in none."""
+    top = name.partition(".")[0]
+    spec = importlib.util.find_spec(top)
+    digest = hashlib.sha256(top.encode())
+    if spec is not None and spec.submodule_search_locations:
+        paths = sorted(path for place in spec.submodule_search_locations for path in Path(place).rglob("*.*"))
+        for path in paths:
+            if path.suffix in _SOURCES:
+                digest.update(path.read_bytes())
+    elif spec is not None and spec.origin is not None and Path(spec.origin).is_file():
+        digest.update(Path(spec.origin).read_bytes())
+    return digest.hexdigest()
+
+
+def _content(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@functools.cache
+def _machine() -> str:
+    """What results may depend on beside the code: the processor and the versions of what computes."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
+            processor = sorted({line for line in file if line.startswith(("model name", "flags", "Features"))})
+    except OSError:  # no Linux
+        processor = [platform.processor()]
+    versions = []
+    for name in _VERSIONS:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions.append(f"{name} {importlib.metadata.version(name)}")
+    return repr((sys.version, platform.machine(), processor, versions))

@@ -1,0 +1,220 @@
+"""Processes that work off pieces, and die without harm."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnContext
+from types import TracebackType
+from typing import Any
+
+# How often a piece is begun before its workers' deaths are its own fault, or the machine's
+_ATTEMPTS = 3
+
+
+@dataclass
+class _Piece:
+    function: Callable[[], Any]
+    future: Future[Any] = field(default_factory=Future)
+    attempts: int = 0
+
+
+@dataclass
+class _Worker:
+    process: multiprocessing.process.BaseProcess
+    piece: _Piece | None = None
+
+
+class Pool(Executor):
+    """Processes as in `concurrent.futures.ProcessPoolExecutor`, but one that dies costs the piece it was at alone: a
+    new process begins that piece again, so a piece must be a function of its arguments. All end with their parent,
+    however that ends. Where the ``with`` block is left by an exception, what runs is stopped.
+
+    Each process has a pipe of its own and shares no lock: there is nothing that it could leave locked.
+
+    :param jobs: how many
+    :param modules: imported by each of them first
+    :raises ValueError: less than one
+    """
+
+    def __init__(self, jobs: int, modules: Sequence[str] = ()):
+        if jobs < 1:
+            raise ValueError(f"jobs={jobs} must be at least 1.")
+        self._jobs, self._modules = jobs, tuple(modules)
+        # Spawned, not forked: the numerical libraries behind a model hold threads
+        self._context: SpawnContext = multiprocessing.get_context("spawn")
+        self._waiting: deque[_Piece] = deque()
+        self._workers: dict[Connection, _Worker] = {}
+        self._closing = self._stopping = False
+        self._lock = threading.Lock()
+        self._woken, self._wake = self._context.Pipe(duplex=False)
+        self._manager: threading.Thread | None = None
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """See `concurrent.futures.Executor.submit`.
+
+        The future raises ValueError where the processes at this piece died again and again.
+        """
+        piece = _Piece(partial(function, *args, **kwargs))
+        with self._lock:
+            if self._closing:
+                raise RuntimeError("This pool is closed.")
+            self._waiting.append(piece)
+            if self._manager is None:
+                self._manager = threading.Thread(target=self._manage, daemon=True)
+                self._manager.start()
+        self._wake.send(None)
+        return piece.future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """See `concurrent.futures.Executor.shutdown`; what runs is stopped too where futures are to be cancelled."""
+        with self._lock:
+            self._closing, self._stopping = True, self._stopping or cancel_futures
+        with contextlib.suppress(OSError):  # all is over
+            self._wake.send(None)
+        if wait and self._manager is not None:
+            self._manager.join()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        self.shutdown(cancel_futures=kind is not None)
+        return None
+
+    def _manage(self) -> None:
+        """Give out pieces and take in results until the pool is closed and nothing is left."""
+        while True:
+            with self._lock:
+                stopping, closing = self._stopping, self._closing
+            if not stopping:
+                self._give_out()
+            busy = any(worker.piece for worker in self._workers.values())
+            if stopping or (closing and not busy and not self._waiting):
+                break
+            for ready in wait([self._woken, *self._workers]):
+                if ready is self._woken:
+                    self._woken.recv()
+                else:
+                    self._take_in(ready)  # type: ignore[arg-type]  # a Connection like the one above
+        self._end()
+
+    def _give_out(self) -> None:
+        while self._waiting:
+            idle = next((connection for connection, worker in self._workers.items() if worker.piece is None), None)
+            if idle is None and len(self._workers) == self._jobs:
+                return
+            piece = self._waiting.popleft()
+            if not piece.attempts and not piece.future.set_running_or_notify_cancel():
+                continue
+            try:
+                text = pickle.dumps(piece.function)
+            except Exception as error:  # whatever pickle raises
+                piece.future.set_exception(error)
+                continue
+            connection = idle or self._hire()
+            self._workers[connection].piece = piece
+            piece.attempts += 1
+            try:
+                connection.send_bytes(text)
+            except OSError:
+                self._bury(connection)
+
+    def _hire(self) -> Connection:
+        mine, theirs = self._context.Pipe()
+        # One thread each, or they fight for the cores
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        process = self._context.Process(target=_work, args=(theirs, self._modules), daemon=True)
+        process.start()
+        theirs.close()  # so that the end of the process ends the pipe
+        self._workers[mine] = _Worker(process)
+        return mine
+
+    def _take_in(self, connection: Connection) -> None:
+        worker = self._workers[connection]
+        try:
+            result = connection.recv_bytes()
+        except (OSError, EOFError):
+            self._bury(connection)
+            return
+        piece, worker.piece = worker.piece, None
+        assert piece is not None
+        try:
+            value, error, trace = pickle.loads(result)
+        except Exception as unreadable:  # whatever the value's class raises
+            value, error, trace = None, unreadable, "as it was read"
+        if error is None:
+            piece.future.set_result(value)
+        else:
+            error.__cause__ = RuntimeError(f"in a process of the pool:\n{trace}")
+            piece.future.set_exception(error)
+
+    def _bury(self, connection: Connection) -> None:
+        """Forget a process that died; its piece waits again, if that was not too often."""
+        worker = self._workers.pop(connection)
+        connection.close()
+        worker.process.join()
+        if worker.piece is None:
+            return
+        if worker.piece.attempts < _ATTEMPTS:
+            self._waiting.appendleft(worker.piece)
+        else:
+            message = f"{_ATTEMPTS} processes died at the same piece of work. Is memory short? Use fewer --jobs."
+            worker.piece.future.set_exception(ValueError(message))
+
+    def _end(self) -> None:
+        for connection, worker in self._workers.items():
+            connection.close()  # which ends an idle process
+            if worker.piece is not None:
+                worker.process.kill()
+                worker.piece.future.set_exception(RuntimeError("The pool was stopped."))
+        for worker in self._workers.values():
+            worker.process.join()
+        for piece in self._waiting:
+            if piece.attempts or not piece.future.cancel():
+                piece.future.set_exception(RuntimeError("The pool was stopped."))
+        self._workers.clear()
+        self._waiting.clear()
+
+
+def _work(connection: Connection, modules: Sequence[str]) -> None:
+    """What a process does until its pipe ends."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this one
+    for module in modules:
+        importlib.import_module(module)
+    while True:
+        try:
+            piece = connection.recv_bytes()
+        except EOFError:
+            return
+        value, error, trace = None, None, ""
+        try:
+            value = pickle.loads(piece)()
+        except Exception as raised:  # it is the caller's
+            error, trace = raised, traceback.format_exc()
+        try:
+            result = pickle.dumps((value, error, trace))
+            pickle.loads(result) if error else None  # some exceptions can be written but not read
+        except Exception as unpicklable:
+            error = RuntimeError(f"{error or 'a result'} cannot be sent to the caller: {unpicklable!r}")
+            result = pickle.dumps((None, error, trace))
+        connection.send_bytes(result)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
