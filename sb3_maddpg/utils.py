@@ -113,11 +113,17 @@ def _remove_left_over(target: Path) -> None:
     for path in target.parent.glob(f"{glob.escape(prefix)}*"):
         process = path.name.removeprefix(prefix)
         # The process may run on another machine, but not for so long without writing
-        if process.isdecimal() and not _runs(int(process)) and time.time() - path.stat().st_mtime > LEFT_OVER_SECONDS:
+        if not process.isdecimal() or time.time() - path.stat().st_mtime <= LEFT_OVER_SECONDS:
+            continue
+        if not process_runs(int(process)):
             path.unlink(missing_ok=True)
 
 
-def _runs(process: int) -> bool:
+def process_runs(process: int) -> bool:
+    """
+    :param process: id of a process of this machine
+    :return: whether it runs
+    """
     if os.name == "nt":  # to ask for a process there would end it
         return process == os.getpid()
     try:

@@ -15,8 +15,7 @@ from typing import Any, NamedTuple, cast
 import gymnasium
 import optuna
 import yaml
-from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -40,6 +39,7 @@ from sb3_maddpg.cli.literals import format_literal, parse_literal
 from sb3_maddpg.cli.options import PROG, check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
+from sb3_maddpg.cli.search import STUDY, as_absolute, bring_back, kept_search, open_storage, sign
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.team import Team
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
@@ -85,6 +85,7 @@ class TeamExperimentManager(ExperimentManager):
     """
 
     study: optuna.Study | None = None  # that was searched
+    continues = False  # with a study of other workers or of an earlier command
 
     def __init__(
         self, args: Any, *rest: Any, uuid_str: str = "", checkpoints: Checkpoints | None = None, **kwargs: Any
@@ -152,11 +153,9 @@ class TeamExperimentManager(ExperimentManager):
         """The arguments of the algorithm in a trial of the study that ``--storage`` and ``--study-name`` name."""
         if not self.storage or not self.study_name:
             raise ValueError(f"--trial-id {trial_id} needs to know of which study: give --storage and --study-name.")
-        storage: Any = self.storage
-        if self.storage.endswith(".log"):
-            if not Path(self.storage).is_file():  # optuna would make an empty one
-                raise FileNotFoundError(f"There is no file {self.storage}.")
-            storage = JournalStorage(JournalFileBackend(self.storage))
+        if self.storage.endswith(".log") and not Path(self.storage).is_file():  # optuna would make an empty one
+            raise FileNotFoundError(f"There is no file {self.storage}.")
+        storage = open_storage(self.storage)
         try:
             study = optuna.load_study(storage=storage, study_name=self.study_name)
         except KeyError:
@@ -345,7 +344,7 @@ class TeamExperimentManager(ExperimentManager):
                 )
         else:
             sampler = super()._create_sampler(sampler_method)
-        if self.storage is not None:
+        if self.continues:
             sampler.reseed_rng()  # workers with one --seed, or a search that is continued, would repeat trials
         return sampler
 
@@ -353,8 +352,18 @@ class TeamExperimentManager(ExperimentManager):
         """Search, alone or with other workers, and write the best trial as a recipe."""
         best = Path(self.log_path, f"{self.env_name}_best.yml")
         check_writable(best)  # as the report beside it
-        if self.storage is not None and not self.storage.endswith(".log"):
+        kept = None
+        if self.storage is None:
+            kept = kept_search(Path(self.log_path), str(self.env_name), (self.recipe, *self._search_settings()))
+            self.storage, self.study_name = str(kept), STUDY
+            self.max_total_trials = self.max_total_trials or self.n_trials
+        elif not self.storage.endswith(".log"):
             _make_tables(self.storage)
+        self.storage = as_absolute(self.storage)
+        self.continues = kept is None or kept.is_file()
+        study = self._bring_back()
+        if kept is not None:
+            self.study = study  # which may lack nothing but its report
         super().hyperparameters_optimization()
         if self.study is None:  # no trial was left to this worker
             return
@@ -363,6 +372,35 @@ class TeamExperimentManager(ExperimentManager):
             file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
         print(f"The best trial as a recipe: {best}. To train by it:")
         print(f"  {PROG} train --algo {self.algo} --env {self.env_name.gym_id} --conf-file {best}")
+        if kept is not None and self._over():
+            kept.unlink(missing_ok=True)
+
+    def _search_settings(self) -> tuple[Any, ...]:
+        names = ("algo", "seed", "n_timesteps", "n_trials", "max_total_trials", "n_startup_trials", "n_evaluations")
+        return tuple(getattr(self, name) for name in (*names, "n_eval_episodes", "n_eval_envs", "sampler", "pruner"))
+
+    def _bring_back(self) -> optuna.Study | None:
+        """Take up the trials of processes that were killed, if there is such a study already."""
+        assert self.storage is not None
+        if self.study_name is None or (self.storage.endswith(".log") and not Path(self.storage).is_file()):
+            return None
+        try:
+            study = optuna.load_study(storage=open_storage(self.storage), study_name=self.study_name)
+        except KeyError:  # a new one
+            return None
+        count, finished = bring_back(study), _finished(study)
+        if finished or count:
+            print(f"The search goes on after {finished} finished trials; {count} that were killed begin again.")
+        return study
+
+    def _over(self) -> bool:
+        """Whether a search without ``--storage`` has made all its trials: it may have been interrupted."""
+        assert self.study is not None
+        assert self.max_total_trials is not None
+        if _finished(self.study) < self.max_total_trials:
+            print(f"The search was interrupted; the same command goes on. Its trials are kept in {self.storage}.")
+            return False
+        return True
 
     def objective(self, trial: optuna.Trial) -> float:
         """
@@ -370,6 +408,7 @@ class TeamExperimentManager(ExperimentManager):
         :return: last mean reward of the evaluation
         """
         self.study = trial.study
+        sign(trial)
         env = self.create_envs(self.n_envs, no_log=True)
         eval_env = self.create_envs(self.n_eval_envs, eval_env=True)
         try:
@@ -489,6 +528,10 @@ def as_yaml(recipe: dict[str, Any]) -> dict[str, Any]:
         except yaml.YAMLError:
             plain[key] = format_literal(value)
     return plain
+
+
+def _finished(study: optuna.Study) -> int:
+    return len(study.get_trials(deepcopy=False, states=[TrialState.COMPLETE, TrialState.PRUNED]))
 
 
 def _make_tables(url: str) -> None:

@@ -1,0 +1,128 @@
+"""Searches whose processes are killed: nothing that is finished is tried again, nothing that was begun is lost."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import optuna
+import pandas as pd
+import pytest
+import yaml
+from optuna.trial import TrialState
+
+from sb3_maddpg.cli.search import bring_back, kept_search, open_storage, sign
+
+pytest.importorskip("rl_zoo3")
+RECIPE = {"n_timesteps": 400, "policy": "MlpPolicy", "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
+COMMAND = [sys.executable, "-m", "sb3_maddpg", "train", "-optimize", "--env", "OwnBit-v0", "--conf-file", "recipe.yml"]
+COMMAND += ["--n-evaluations", "2", "--n-eval-envs", "1", "--seed", "1", "--n-startup-trials", "2"]
+
+
+def start(*words: str) -> subprocess.Popen:
+    Path("recipe.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
+    return subprocess.Popen([*COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def states() -> list[TrialState]:
+    """Of all trials of the search that is kept here."""
+    try:
+        (path,) = Path("logs/maddpg").glob("*_search_*.log")
+        return [trial.state for trial in optuna.load_study(storage=open_storage(str(path)), study_name="search").trials]
+    except (ValueError, KeyError):  # it has not begun
+        return []
+
+
+def kill_within_a_trial(process: subprocess.Popen, finished: int) -> None:
+    """SIGKILL once so many trials are finished and another one runs."""
+    end = time.monotonic() + 120
+    while sum(state.is_finished() for state in states()) < finished or TrialState.RUNNING not in states():
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    process.kill()
+    process.communicate()
+
+
+def test_a_search_goes_on_after_kills(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["--n-trials", "4"]
+    for finished in (0, 2):
+        kill_within_a_trial(start(*words), finished)
+    process = start(*words)
+    output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, output
+    assert "The search goes on after" in output
+    (report,) = Path("logs/maddpg").glob("report*.csv")
+    states = list(pd.read_csv(report)["state"])
+    assert states.count("COMPLETE") + states.count("PRUNED") == 4
+    assert states.count("FAIL") == 2, "those that were killed"
+    assert set(states) == {"COMPLETE", "PRUNED", "FAIL"} or set(states) == {"COMPLETE", "FAIL"}
+    assert not list(Path("logs/maddpg").glob("*_search_*")), "nothing is kept of what is done"
+    assert Path("logs/maddpg/OwnBit-v0_best.yml").exists()
+
+
+def test_an_interrupted_search_is_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    process = start("--n-trials", "50")
+    end = time.monotonic() + 120
+    while TrialState.COMPLETE not in states():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert "The search was interrupted; the same command goes on" in output
+    assert len(list(Path("logs/maddpg").glob("*_search_*.log"))) == 1
+
+
+@pytest.fixture
+def study(tmp_path) -> optuna.Study:
+    return optuna.create_study(storage=open_storage(str(tmp_path / "s.log")), study_name="s")
+
+
+def begin(study: optuna.Study, process: str | None) -> optuna.Trial:
+    trial = study.ask()
+    trial.suggest_float("x", 0, 1)
+    if process is not None:
+        trial.set_user_attr("process", process)
+    return trial
+
+
+def test_trials_of_processes_that_are_gone_come_back_with_their_parameters(study):
+    host = socket.gethostname()
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    killed = begin(study, f"{host} {gone.pid} 1")
+    another_process_has_its_number = begin(study, f"{host} {os.getpid()} 1")
+    elsewhere, older, odd = (begin(study, text) for text in (f"else {gone.pid} 1", None, "?"))
+    mine = study.ask()
+    sign(mine)
+    expected = 2 if Path("/proc/self/stat").exists() else 1
+    assert bring_back(study) == expected
+    states = {trial.number: trial.state for trial in study.trials}
+    assert states[killed.number] == TrialState.FAIL
+    assert (states[another_process_has_its_number.number] == TrialState.FAIL) == (expected == 2)
+    assert {states[trial.number] for trial in (elsewhere, older, odd, mine)} == {TrialState.RUNNING}
+    assert bring_back(study) == 0, "once is enough"
+    again = study.ask()
+    assert again.suggest_float("x", 0, 1) == killed.params["x"]
+
+
+def test_a_lock_that_a_killed_process_left_is_released(tmp_path, monkeypatch):
+    """Optuna looks for the age of what the lock points to, which it does not find by a relative path."""
+    monkeypatch.chdir(tmp_path)
+    optuna.create_study(storage=open_storage("s.log"), study_name="s")
+    backend = open_storage("s.log")._backend
+    backend._lock.acquire()
+    assert Path("s.log.lock").exists(), "not a link to nothing"
+    monkeypatch.setattr(backend._lock, "grace_period", 0.2)
+    backend._lock.acquire()
+    backend._lock.release()
+
+
+def test_the_same_settings_name_the_same_search(tmp_path):
+    assert kept_search(tmp_path, "Env-v0", ({"a": 1}, 2)) == kept_search(tmp_path, "Env-v0", ({"a": 1}, 2))
+    assert kept_search(tmp_path, "Env-v0", ({"a": 1}, 2)) != kept_search(tmp_path, "Env-v0", ({"a": 1}, 3))
