@@ -1,14 +1,17 @@
 """Kill a training again and again, resume it each time, and compare what it ends with.
 
-``python -m studies.kills [--kills 50] [--steps N] [--json F]``. Half of the kills come after a random time, half at the
-points of a commit, one after the other: before and after each write, sync and rename. The uninterrupted run of the same
-seed tells what the digest (`sb3_maddpg.checkpoints.digest`) has to be. JSON: one row for each kill, and one for the
-end.
+``python -m studies.kills [--kills 50] [--every SECONDS] [--steps N] [--json F]``. Half of the kills come after a random
+time, half at the points of a commit, one after the other: before and after each write, sync and rename. Then the disk
+is full at each of these points, the newest checkpoint is truncated, and a bit of it is flipped, each `DAMAGED` times,
+and a second process wants the same folder. With ``--every`` there are only kills, so many seconds apart. The
+uninterrupted run of the same seed tells what the digest (`sb3_maddpg.checkpoints.digest`) has to be. JSON: one row for
+each kill and fault, and one for the end.
 """
 
 from __future__ import annotations
 
 import argparse
+import errno
 import itertools
 import os
 import random
@@ -40,7 +43,9 @@ POINTS = (
     "renamed",
     "committed",
 )
+DAMAGED = 5
 _FAULT = "STUDIES_KILLS_FAULT"  # the point at which a child kills itself
+_FULL = "STUDIES_KILLS_FULL"  # the point at which its disk is full
 
 
 def train(folder: Path, steps: int) -> str:
@@ -81,22 +86,27 @@ def train(folder: Path, steps: int) -> str:
 
 def child(folder: Path, steps: int) -> None:
     """What is killed."""
-    if point := os.environ.get(_FAULT):
+    full = os.environ.get(_FULL)
 
-        def fault(name: str) -> None:
-            if name == point:
-                os.kill(os.getpid(), signal.SIGKILL)
+    def fault(name: str) -> None:
+        nonlocal full
+        if name == os.environ.get(_FAULT):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if name == full:
+            full = None  # there is space again
+            raise OSError(errno.ENOSPC, "No space left on device")
 
-        checkpoints.fault = fault
+    checkpoints.fault = fault
     print(train(folder, steps), flush=True)
 
 
-def start(folder: Path, steps: int, fault: str | None = None) -> subprocess.Popen[str]:
+def start(folder: Path, steps: int, fault: str = "", full: str = "") -> subprocess.Popen[str]:
     """A child that trains.
 
     :param fault: point of a commit at which it kills itself
+    :param full: point of a commit at which the disk is full, once
     """
-    env = {**os.environ, "OMP_NUM_THREADS": "1", **({_FAULT: fault} if fault else {})}
+    env = {**os.environ, "OMP_NUM_THREADS": "1", _FAULT: fault, _FULL: full}
     command = [sys.executable, "-m", "studies.kills", "--child", str(folder), "--steps", str(steps)]
     return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
 
@@ -107,29 +117,97 @@ def newest_step(folder: Path) -> int:
     return int(path.name.rpartition("-")[2]) if path else 0
 
 
-def kill(folder: Path, steps: int, fault: str | None, seconds: float) -> dict[str, Any]:
+def wait_for_checkpoints(folder: Path, process: subprocess.Popen[str], count: int) -> None:
+    """Until a child has written so many new checkpoints, or ended."""
+    step, end = newest_step(folder), time.monotonic() + 300
+    while count and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.05)
+        if (found := newest_step(folder)) > step:
+            step, count = found, count - 1
+
+
+def row_of(kind: str, folder: Path, before: int, process: subprocess.Popen[str]) -> dict[str, Any]:
+    """The row of a child that has ended; `done` where it came to its end."""
+    output = process.communicate()[0]
+    row = {"kill": kind, "from_step": before, "kept_step": newest_step(folder)}
+    return row | {"done": output.strip() or None, "leftovers": len(list(folder.glob("*.unfinished")))}
+
+
+def kill(folder: Path, steps: int, fault: str = "", seconds: float = 0.0, full: str = "") -> dict[str, Any]:
     """Start a child, and kill it.
 
-    :return: a row; `done` where it came to its end before
+    :param fault: the point of a commit at which it dies; else it dies a time after its first new checkpoint
+    :param seconds: that time
+    :param full: the point of a commit at which its disk is full before that
     """
     before = newest_step(folder)
-    process = start(folder, steps, fault)
-    if fault is None:
-        end = time.monotonic() + 120
-        # From a random time after the first new checkpoint on, so that runs get ahead
-        while newest_step(folder) == before and process.poll() is None and time.monotonic() < end:
-            time.sleep(0.05)
+    process = start(folder, steps, fault, full)
+    if not fault:
+        wait_for_checkpoints(folder, process, 1)
         time.sleep(seconds)
         process.kill()
-    output = process.communicate()[0]
-    row = {"kill": fault or "at any time", "from_step": before, "kept_step": newest_step(folder)}
-    return row | {"done": output.strip() or None, "leftovers": len(list(folder.glob("*.unfinished")))}
+    return row_of(fault or (f"disk full: {full}" if full else "at any time"), folder, before, process)
+
+
+def damage(folder: Path, kind: str, rng: random.Random) -> dict[str, Any]:
+    """Truncate a file of the newest checkpoint, or flip a bit of it."""
+    newest = checkpoints.newest(folder)
+    assert newest is not None
+    path = rng.choice(sorted(newest.iterdir()))
+    content = bytearray(path.read_bytes())
+    if kind == "truncated":
+        content = content[: rng.randrange(len(content))]
+    else:
+        content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    path.write_bytes(content)
+    before, kept = int(newest.name.rpartition("-")[2]), newest_step(folder)
+    return {"kill": f"{kind}: {path.name}", "from_step": before, "kept_step": kept, "done": None, "leftovers": 0}
+
+
+def second_process(folder: Path, steps: int) -> dict[str, Any]:
+    """Start a child beside another one: it must not touch the folder."""
+    before = newest_step(folder)
+    first = start(folder, steps)
+    wait_for_checkpoints(folder, first, 1)
+    second = start(folder, steps)
+    refused = second.wait(timeout=300) != 0 and not second.communicate()[0]
+    first.kill()
+    return row_of("a second process", folder, before, first) | {"refused": refused}
+
+
+def kills(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
+    """The kills of a command line, a row each."""
+    rng, points = random.Random(args.seed), itertools.cycle(POINTS)
+    rows: list[dict[str, Any]] = []
+    for number in tqdm(range(args.kills), disable=not sys.stderr.isatty()):
+        if args.every:
+            rows.append(kill(folder, args.steps, seconds=args.every))
+        elif number % 2:
+            rows.append(kill(folder, args.steps, fault=next(points)))
+        else:
+            rows.append(kill(folder, args.steps, seconds=rng.uniform(0, 1)))
+        if rows[-1]["done"]:
+            print(f"The training ended before kill {number + 1}: raise --steps.")
+            break
+    return rows
+
+
+def faults(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
+    """Full disks, damaged checkpoints and a second process, a row each."""
+    rng = random.Random(args.seed)
+    rows = [kill(folder, args.steps, full=point, seconds=rng.uniform(0, 1)) for point in POINTS]
+    for kind in ("truncated", "flipped"):
+        for _ in range(DAMAGED):
+            rows += [damage(folder, kind, rng), kill(folder, args.steps)]
+    return [*rows, second_process(folder, args.steps)]
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--every", type=float, metavar="SECONDS", help="kill so long after a checkpoint, nothing else")
+    parser.add_argument("--faults", action=argparse.BooleanOptionalAction, default=True, help="what follows the kills")
     parser.add_argument("--steps", type=int, default=40_000, help="of the training (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (%(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
@@ -137,24 +215,25 @@ def main() -> None:
     args = parser.parse_args()
     if args.child is not None:
         return child(args.child, args.steps)
-    rng, points = random.Random(args.seed), itertools.cycle(POINTS)
     with tempfile.TemporaryDirectory() as whole, tempfile.TemporaryDirectory() as parts:
         expected = start(Path(whole), args.steps).communicate()[0].strip()
-        rows = []
-        for number in tqdm(range(args.kills), disable=not sys.stderr.isatty()):
-            rows.append(kill(Path(parts), args.steps, next(points) if number % 2 else None, rng.uniform(0, 1)))
-            if rows[-1]["done"]:
-                print(f"The training ended before kill {number + 1}: raise --steps.")
-                break
+        rows = kills(args, Path(parts))
+        if args.faults and not args.every:
+            rows += faults(args, Path(parts))
         found = start(Path(parts), args.steps).communicate()[0].strip()
-    killed = [row for row in rows if not row["done"]]
-    lost = [row for row in killed if row["kept_step"] < row["from_step"]]
+    early = [row for row in rows if row["done"]]
+    # A damaged checkpoint is passed over; everything else keeps what was committed
+    lost = [row for row in rows if row["kept_step"] < row["from_step"] and ":" not in row["kill"]]
+    intruded = [row for row in rows if not row.get("refused", True)]
     same = bool(expected) and found == expected
     verdict = "the same" if same else "ANOTHER"
-    print(f"{len(killed)} kills, {len(lost)} lost a checkpoint; the digest is {verdict}: {found}")
+    print(
+        f"{args.kills} kills, {len(rows) - args.kills} faults and kills after them, {len(lost)} lost a checkpoint, "
+        f"{len(early)} came after the end; the digest is {verdict}: {found}"
+    )
     if args.json:
-        write_rows(args.json, [*rows, {"kills": len(killed), "lost": len(lost), "expected": expected, "found": found}])
-    sys.exit(0 if same and not lost else 1)
+        write_rows(args.json, [*rows, {"kills": args.kills, "lost": len(lost), "expected": expected, "found": found}])
+    sys.exit(0 if same and not lost and not intruded and not early else 1)
 
 
 if __name__ == "__main__":

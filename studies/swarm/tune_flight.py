@@ -4,8 +4,9 @@
 a model, is safe if it is as safe as full communication, to within `SAFETY_MARGIN`, in every scenario and with every
 number of robots. All rules fly a few episodes of both swaps with eight robots, which tell their requests there; of
 those that fly these alike, one is kept. Then they are tried from the cheapest on, in stages of more and more episodes,
-until one is safe; what can no longer turn out to be safe is not flown on. A model's thresholds are tried from the
-highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
+until one is safe; what can no longer turn out to be safe is not flown on. To find that out soon, each first flies those
+of the hardest cell's episodes in which others have collided (rows with ``selected``). A model's thresholds are tried
+from the highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
 over the episodes that it flew, and family, setting, safe (None: only its requests are known). What the table has is
 not flown again.
 """
@@ -15,18 +16,22 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
+from quad_swarm.evaluation.flight import first_episode, run_episodes
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
     DATA,
     NAMES,
     QUICK_STAGES,
+    VALIDATION,
+    condition,
     fly_validation,
     progress,
     replace_rows,
@@ -58,6 +63,7 @@ OWN_SWAPS = [cell for cell in CELLS if cell[0] == 8 and cell[1] in SWAPS]
 STAGES = (25, 50, 100, 250, 500, 1000, 2000, 4000)
 # Episodes of one cell after the other, the hardest and the others; more only of those that none of them ruled out
 FIRST, FIRST_OTHERS = 500, 100
+HARDEST = 60  # episodes of the hardest cell in which most others have collided, which are flown before all
 THRESHOLDS = (0.9, 0.85, *(round(0.8 - 0.025 * k, 3) for k in range(23)), 0.2, 0.15, 0.1, 0.05, 0.02)
 
 
@@ -104,14 +110,42 @@ def last(cell: Cell, stages: Sequence[int]) -> int:
     return min(SIZES[cell[0]], stages[-1])
 
 
-def try_out(policy: str, flown: Flown, full: Flown, stages: Sequence[int]) -> tuple[Flown, bool]:
+class Trial(NamedTuple):
+    """What came of trying a setting.
+
+    :param flown: its figures; if others' collisions ruled it out, in those episodes alone
+    :param safe: whether it is as safe as full communication; so few episodes as in a quick run prove nothing
+    :param collided: episodes of the hardest cell in which it collided
+    :param selected: whether the episodes are those in which others collided
+    """
+
+    flown: Flown
+    safe: bool
+    collided: list[int]
+    selected: bool = False
+
+
+def try_out(policy: str, full: Flown, stages: Sequence[int], hard: Sequence[int] = ()) -> Trial:
     """Fly a policy in more and more episodes as long as it may be as safe as full communication in every cell.
 
-    :param flown: its figures, as far as they are known
-    :param full: those of full communication, of as many episodes as decide
-    :return: the policy's figures, and whether it is as safe; so few episodes as in a quick run prove nothing
+    :param full: figures of full communication, of as many episodes as decide
+    :param hard: episodes of the hardest cell to fly before all
     """
-    flown = dict(flown)
+    cell = CELLS[0]
+    if hard:
+        first_one = first_episode(VALIDATION)
+        one = condition(policy, cell[1], world(PRESET, cell[0]))
+        rows = run_episodes(one, [first_one + k for k in hard])
+        collided = [k for k, row in zip(hard, rows, strict=True) if row["collided"]]
+        at_best: Rows = [{"collided": k in set(collided)} for k in range(last(cell, stages))]
+        if not may_be_safe(at_best, full[cell], SIZES[cell[0]]):
+            return Trial({cell: rows}, False, collided, selected=True)
+    flown, safe = _by_stages(policy, full, stages)
+    return Trial(flown, safe, [k for k, row in enumerate(flown[cell]) if row["collided"]])
+
+
+def _by_stages(policy: str, full: Flown, stages: Sequence[int]) -> tuple[Flown, bool]:
+    flown: Flown = {}
     first = {
         cell: [stage for stage in stages if stage <= (FIRST_OTHERS if k else FIRST)] for k, cell in enumerate(CELLS)
     }
@@ -135,9 +169,10 @@ def may_be_safe(flown: Rows, full: Rows, deciding: int) -> bool:
     return Comparison.of([*flown, *no_more][:deciding], [*full, *no_more][:deciding]).as_safe(SAFETY_MARGIN)
 
 
-def rows_of(family: str, setting: str, flown: Flown, safe: bool | None) -> list[dict[str, Any]]:
+def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected: bool = False) -> list[dict[str, Any]]:
     """The rows of a setting."""
-    keys = {"preset": PRESET, "family": family, "setting": setting, "safe": safe}
+    keys: dict[str, Any] = {"preset": PRESET, "family": family, "setting": setting, "safe": safe}
+    keys |= {"selected": True} if selected else {}
     return [
         keys | {"n_robots": n_robots, "scenario": name} | summarise(rows, world(PRESET, n_robots))
         for (n_robots, name), rows in flown.items()
@@ -186,7 +221,8 @@ def tune(
     :param jobs: how many are tried at once, of one ladder if there is only one
     """
     decided = {row["setting"]: row["safe"] for row in read_rows(path) if row["safe"] is not None}
-    running: dict[Future[tuple[Flown, bool]], Setting] = {}
+    running: dict[Future[Trial], Setting] = {}
+    collisions: Counter[int] = Counter()
 
     def following() -> Setting | None:
         busy = {setting.name for setting in running.values()}
@@ -200,21 +236,27 @@ def tune(
 
     while True:
         while len(running) < jobs and (setting := following()):
-            running[pool.submit(try_out, setting.name, {}, full, stages)] = setting
+            hard = [k for k, _ in collisions.most_common(HARDEST)]
+            running[pool.submit(try_out, setting.name, full, stages, hard)] = setting
         if not running:
             return
         for done in wait(running, return_when=FIRST_COMPLETED).done:
             setting = running.pop(done)
-            flown, decided[setting.name] = done.result()
-            rows = rows_of(*setting, flown, decided[setting.name])
+            trial = done.result()
+            decided[setting.name] = trial.safe
+            collisions.update(trial.collided)
+            rows = rows_of(*setting, trial.flown, trial.safe, trial.selected)
             replace_rows(path, rows, ("preset", "setting", "n_robots", "scenario"))
-            print(f"{setting.name:50} {verdict(flown, full, decided[setting.name])}", flush=True)
+            print(f"{setting.name:50} {verdict(trial, full)}", flush=True)
 
 
-def verdict(flown: Flown, full: Flown, safe: bool) -> str:
+def verdict(trial: Trial, full: Flown) -> str:
     """Where a setting turned out not to be safe."""
-    if safe:
+    flown = trial.flown
+    if trial.safe:
         return "safe"
+    if trial.selected:
+        return f"{len(trial.collided)} of {len(flown[CELLS[0]])} in which others collided"
     excess = {c: sum(a["collided"] - b["collided"] for a, b in zip(flown[c], full[c], strict=False)) for c in flown}
     cell = max(excess, key=lambda cell: excess[cell])
     collisions = sum(bool(row["collided"]) for row in flown[cell])

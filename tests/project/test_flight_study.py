@@ -77,8 +77,8 @@ FULL: tune_flight.Flown = {cell: [{"collided": False}] * tune_flight.STAGES[-1] 
 
 
 def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
-    assert tune_flight.try_out("good", {}, FULL, tune_flight.STAGES)[1]
-    assert not tune_flight.try_out("bad", {}, FULL, tune_flight.STAGES)[1]
+    assert tune_flight.try_out("good", FULL, tune_flight.STAGES).safe
+    assert not tune_flight.try_out("bad", FULL, tune_flight.STAGES).safe
     # Piece by piece, in every scenario
     stages = [0, *tune_flight.STAGES]
     assert [one[2:] for one in flown if one[:2] == ("good", (8, "random"))] == list(pairwise(stages))
@@ -92,6 +92,24 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     assert max(hardest) == tune_flight.FIRST
     assert max(other) == tune_flight.STAGES[0], "what cannot turn out to be safe is not flown on"
     assert tune_flight.CELLS[0] == (16, "symmetric_swap")
+
+
+def test_what_collides_where_others_do_is_not_flown_on(flown, monkeypatch):
+    flights = []
+
+    def collide(one, episodes):
+        flights.append((one.scenario, one.config.n_robots, [k - tune_flight.first_episode(1) for k in episodes]))
+        return [{"collided": k % 2 == 1, "requests": 1.0} for k in flights[-1][2]]
+
+    monkeypatch.setattr(tune_flight, "run_episodes", collide)
+    trial = tune_flight.try_out("bad", FULL, tune_flight.STAGES, hard=(7, 4, 9, 1501))
+    assert flights == [("symmetric_swap", 16, [7, 4, 9, 1501])]
+    assert (trial.safe, trial.selected, trial.collided) == (False, True, [7, 9, 1501])
+    assert not flown, "three collisions in 2,000 episodes are too many"
+    # Two are not, so it flies as all do
+    trial = tune_flight.try_out("good", FULL, tune_flight.STAGES, hard=(7, 9, 10))
+    assert (trial.safe, trial.selected) == (True, False)
+    assert max(one[3] for one in flown) == tune_flight.STAGES[-1]
 
 
 def settings(path: Path) -> dict[str, bool | None]:
