@@ -31,6 +31,24 @@ def test_five_kills_change_nothing(tmp_path):
     assert all(row["kept_step"] >= row["from_step"] for row in rows)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+def test_killed_workers_change_no_table(tmp_path):
+    done = study("killed_workers", "evaluation", "--kills", "4", "--json", str(tmp_path / "workers.json"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    (row,) = read_rows(tmp_path / "workers.json")
+    assert (row["workers_killed"], row["commands_killed"]) == (3, 1)
+    assert (row["same"], row["orphans"], row["pieces_left"]) == (True, 0, 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_many_episodes_do_not_grow_the_process(tmp_path):
+    done = study("soak", "--episodes", "3000", "--json", str(tmp_path / "soak.json"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    (row,) = read_rows(tmp_path / "soak.json")
+    assert row["episodes"] == 3006
+    assert (row["files_grown"], row["threads_grown"]) == (0, 0)
+
+
 @pytest.mark.parametrize("seed", ["1"])
 def test_damaged_files_are_refused_or_harmless(tmp_path, seed):
     done = study("mutated_files", "--count", "250", "--seed", seed, "--json", str(tmp_path / "files.json"))

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_maddpg.cli.commands import main
 
@@ -64,14 +65,18 @@ def results(folder: Path, env_id: str) -> dict:
     with np.load(run / "evaluations.npz") as curves:
         found |= {name: curves[name].tolist() for name in CURVES}
     found["files"] = sorted(str(path.relative_to(run)) for path in run.rglob("*"))
-    return found
+    (log,) = folder.glob("tb/*/*")
+    # As TensorBoard reads it: what a later session writes again takes the place of what was written
+    events = EventAccumulator(str(log), size_guidance={"scalars": 0}).Reload()
+    tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(("time/", "planner/solve_us"))]
+    return found | {tag: [(one.step, one.value) for one in events.Scalars(tag)] for tag in tags}
 
 
 @pytest.mark.parametrize("env_id", RECIPES)
 def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     argv = ["--env", env_id, "--conf-file", "r.yml", "--seed", "1", "--checkpoint-every", "300", "--verbose", "0"]
-    argv += ["--eval-freq", "800", "--eval-episodes", "2"]
+    argv += ["--eval-freq", "800", "--eval-episodes", "2", "--tensorboard-log", "tb"]
     for folder in (whole, parts):
         folder.mkdir()
         (folder / "r.yml").write_text(yaml.safe_dump({env_id: RECIPES[env_id]}))
@@ -98,6 +103,8 @@ def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tm
     expected, found = results(whole, env_id), results(parts, env_id)
     assert len(expected["monitor"]) > 20
     assert len(expected["timesteps"]) >= 3
+    assert len(expected["train/critic_loss"]) > 2
+    assert expected.keys() == found.keys()
     for name, value in expected.items():
         assert found[name] == value, name
     assert not any("checkpoint" in name or "before" in name for name in found["files"])

@@ -1,0 +1,144 @@
+"""Kill the workers of evaluations and searches, and the commands themselves, and compare what they end with.
+
+``python -m studies.killed_workers [evaluation] [search] [--kills 20] [--json F]``. An evaluation with two processes loses one of them, or is
+killed as a whole and started again, at random moments; its table has to be that of the evaluation left alone. Two
+workers of one search for hyperparameters are killed and started again; no trial may be lost, and the search has to end
+with as many finished trials as were asked for. JSON: a row for each of the two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import optuna
+import yaml
+from optuna.trial import TrialState
+
+from quad_swarm.evaluation.rows import read_rows, write_rows
+from sb3_maddpg.cli.search import open_storage
+
+EVALUATE = ["evaluate", "--preset", "dense", "--policy", "full", "cpa:0.7:1.5", "--episodes", "1500", "--jobs", "2"]
+TRIALS = 12
+RECIPE = {"n_timesteps": 1500, "policy": "MlpPolicy", "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
+SEARCH = ["train", "-optimize", "--env", "OwnBit-v0", "--conf-file", "recipe.yml", "--n-evaluations", "2"]
+SEARCH += ["--n-eval-envs", "1", "--max-total-trials", str(TRIALS), "--storage", "search.log", "--study-name", "s"]
+
+
+def start(words: list[str], folder: Path) -> subprocess.Popen[bytes]:
+    """A command of ours in a folder that also holds its cache of pieces."""
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "QUAD_SWARM_CACHE": str(folder / "cache")}
+    command = [sys.executable, "-m", "sb3_maddpg", *words]
+    return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def children(process: int) -> list[int]:
+    """Ids of the processes that another one has begun to work with."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(status.read_text().rpartition(")")[2].split()[1])
+            command = (status.parent / "cmdline").read_text()
+        except OSError:
+            continue
+        if parent == process and "spawn_main" in command:
+            found.append(int(status.parent.name))
+    return found
+
+
+def kill(process: int) -> bool:
+    """Whether there was such a process."""
+    try:
+        os.kill(process, signal.SIGKILL)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def untimed(path: Path) -> list[dict[str, Any]]:
+    """The rows of an evaluation without what differs from run to run."""
+    return [{key: value for key, value in row.items() if key != "solve_us"} for row in read_rows(path)]
+
+
+def evaluation(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
+    """Kill workers of an evaluation, and each fourth time the evaluation."""
+    words = [*EVALUATE, "--json", str(folder / "table.json")]
+    start([*EVALUATE, "--json", str(folder / "alone.json")], folder).wait()
+    orphans = commands = workers = 0
+    process = start(words, folder)
+    while workers + commands < count:
+        time.sleep(rng.uniform(0.5, 2.5))
+        if process.poll() is not None:  # it was faster than the kills
+            process = start(words, folder)
+            continue
+        found = children(process.pid)
+        if not found:
+            continue
+        if (workers + commands) % 4 == 3:
+            process.kill()
+            process.wait()
+            commands += 1
+            time.sleep(1.0)
+            orphans += sum(Path(f"/proc/{one}").exists() for one in found)
+            process = start(words, folder)
+        else:
+            workers += kill(rng.choice(found))
+    code = process.wait()
+    same = code == 0 and untimed(folder / "table.json") == untimed(folder / "alone.json")
+    row = {"what": "evaluation", "workers_killed": workers, "commands_killed": commands, "orphans": orphans}
+    return row | {"same": same, "pieces_left": len(list((folder / "cache" / "pieces").glob("*")))}
+
+
+def search(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
+    """Kill the workers of a search."""
+    (folder / "recipe.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
+    workers = [start(SEARCH, folder) for _ in range(2)]
+    killed = 0
+    while killed < count and not all(worker.poll() == 0 for worker in workers):
+        time.sleep(rng.uniform(4.0, 9.0))
+        k = rng.randrange(2)
+        if workers[k].poll() is None:
+            workers[k].kill()
+            workers[k].wait()
+            killed += 1
+            workers[k] = start(SEARCH, folder)
+    codes = [worker.wait() for worker in workers]
+    codes.append(start(SEARCH, folder).wait())  # takes up what was killed last
+    study = optuna.load_study(storage=open_storage(str(folder / "search.log")), study_name="s")
+    states = [trial.state for trial in study.trials]
+    counts = {state.name.lower(): states.count(state) for state in TrialState}
+    finished = counts["complete"] + counts["pruned"]
+    same = codes[-1] == 0 and finished >= TRIALS and not counts["running"] and counts["fail"] <= killed
+    return {"what": "search", "workers_killed": killed, "trials": TRIALS, **counts, "same": same}
+
+
+TRIED = {"evaluation": evaluation, "search": search}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", choices=TRIED, default=list(TRIED), help="both unless named")
+    parser.add_argument("--kills", type=int, default=20, help="of workers, in each of the two (%(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    rows = []
+    for what in args.what:
+        with tempfile.TemporaryDirectory() as folder:
+            rows.append(TRIED[what](Path(folder), args.kills, random.Random(0)))
+        print(rows[-1], flush=True)
+    if args.json:
+        write_rows(args.json, rows)
+    sys.exit(0 if all(row["same"] and not row.get("orphans") for row in rows) else 1)
+
+
+if __name__ == "__main__":
+    main()

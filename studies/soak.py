@@ -1,0 +1,89 @@
+"""Fly many episodes in one process that should not grow: ``python -m studies.soak [--episodes N] [--json F]``.
+
+Four robots of `flight` fly in batches as in an evaluation, and one environment after the other is made, flown and
+closed as in a script. Memory, open files, threads and objects are counted once the first tenth is flown, and at the
+end. JSON: one row with these and what they grew by.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+from tqdm import tqdm
+
+import quad_swarm  # noqa: F401 - registers the environment
+from quad_swarm.evaluation.flight import first_episode, run_episodes
+from quad_swarm.evaluation.rows import write_rows
+from quad_swarm.world.presets import make_config
+from studies.swarm.protocol import condition
+
+BATCH = 500
+GROWTH = 32.0  # MB that the process may grow by: noise of the allocator, less than half a kilobyte an episode
+POLICIES = ("full", "plan:1.1s&stale:4")
+
+
+def counts() -> dict[str, float]:
+    """What a process could grow by."""
+    gc.collect()
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return {
+        "megabytes": int(status["VmRSS"].split()[0]) / 1024,
+        "files": len(os.listdir("/proc/self/fd")),
+        "threads": threading.active_count(),
+        "objects": len(gc.get_objects()),
+    }
+
+
+def fly(batch: int) -> int:
+    """Fly a batch.
+
+    :return: number of episodes
+    """
+    config = make_config("flight", n_robots=4)
+    one = condition(POLICIES[batch % len(POLICIES)], "asymmetric_swap", config)
+    begin = first_episode(0) + batch * BATCH
+    rows = run_episodes(one, range(begin, begin + BATCH))
+    env = gymnasium.make("QuadSwarm-v0", preset="flight", n_robots=3, max_steps=10)
+    env.reset(seed=batch)
+    env.action_space.seed(batch)
+    over = False
+    while not over:
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        over = terminated or truncated
+    env.close()
+    return len(rows) + 1
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=100_000, help="%(default)s unless given")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    started, episodes, before = time.monotonic(), 0, None
+    batches = max(-(-args.episodes // BATCH), 2)
+    for batch in tqdm(range(batches), disable=not sys.stderr.isatty()):
+        episodes += fly(batch)
+        if batch == max(batches // 10, 1) - 1:
+            before = counts()
+    after = counts()
+    assert before is not None
+    grown = {f"{name}_grown": after[name] - before[name] for name in after}
+    row: dict[str, Any] = {"episodes": episodes, "seconds": time.monotonic() - started, **after, **grown}
+    print(row)
+    if args.json:
+        write_rows(args.json, [row])
+    leaks = grown["files_grown"] > 0 or grown["threads_grown"] > 0
+    sys.exit(1 if leaks or grown["megabytes_grown"] > GROWTH else 0)
+
+
+if __name__ == "__main__":
+    main()
