@@ -1,9 +1,9 @@
 """Kill the workers of evaluations and searches, and the commands themselves, and compare what they end with.
 
-``python -m studies.killed_workers [evaluation] [search] [--kills 20] [--json F]``. An evaluation with two processes loses one of them, or is
-killed as a whole and started again, at random moments; its table has to be that of the evaluation left alone. Two
-workers of one search for hyperparameters are killed and started again; no trial may be lost, and the search has to end
-with as many finished trials as were asked for. JSON: a row for each of the two.
+``python -m studies.killed_workers [--what evaluation search] [--kills 20] [--json F]``. An evaluation with two
+processes loses one of them, or is killed as a whole and started again, at random moments; its table has to be that of
+the evaluation left alone. Two workers of one search for hyperparameters are killed and started again; no trial may be
+lost, and the search has to end with as many finished trials as were asked for. JSON: a row for each of the two.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from optuna.trial import TrialState
 from quad_swarm.evaluation.rows import read_rows, write_rows
 from sb3_maddpg.cli.search import open_storage
 
-EVALUATE = ["evaluate", "--preset", "dense", "--policy", "full", "cpa:0.7:1.5", "--episodes", "1500", "--jobs", "2"]
+EVALUATE = ["evaluate", "--policy", "full", "cpa:0.7:1.5", "--episodes", "1000", "--jobs", "2"]
 TRIALS = 12
 RECIPE = {"n_timesteps": 1500, "policy": "MlpPolicy", "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
 SEARCH = ["train", "-optimize", "--env", "OwnBit-v0", "--conf-file", "recipe.yml", "--n-evaluations", "2"]
@@ -52,6 +52,19 @@ def children(process: int) -> list[int]:
         if parent == process and "spawn_main" in command:
             found.append(int(status.parent.name))
     return found
+
+
+def gone(process: int) -> bool:
+    """Whether a process ends within ten seconds."""
+    for _ in range(100):
+        try:
+            state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return True
+        if state == "Z":  # waits for the system to take note
+            return True
+        time.sleep(0.1)
+    return False
 
 
 def kill(process: int) -> bool:
@@ -86,8 +99,7 @@ def evaluation(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
             process.kill()
             process.wait()
             commands += 1
-            time.sleep(1.0)
-            orphans += sum(Path(f"/proc/{one}").exists() for one in found)
+            orphans += sum(not gone(one) for one in found)
             process = start(words, folder)
         else:
             workers += kill(rng.choice(found))
@@ -126,7 +138,7 @@ TRIED = {"evaluation": evaluation, "search": search}
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="*", choices=TRIED, default=list(TRIED), help="both unless named")
+    parser.add_argument("--what", nargs="+", choices=TRIED, default=list(TRIED), help="both unless named")
     parser.add_argument("--kills", type=int, default=20, help="of workers, in each of the two (%(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()

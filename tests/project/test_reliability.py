@@ -33,7 +33,7 @@ def test_five_kills_change_nothing(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 def test_killed_workers_change_no_table(tmp_path):
-    done = study("killed_workers", "evaluation", "--kills", "4", "--json", str(tmp_path / "workers.json"))
+    done = study("killed_workers", "--what", "evaluation", "--kills", "4", "--json", str(tmp_path / "workers.json"))
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = read_rows(tmp_path / "workers.json")
     assert (row["workers_killed"], row["commands_killed"]) == (3, 1)
