@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Sequence
@@ -114,21 +115,51 @@ class AgentPolicy(nn.Module):
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """
-        Write the policy as a TorchScript program, which ``torch.jit.load`` and libtorch (C++) run without this package:
-        a function from (batch, obs_dim) float32 to actions as ``forward`` gives them.
+        Write the policy as a program that needs nothing of this package: a function from observations, (batch, obs_dim)
+        float32, to actions as ``forward`` gives them. A name that ends with ``.onnx`` writes ONNX, for ONNX Runtime and
+        the compilers of embedded processors (input ``observation``, output ``action``; needs the extra ``onnx``), any
+        other TorchScript, for ``torch.jit.load`` and libtorch (C++).
 
         :param path: of the file
-        :raises ValueError: a parameter is not finite
+        :raises ValueError: a parameter is not finite, or ONNX is not installed
         """
         if not isinstance(path, (str, os.PathLike)):
             raise ValueError(f"{shown(path)} is no path of a file.")
         for name, parameter in self.named_parameters():
             if not parameter.isfinite().all():
                 raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
+        if os.fspath(path).endswith(".onnx"):
+            program = self._to_onnx()
+            with atomic_write(path, suffix="onnx") as file:
+                file.write(program)
+            return
         example, other = th.zeros(2, self.obs_dim), th.linspace(-2.0, 2.0, 5 * self.obs_dim).view(5, -1)
         with warnings.catch_warnings():
             # What torch offers instead, torch.export, needs a compiler to run without Python
             warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
-            program = th.jit.trace(self, example, check_inputs=[(other,)])
+            script = th.jit.trace(self, example, check_inputs=[(other,)])
             with atomic_write(path, suffix="pt") as file:
-                th.jit.save(program, file)
+                th.jit.save(script, file)
+
+    def _to_onnx(self) -> bytes:
+        logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+        level = logger.level
+        logger.setLevel(logging.ERROR)  # it misses torchvision, which is not needed
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # about the exporter's own insides
+                program = th.onnx.export(
+                    self,
+                    (th.zeros(2, self.obs_dim),),
+                    dynamo=True,
+                    dynamic_shapes=({0: th.export.Dim("batch")},),
+                    input_names=["observation"],
+                    output_names=["action"],
+                    verbose=False,
+                )
+        except ImportError as error:
+            raise ValueError(f'ONNX is not installed ({error}): pip install "sb3-maddpg[onnx]".') from error
+        finally:
+            logger.setLevel(level)
+        assert program is not None
+        return program.model_proto.SerializeToString()

@@ -133,6 +133,38 @@ def test_exported_agents_run_without_this_package(tmp_path):
         assert np.allclose(actions, expected, atol=1e-6)
 
 
+@each_model
+def test_agents_exported_to_onnx_act_as_in_the_team(make, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    cases = team_actions(varied(make))[:3]
+    state = th.random.get_rng_state()
+    for number, (policy, obs, expected) in enumerate(cases):
+        path = tmp_path / f"{number}.onnx"
+        policy.export(path)
+        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        (seen,), (given,) = session.get_inputs(), session.get_outputs()
+        assert (seen.name, seen.shape[1:], given.name) == ("observation", [policy.obs_dim], "action")
+        obs = obs.astype(np.float32)
+        (actions,) = session.run(None, {"observation": obs})
+        assert actions.dtype == policy.predict(obs).dtype
+        assert np.allclose(actions, expected, atol=1e-5)
+        for count in (1, 3):
+            assert np.allclose(session.run(None, {"observation": obs[:count]})[0], expected[:count], atol=1e-5)
+    assert th.equal(th.random.get_rng_state(), state)
+
+
+def test_without_onnx_the_remedy_is_named(tmp_path, monkeypatch):
+    policy = MODELS["binary"]().agent_policy(0)
+
+    def export(*args, **kwargs):
+        raise ModuleNotFoundError("No module named 'onnxscript'", name="onnxscript")
+
+    monkeypatch.setattr(th.onnx, "export", export)
+    with pytest.raises(ValueError, match=r'ONNX is not installed .*pip install "sb3-maddpg\[onnx\]"'):
+        policy.export(tmp_path / "a.onnx")
+    assert not list(tmp_path.iterdir())
+
+
 def test_agents_have_the_names_of_the_environment():
     model = MADDPG("MlpPolicy", gymnasium.make("QuadSwarm-v0", n_robots=3), **SMALL)
     obs = np.random.default_rng(0).normal(size=(20, 18)).astype(np.float32)
@@ -169,7 +201,7 @@ def test_an_observation_that_does_not_fit_is_refused(observation, message):
 def test_a_policy_that_is_not_finite_is_not_exported(tmp_path):
     model = MODELS["binary"]()
     agent = model.agent_policy("binary_1")
-    exports = {agent.network: lambda: agent.export(tmp_path / "a.pt"), model.actor: lambda: model.agent_policy(0)}
+    exports = {agent.network: lambda: agent.export(tmp_path / "a.onnx"), model.actor: lambda: model.agent_policy(0)}
     for policy, export in exports.items():
         with th.no_grad():
             next(policy.parameters()).fill_(float("nan"))
