@@ -63,7 +63,8 @@ OWN_SWAPS = [cell for cell in CELLS if cell[0] == 8 and cell[1] in SWAPS]
 STAGES = (25, 50, 100, 250, 500, 1000, 2000, 4000)
 # Episodes of one cell after the other, the hardest and the others; more only of those that none of them ruled out
 FIRST, FIRST_OTHERS = 500, 100
-HARDEST = 60  # episodes of the hardest cell in which most others have collided, which are flown before all
+# Episodes of the hardest cell in which most others have collided, which are flown before all, so many at a time
+HARDEST, AT_ONCE = 240, 60
 THRESHOLDS = (0.9, 0.85, *(round(0.8 - 0.025 * k, 3) for k in range(23)), 0.2, 0.15, 0.1, 0.05, 0.02)
 
 
@@ -135,11 +136,15 @@ def try_out(policy: str, full: Flown, stages: Sequence[int], hard: Sequence[int]
     if hard:
         first_one = first_episode(VALIDATION)
         one = condition(policy, cell[1], world(PRESET, cell[0]))
-        rows = run_episodes(one, [first_one + k for k in hard])
-        collided = [k for k, row in zip(hard, rows, strict=True) if row["collided"]]
-        at_best: Rows = [{"collided": k in set(collided)} for k in range(last(cell, stages))]
-        if not may_be_safe(at_best, full[cell], SIZES[cell[0]]):
-            return Trial({cell: rows}, False, collided, selected=True)
+        rows: Rows = []
+        collided: set[int] = set()
+        for begin in range(0, len(hard), AT_ONCE):
+            part = hard[begin : begin + AT_ONCE]
+            rows += run_episodes(one, [first_one + k for k in part])
+            collided |= {k for k, row in zip(part, rows[begin:], strict=True) if row["collided"]}
+            at_best: Rows = [{"collided": k in collided} for k in range(last(cell, stages))]
+            if not may_be_safe(at_best, full[cell], SIZES[cell[0]]):
+                return Trial({cell: rows}, False, sorted(collided), selected=True)
     flown, safe = _by_stages(policy, full, stages)
     return Trial(flown, safe, [k for k, row in enumerate(flown[cell]) if row["collided"]])
 
@@ -222,7 +227,7 @@ def tune(
     """
     decided = {row["setting"]: row["safe"] for row in read_rows(path) if row["safe"] is not None}
     running: dict[Future[Trial], Setting] = {}
-    collisions: Counter[int] = Counter()
+    collisions = Counter(k for row in read_rows(path) for k in row.get("collided", []))
 
     def following() -> Setting | None:
         busy = {setting.name for setting in running.values()}
@@ -246,6 +251,8 @@ def tune(
             decided[setting.name] = trial.safe
             collisions.update(trial.collided)
             rows = rows_of(*setting, trial.flown, trial.safe, trial.selected)
+            for row in rows:
+                row |= {"collided": trial.collided} if (row["n_robots"], row["scenario"]) == CELLS[0] else {}
             replace_rows(path, rows, ("preset", "setting", "n_robots", "scenario"))
             print(f"{setting.name:50} {verdict(trial, full)}", flush=True)
 
