@@ -44,6 +44,7 @@ class ActionKind(nn.Module):
     n_columns: th.Tensor
     width: int
     padded: bool
+    has_masks = False
 
     def __init__(self, agents: Sequence[int], action_spaces: Sequence[AgentActionSpace]):
         super().__init__()
@@ -85,12 +86,20 @@ class ActionKind(nn.Module):
         """
         raise NotImplementedError
 
+    def mask(self, logits: th.Tensor, allowed: th.Tensor) -> th.Tensor:
+        """
+        :param logits: (batch, n_agents, width)
+        :param allowed: what each agent may choose, the same shape, bool
+        :return: the logits, minus infinity where an agent may not choose
+        """
+        return logits.masked_fill(~allowed, -th.inf)
+
     def regularization(self, logits: th.Tensor) -> th.Tensor:
         """
         :param logits: (batch, n_agents, width)
-        :return: mean square of each agent's outputs without padding, (batch, n_agents)
+        :return: mean square of each agent's outputs without padding and what is masked, (batch, n_agents)
         """
-        squares = logits.square()
+        squares = (logits.masked_fill(logits.isneginf(), 0.0) if self.has_masks else logits).square()
         return (squares * self.real).sum(dim=-1) / self.n_columns if self.padded else squares.mean(dim=-1)
 
 
@@ -188,6 +197,11 @@ class Categorical(ActionKind):
         real = self.real if heads.dim() == 4 else self.real.unsqueeze(-2)  # with an axis of alternatives
         return columns * real
 
+    def mask(self, logits: th.Tensor, allowed: th.Tensor) -> th.Tensor:
+        heads = allowed.unflatten(-1, self.shape) & self.real.unflatten(-1, self.shape)
+        # An agent that may choose nothing takes no part, and what it chooses is not read
+        return super().mask(logits, (heads | ~heads.any(dim=-1, keepdim=True)).flatten(-2))
+
     def squash(self, logits: th.Tensor) -> th.Tensor:
         return self._columns(self._heads(logits).softmax(dim=-1))
 
@@ -243,8 +257,11 @@ class TeamActions(nn.Module):
     :param threshold: for binary actions, see ``Binary``
     :param n_thresholds: for binary actions, see ``Binary``
     :param random_thresholds: for binary actions, see ``Binary``
+    :param masks: columns of the agents' action masks in their observations, see ``Team``; empty without any
     """
 
+    mask_columns: th.Tensor
+    masked: th.Tensor
     source: th.Tensor
     value: th.Tensor
     real: th.Tensor
@@ -260,6 +277,7 @@ class TeamActions(nn.Module):
         threshold: float = 0.5,
         n_thresholds: int = 1,
         random_thresholds: float = 1.0,
+        masks: Sequence[Sequence[int]] = (),
     ):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
@@ -269,6 +287,9 @@ class TeamActions(nn.Module):
         self.kinds = cast("Sequence[ActionKind]", nn.ModuleList(kinds))
         self.width = max(kind.width for kind in self.kinds)
         self._make_tables()
+        self.has_masks = any(masks)
+        if self.has_masks:
+            self._place_masks(masks)
         boxes = [
             (space.low.ravel(), space.high.ravel())
             if isinstance(space, spaces.Box)
@@ -315,6 +336,76 @@ class TeamActions(nn.Module):
             ("discrete_columns", real & ~continuous),
         ):
             self.register_buffer(name, th.as_tensor(table), persistent=False)
+
+    def _place_masks(self, masks: Sequence[Sequence[int]]) -> None:
+        """Which column of an agent's observation says whether it may choose a number of its encoded action."""
+        columns = np.zeros((self.n_agents, self.width), int)
+        masked = np.zeros((self.n_agents, self.width), bool)
+        for kind in self.kinds:
+            kind.has_masks = True
+            for row, agent in enumerate(kind.agents):
+                if masks[agent]:
+                    real = np.flatnonzero(self._of_mask(kind, row))
+                    columns[agent, real], masked[agent, real] = masks[agent], True
+        self.register_buffer("mask_columns", th.as_tensor(columns), persistent=False)
+        self.register_buffer("masked", th.as_tensor(masked), persistent=False)
+
+    def _of_mask(self, kind: ActionKind, row: int) -> np.ndarray:
+        """Which columns of the encoded action a mask speaks of, in its order, (width,) bool."""
+        columns = np.zeros(self.width, bool)
+        if isinstance(kind, Categorical):
+            for head, size in enumerate(kind.sizes[row]):
+                columns[head * kind.shape[1] : head * kind.shape[1] + size] = True
+        else:
+            columns[: len(kind.sizes[row])] = True
+        return columns
+
+    def allowed(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (batch, n_agents, obs_dim or more)
+        :return: what the agents may choose by their action masks, (batch, n_agents, width) bool
+        """
+        return (obs.gather(2, self.mask_columns.expand(len(obs), -1, -1)) > 0) | ~self.masked
+
+    def mask(self, logits: th.Tensor, obs: th.Tensor) -> th.Tensor:
+        """
+        :param logits: (batch, n_agents, width)
+        :param obs: (batch, n_agents, obs_dim or more)
+        :return: the logits, minus infinity where the action masks in the observations are not positive. An agent whose
+            mask allows none of its categories takes no part, and keeps all of them
+        """
+        if not self.has_masks:
+            return logits
+        allowed = self.allowed(obs)
+        if len(self.kinds) == 1:
+            return self.kinds[0].mask(logits, allowed)
+        result = logits.clone()
+        for kind in self.kinds:
+            part = allowed[:, kind.agents, : kind.width]
+            result[:, kind.agents, : kind.width] = kind.mask(logits[:, kind.agents, : kind.width], part)
+        return result
+
+    def legal(self, flat: th.Tensor, obs: th.Tensor) -> th.Tensor:
+        """
+        :param flat: buffer actions, (batch, length)
+        :param obs: (batch, n_agents, obs_dim or more)
+        :return: the same where they are allowed: a forbidden category is drawn anew, a forbidden bit is 0
+        """
+        encoded = self.encode(flat)
+        logits = self.mask(th.zeros_like(encoded), obs)
+        drawn = self.act(logits, deterministic=False)
+        forbidden = (encoded != 0) & logits.isneginf()
+        for kind in self.kinds:
+            own = forbidden[:, kind.agents, : kind.width]
+            part = encoded[:, kind.agents, : kind.width]
+            if isinstance(kind, Categorical):
+                wrong = own.unflatten(-1, kind.shape).any(dim=-1, keepdim=True)
+                heads = drawn[:, kind.agents, : kind.width].unflatten(-1, kind.shape)
+                part = th.where(wrong, heads, part.unflatten(-1, kind.shape)).flatten(-2)
+            else:
+                part = part.masked_fill(own, 0.0)
+            encoded[:, kind.agents, : kind.width] = part
+        return self.decode(encoded)
 
     def set_threshold(self, threshold: float) -> None:
         """

@@ -33,9 +33,11 @@ class AgentPolicy(nn.Module):
     :param action_space: the agent's
     :param obs_dim: length of its observation
     :param threshold: for binary actions, see ``Binary``
+    :param mask: columns of its action mask in its observation, see ``TeamObservation``; empty without one
     """
 
     columns: th.Tensor
+    mask: th.Tensor
     low: th.Tensor
     high: th.Tensor
     start: th.Tensor
@@ -48,6 +50,7 @@ class AgentPolicy(nn.Module):
         action_space: AgentActionSpace,
         obs_dim: int,
         threshold: float,
+        mask: Sequence[int] = (),
     ):
         super().__init__()
         self.name = name
@@ -56,6 +59,12 @@ class AgentPolicy(nn.Module):
         self.obs_dim = obs_dim
         self.kind: ActionKind = make_kinds([action_space], threshold)[0]
         self.register_buffer("columns", th.tensor(columns))
+        self.has_mask = bool(mask)
+        if self.has_mask:
+            # Where encoded actions are padded, any column will do
+            full = np.zeros(self.kind.width, int)
+            full[self.kind.real[0].numpy()] = mask
+            self.register_buffer("mask", th.tensor(full))
         if isinstance(self.kind, Categorical):
             start = th.as_tensor(np.ravel(getattr(action_space, "start", 0)), dtype=th.int64)
             self.register_buffer("start", start)
@@ -75,7 +84,8 @@ class AgentPolicy(nn.Module):
         team, index = policy.team, policy.team.index(agent)
         network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
         columns, space = policy.actions.columns_of(index), team.action_spaces[index]
-        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold)
+        mask = team.masks[index] if team.masks else ()
+        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
@@ -84,6 +94,8 @@ class AgentPolicy(nn.Module):
             as float32, categorical ones as int64
         """
         logits = self.network(obs)[:, self.columns].unsqueeze(1)
+        if self.has_mask:
+            logits = self.kind.mask(logits, (obs[:, self.mask] > 0).unsqueeze(1))
         actions = self.kind.act(logits, deterministic=True).squeeze(1)
         if isinstance(self.kind, Continuous):
             return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)

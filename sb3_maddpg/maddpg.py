@@ -304,6 +304,11 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _check_normalization(self, env: GymEnv) -> None:
         layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
+        if normalizer is not None and any(getattr(normalizer.observation_space, "masks", ())):
+            raise ValueError(
+                "VecNormalize(norm_obs=True) moves the numbers of action masks, which are positive where an action is "
+                "allowed. Set norm_obs=False and scale observations in the environment."
+            )
         if layout is not None and normalizer is not None and not layout.get("complete", False):
             raise ValueError(
                 "VecNormalize(norm_obs=True) moves the zeros by which PairPolicy knows absent neighbours: they would "
@@ -424,11 +429,14 @@ class MADDPG(OffPolicyAlgorithm):
         actions = self.policy.actions
         if self.num_timesteps < learning_starts:
             drawn = np.array([self.action_space.sample() for _ in range(n_envs)])
-            return drawn, actions.scale(drawn)
-        assert isinstance(self._last_obs, np.ndarray)
-        self.policy.check_finite(self._last_obs)
+            scaled = actions.scale(drawn)
+            if not actions.has_masks:
+                return drawn, scaled
+            legal = actions.legal(th.as_tensor(scaled, dtype=th.float32, device=self.device), self._present_obs())
+            scaled = legal.cpu().numpy()
+            return actions.unscale(scaled).astype(self.action_space.dtype), scaled
         with th.no_grad():
-            obs = th.as_tensor(self._last_obs, dtype=th.float32, device=self.device)
+            obs = self._present_obs()
             flat = self.policy.flat_actions(obs).cpu().numpy()
         if actions.has_continuous:
             # SB3's seeded generator
@@ -436,6 +444,12 @@ class MADDPG(OffPolicyAlgorithm):
             noisy = np.clip(flat + noise, -1.0, 1.0)
             flat = np.where(actions.is_continuous, noisy, flat).astype(np.float32)
         return actions.unscale(flat).astype(self.action_space.dtype), flat
+
+    def _present_obs(self) -> th.Tensor:
+        """What the team sees now, (n_envs, n_agents, obs_dim or more)."""
+        assert isinstance(self._last_obs, np.ndarray)
+        self.policy.check_finite(self._last_obs)
+        return th.as_tensor(self._last_obs, dtype=th.float32, device=self.device)
 
     @property
     def noise_std(self) -> float:

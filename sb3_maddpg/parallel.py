@@ -19,6 +19,7 @@ from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint
 from sb3_maddpg.utils import as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
+MASK = "action_mask"
 
 
 class _Action(NamedTuple):
@@ -42,6 +43,9 @@ class TeamEnv(gymnasium.Env):
     agent that ends is shown its last observation once; from then on its row is zero and it is sent no action. The
     episode ends with the last agent: by truncation, if it was truncated (or one that ended in the same step was).
 
+    Where an agent observes a dict with an entry ``action_mask``, as PettingZoo's environments with illegal moves do, it
+    chooses only what the mask allows, while it explores as well as in the targets and gradients of the training.
+
     MADDPG makes a ``TeamEnv`` of a ``ParallelEnv`` by itself. Stable-Baselines3's functions need one where they take an
     environment: ``evaluate_policy(model, Monitor(TeamEnv(env)))``, and likewise ``EvalCallback``.
 
@@ -59,18 +63,29 @@ class TeamEnv(gymnasium.Env):
     - ``agent_infos``: what the environment says about the agents, by name; left out where it says nothing
     - ``metrics``: at the end of an episode, ``rollout/ep_rew_NAME`` of each agent that took part
 
-    :param env: the environment
+    :param env: the environment, turn-based ones too
     :param state: append ``env.state()`` to the observation, for the critics
+    :param info_mask: take the action masks from ``infos[agent]["action_mask"]``; who is given none may choose anything
     :raises ValueError: an environment or a space that cannot be treated so
     """
 
     observation_space: TeamObservation
 
-    def __init__(self, env: ParallelEnv, state: bool = False):
+    def __init__(self, env: ParallelEnv | AECEnv, state: bool = False, info_mask: bool = False):
+        if isinstance(env, AECEnv):
+            env = TurnBased(env)
         agents = _possible_agents(env)
         self._agents = agents
         self._rows = {agent: row for row, agent in enumerate(agents)}
+        action_spaces = [_space_of(env, "action_space", agent) for agent in agents]
+        for agent, space in zip(agents, action_spaces, strict=True):
+            check_action_space(agent, space)
         self._observation_spaces = [_space_of(env, "observation_space", agent) for agent in agents]
+        self._info_mask = info_mask
+        if info_mask:
+            self._observation_spaces = [
+                _masked_space(seen, space) for seen, space in zip(self._observation_spaces, action_spaces, strict=True)
+            ]
         self.parallel_env = env
         self.metadata = {"render_modes": [], **getattr(env, "metadata", {})}
         self.render_mode = getattr(env, "render_mode", None)
@@ -81,10 +96,8 @@ class TeamEnv(gymnasium.Env):
                 for agent, space in zip(agents, self._observation_spaces, strict=True)
             },
             _state_space(env) if state else None,
+            {str(agent): _mask_columns(s) for agent, s in zip(agents, self._observation_spaces, strict=True)},
         )
-        action_spaces = [_space_of(env, "action_space", agent) for agent in agents]
-        for agent, space in zip(agents, action_spaces, strict=True):
-            check_action_space(agent, space)
         self.action_space = joint_action_space(action_spaces)
         self._state_space: Any = env.state_space if state else None
         self._metric_names = [f"rollout/ep_rew_{name}" for name in self.agent_names]
@@ -137,7 +150,7 @@ class TeamEnv(gymnasium.Env):
             raise ValueError(f"After reset(), agents of {self.parallel_env} is empty: it must list who takes part.")
         self._taking_part = self._live
         self._returns = [0.0] * len(self._agents)
-        return self._observe(observations, self._live), _agent_infos(infos)
+        return self._observe(self._with_masks(observations, infos), self._live), _agent_infos(infos)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
@@ -197,7 +210,7 @@ class TeamEnv(gymnasium.Env):
             successes = [agent["is_success"] for agent in infos.values() if agent and "is_success" in agent]
             if successes:
                 info["is_success"] = all(successes)
-        return self._observe(observations, seen), total / n_agents, over and not cut, cut, info
+        return self._observe(self._with_masks(observations, infos), seen), total / n_agents, over and not cut, cut, info
 
     def render(self) -> Any:
         """What the environment renders."""
@@ -345,6 +358,19 @@ class TeamEnv(gymnasium.Env):
             )
         return matrix
 
+    def _with_masks(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> Mapping[Any, Any]:
+        """Observations with the masks that infos hold, where these are asked for."""
+        if not self._info_mask:
+            return observations
+        masked = {}
+        for agent, observation in observations.items():
+            mask = (infos.get(agent) or {}).get(MASK)
+            if mask is None and agent in self._rows:
+                space: Any = self._observation_spaces[self._rows[agent]]
+                mask = np.ones(space[MASK].shape, np.int8)
+            masked[agent] = {MASK: mask, "observation": observation}
+        return masked
+
     def _state(self, size: int) -> np.ndarray:
         try:
             state = np.asarray(flatten(self._state_space, self.parallel_env.state()))
@@ -397,6 +423,108 @@ class TeamEnv(gymnasium.Env):
         raise ValueError(f"{self.parallel_env} gave a reward of {wrong} {self._when}: rewards must be finite.")
 
 
+class TurnBased(ParallelEnv):
+    """
+    A PettingZoo environment with turns (``AECEnv``) as a parallel one. In each step one agent moves. The others see the
+    board too, but their action masks allow the first action alone, which is not read: nothing is learned from it, while
+    their critics learn from every step.
+
+    ``TeamEnv`` makes one of an ``AECEnv`` by itself.
+
+    :param env: with ``Discrete`` actions
+    :raises ValueError: other actions, or an environment whose agents could act at once
+    """
+
+    metadata: dict[str, Any]
+
+    def __init__(self, env: AECEnv):
+        if getattr(env, "metadata", {}).get("is_parallelizable"):
+            raise ValueError(
+                f"{env} takes turns only in form: take its parallel_env, or "
+                "pettingzoo.utils.conversions.aec_to_parallel(env)."
+            )
+        self.env = env
+        self.metadata = {**getattr(env, "metadata", {})}
+        self.render_mode = getattr(env, "render_mode", None)
+        self.possible_agents = list(getattr(env, "possible_agents", None) or ())
+        self.agents: list[Any] = []
+        self._action_spaces: dict[Any, Any] = {
+            agent: _space_of(env, "action_space", agent) for agent in self.possible_agents
+        }
+        self._observation_spaces = {}
+        for agent, space in self._action_spaces.items():
+            if not isinstance(space, spaces.Discrete):
+                raise ValueError(
+                    f"Agent {agent!r} of {env}, an environment with turns, has the action space {space}: who is not to "
+                    "move is left one action by its mask, so it must be Discrete."
+                )
+            seen = _space_of(env, "observation_space", agent)
+            masked = isinstance(seen, spaces.Dict) and MASK in seen.spaces
+            self._observation_spaces[agent] = seen if masked else _masked_space(seen, space)
+        if getattr(env, "state_space", None) is not None:
+            self.state_space = env.state_space
+
+    def observation_space(self, agent: Any) -> spaces.Space:
+        """What an agent observes: a dict with its action mask."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: Any) -> spaces.Space:
+        """How an agent moves."""
+        return self._action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        """:return: observations and infos by agent"""
+        self.env.reset(seed=seed, options=options)
+        self.agents = list(self.env.agents)
+        return self._observe(), {agent: dict(self.env.infos.get(agent) or {}) for agent in self.agents}
+
+    def step(self, actions: dict[Any, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """
+        :param actions: by agent; only that of the agent whose turn it is is read
+        :return: observations, rewards, terminations, truncations and infos by agent
+        """
+        env, agents = self.env, self.agents
+        env.step(actions[env.agent_selection])
+        rewards = {agent: float(env.rewards.get(agent, 0.0)) for agent in agents}
+        ended = {agent: bool(env.terminations.get(agent, True)) for agent in agents}
+        cut = {agent: bool(env.truncations.get(agent, False)) for agent in agents}
+        infos = {agent: dict(env.infos.get(agent) or {}) for agent in agents}
+        observations = self._observe()
+        while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
+            env.step(None)  # who has ended is taken off by PettingZoo's rules
+        self.agents = [agent for agent in agents if not (ended[agent] or cut[agent])]
+        return observations, rewards, ended, cut, infos
+
+    def _observe(self) -> dict[Any, Any]:
+        observations = {}
+        for agent in self.agents:
+            seen = self.env.observe(agent)
+            if not isinstance(seen, Mapping) or MASK not in seen:
+                mask = (self.env.infos.get(agent) or {}).get(MASK)
+                seen = {
+                    MASK: np.ones(int(self._action_spaces[agent].n), np.int8) if mask is None else mask,
+                    "observation": seen,
+                }
+            if agent != self.env.agent_selection:
+                only_first = np.zeros_like(seen[MASK])
+                only_first[0] = 1
+                seen = {**seen, MASK: only_first}
+            observations[agent] = seen
+        return observations
+
+    def state(self) -> np.ndarray:
+        """The global state."""
+        return self.env.state()
+
+    def render(self) -> Any:
+        """What the environment renders."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+
 def _agent_infos(infos: Mapping[Any, Any]) -> dict[str, Any]:
     if not any(infos.values()):
         return {}
@@ -424,11 +552,6 @@ def _fits(space: spaces.Space, value: Any) -> bool:
 
 
 def _possible_agents(env: Any) -> tuple[Any, ...]:
-    if isinstance(env, AECEnv):
-        raise ValueError(
-            f"{env} is a PettingZoo environment with turns (AECEnv). Convert it with "
-            "pettingzoo.utils.conversions.aec_to_parallel, or take its parallel_env."
-        )
     if not isinstance(env, ParallelEnv):
         raise ValueError(f"{shown(env)} is no PettingZoo ParallelEnv.")
     agents = getattr(env, "possible_agents", None) or ()
@@ -474,6 +597,26 @@ def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
     return flat
 
 
+def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:
+    heads = heads_of(action)
+    length = len(heads) if isinstance(action, spaces.MultiBinary) else sum(heads)
+    if not length:
+        raise ValueError(f"info_mask=True: {action} is continuous, and nothing of it can be masked.")
+    return spaces.Dict({MASK: spaces.Box(0, 1, (length,), np.int8), "observation": observation})
+
+
+def _mask_columns(space: spaces.Space) -> list[int]:
+    """Where a flat observation holds the action mask, by PettingZoo's convention an entry of that name in a dict."""
+    if not isinstance(space, spaces.Dict) or MASK not in space.spaces:
+        return []
+    begin = 0
+    for name, part in space.spaces.items():
+        if name == MASK:
+            return list(range(begin, begin + spaces.flatdim(part)))
+        begin += spaces.flatdim(part)
+    raise AssertionError
+
+
 def _state_space(env: Any) -> spaces.Box:
     space = getattr(env, "state_space", None)
     if space is None:
@@ -482,7 +625,11 @@ def _state_space(env: Any) -> spaces.Box:
 
 
 def make(
-    entry: str, state: bool = False, wrappers: Iterable[str | Mapping[str, Any]] | None = None, **kwargs: Any
+    entry: str,
+    state: bool = False,
+    wrappers: Iterable[str | Mapping[str, Any]] | None = None,
+    info_mask: bool = False,
+    **kwargs: Any,
 ) -> TeamEnv:
     """
     Make a team environment out of a module with a function ``parallel_env``, as PettingZoo's modules are.
@@ -491,9 +638,10 @@ def make(
     :param state: append the global state to the observation, for the critics
     :param wrappers: of the parallel environment, the innermost first: dotted paths, or dicts from such a path to the
         wrapper's arguments, e.g. ``["supersuit.pad_observations_v0", {"supersuit.frame_stack_v2": {"stack_size": 2}}]``
+    :param info_mask: see ``TeamEnv``
     :param kwargs: arguments of ``parallel_env``
     """
-    return TeamEnv(make_parallel_env(entry, wrappers, **kwargs), state=state)
+    return TeamEnv(make_parallel_env(entry, wrappers, **kwargs), state=state, info_mask=info_mask)
 
 
 def make_parallel_env(
@@ -553,8 +701,9 @@ def find_module(name: str) -> ModuleType | None:
         raise ValueError(f"{name} cannot be imported: {error}. Install what it needs.") from error
 
 
-def find_parallel_env(entry: str) -> Callable[..., ParallelEnv]:
-    parallel_env = getattr(find_module(entry), "parallel_env", None)
-    if not callable(parallel_env):
+def find_parallel_env(entry: str) -> Callable[..., ParallelEnv | AECEnv]:
+    module = find_module(entry)
+    make_env = getattr(module, "parallel_env", None) or getattr(module, "env", None)  # the latter takes turns
+    if not callable(make_env):
         raise ValueError(f"There is no function parallel_env in {entry}: name a module that has one.")
-    return parallel_env
+    return make_env

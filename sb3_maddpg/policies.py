@@ -75,14 +75,16 @@ class Actor(nn.Module):
     def logits(self, obs: th.Tensor) -> th.Tensor:
         """
         :param obs: (batch, n_agents, obs_dim or more)
-        :return: the networks' outputs before they are squashed, (batch, n_agents, width)
+        :return: the networks' outputs before they are squashed, minus infinity where an action mask forbids a choice
+            (``TeamActions.mask``), (batch, n_agents, width)
         """
         raise NotImplementedError
 
     def single(self, agent: int) -> nn.Module:
         """
         :param agent: which one
-        :return: a network that maps its observation without padding, (batch, its obs_dim), to outputs, (batch, width)
+        :return: a network that maps its observation without padding, (batch, its obs_dim), to outputs, (batch, width),
+            which no action mask has touched
         """
         raise NotImplementedError
 
@@ -132,7 +134,8 @@ class MLPActor(Actor):
         self.net = StackedMLP(groups or range(team.n_agents), team.obs_dim, actions.width, net_arch, activation_fn)
 
     def logits(self, obs: th.Tensor) -> th.Tensor:
-        return self.net(obs[..., : self.team.obs_dim].permute(1, 2, 0)).permute(2, 0, 1)
+        outputs = self.net(obs[..., : self.team.obs_dim].permute(1, 2, 0)).permute(2, 0, 1)
+        return self.actions.mask(outputs, obs)
 
     def single(self, agent: int) -> nn.Module:
         return self.net.single(agent, self.team.obs_dims[agent])
@@ -429,7 +432,12 @@ class MADDPGPolicy(BasePolicy):
             target.requires_grad_(False)
 
     def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
-        actions = TeamActions(self.team.action_spaces, self.threshold, random_thresholds=self.random_thresholds)
+        actions = TeamActions(
+            self.team.action_spaces,
+            self.threshold,
+            random_thresholds=self.random_thresholds,
+            masks=self.team.masks,
+        )
         actor_groups = sharing_groups(self.share_actor, self.team, "share_actor")
         critic_groups = sharing_groups(self.share_critic, self.team, "share_critic")
         return (

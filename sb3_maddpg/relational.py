@@ -281,8 +281,9 @@ class PairActor(Actor):
             logits = self.net.head(hidden.add_(self.net.extra(0, own).unsqueeze(-2)))
             if self.views.mask is not None:
                 logits = logits.masked_fill(self.views.mask(obs) <= 0, _NEVER)
-            return logits.flatten(-2)
-        return self.net.head(self.net.of_pool(pool) + self.net.extra(0, own) + self.net.of_pair.bias)
+            return self.actions.mask(logits.flatten(-2), obs)
+        outputs = self.net.head(self.net.of_pool(pool) + self.net.extra(0, own) + self.net.of_pair.bias)
+        return self.actions.mask(outputs, obs)
 
     def single(self, agent: int) -> nn.Module:
         alone = copy(self)
@@ -462,7 +463,7 @@ class PairPolicy(MADDPGPolicy):
         views, of_critic = NeighbourViews(layout, self.team), NeighbourViews(layout, self.team, of_critic=True)
         apart = on_neighbours and not self.shared_threshold
         n_thresholds = views.n_neighbours if apart else 1
-        actions = TeamActions(action_spaces, self.threshold, n_thresholds, self.random_thresholds)
+        actions = TeamActions(action_spaces, self.threshold, n_thresholds, self.random_thresholds, self.team.masks)
         factors = actions
         if on_neighbours:
             parts = [part for space in action_spaces for part in _split(space, views.n_neighbours)]

@@ -89,10 +89,18 @@ class TeamObservation(spaces.Box):
 
     :param agents: name and flat observation space of each agent
     :param state: flat space of the global state, if critics are to read it
+    :param masks: for agents whose observation holds an action mask the columns of it: one for each category, sub-action
+        after sub-action, or for each bit; positive where the agent may choose it
     """
 
-    def __init__(self, agents: Mapping[str, spaces.Box], state: spaces.Box | None = None):
+    def __init__(
+        self,
+        agents: Mapping[str, spaces.Box],
+        state: spaces.Box | None = None,
+        masks: Mapping[str, Sequence[int]] | None = None,
+    ):
         self.names = tuple(agents)
+        self.masks = tuple(tuple(map(int, (masks or {}).get(name, ()))) for name in self.names)
         self.obs_dims = tuple(int(np.prod(space.shape)) for space in agents.values())
         self.state_dim = 0 if state is None else int(np.prod(state.shape))
         n_agents, self.obs_dim = len(agents), max(self.obs_dims)
@@ -112,12 +120,14 @@ class TeamObservation(spaces.Box):
     def __eq__(self, other: Any) -> bool:
         return super().__eq__(other) and (
             not isinstance(other, TeamObservation)
-            or (self.names, self.obs_dims, self.state_dim) == (other.names, other.obs_dims, other.state_dim)
+            or (self.names, self.obs_dims, self.state_dim, self.masks)
+            == (other.names, other.obs_dims, other.state_dim, other.masks)
         )
 
     def __repr__(self) -> str:
         agents = ", ".join(f"{name}: {length}" for name, length in zip(self.names, self.obs_dims, strict=True))
-        return f"TeamObservation({agents}{f', state: {self.state_dim}' if self.state_dim else ''})"
+        more = f", state: {self.state_dim}" if self.state_dim else ""
+        return f"TeamObservation({agents}{more}{', with action masks' if any(self.masks) else ''})"
 
 
 class MixedActions(spaces.Box):
@@ -226,6 +236,8 @@ class Team:
     :param obs_dim: the longest of them
     :param state_dim: length of the global state, 0 without
     :param action_spaces: each agent's action space, categories counting from 0
+    :param masks: columns of each agent's action mask, none for an agent without, see ``TeamObservation``; empty where
+        no agent has one
     """
 
     names: tuple[str, ...]
@@ -233,6 +245,7 @@ class Team:
     obs_dim: int
     state_dim: int
     action_spaces: tuple[AgentActionSpace, ...]
+    masks: tuple[tuple[int, ...], ...] = ()
 
     @property
     def n_agents(self) -> int:
@@ -260,7 +273,8 @@ class Team:
         :return: whether they observe and act in the same spaces, so that they could share a network
         """
         same_obs = self.obs_dims[agent] == self.obs_dims[other]
-        return same_obs and self.action_spaces[agent] == self.action_spaces[other]
+        same_masks = not self.masks or self.masks[agent] == self.masks[other]
+        return same_obs and same_masks and self.action_spaces[agent] == self.action_spaces[other]
 
     @classmethod
     def from_spaces(
@@ -305,7 +319,11 @@ class Team:
         action_spaces = _agents_spaces(action_space, n_agents)
         for name, space in zip(names, action_spaces, strict=True):
             check_action_space(name, space)
-        return cls(names, *shape, action_spaces)
+        masks: tuple[tuple[int, ...], ...] = getattr(observation_space, "masks", ())
+        for name, space, columns in zip(names, action_spaces, masks, strict=False):
+            if columns:
+                check_mask(name, space, len(columns))
+        return cls(names, *shape, action_spaces, masks if any(masks) else ())
 
 
 def check_action_space(agent: Any, space: spaces.Space) -> None:
@@ -328,6 +346,20 @@ def check_action_space(agent: Any, space: spaces.Space) -> None:
                 f"Agent {agent!r} has the action space {space} without bounds, which say how far actions reach, or "
                 "with bounds too large for single precision. Give it smaller, finite ones."
             )
+
+
+def check_mask(agent: Any, space: spaces.Space, length: int) -> None:
+    """
+    :param agent: its name, for the message
+    :param space: its action space
+    :param length: of its action mask
+    :raises ValueError: a mask that does not fit
+    """
+    heads = heads_of(space)  # type: ignore[arg-type]
+    expected = len(heads) if isinstance(space, spaces.MultiBinary) else sum(heads)  # 0 for continuous actions
+    if length != expected:
+        rule = "one number for each category, or for each bit" if expected else "none: it has continuous actions"
+        raise ValueError(f"Agent {agent!r} has an action mask of {length} numbers; its space {space} takes {rule}.")
 
 
 def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace, ...]:

@@ -188,9 +188,9 @@ def _read_box(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> spaces.
 
 
 def _write_team(space: TeamObservation, part: Callable[[Any], Json]) -> dict[str, Json]:
-    return {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim} | _write_box(
-        space, part
-    )
+    names = {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim}
+    masks: dict[str, Json] = {"masks": [list(mask) for mask in space.masks]} if any(space.masks) else {}
+    return names | masks | _write_box(space, part)
 
 
 def _read_team(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamObservation:
@@ -201,7 +201,10 @@ def _read_team(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamOb
         for row, (name, columns) in enumerate(zip(entry["names"], lengths, strict=True))
     }
     low, high = (bound[:, own:].ravel()[:length] for bound in (box.low, box.high))
-    space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None)
+    masks = dict(zip(entry["names"], entry.get("masks", []), strict=False))
+    if any(not 0 <= column < own for mask in masks.values() for column in mask):
+        raise ValueError(f"it has action masks in columns that its observation of length {own} lacks")
+    space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None, masks)
     if space.shape != box.shape:
         raise ValueError(f"it has a team's observation of shape {box.shape} instead of {space.shape}")
     return space
