@@ -6,6 +6,7 @@ from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
 from sb3_maddpg.env_checker import check_team_env
+from sb3_maddpg.iddpg import IDDPG
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.normalization import SafeVecNormalize
@@ -17,6 +18,7 @@ from sb3_maddpg.typed_json import allow_in_files
 
 __version__ = version("sb3-maddpg")
 __all__ = [
+    "IDDPG",
     "MADDPG",
     "MATD3",
     "AgentPolicy",

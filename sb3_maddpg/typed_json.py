@@ -103,11 +103,16 @@ def _name(cls: type) -> str:
 def _built_in() -> dict[str, type]:
     """The classes that files may name beside those of users: what models are made of."""
     from sb3_maddpg import buffers as own_buffers
-    from sb3_maddpg import policies, relational
+    from sb3_maddpg import iddpg, policies, relational
 
     classes = [
         *_PLAIN_OBJECTS,
-        *(one for module in (policies, relational) for one in vars(module).values() if _is_public_class(one, module)),
+        *(
+            one
+            for module in (policies, relational, iddpg)
+            for one in vars(module).values()
+            if _is_public_class(one, module)
+        ),
         *(one for one in vars(own_buffers).values() if _is_public_class(one, own_buffers)),
         *(one for one in vars(buffers).values() if isinstance(one, type) and issubclass(one, buffers.BaseBuffer)),
         *(getattr(th.nn.modules.activation, one) for one in th.nn.modules.activation.__all__),

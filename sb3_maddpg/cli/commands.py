@@ -16,6 +16,7 @@ import gymnasium
 import yaml
 
 from sb3_maddpg.cli.options import PROG, check_writable, common_options, import_packages
+from sb3_maddpg.iddpg import IDDPG
 from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
@@ -31,7 +32,7 @@ Multi-agent reinforcement learning with MADDPG and MATD3 for Stable-Baselines3.
 {commands}
 
 `<command> --help` lists a command's options and shows an example. Those of train, tune, enjoy and record are rl_zoo3's.
-What differs: --algo is maddpg unless given (or matd3), the packaged recipe is used unless --conf-file is given,
+What differs: --algo is maddpg unless given (or matd3, iddpg), the packaged recipe is used unless --conf-file is given,
 --env-kwargs are merged over the recipe's, --num-threads is 1 unless given, and -i MODEL.zip continues the training
 where it ended. Values of --env-kwargs and -params are written as in Python or YAML; nothing is evaluated.
 --gym-packages PACKAGE ... imports packages that register environments, rules or scenarios, in every command.
@@ -185,7 +186,7 @@ def _convert(argv: list[str]) -> int:
     return 0
 
 
-_OWN = {"maddpg": MADDPG, "matd3": MATD3}
+_OWN = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 
 
 def _headline(readme: Path) -> str:
@@ -216,6 +217,7 @@ COMMANDS: dict[str, Command] = {
         f"""\
   {PROG} train --env mpe2/simple_spread_v3 --progress --tensorboard-log logs/tensorboard
   {PROG} train --algo matd3 --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:false
+  {PROG} train --algo iddpg --env mpe2/simple_spread_v3
   {PROG} train --algo ppo --env mpe2/simple_spread_v3 -params n_envs:8 learning_rate:lin_1e-3
   {PROG} train --gym-packages my_package --env MyTeam-v0 --conf-file recipes.yml""",
     ),

@@ -1,4 +1,4 @@
-"""``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3 and the installed environments."""
+"""``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3, IDDPG and the installed environments."""
 
 import argparse
 import difflib
@@ -38,15 +38,17 @@ from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.recipes import LengthOption, check_options
 from sb3_maddpg.cli.safety import no_code_from_files
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
+from sb3_maddpg.iddpg import IDDPG
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.utils import suggest
 
 
 def register() -> None:
     """Make the algorithms and every installed environment known to rl_zoo3, whose command line reads these dicts."""
-    ALGOS.update({"maddpg": MADDPG, "matd3": MATD3})
-    HYPERPARAMS_SAMPLER.update({"maddpg": sample_maddpg_params, "matd3": sample_matd3_params})
-    HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3"), convert_params))
+    ALGOS.update({"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG})
+    HYPERPARAMS_SAMPLER.update(dict.fromkeys(("maddpg", "iddpg"), sample_maddpg_params))
+    HYPERPARAMS_SAMPLER["matd3"] = sample_matd3_params
+    HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3", "iddpg"), convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
     for module in (rl_zoo3.train, rl_zoo3.enjoy, rl_zoo3.utils):  # record takes it from the last
         module.StoreDict = StoreValues  # type: ignore[attr-defined]

@@ -1,0 +1,89 @@
+"""Independent DDPG: the baseline without centralised critics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from torch import nn
+
+from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.networks import StackedMLP
+from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, sharing_groups
+from sb3_maddpg.team import Team
+
+
+class IndependentCritic(Critic):
+    """
+    One multi-layer perceptron per agent that reads what its actor reads, and its own action: Q_i(z_i, a_i).
+
+    :param team: the team
+    :param actions: how it acts
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    :param groups: for each agent the number of its network
+    :param n_critics: number of critics
+    """
+
+    def __init__(
+        self,
+        team: Team,
+        actions: TeamActions,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        groups: Sequence[int] | None = None,
+        n_critics: int = 1,
+    ):
+        super().__init__(actions, team.n_agents, n_critics=n_critics)
+        self.obs_dim = team.obs_dim
+        groups = list(groups or range(team.n_agents))
+        networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
+        self.net = StackedMLP(networks, team.obs_dim + actions.width, 1, net_arch, activation_fn)
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        inputs = th.cat([obs[..., : self.obs_dim], actions], dim=2).permute(1, 2, 0)
+        values = self.net(inputs.repeat(self.n_critics, 1, 1))
+        return values.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
+
+    def forward_alternatives(
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
+    ) -> th.Tensor:
+        agents = th.arange(self.n_agents, device=own.device) if factors is None else factors
+        layers = self.net.layers()
+        weight, bias = (self.net.of_networks(parameter, agents) for parameter in layers[0])
+        # The first layer is linear: the observation passes it once for all alternatives
+        seen = th.baddbmm(bias, weight[..., : self.obs_dim], obs[:, agents, : self.obs_dim].permute(1, 2, 0))
+        chosen = own.permute(1, 3, 2, 0)
+        shape = chosen.shape[2:]
+        first = th.bmm(weight[..., self.obs_dim :], chosen.flatten(2)).unflatten(2, shape) + seen.unsqueeze(2)
+        values = self.net.after_first(first.flatten(2), layers, agents)
+        return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        self.net.clip_grad_norm_(max_norm)
+
+
+class IndependentPolicy(MADDPGPolicy):
+    """``MADDPGPolicy`` with critics that read what their own agent sees and does, and nothing else."""
+
+    def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
+        actor, _ = super()._make_networks(actor_arch, critic_arch)
+        assert isinstance(actor, MLPActor)
+        groups = sharing_groups(self.share_critic, self.team, "share_critic")
+        critic = IndependentCritic(self.team, actor.actions, critic_arch, self.activation_fn, groups, self.n_critics)
+        return actor, critic
+
+
+class IDDPG(MADDPG):
+    """
+    Independent DDPG (IDDPG): each agent learns by itself, with a critic of what it sees and does. The baseline that
+    tells what centralised critics are worth; all else is ``MADDPG``, also its arguments.
+
+    Independent learners are compared with MADDPG in Lowe et al. (2017), https://arxiv.org/abs/1706.02275.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": IndependentPolicy}
+    algorithm_name: ClassVar[str] = "IDDPG"
