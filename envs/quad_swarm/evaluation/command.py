@@ -5,18 +5,20 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.evaluation.evaluation import evaluate
+from quad_swarm.evaluation.evaluation import evaluate, make_pool
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.policies import is_model, load_model, short_name, trained_in
 from quad_swarm.evaluation.rows import check_writable, write_rows
 from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.task.rules import RULES
+from quad_swarm.tasks import ENGINES
 from quad_swarm.tasks.journal import default_folder
 from quad_swarm.world.presets import PRESET_VERSION, PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
@@ -179,6 +181,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes of each policy and scenario (default 200)")
     parser.add_argument("--jobs", type=int, default=1, help="processes; the result does not depend on it (default 1)")
+    parser.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where processes run (default local)")
+    parser.add_argument("--address", help="of a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
+    parser.add_argument("--mixed", action="store_true", help="take results of machines unlike this one")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a policy and scenario")
     parser.add_argument(
         "--plot", type=Path, metavar="DIR", help="draw collisions, requests and flights into this folder"
@@ -199,8 +204,10 @@ def _compare(args: argparse.Namespace) -> None:
         check_writable(args.json, "--json")
     if args.plot:
         check_writable(args.plot / "plot", "--plot")
+    elsewhere = args.engine != "local" or args.address is not None
     try:
-        rows = evaluate(conditions, args.episodes, args.seed, args.jobs, journal=default_folder())
+        with make_pool(args.jobs, args.engine, args.address, args.mixed) if elsewhere else nullcontext() as executor:
+            rows = evaluate(conditions, args.episodes, args.seed, args.jobs, default_folder(), executor)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from here", file=sys.stderr)
         raise

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import Executor, as_completed
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model, make_policy
 from quad_swarm.task.episode_statistics import exchange_bytes
 from quad_swarm.task.rules import RULES
-from quad_swarm.tasks import Journal, Pool
+from quad_swarm.tasks import Journal, make_executor
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -91,7 +92,12 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
 
 
 def evaluate(
-    conditions: Sequence[Condition], episodes: int, seed: int = 0, jobs: int = 1, journal: Path | None = None
+    conditions: Sequence[Condition],
+    episodes: int,
+    seed: int = 0,
+    jobs: int = 1,
+    journal: Path | None = None,
+    executor: Executor | None = None,
 ) -> list[dict[str, Any]]:
     """Fly ``episodes`` episodes of every condition.
 
@@ -100,9 +106,10 @@ def evaluate(
     :param seed: which set of held-out episodes; every condition flies the same
     :param jobs: processes; one that dies costs the piece it was flying alone
     :param journal: folder in which finished pieces are kept until all are, see `Journal`; None keeps none
+    :param executor: what flies the pieces, such as a `Cluster`; None: ``jobs`` processes of this machine
     :return: one row a condition, see `summarise` and, where full communication is among the policies, `lost_against`
     """
-    flown = fly_all(conditions, episodes, seed, jobs, journal=journal)
+    flown = fly_all(conditions, episodes, seed, jobs, journal=journal, executor=executor)
     table = []
     for condition, rows in flown.items():
         row = {"policy": condition.policy, "scenario": condition.scenario, **summarise(rows, condition.config)}
@@ -132,6 +139,7 @@ def fly_all(
     jobs: int = 1,
     skip: int = 0,
     journal: Path | None = None,
+    executor: Executor | None = None,
 ) -> dict[Condition, Rows]:
     """`evaluate`, episode by episode: the figures of each, see `EpisodeStatistics`.
 
@@ -145,12 +153,14 @@ def fly_all(
     chunks = [range(first + k, first + min(k + _CHUNK, episodes)) for k in range(skip, episodes, _CHUNK)]
     flown: dict[Condition, Rows] = {condition: [] for condition in conditions}
     work = [(condition, chunk) for condition in flown for chunk in chunks]
-    for (condition, _), rows in zip(work, _run_all(work, jobs, Journal(journal)), strict=True):
+    for (condition, _), rows in zip(work, _run_all(work, jobs, Journal(journal), executor), strict=True):
         flown[condition] += rows
     return flown
 
 
-def _run_all(work: Sequence[tuple[Condition, range]], jobs: int, journal: Journal) -> list[Rows]:
+def _run_all(
+    work: Sequence[tuple[Condition, range]], jobs: int, journal: Journal, executor: Executor | None
+) -> list[Rows]:
     """The figures of each piece of work, in its order; what the journal holds of it is not flown again."""
     keys = [_key(*piece) for piece in work]
     done: dict[int, Rows] = {k: rows for k, key in enumerate(keys) if (rows := journal.fetch(key)) is not None}
@@ -161,7 +171,7 @@ def _run_all(work: Sequence[tuple[Condition, range]], jobs: int, journal: Journa
         total=len(work), initial=len(done), unit="piece", desc="evaluate", disable=not sys.stderr.isatty(), leave=False
     )
     with progress:
-        for k, rows in _fly(work, left, jobs):
+        for k, rows in _fly(work, left, jobs, executor):
             journal.keep(keys[k], rows)
             done[k] = rows
             progress.update()
@@ -169,13 +179,15 @@ def _run_all(work: Sequence[tuple[Condition, range]], jobs: int, journal: Journa
     return [done[k] for k in range(len(work))]
 
 
-def _fly(work: Sequence[tuple[Condition, range]], left: Sequence[int], jobs: int) -> Iterator[tuple[int, Rows]]:
+def _fly(
+    work: Sequence[tuple[Condition, range]], left: Sequence[int], jobs: int, executor: Executor | None
+) -> Iterator[tuple[int, Rows]]:
     """Number and figures of pieces of work as they come."""
-    if jobs == 1 or len(left) < 2:
+    if executor is None and (jobs == 1 or len(left) < 2):
         for k in left:
             yield k, run_episodes(*work[k])
         return
-    with make_pool(jobs) as pool:
+    with make_pool(jobs) if executor is None else nullcontext(executor) as pool:
         futures = {pool.submit(run_episodes, *work[k]): k for k in left}
         for future in as_completed(futures):
             yield futures[future], future.result()
@@ -190,13 +202,14 @@ def _key(condition: Condition, episodes: range) -> str:
     return Journal.key(repr((condition, episodes)), packages, files)
 
 
-def make_pool(jobs: int) -> Pool:
+def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixed: bool = False) -> Executor:
     """Processes that fly episodes; they know what a user added to the scenarios and rules once its modules are
     imported there too.
 
     :param jobs: how many
+    :param engine: see `make_executor`, as for the others
     """
-    return Pool(jobs, _user_modules())
+    return make_executor(engine, jobs, _user_modules(), address, mixed)
 
 
 def _user_modules() -> list[str]:

@@ -52,7 +52,7 @@ class Journal:
         :param files: others that it depends on, such as models
         """
         digest = hashlib.sha256(what.encode())
-        for part in (*(_sources(name) for name in sorted(set(packages))), *map(_content, files), _machine()):
+        for part in (*(_sources(name) for name in sorted(set(packages))), *map(_content, files), machine()):
             digest.update(b"\0" + part.encode())
         return digest.hexdigest()[:32]
 
@@ -130,8 +130,8 @@ def _content(path: Path) -> str:
 
 
 @functools.cache
-def _machine() -> str:
-    """What results may depend on beside the code: the processor and the versions of what computes."""
+def machine() -> str:
+    """What the last bits of results depend on beside the code: the processor and the versions of what computes."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             processor = sorted({line for line in file if line.startswith(("model name", "flags", "Features"))})

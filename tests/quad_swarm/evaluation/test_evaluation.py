@@ -155,7 +155,7 @@ def test_pieces_are_told_apart_by_all_that_they_depend_on(tmp_path, monkeypatch)
     keys.append(evaluation._key(conditions[1], episodes))
     monkeypatch.setattr("quad_swarm.tasks.journal._sources", lambda name: "other code")
     keys.append(evaluation._key(one, episodes))
-    monkeypatch.setattr("quad_swarm.tasks.journal._machine", lambda: "another machine")
+    monkeypatch.setattr("quad_swarm.tasks.journal.machine", lambda: "another machine")
     keys.append(evaluation._key(one, episodes))
     assert len(set(keys)) == len(keys)
     assert evaluation._key(one, episodes) == keys[-1]

@@ -1,0 +1,183 @@
+"""Ray as an executor: the same results, whatever dies."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from quad_swarm.evaluation.evaluation import fly_all
+from quad_swarm.evaluation.flight import Condition
+from quad_swarm.tasks import Cluster, Pool, cluster, make_executor
+from quad_swarm.world.presets import make_config
+
+ray = pytest.importorskip("ray")
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::ResourceWarning")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def on_this_machine():
+    """One cluster for all tests but those that begin their own."""
+    # Processes of the cluster find the tests' functions
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
+    yield
+    ray.shutdown()
+
+
+def square(x: int) -> int:
+    return x * x
+
+
+def fail(text: str) -> None:
+    raise KeyError(text)
+
+
+class TwoArguments(Exception):
+    """Can be pickled, but not read again."""
+
+    def __init__(self, first, second):
+        super().__init__(first)
+
+
+def fail_oddly() -> None:
+    raise TwoArguments(1, 2)
+
+
+def die_once(marker: str) -> str:
+    path = Path(marker)
+    if not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return "alive"
+
+
+def process_of(folder: str, k: int) -> int:
+    """Takes a while, and tells where it is."""
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(0.2)
+    return k
+
+
+def untimed(flown):
+    return {key: [{**row, "solve_seconds": 0.0} for row in rows] for key, rows in flown.items()}
+
+
+def test_flights_are_those_of_this_process():
+    conditions = [Condition(policy, "symmetric_swap", make_config("flight", n_robots=3)) for policy in ("none", "full")]
+    with Cluster(2) as executor:
+        there = fly_all(conditions, 300, executor=executor)
+    assert untimed(there) == untimed(fly_all(conditions, 300))
+
+
+def test_errors_are_the_callers():
+    with Cluster(2) as executor:
+        assert list(executor.map(square, range(5))) == [0, 1, 4, 9, 16]
+        with pytest.raises(KeyError, match="'a key'") as raised:
+            executor.submit(fail, "a key").result(timeout=60)
+        assert "in fail" in str(raised.value.__cause__)
+        with pytest.raises(RuntimeError, match="TwoArguments"):
+            executor.submit(fail_oddly).result(timeout=60)
+
+
+def test_a_piece_whose_process_dies_is_begun_again(tmp_path):
+    with Cluster(2) as executor:
+        assert executor.submit(die_once, str(tmp_path / "died")).result(timeout=60) == "alive"
+        assert (tmp_path / "died").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
+def test_processes_may_be_killed_at_random(tmp_path):
+    over = threading.Event()
+    killed = set()
+
+    def killer() -> None:
+        while not over.wait(2.0):
+            for path in set(tmp_path.iterdir()) - killed:
+                killed.add(path)
+                try:
+                    os.kill(int(path.name), signal.SIGKILL)
+                except ProcessLookupError:
+                    continue
+                break
+
+    thread = threading.Thread(target=killer)
+    with Cluster(2) as executor:
+        futures = [executor.submit(process_of, str(tmp_path), k) for k in range(60)]
+        thread.start()
+        try:
+            assert [future.result(timeout=120) for future in futures] == list(range(60))
+        finally:
+            over.set()
+            thread.join()
+    assert len(killed) >= 2
+
+
+def test_machines_of_another_kind_are_refused_unless_asked_for(monkeypatch):
+    monkeypatch.setattr(cluster, "machine", lambda: "a processor of its own")
+    with Cluster(2) as executor, pytest.raises(ValueError, match=r"machine unlike this one.*a processor of its own"):
+        executor.submit(square, 2).result(timeout=60)
+    with Cluster(2, mixed=True) as executor:
+        assert executor.submit(square, 2).result(timeout=60) == 4
+
+
+def test_an_exception_stops_what_runs():
+    futures = []
+
+    def interrupted() -> None:
+        with Cluster(2) as executor:
+            futures.extend(executor.submit(time.sleep, 600) for _ in range(3))
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        interrupted()
+    for future in futures:
+        with pytest.raises(RuntimeError, match="stopped"):
+            future.result(timeout=10)
+
+
+def test_engines_by_name(monkeypatch):
+    with make_executor("local", 1) as executor:
+        assert isinstance(executor, Pool)
+    with make_executor("ray", 2) as executor:
+        assert isinstance(executor, Cluster)
+    with pytest.raises(ValueError, match=r"Did you mean 'ray'\?"):
+        make_executor("rai", 1)
+    with pytest.raises(ValueError, match="address='auto' is for engine='ray'"):
+        make_executor("local", 1, address="auto")
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match=r'Ray is not installed .*pip install "sb3-maddpg\[ray\]"'):
+        make_executor("ray", 1)
+
+
+@pytest.mark.slow
+def test_a_machine_may_be_lost(tmp_path):
+    from ray.cluster_utils import Cluster as Machines
+
+    ray.shutdown()
+    machines = Machines(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": 100 * 2**20})
+    second = machines.add_node(num_cpus=1, object_store_memory=100 * 2**20)
+    machines.wait_for_nodes()
+    try:
+        with Cluster(2, address=machines.address) as executor:
+            futures = [executor.submit(process_of, str(tmp_path), k) for k in range(40)]
+            while len(list(tmp_path.iterdir())) < 2:
+                time.sleep(0.05)
+            machines.remove_node(second)
+            assert [future.result(timeout=180) for future in futures] == list(range(40))
+    finally:
+        ray.shutdown()
+        machines.shutdown()
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
+
+
+def test_an_address_where_nobody_answers():
+    ray.shutdown()
+    try:
+        with pytest.raises(ValueError, match=r"address='auto': no Ray cluster answers there"):
+            Cluster(1, address="auto")
+    finally:
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
