@@ -218,6 +218,7 @@ COMMANDS: dict[str, Command] = {
   {PROG} train --env mpe2/simple_spread_v3 --progress --tensorboard-log logs/tensorboard
   {PROG} train --algo matd3 --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:false
   {PROG} train --algo iddpg --env mpe2/simple_spread_v3
+  {PROG} train --env mpe2/simple_spread_v3 --seeds 0-4 --jobs 2
   {PROG} train --algo ppo --env mpe2/simple_spread_v3 -params n_envs:8 learning_rate:lin_1e-3
   {PROG} train --gym-packages my_package --env MyTeam-v0 --conf-file recipes.yml""",
     ),

@@ -37,6 +37,7 @@ from sb3_maddpg.cli.options import PROG, common_options, import_packages
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.recipes import LengthOption, check_options
 from sb3_maddpg.cli.safety import no_code_from_files
+from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.iddpg import IDDPG
 from sb3_maddpg.matd3 import MATD3
@@ -85,11 +86,17 @@ def train(argv: list[str]) -> int:
     resuming.add_argument("--checkpoint-every", type=int, metavar="STEPS")
     resuming.add_argument("--resume", nargs="?", const="", metavar="RUN")
     resuming.add_argument("-f", "--log-folder", default="logs")
+    resuming.add_argument("--seeds", metavar="0-9")
+    resuming.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     asked, argv = resuming.parse_known_args(argv)
-    if asked.resume is None:
-        argv += ["--log-folder", asked.log_folder]
     if asked.checkpoint_every is not None and asked.checkpoint_every < 0:
         raise ValueError(f"--checkpoint-every {asked.checkpoint_every}: give a number of steps, or 0 for none.")
+    if asked.seeds is not None:
+        if asked.resume is not None:
+            raise ValueError("--resume goes on with one run; --seeds goes on with those of its command by itself.")
+        return train_seeds(argv, parse_seeds(asked.seeds), asked.jobs, asked.log_folder, asked.checkpoint_every)
+    if asked.resume is None:
+        argv += ["--log-folder", asked.log_folder]
     checkpoints: Checkpoints | None = None
     if asked.checkpoint_every != 0:
         checkpoints = Checkpoints(asked.checkpoint_every, {"argv": argv, "every": asked.checkpoint_every})

@@ -1,0 +1,123 @@
+"""Many trainings by one command, some of which are killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.seeds import parse_seeds
+
+pytest.importorskip("rl_zoo3")
+RECIPE = {"n_timesteps": 1500, "policy": "MlpPolicy", "learning_starts": 100, "batch_size": 16, "train_freq": 3}
+ARGV = ["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "200"]
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("3", [3]), ("0-2", [0, 1, 2]), ("5, 1-2,1", [5, 1, 2])])
+def test_seeds_are_numbers_and_ranges(text, seeds):
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "a", "2-1", "1-", "-1", "1.5", "1;2"])
+def test_anything_else_is_refused(text):
+    with pytest.raises(ValueError, match="write numbers and ranges, such as 0-4"):
+        parse_seeds(text)
+
+
+def weights(folder: Path) -> dict[str, bytes]:
+    """Of each run by its seed."""
+    found = {}
+    for path in folder.glob("logs/maddpg/*_*/OwnBit-v0.zip"):
+        seed = yaml.unsafe_load((path.parent / "OwnBit-v0" / "args.yml").read_text())["seed"]
+        with zipfile.ZipFile(path) as archive:
+            assert seed not in found
+            found[seed] = archive.read("policy.pth")
+    return found
+
+
+def start(folder: Path, *words: str) -> subprocess.Popen:
+    folder.mkdir(exist_ok=True)
+    (folder / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
+    command = [sys.executable, "-m", "sb3_maddpg", *ARGV, *words]
+    env = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(status.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(status.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def wait_for_checkpoints(folder: Path, process: subprocess.Popen) -> None:
+    end = time.monotonic() + 120
+    while len(list(folder.glob("logs/maddpg/*/checkpoints/checkpoint-*[0-9]"))) < 2:
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM])
+def test_killed_and_begun_again_all_seeds_end_as_if_nothing_had_happened(kind, tmp_path):
+    alone, parts = tmp_path / "alone", tmp_path / "parts"
+    expected = start(alone, "--seeds", "1-2", "--jobs", "2")
+    assert expected.wait(timeout=200) == 0, expected.stdout.read()
+    process = start(parts, "--seeds", "1-2", "--jobs", "2")
+    wait_for_checkpoints(parts, process)
+    trainings = children(process.pid)
+    assert len(trainings) == 2
+    process.send_signal(kind)
+    process.communicate(timeout=100)
+    for _ in range(300):
+        if not any(
+            Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_text() for pid in trainings
+        ):
+            break
+        time.sleep(0.1)
+    else:
+        raise AssertionError("trainings outlive the command")
+    again = start(parts, "--seeds", "1-2", "--jobs", "2")
+    output, _ = again.communicate(timeout=200)
+    assert again.returncode == 0, output
+    assert "goes on with" in output
+    assert weights(parts) == weights(alone)
+    assert set(weights(parts)) == {1, 2}
+    third = start(parts, "--seeds", "1-3", "--jobs", "2")
+    output, _ = third.communicate(timeout=200)
+    assert output.count("finished before") == 2
+    assert set(weights(parts)) == {1, 2, 3}
+
+
+def test_a_training_that_fails_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "batch_size": -1}}))
+    assert main([*ARGV, "--seeds", "0-1", "--jobs", "1"]) == 2
+    assert "seed 1: ended with 2, see" in capsys.readouterr().out
+    assert "batch_size=-1" in Path("logs/seed_0.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--seeds", "0-1", "--seed", "3"], "--seeds and --seed: give one of them"),
+        (["--seeds", "0", "--jobs", "0"], "--jobs 0 must be at least 1"),
+        (["--seeds", "x"], "write numbers and ranges"),
+        (["--seeds", "0", "--resume"], "--resume goes on with one run"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([*ARGV, *words]) == 2
+    assert message in capsys.readouterr().err
