@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple, cast, get_args
 
 import gymnasium
 import yaml
@@ -186,7 +186,33 @@ def _convert(argv: list[str]) -> int:
     return 0
 
 
-_OWN = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
+def _publish(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog=f"{PROG} publish",
+        description="Upload a model to the Hugging Face Hub: a file that runs no code when it is loaded, a card, and "
+        "the recipe and evaluations of its run. Log in before with `hf auth login`.",
+    )
+    parser.add_argument("model", metavar="MODEL.zip", help="or latest:LOGDIR, pretrained:NAME")
+    parser.add_argument("repository", metavar="NAME/REPOSITORY")
+    parser.add_argument("--algo", default="maddpg", choices=sorted(_OWN), help="default %(default)s")
+    parser.add_argument("--env", default="QuadSwarm-v0", help="for latest:LOGDIR (default %(default)s)")
+    parser.add_argument("--whole", action="store_true", help="with all that a training goes on from")
+    parser.add_argument("--private", action="store_true", help="make a new repository private")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write it all into this folder instead")
+    args = parser.parse_args(argv)
+    from sb3_maddpg import hub
+
+    path = Path(_model(args.model, args.algo, args.env))
+    model, lean = _OWN[args.algo].load(path, device="cpu"), None if args.whole else "critic"
+    if args.out is not None:
+        hub.write_model_folder(model, args.out, args.repository, path.parent, cast("Lean | None", lean))
+        print(f"wrote {args.out}")
+    else:
+        print(hub.publish(model, args.repository, path.parent, cast("Lean | None", lean), args.private))
+    return 0
+
+
+_OWN: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 
 
 def _headline(readme: Path) -> str:
@@ -255,6 +281,11 @@ COMMANDS: dict[str, Command] = {
         _bench,
         "measure how fast a recipe trains on this machine, and where the time goes",
         f"  {PROG} bench --env mpe2/simple_spread_v3 --n-timesteps 20000",
+    ),
+    "publish": Command(
+        _publish,
+        "upload a model to the Hugging Face Hub",
+        f"  {PROG} publish --algo maddpg --env mpe2/simple_spread_v3 latest:logs me/maddpg-simple_spread",
     ),
     "convert": Command(
         _convert,

@@ -1,0 +1,112 @@
+"""What is uploaded to the Hugging Face Hub, and how; nothing here reaches a network."""
+
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_maddpg import IDDPG, MADDPG, hub
+from sb3_maddpg.cli.commands import main
+from sb3_maddpg.model_files import refuse_pickled
+from sb3_maddpg.parallel import make
+from sb3_maddpg.pretrained_models import pretrained_folder
+from toys import SMALL
+
+
+class RecordedApi:
+    """In the place of the Hub's interface: keeps what it is given."""
+
+    calls: list = []  # noqa: RUF012
+
+    def __init__(self, token=None):
+        self.calls.append(("token", token))
+
+    def create_repo(self, repo_id, **kwargs):
+        self.calls.append(("create", repo_id, kwargs))
+
+    def upload_folder(self, folder_path, repo_id, commit_message):
+        self.calls.append(("upload", repo_id, {path.name: path.read_bytes() for path in Path(folder_path).iterdir()}))
+
+
+@pytest.fixture
+def api(monkeypatch):
+    huggingface_hub = pytest.importorskip("huggingface_hub")
+    RecordedApi.calls = []
+    monkeypatch.setattr(huggingface_hub, "HfApi", RecordedApi)
+    return RecordedApi
+
+
+@pytest.fixture(scope="module")
+def model():
+    return MADDPG("MlpPolicy", make("mpe2.simple_spread_v3", continuous_actions=True), **SMALL)
+
+
+def header(card: str) -> dict:
+    begin, text, _ = card.split("---\n", 2)
+    assert begin == ""
+    return yaml.safe_load(text)
+
+
+def test_a_model_is_uploaded_with_its_card(api, model, tmp_path):
+    np.savez(tmp_path / "evaluations.npz", results=np.array([[0.0, 1.0], [2.0, 4.0]]), timesteps=[1, 2])
+    (tmp_path / "OwnBit-v0").mkdir()
+    (tmp_path / "OwnBit-v0" / "config.yml").write_text("gamma: 0.9")
+    address = hub.publish(model, "me/a-model", tmp_path, private=True, token="secret")
+    assert address == "https://huggingface.co/me/a-model"
+    token, create, upload = api.calls
+    assert token == ("token", "secret")
+    assert create == ("create", "me/a-model", {"private": True, "exist_ok": True})
+    files = upload[2]
+    assert set(files) == {"model.zip", "README.md", "config.yml", "evaluations.npz"}
+    assert files["config.yml"] == b"gamma: 0.9"
+    card = files["README.md"].decode()
+    (results,) = header(card)["model-index"]
+    assert results["results"][0]["metrics"][0]["value"] == "3.00 +/- 1.00"
+    assert "secret" not in card
+
+
+def test_the_file_runs_no_code_and_the_card_says_how_to_load_it(model, tmp_path, monkeypatch):
+    hub.write_model_folder(model, tmp_path / "out", "me/a-model")
+    refuse_pickled(tmp_path / "out" / "model.zip", {})
+    with zipfile.ZipFile(tmp_path / "out" / "model.zip") as archive:
+        assert not [name for name in archive.namelist() if "optimizer" in name]
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "model-index" not in header(card)
+    assert {"MADDPG", "multi-agent"} <= set(header(card)["tags"])
+    # The lines of the card, with a download that finds the file here
+    huggingface_hub = pytest.importorskip("huggingface_hub")
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", lambda repo, name: str(tmp_path / "out" / name))
+    (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
+    scope: dict = {}
+    exec(code, scope)
+    obs = np.zeros(model.observation_space.shape, np.float32)
+    assert np.array_equal(scope["model"].predict(obs)[0], model.predict(obs)[0])
+
+
+def test_the_card_tells_the_arguments_of_the_environment(tmp_path):
+    assert main(["publish", "pretrained:quad-swarm-paper", "me/paper", "--out", str(tmp_path / "out")]) == 0
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "# MADDPG on QuadSwarm-v0" in card
+    (arguments,) = re.findall(r"```yaml\n(.*?)```", card, re.DOTALL)
+    assert yaml.safe_load(arguments)["observation"] == "state+approach+memory+plan+critic"
+    folder = pretrained_folder("quad-swarm-paper")
+    assert (tmp_path / "out" / "config.yml").read_bytes() == (folder / "config.yml").read_bytes()
+    assert MADDPG.load(tmp_path / "out" / "model.zip").env_spec["id"] == "QuadSwarm-v0"
+
+
+def test_a_whole_model_can_be_trained_on(api, tmp_path):
+    model = IDDPG("MlpPolicy", make("mpe2.simple_spread_v3"), **SMALL)
+    model.save(tmp_path / "model.zip")
+    assert main(["publish", "--algo", "iddpg", "--whole", str(tmp_path / "model.zip"), "me/a-model"]) == 0
+    (tmp_path / "again.zip").write_bytes(api.calls[-1][2]["model.zip"])
+    assert IDDPG.load(tmp_path / "again.zip").lean is None
+
+
+@pytest.mark.parametrize("name", ["model", "a/b/c", "/model", "me/", 3])
+def test_another_name_is_refused(api, model, name):
+    with pytest.raises(ValueError, match="must be NAME/REPOSITORY"):
+        hub.publish(model, name)
+    assert not api.calls
