@@ -15,17 +15,8 @@ from sb3_maddpg.estimators import ESTIMATORS
 
 ROOT = Path(__file__).parents[2]
 LEARNER = ("maddpg", "matd3", "pettingzoo", "relational", "migration", "support", "integrations")
-SITE = ("quickstart", "tensorboard", "resuming", "tutorials/swarm", "tutorials/pettingzoo")
-NO_LEARNING = (
-    "tutorials/scenario",
-    "tutorials/rule",
-    "tutorials/reading",
-    "planner",
-    "index",
-    "faq",
-    "files",
-    "clusters",
-)
+SITE = ("quickstart", "tensorboard", "resuming", "clusters", "tutorials/swarm", "tutorials/pettingzoo")
+NO_LEARNING = ("tutorials/scenario", "tutorials/rule", "tutorials/reading", "planner", "index", "faq", "files")
 PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (*LEARNER, *SITE, *NO_LEARNING)))
 STEPS, LEARNING_STARTS, BATCH_SIZE = 300, 100, 64
 FENCED = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)  # also ```{eval-rst}
