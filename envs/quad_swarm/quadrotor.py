@@ -10,6 +10,7 @@ commands with first-order lags, and yaw does not couple into the translation.
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -20,6 +21,8 @@ import casadi as ca
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
+from quad_swarm.native.build import BuildError
+from quad_swarm.native.functions import RowFunction
 from quad_swarm.validation import checked
 
 N_STATES = 9
@@ -27,6 +30,7 @@ N_INPUTS = 4
 POSITION = slice(0, 3)
 VELOCITY = slice(3, 6)
 ATTITUDE = slice(6, 9)
+_WORTH_COMPILING = 32  # robots, from which on a call is worth some tenths of a second once for each machine
 
 
 # Larger ones overflow within a step
@@ -126,6 +130,15 @@ def step_function(params: QuadrotorParams, dt: float | None, varied: bool = Fals
     return ca.Function("quadrotor_step", list(inputs.values()), [x_next], list(inputs), ["x_next"])
 
 
+@functools.lru_cache(maxsize=256)
+def _compiled_step(params: QuadrotorParams, dt: float | None, varied: bool) -> RowFunction | None:
+    """`step_function` for many rows; None where it cannot be compiled, of which the planner warns."""
+    try:
+        return RowFunction(step_function(params, dt, varied))
+    except BuildError:
+        return None
+
+
 class QuadrotorModel:
     """The discrete dynamics of many quadrotors at once, on NumPy arrays; threads may share it.
 
@@ -161,6 +174,8 @@ class QuadrotorModel:
         count = x.size // N_STATES
         if count == 0:
             return x.copy()
+        if count >= _WORTH_COMPILING and (compiled := _compiled_step(self.params, dt, varied)) is not None:
+            return compiled(count, arguments).reshape(x.shape)
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
         calls: dict[Any, _BufferedCall] = self._local.__dict__
         key = (dt, varied, capacity)
