@@ -513,6 +513,10 @@ class MADDPGPolicy(BasePolicy):
             "infinity. An action for it would mean nothing: clip or replace such values in the environment."
         )
 
+    def set_training_mode(self, mode: bool) -> None:
+        if self.training != mode:  # SB3 asks for it at each prediction, and going through all modules takes its time
+            super().set_training_mode(mode)
+
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
 
