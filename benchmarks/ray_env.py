@@ -1,0 +1,94 @@
+"""What environments in other processes gain: ``python benchmarks/ray_env.py [--workers 2] [--json F]``.
+
+Steps an environment that takes so many milliseconds a step, in this process and as shards of a `RayVecEnv`, a worker
+each, and the swarm. An environment that waits takes no processor time, so more workers than cores tell what a larger
+machine would. JSON: one row a case with milliseconds, workers, local and remote steps/s, and efficiency: the remote rate
+over the local one and the workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from quad_swarm.evaluation.rows import write_rows
+from sb3_maddpg.ray_vec_env import RayVecEnv
+from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.vec_env import GymnasiumVecEnv
+
+
+class Slow(OwnBit):
+    """Takes its time."""
+
+    def __init__(self, milliseconds: float):
+        super().__init__()
+        self.milliseconds = milliseconds
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        time.sleep(self.milliseconds / 1000)
+        return super().step(action)
+
+
+def slow(milliseconds: float) -> VecEnv:
+    """A shard of one environment."""
+    return DummyVecEnv([partial(Slow, milliseconds)])
+
+
+def swarms() -> VecEnv:
+    """A shard of 32 swarms."""
+    import quad_swarm  # noqa: F401 - registers the environment in the worker
+
+    return GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=32))
+
+
+def rate(env: VecEnv, seconds: float) -> float:
+    """Steps per second of all its environments."""
+    env.reset()
+    actions = np.array([env.action_space.sample() for _ in range(env.num_envs)])
+    for _ in range(3):
+        env.step(actions)
+    count, started = 0, time.perf_counter()
+    while time.perf_counter() - started < seconds:
+        env.step(actions)
+        count += 1
+    return count * env.num_envs / (time.perf_counter() - started)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workers", type=int, nargs="+", default=[2, 4])
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    cases: dict[str, Callable[[], VecEnv]] = {
+        **{f"{m:g} ms": partial(slow, m) for m in (1.0, 10.0, 100.0)},
+        "32 swarms": swarms,
+    }
+    rows = []
+    for name, make in cases.items():
+        local = rate(make(), args.seconds)
+        for workers in args.workers:
+            env = RayVecEnv([make] * workers, snapshot_every=1000)
+            remote = rate(env, args.seconds)
+            env.close()
+            row = {"case": name, "workers": workers, "local": local, "remote": remote}
+            rows.append(row | {"efficiency": remote / (local * workers)})
+            print(f"{name:10} {workers} workers: {local:8.1f} -> {remote:8.1f} steps/s, {rows[-1]['efficiency']:.0%}")
+    if args.json:
+        write_rows(args.json, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,257 @@
+"""Environments in the processes of a Ray cluster, for those that are slow to step."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from logging import WARNING
+from typing import Any
+
+import numpy as np
+from gymnasium import Wrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from sb3_maddpg.env_states import NoStateError, Replayable, load_vec_env_state, tells_state, vec_env_state
+from sb3_maddpg.utils import shown
+
+Call = tuple[str, tuple[Any, ...]]
+
+
+class RayVecEnv(VecEnv):
+    """
+    A vector of environments in shards, each a process of a Ray cluster (https://docs.ray.io). What they return, and so
+    what is learned, is to the last bit what the same shards would return in this process.
+
+    A process that dies is not begun empty: a new one takes the last snapshot of its shard and repeats what was done
+    since. Environments that do not tell their state (``state_dict``) are wrapped in ``Replayable``, which takes them to
+    do the same after the same seed and actions.
+
+    It pays where a step takes long: an empty one takes some milliseconds. Wrap it in ``VecMonitor`` for statistics.
+
+    :param shards: functions that make a vector environment each, all with the same spaces
+    :param snapshot_every: steps from one snapshot to the next
+    :param address: of a running cluster, ``auto`` or ``HOST:PORT``; None begins one on this machine and ends it again
+    :raises ValueError: Ray is not installed, or there is no such cluster, or no shard
+    """
+
+    def __init__(self, shards: Sequence[Callable[[], VecEnv]], snapshot_every: int = 100, address: str | None = None):
+        if not shards or snapshot_every < 1:
+            raise ValueError(
+                f"{len(shards)} shards and snapshot_every={snapshot_every}: there must be at least one of each."
+            )
+        try:
+            import ray
+        except ImportError as error:
+            raise ValueError(f'Ray is not installed ({error}): pip install "sb3-maddpg[ray]".') from error
+        self._ray = ray
+        self._begun = not ray.is_initialized()
+        if self._begun:
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unasked
+            try:
+                ray.init(
+                    address=address,
+                    num_cpus=None if address else len(shards),
+                    include_dashboard=None if address else False,
+                    log_to_driver=False,
+                    logging_level=WARNING,
+                )
+            except (ConnectionError, ValueError, RuntimeError) as error:
+                raise ValueError(f"address={shown(address)}: no Ray cluster answers there ({error}).") from error
+        self._shards = [_Remote(ray, make) for make in shards]
+        self.snapshot_every = snapshot_every
+        described = self._all("describe")
+        sizes = [size for size, *_ in described]
+        self._ends = np.cumsum(sizes).tolist()
+        observation_space, action_space = described[0][1:]
+        if any(spaces[1:] != described[0][1:] for spaces in described):
+            raise ValueError("The shards have different spaces.")
+        self._waiting: list[Any] = []
+        self._steps = 0
+        super().__init__(sum(sizes), observation_space, action_space)
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+
+    @property
+    def _parts(self) -> list[slice]:
+        return [slice(begin, end) for begin, end in zip([0, *self._ends], self._ends, strict=False)]
+
+    def _all(self, method: str, *arguments: Any) -> list[Any]:
+        """Call all shards at once with the same arguments."""
+        for shard in self._shards:
+            shard.begin(method, *arguments)
+        return [shard.result() for shard in self._shards]
+
+    def reset(self) -> VecEnvObs:
+        for shard, part in zip(self._shards, self._parts, strict=True):
+            shard.begin("reset", self._seeds[part], self._options[part])
+        results = [shard.result() for shard in self._shards]
+        self.reset_infos = [info for _, infos in results for info in infos]
+        self._reset_seeds()
+        self._reset_options()
+        return np.concatenate([obs for obs, _ in results])
+
+    def step_async(self, actions: np.ndarray) -> None:
+        for shard, part in zip(self._shards, self._parts, strict=True):
+            shard.begin("step", np.asarray(actions[part]))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        results = [shard.result() for shard in self._shards]
+        self._steps += 1
+        if self._steps % self.snapshot_every == 0:
+            for shard in self._shards:
+                shard.take_snapshot()
+        observations, rewards, dones, infos, reset_infos = zip(*results, strict=True)
+        self.reset_infos = [info for part in reset_infos for info in part]
+        return (
+            np.concatenate(observations),
+            np.concatenate(rewards),
+            np.concatenate(dones),
+            [info for part in infos for info in part],
+        )
+
+    def close(self) -> None:
+        for shard in self._shards:
+            shard.end()
+        self._shards = []
+        if self._begun and self._ray.is_initialized():
+            self._ray.shutdown()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of the given environments."""
+        return self._at("get_attr", indices, attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set the attribute in the given environments."""
+        self._at("set_attr", indices, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args, indices: VecEnvIndices = None, **method_kwargs) -> list[Any]:
+        """Call the method of the given environments."""
+        return self._at("env_method", indices, method_name, method_args, method_kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """Whether the given environments have the wrapper."""
+        return self._at("env_is_wrapped", indices, wrapper_class)
+
+    def _at(self, method: str, indices: VecEnvIndices, *arguments: Any) -> list[Any]:
+        """Call a method for some environments, which may lie in some of the shards."""
+        wanted = list(self._get_indices(indices))
+        found: dict[int, Any] = {}
+        for shard, part in zip(self._shards, self._parts, strict=True):
+            own = [index for index in wanted if part.start <= index < part.stop]
+            if own:
+                shard.begin(method, [index - part.start for index in own], *arguments)
+                found |= dict(zip(own, shard.result() or [None] * len(own), strict=True))
+        return [found[index] for index in wanted]
+
+
+class _Remote:
+    """A shard as this process sees it: the actor, its last snapshot, and what was done since."""
+
+    def __init__(self, ray: Any, make: Callable[[], VecEnv]):
+        self._ray, self._make = ray, make
+        self._snapshot: dict[str, Any] | None = None
+        self._done: list[Call] = []
+        self._present: Call | None = None
+        self._reference: Any = None
+        self._actor = self._hire()
+
+    def _hire(self) -> Any:
+        actor = self._ray.remote(_Shard).options(num_cpus=1, max_restarts=0)
+        return actor.remote(self._make, self._snapshot, self._done)
+
+    def begin(self, method: str, *arguments: Any) -> None:
+        """Call a method of the shard, whose result ``result`` waits for."""
+        self._present = (method, arguments)
+        self._reference = self._actor.call.remote(method, arguments)
+
+    def result(self) -> Any:
+        """:return: what was begun; where its process has died, from a new one"""
+        assert self._present is not None
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
+                result = self._ray.get(self._reference)
+                break
+            except self._ray.exceptions.RayTaskError as error:
+                raise error.cause from error  # the environment's own
+            except self._ray.exceptions.RayActorError as error:
+                if attempt == _ATTEMPTS:
+                    reason = str(error).strip().splitlines()[-1]
+                    raise ValueError(
+                        f"{attempt} processes died at {self._present[0]}() of a shard: {reason}"
+                    ) from error
+                self._ray.kill(self._actor)  # it may be unreachable only
+                self._actor = self._hire()
+                self.begin(self._present[0], *self._present[1])
+        if self._present[0] in _CHANGES:
+            self._done.append(self._present)
+        return result
+
+    def take_snapshot(self) -> None:
+        """From here on a new process goes on."""
+        self.begin("state")
+        self._snapshot, self._done = self.result(), []
+
+    def end(self) -> None:
+        """End the process."""
+        self._ray.kill(self._actor)
+
+
+_ATTEMPTS = 4  # at a call, before the environment's own fault is assumed
+# What a new process has to repeat
+_CHANGES = ("reset", "step", "set_attr", "env_method")
+
+
+class _Shard:
+    """
+    A vector environment in a process of its own.
+
+    :param make: makes it
+    :param snapshot: its state, None as it is made
+    :param done: what was done since
+    """
+
+    def __init__(self, make: Callable[[], VecEnv], snapshot: dict[str, Any] | None, done: Sequence[Call]):
+        self.env = make()
+        if isinstance(self.env, DummyVecEnv):
+            self.env.envs = [one if tells_state(one) else Replayable(one) for one in self.env.envs]
+        if snapshot is not None:
+            load_vec_env_state(self.env, deepcopy(snapshot))  # Ray gives arrays that cannot be written to
+        for call in done:
+            self.call(*call)
+
+    def call(self, method: str, arguments: tuple[Any, ...]) -> Any:
+        return getattr(self, f"_{method}")(*arguments)
+
+    def _describe(self) -> tuple[Any, ...]:
+        return self.env.num_envs, self.env.observation_space, self.env.action_space
+
+    def _reset(self, seeds: list[int | None], options: list[dict[str, Any]]) -> tuple[Any, list[dict[str, Any]]]:
+        self.env._seeds, self.env._options = list(seeds), list(options)
+        return self.env.reset(), self.env.reset_infos
+
+    def _step(self, actions: np.ndarray) -> tuple[Any, ...]:
+        observations, rewards, dones, infos = self.env.step(actions)
+        return np.array(observations), np.array(rewards), np.array(dones), infos, self.env.reset_infos
+
+    def _state(self) -> dict[str, Any]:
+        try:
+            return vec_env_state(self.env)
+        except NoStateError as error:
+            raise ValueError(f"A shard cannot be rebuilt where its process dies: {error}") from error
+
+    def _get_attr(self, indices: list[int], name: str) -> list[Any]:
+        return self.env.get_attr(name, self._given(indices))
+
+    def _set_attr(self, indices: list[int], name: str, value: Any) -> None:
+        self.env.set_attr(name, value, self._given(indices))
+
+    def _env_method(self, indices: list[int], name: str, arguments: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        return self.env.env_method(name, *arguments, indices=self._given(indices), **kwargs)
+
+    def _env_is_wrapped(self, indices: list[int], wrapper_class: type[Wrapper]) -> list[bool]:
+        return self.env.env_is_wrapped(wrapper_class, self._given(indices))
+
+    def _given(self, indices: list[int]) -> list[int] | None:
+        """All of them as None, which is all that some vector environments take."""
+        return None if len(indices) == self.env.num_envs else indices
