@@ -2,7 +2,7 @@
 
 Steps an environment that takes so many milliseconds a step, in this process and as shards of a `RayVecEnv`, a worker
 each, and the swarm. An environment that waits takes no processor time, so more workers than cores tell what a larger
-machine would. JSON: one row a case with milliseconds, workers, local and remote steps/s, and efficiency: the remote rate
+machine would. JSON: one row a case with case, workers, local and remote steps/s, and efficiency: the remote rate
 over the local one and the workers.
 """
 
