@@ -62,7 +62,7 @@ CELLS: list[Cell] = [
 OWN_SWAPS = [cell for cell in CELLS if cell[0] == 8 and cell[1] in SWAPS]
 STAGES = (25, 50, 100, 250, 500, 1000, 2000, 4000)
 # Episodes of one cell after the other, the hardest and the others; more only of those that none of them ruled out
-FIRST, FIRST_OTHERS = 500, 100
+FIRST, FIRST_OTHERS = 2000, 100
 # Episodes of the hardest cell in which most others have collided, which are flown before all, so many at a time
 HARDEST, AT_ONCE = 240, 60
 THRESHOLDS = (0.9, 0.85, *(round(0.8 - 0.025 * k, 3) for k in range(23)), 0.2, 0.15, 0.1, 0.05, 0.02)
