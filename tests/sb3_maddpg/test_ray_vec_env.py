@@ -6,7 +6,6 @@ import signal
 import gymnasium
 import numpy as np
 import pytest
-import torch as th
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
@@ -16,7 +15,6 @@ from sb3_maddpg.checkpoints import digest
 from sb3_maddpg.env_states import Replayable
 from sb3_maddpg.ray_vec_env import RayVecEnv
 from sb3_maddpg.team_tasks import OwnBit
-from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::ResourceWarning")
@@ -98,7 +96,7 @@ def test_what_is_seen_is_what_the_shards_would_return_here(make, local, kill_at)
     here = flown(Together(local))
     assert len(there) == len(here)
     assert all(np.array_equal(one, other) for one, other in zip(there, here, strict=True))
-    assert sum(np.shape(one) == () or one.dtype == bool for one in there) > 0
+    assert any(one.dtype == bool and one.any() for one in there), "episodes end"
 
 
 def test_what_is_learned_is_the_same_to_the_last_bit():
@@ -111,7 +109,6 @@ def test_what_is_learned_is_the_same_to_the_last_bit():
         digests.append(digest(model))
         env.close() if isinstance(env, RayVecEnv) else None
     assert digests[0] == digests[1]
-    assert th.is_tensor(next(model.policy.parameters()))
 
 
 def test_attributes_and_methods_reach_the_environments():
@@ -139,4 +136,3 @@ def test_a_shard_that_cannot_be_made_is_told():
         RayVecEnv([])
     with pytest.raises(ValueError, match="different spaces"):
         RayVecEnv([bits, swarms])
-    assert GymnasiumVecEnv
