@@ -15,7 +15,7 @@ html_theme_options = {"light_css_variables": {"code-font-size": "0.75rem"}}  # 9
 html_static_path = ["_static"]
 html_css_files = ["tables.css"]
 
-myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 4
 
 autodoc_member_order = "bysource"

@@ -16,22 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from quad_swarm.evaluation.flight import Flight, fly
+from quad_swarm.evaluation.flight import Flight
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
-from quad_swarm.figures.colours import colour_of
-from quad_swarm.figures.plots import draw_flight
 from quad_swarm.world.beliefs import other_indices
-from quad_swarm.world.presets import PRESETS, make_config
-from quad_swarm.world.scenarios import SCENARIOS
-from studies.swarm.protocol import DATA, EARLIER, OF_TEAM, ROOT, absolute_path, best_rules, condition, models, progress
+from studies.swarm.figures import NAMES, draw_asking, draw_fronts, draw_trajectories, flights, rate_of
+from studies.swarm.protocol import DATA, OF_TEAM, ROOT, absolute_path, best_rules, models
 
-PAGES = tuple(ROOT / page for page in ("docs/results.md", "docs/swarm_learning.md", "docs/flight.md", "README.md"))
+RESULTS = ("results", "results/swarm_tables", "results/teams", "results/robustness", "results/asking", "lab_notebook")
+PAGES = (ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in (*RESULTS, "swarm_learning", "flight")))
 IMAGES = ROOT / "docs" / "images"
-NAMES = list(SCENARIOS)[::-1]
 Rows = list[dict[str, Any]]
 
 
@@ -424,69 +420,6 @@ def kind_of(row: dict[str, Any]) -> str:
     return label(row["policy"]) if is_model(row["policy"]) or row["policy"] in ("full", "none") else "best rule"
 
 
-def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, path: Path) -> None:
-    """Requests against collisions: rule families, the learned policy at all thresholds, and the tested policies."""
-    presets = [preset for preset in PRESETS if any(row["preset"] == preset for row in rules)]
-    size = (15, 3.5 * len(presets))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(presets), 4, sharey="row", squeeze=False)
-    families = list(dict.fromkeys(row["family"] for row in rules))
-    for line, preset in zip(panels, presets, strict=True):
-        for axes, name in zip(line, NAMES, strict=True):
-            here = [r for r in rules if (r["preset"], r["scenario"]) == (preset, name) and r["episodes"] >= 250]
-            for k, family in enumerate(families):
-                points = sorted((r["request_share"], rate_of(r)) for r in here if r["family"] == family)
-                front = [(s, c) for s, c in points if not any(s2 <= s and c2 < c for s2, c2 in points)]
-                if front:
-                    marker = "o" if k < 7 else "s"  # colours repeat after eight
-                    style = {"marker": marker, "markersize": 4, "linewidth": 0.8, "color": colour_of(k + 1)}
-                    axes.plot(*zip(*front, strict=True), label=family, **style)
-            learned = sorted(
-                (r["request_share"], rate_of(r))
-                for r in sweep
-                if (r["preset"], r["scenario"]) == (preset, name) and is_model(r["policy"])
-            )
-            if learned:
-                axes.plot(*zip(*learned, strict=True), "o-", color="black", label="learned, one model, all thresholds")
-            seeds = [
-                (r["request_share"], rate_of(r))
-                for r in tests
-                if (r["preset"], r["scenario"]) == (preset, name) and f"/{preset}_seed" in r["policy"]
-            ]
-            if seeds:
-                axes.plot(*zip(*seeds, strict=True), "*", color="#d55e00", markersize=11, label="learned, five seeds")
-            axes.set_xscale("log")
-            axes.set_yscale("symlog", linthresh=1e-3)
-            axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
-    for axes in panels[:, 0]:
-        axes.set_ylabel("episodes with a collision")
-    for axes in panels[-1]:
-        axes.set_xlabel("requests, of all possible")
-    legends = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels.flat]
-    handles = {text: handle for legend in legends for handle, text in legend}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=8)
-    figure.savefig(path, dpi=90)
-
-
-def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
-    """The first test episode of each scenario as a model flies it, and whom a rule would have asked on its way."""
-    config = make_config(preset)
-    names = progress(NAMES, f"flights, {preset}", len(NAMES))
-    return {name: fly(condition(model, name, config), EARLIER, other_rule=rule) for name in names}
-
-
-def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
-    """The paper's Fig. 2: the flights of each preset from above."""
-    size = (15, 4 * len(flown))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(flown), len(NAMES), squeeze=False)
-    for line, (preset, by_name) in zip(panels, flown.items(), strict=True):
-        for axes, (name, flight) in zip(line, by_name.items(), strict=True):
-            draw_flight(axes, flight)
-            axes.set_title(f"{preset}, {name.replace('_', ' ')}", fontsize=10)
-    figure.savefig(path, dpi=90)
-
-
 def step_by_step(flight: Flight) -> str:
     """A flight as a table: who asks whom, what it sees of it, and whom the rule would have asked."""
     others = other_indices(flight.n_robots)
@@ -516,38 +449,6 @@ def interventions_table(rows: Rows) -> str:
         shares = [f"{mine[k]['avoided'] / max(mine[k]['n'], 1):.0%}" for k in steps]
         lines.append([f"{preset}, {mine[steps[0]]['n']} collisions", who, *shares])
     return table(["world", "from so many steps before the collision on", *(str(k) for k in steps)], lines)
-
-
-def rate_of(row: dict[str, Any]) -> float:
-    """Share of the episodes with a collision."""
-    return row["collisions"] / row["episodes"]
-
-
-def draw_asking(rows: Rows, path: Path) -> None:
-    """How often policies ask at what they see."""
-    quantities = list(dict.fromkeys(row["quantity"] for row in rows))
-    presets = list(dict.fromkeys(row["preset"] for row in rows))
-    size = (15, 2.8 * len(presets))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(presets), len(quantities), sharey="row", squeeze=False)
-    for line, preset in zip(panels, presets, strict=True):
-        for axes, quantity in zip(line, quantities, strict=True):
-            for learned in (False, True):
-                sums: dict[float, list[int]] = {}
-                for row in rows:
-                    if (row["preset"], row["quantity"], is_model(row["policy"])) == (preset, quantity, learned):
-                        total = sums.setdefault((row["low"] + row["high"]) / 2, [0, 0])
-                        total[0] += row["asked"]
-                        total[1] += row["n"]
-                points = [(x, asked / n) for x, (asked, n) in sorted(sums.items()) if n >= 100]
-                if points:
-                    name, colour = ("learned", "#d55e00") if learned else ("best rule of each scenario", "#555555")
-                    axes.plot(*zip(*points, strict=True), ".-", color=colour, label=name)
-            axes.set_xlabel(quantity)
-            axes.spines[["top", "right"]].set_visible(False)
-        line[0].set_ylabel(f"{preset}: share asked")
-        line[0].legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=90)
 
 
 def fill(page: str, blocks: dict[str, str]) -> str:
@@ -610,7 +511,7 @@ def main() -> None:
     }
     for name in ("symmetric_swap", "asymmetric_swap"):
         blocks[f"told {name}"] = step_by_step(flown["paper"][name]) if "paper" in flown else "Not flown yet."
-    picture = "![How often policies ask: distance, approach, time, way to go, crowd](images/asking.png)"
+    picture = "![How often policies ask: distance, approach, time, way to go, crowd](../images/asking.png)"
     blocks["asking"] = picture if asking else "Not flown yet."
     for page in PAGES:
         target = args.pages / page.relative_to(ROOT)
@@ -618,7 +519,8 @@ def main() -> None:
         target.write_text(fill(page.read_text(), blocks))
     args.images.mkdir(parents=True, exist_ok=True)
     if rules:
-        draw_fronts(rules, sweep, test, args.images / "fronts.png")
+        draw_fronts(rules, sweep, test, NAMES[:2], args.images / "fronts.png")
+        draw_fronts(rules, sweep, test, NAMES, args.images / "fronts_all.png")
     if flown:
         draw_trajectories(flown, args.images / "flights.png")
     if asking:

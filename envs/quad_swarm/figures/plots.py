@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -15,11 +16,9 @@ from PIL import Image
 
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import short_name
-from quad_swarm.figures.colours import OKABE_ITO, colour_of
+from quad_swarm.figures.colours import INK, RULES, STYLE, colour_of
 from quad_swarm.figures.render import Renderer
-
-# Of a path, where a robot asks and where it does not: yellow and blue, as in the paper
-ASKING, SILENT = OKABE_ITO[6], OKABE_ITO[0]
+from quad_swarm.geometry import length
 
 
 def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition], seed: int, folder: Path) -> list[Path]:
@@ -42,12 +41,13 @@ def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition],
     for name, figure in figures.items():
         for kind in ("png", "pdf"):
             paths.append(folder / f"{name}.{kind}")
-            figure.savefig(paths[-1], dpi=130)
+            figure.savefig(paths[-1], dpi=STYLE["savefig.dpi"])
     paths.append(folder / "swarm.gif")
     animate(last[-1], flights[-1], paths[-1])
     return paths
 
 
+@rc_context(STYLE)
 def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Share of episodes with a collision, with 95 % Wilson intervals."""
     figure = Figure(figsize=(8, 3.5), layout="constrained")
@@ -57,6 +57,7 @@ def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
+@rc_context(STYLE)
 def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Share of the possible requests that were made."""
     figure = Figure(figsize=(8, 3.5), layout="constrained")
@@ -66,6 +67,7 @@ def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
+@rc_context(STYLE)
 def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Requests against collisions, a panel for each scenario. A line joins the policies that none is better than in
     both (the Pareto front); bars are 95 % Wilson intervals."""
@@ -77,20 +79,19 @@ def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
         mine = [row for row in rows if row["scenario"] == name]
         points = {row["policy"]: (row["request_share"], row["collisions"] / row["episodes"]) for row in mine}
         front = sorted(p for p in points.values() if not any(_dominates(q, p) for q in points.values()))
-        axes.plot(*zip(*front, strict=True), color="#999999", linewidth=1, zorder=1)
+        axes.plot(*zip(*front, strict=True), color=RULES, linewidth=1, zorder=1)
         for row in mine:
             x, y = points[row["policy"]]
             k = policies.index(row["policy"])
             bar = [[y - row["collision_low"]], [row["collision_high"] - y]]
             style = {"fmt": "os^Dv"[k // 8 % 5], "color": colour_of(k), "capsize": 2}
             axes.errorbar([x], [y], np.maximum(bar, 0), label=short_name(row["policy"]), **style)
-        axes.set_title(name.replace("_", " "), fontsize=10)
+        axes.set_title(name.replace("_", " "))
         axes.set_xlabel("requests made, of all possible")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(PercentFormatter(1.0))
-        axes.spines[["top", "right"]].set_visible(False)
     panels[0][0].set_ylabel("episodes with a collision")
-    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     return figure
 
 
@@ -109,13 +110,14 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
         axes.bar(x, heights, 0.9 * width, color=colour_of(k), label=short_name(policy))
         if interval is not None:
             bounds = np.array([interval(mine[name]) for name in scenarios]).T
-            axes.errorbar(x, heights, np.abs(bounds - heights), fmt="none", ecolor="#333333", capsize=2, linewidth=1)
+            axes.errorbar(x, heights, np.abs(bounds - heights), fmt="none", ecolor=INK, capsize=2, linewidth=1)
     axes.set_xticks(range(len(scenarios)), [name.replace("_", " ") for name in scenarios])
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    axes.legend(frameon=False, ncols=min(len(policies), 5), loc="upper left", bbox_to_anchor=(0, 1.17))
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(ncols=min(len(policies), 5), loc="upper left", bbox_to_anchor=(0, 1.17))
+    axes.grid(axis="x", visible=False)
 
 
+@rc_context(STYLE)
 def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight]) -> Figure:
     """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2)."""
     columns = min(len(conditions), 2)
@@ -126,9 +128,8 @@ def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight]) -> 
         axes.set_visible(False)
     for axes, condition, flight in zip(panels.flat, conditions, flights, strict=False):
         draw_flight(axes, flight)
-        axes.set_title(condition.scenario.replace("_", " "), fontsize=10)
-    name = short_name(conditions[-1].policy)
-    figure.suptitle(f"{name}: yellow where a robot asks, blue where it does not", fontsize=9)
+        axes.set_title(condition.scenario.replace("_", " "))
+    explain_flights(figure, panels.flat[0], short_name(conditions[-1].policy))
     return figure
 
 
@@ -149,16 +150,36 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
 
 
 def draw_flight(axes: Axes, flight: Flight) -> None:
-    """A flight from above: yellow where a robot asks, blue where it does not."""
+    """A flight from above, in the colours of the robots: a dot where a robot asks, an arrow half-way."""
     asks = flight.requests.sum(axis=2) > 0
-    for i in range(len(flight.goal)):
-        path = flight.state[:, i, :2]
-        axes.plot(path[:, 0], path[:, 1], color=SILENT, linewidth=1)
+    for i, goal in enumerate(flight.goal):
+        path, colour = flight.state[:, i, :2], colour_of(i)
+        axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.2)
+        travelled = np.cumsum(length(np.diff(flight.pos[:, i], axis=0)))
+        k = int(np.searchsorted(travelled, travelled[-1] / 2))
+        arrow = {"arrowstyle": "-|>", "color": colour, "mutation_scale": 15, "linewidth": 0}
+        axes.annotate("", path[k + 1], path[k], arrowprops=arrow)
         asking = path[:-1][asks[:, i]]
-        axes.scatter(asking[:, 0], asking[:, 1], s=16, color=ASKING, edgecolor="#7a6000", linewidth=0.4, zorder=3)
-        axes.plot(*path[0], "o", color=colour_of(i), markersize=7, markerfacecolor="white")
-        axes.plot(*flight.goal[i, :2], "*", color=colour_of(i), markersize=11)
+        axes.scatter(asking[:, 0], asking[:, 1], s=18, color=colour, edgecolor="black", linewidth=0.5, zorder=3)
+        axes.plot(*path[0], "o", color=colour, markersize=7, markerfacecolor="white")
+        axes.plot(*goal[:2], "*", color=colour, markersize=10)
     axes.set_aspect("equal")
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.margins(0.08)
+
+
+def explain_flights(figure: Figure, axes: Axes, policy: str = "") -> None:
+    """A legend of what `draw_flight` draws.
+
+    :param figure: to whose foot it goes
+    :param axes: any of its panels
+    :param policy: who flew
+    """
+    marks: dict[str, dict[str, Any]] = {
+        "start": {"marker": "o", "markersize": 7, "markerfacecolor": "white"},
+        "goal": {"marker": "*", "markersize": 10},
+        "asks somebody": {"marker": "o", "markersize": 5, "markeredgecolor": "black"},
+    }
+    handles = [axes.plot([], [], linestyle="", color=RULES, label=name, **style)[0] for name, style in marks.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), title=policy or None)

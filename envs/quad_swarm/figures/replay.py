@@ -20,7 +20,7 @@ from quad_swarm.evaluation.command import add_policy_arguments, make_conditions,
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import short_name
 from quad_swarm.evaluation.rows import check_writable
-from quad_swarm.figures.colours import OKABE_ITO
+from quad_swarm.figures.colours import COLOURS
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.scenarios import SCENARIOS
@@ -54,7 +54,7 @@ def replay_page(conditions: Sequence[Condition], seed: int = 0, episode: int = 0
         "goal_radius": config.goal_radius,
         "collision_distance": 2 * config.radius,
         "room": [config.planner.workspace_low, config.planner.workspace_high],
-        "colours": OKABE_ITO,
+        "colours": COLOURS,
         "flights": [_describe(one.policy, fly(one, seed, episode)) for one in conditions],
     }
     # "</script>" in the name of a policy would end the data

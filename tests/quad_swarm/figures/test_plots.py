@@ -12,6 +12,7 @@ from PIL import Image
 
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.figures import plots
+from quad_swarm.figures.colours import colour_of
 from quad_swarm.world.presets import make_config
 
 
@@ -60,14 +61,14 @@ def test_bars_are_as_high_as_the_rows_say(draw, height):
 
 def test_the_front_joins_policies_that_none_is_better_than_in_both():
     figure = plots.draw_front(ROWS)
-    assert [axes.get_title() for axes in figure.axes] == ["random", "random swap"]
+    assert [axes.get_title("left") for axes in figure.axes] == ["random", "random swap"]
     fronts = [axes.lines[0].get_xydata().tolist() for axes in figure.axes]
     assert fronts == [[[0, 0.5], [0.2, 0.1], [1, 0]], [[0, 1.0], [0.3, 0.25], [0.4, 0.15], [1, 0.05]]]
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["none", "full", "cpa:1:1", "random:0.5"]
 
 
-def test_a_flight_is_yellow_where_a_robot_asks(flown):
+def test_a_flight_has_dots_where_a_robot_asks(flown):
     _, flight = flown
     axes = Figure().subplots()
     plots.draw_flight(axes, flight)
@@ -77,7 +78,7 @@ def test_a_flight_is_yellow_where_a_robot_asks(flown):
     for robot, points in enumerate(axes.collections):
         np.testing.assert_array_equal(points.get_offsets(), flight.state[:-1][asks[:, robot], robot, :2])
         if asks[:, robot].any():
-            assert matplotlib.colors.to_hex(points.get_facecolor()[0]) == plots.ASKING.lower()
+            assert matplotlib.colors.to_hex(points.get_facecolor()[0]) == colour_of(robot).lower()
     path, start, goal = axes.lines[:3]
     np.testing.assert_array_equal(path.get_xydata(), flight.state[:, 0, :2])
     assert start.get_xydata()[0].tolist() == flight.state[0, 0, :2].tolist()
@@ -88,8 +89,10 @@ def test_a_panel_for_each_flight(flown):
     condition, flight = flown
     figure = plots.draw_flights([condition] * 3, [flight] * 3)
     assert [axes.get_visible() for axes in figure.axes] == [True, True, True, False]
-    assert [axes.get_title() for axes in figure.axes[:3]] == ["random swap"] * 3
-    assert "distance:2.5" in figure.get_suptitle()
+    assert [axes.get_title("left") for axes in figure.axes[:3]] == ["random swap"] * 3
+    (legend,) = figure.legends
+    assert legend.get_title().get_text() == "distance:2.5"
+    assert [text.get_text() for text in legend.get_texts()] == ["start", "goal", "asks somebody"]
 
 
 def test_the_animation_ends_shortly_after_all_have_arrived(flown, tmp_path):

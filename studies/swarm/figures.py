@@ -1,0 +1,148 @@
+"""The figures of the pages of results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, PercentFormatter
+
+from quad_swarm.evaluation.flight import Flight, fly
+from quad_swarm.evaluation.policies import is_model
+from quad_swarm.figures.colours import INK, LEARNED, RULES, STYLE
+from quad_swarm.figures.plots import draw_flight, explain_flights
+from quad_swarm.world.presets import PRESETS, make_config
+from quad_swarm.world.scenarios import SCENARIOS
+from studies.swarm.protocol import EARLIER, condition, progress
+
+NAMES = list(SCENARIOS)[::-1]  # the hardest first
+WORLDS = {"paper": "Four robots (paper)", "dense": "Eight robots (dense)"}
+Rows = list[dict[str, Any]]
+
+
+def rate_of(row: dict[str, Any]) -> float:
+    """Share of the episodes with a collision."""
+    return row["collisions"] / row["episodes"]
+
+
+@rc_context(STYLE)
+def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, names: Sequence[str], path: Path) -> None:
+    """Requests against collisions: all rules that were tried, the learned policy at all thresholds, and the tested
+    policies; a column for each preset, a line for each scenario."""
+    presets = [preset for preset in PRESETS if any(row["preset"] == preset for row in rules)]
+    figure = Figure(figsize=(8, 0.6 + 2.5 * len(names)), layout="constrained")
+    panels = figure.subplots(len(names), len(presets), sharex="col", sharey="row", squeeze=False)
+    for line, name in zip(panels, names, strict=True):
+        for axes, preset in zip(line, presets, strict=True):
+            here = [
+                [r for r in rows if (r["preset"], r["scenario"]) == (preset, name)] for rows in (rules, sweep, tests)
+            ]
+            _draw_front(axes, preset, *here)
+            axes.set_title(f"{WORLDS.get(preset, preset)}: {name.replace('_', ' ')}")
+        line[0].set_ylabel("episodes with a collision")
+    for axes in panels[-1]:
+        axes.set_xlabel("requests, of all possible")
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.savefig(path)
+
+
+def _draw_front(axes: Axes, preset: str, rules: Rows, sweep: Rows, tests: Rows) -> None:
+    tried = [(r["request_share"], rate_of(r)) for r in rules if r["episodes"] >= 250]
+    axes.plot(
+        *zip(*tried, strict=True),
+        ".",
+        color=RULES,
+        markersize=3,
+        alpha=0.35,
+        label="hand-made rules, each setting tried (250 to 12,000 episodes)",
+    )
+    best = sorted((s, c) for s, c in tried if not any(s2 <= s and c2 < c for s2, c2 in tried))
+    axes.plot(*zip(*best, strict=True), color=RULES, drawstyle="steps-post", label="the best rules")
+    learned = sorted((r for r in sweep if is_model(r["policy"])), key=lambda r: r["request_share"])
+    if learned:
+        shares = [r["request_share"] for r in learned]
+        low, high = ([r[f"collision_{end}"] for r in learned] for end in ("low", "high"))
+        axes.fill_between(shares, low, high, color=LEARNED, alpha=0.15, linewidth=0)
+        axes.plot(
+            shares,
+            [rate_of(r) for r in learned],
+            ".-",
+            color=LEARNED,
+            label="learned: one model, all thresholds (1,000 episodes, 95 %)",
+        )
+    seeds = [(r["request_share"], rate_of(r)) for r in tests if f"/{preset}_seed" in r["policy"]]
+    if seeds:
+        style: dict[str, Any] = {"markersize": 11, "markeredgecolor": "white", "markeredgewidth": 0.7, "linestyle": ""}
+        axes.plot(
+            *zip(*seeds, strict=True), "*", color=LEARNED, label="learned: five seeds (12,000 sealed episodes)", **style
+        )
+    for row in tests:
+        if row["policy"] == "full":
+            axes.axhline(
+                rate_of(row),
+                color=INK,
+                linestyle=":",
+                linewidth=1.2,
+                label="full communication (12,000; 100 % of the requests)",
+            )
+    axes.set_xscale("log")
+    axes.set_yscale("symlog", linthresh=1e-3)
+    axes.set_ylim(-1e-4, 1)
+    axes.yaxis.set_major_locator(FixedLocator([0, 1e-3, 1e-2, 1e-1, 1]))
+    axes.yaxis.set_minor_locator(FixedLocator([]))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda share, _: f"{100 * share:.4g}%")
+
+
+def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
+    """The first test episode of each scenario as a model flies it, and whom a rule would have asked on its way."""
+    config = make_config(preset)
+    names = progress(NAMES, f"flights, {preset}", len(NAMES))
+    return {name: fly(condition(model, name, config), EARLIER, other_rule=rule) for name in names}
+
+
+@rc_context(STYLE)
+def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
+    """The paper's Fig. 2: the flights of each preset from above, a column each."""
+    figure = Figure(figsize=(4 * len(flown), 4 * len(NAMES)), layout="constrained")
+    panels = figure.subplots(len(NAMES), len(flown), squeeze=False)
+    for column, (preset, by_name) in zip(panels.T, flown.items(), strict=True):
+        for axes, (name, flight) in zip(column, by_name.items(), strict=True):
+            draw_flight(axes, flight)
+            axes.set_title(f"{WORLDS.get(preset, preset)}: {name.replace('_', ' ')}")
+    explain_flights(figure, panels[0][0])
+    figure.savefig(path)
+
+
+@rc_context(STYLE)
+def draw_asking(rows: Rows, path: Path) -> None:
+    """How often policies ask at what they see: a line for each quantity, a column for each preset."""
+    quantities = list(dict.fromkeys(row["quantity"] for row in rows))
+    presets = list(dict.fromkeys(row["preset"] for row in rows))
+    figure = Figure(figsize=(8, 0.4 + 2.0 * len(quantities)), layout="constrained")
+    panels = figure.subplots(len(quantities), len(presets), sharex="row", squeeze=False)
+    for line, quantity in zip(panels, quantities, strict=True):
+        for axes, preset in zip(line, presets, strict=True):
+            for learned in (False, True):
+                sums: dict[float, list[int]] = {}
+                for row in rows:
+                    if (row["preset"], row["quantity"], is_model(row["policy"])) == (preset, quantity, learned):
+                        total = sums.setdefault((row["low"] + row["high"]) / 2, [0, 0])
+                        total[0] += row["asked"]
+                        total[1] += row["n"]
+                points = [(x, asked / n) for x, (asked, n) in sorted(sums.items()) if n >= 100]
+                if points:
+                    name, colour = ("learned", LEARNED) if learned else ("best rule of each scenario", RULES)
+                    axes.plot(*zip(*points, strict=True), ".-", color=colour, label=name)
+            axes.set_xlabel(quantity)
+            axes.set_ylim(bottom=0)
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        line[0].set_ylabel("share asked")
+    for axes, preset in zip(panels[0], presets, strict=True):
+        axes.set_title(WORLDS.get(preset, preset))
+    panels[0][0].legend()
+    figure.savefig(path)
