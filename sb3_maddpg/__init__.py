@@ -5,6 +5,7 @@ from importlib.metadata import version
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
+from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.env_checker import check_team_env
 from sb3_maddpg.iddpg import IDDPG
 from sb3_maddpg.maddpg import MADDPG
@@ -22,6 +23,7 @@ __all__ = [
     "MADDPG",
     "MATD3",
     "AgentPolicy",
+    "CnnPolicy",
     "CurriculumCallback",
     "DashboardCallback",
     "MADDPGPolicy",

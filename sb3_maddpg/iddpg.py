@@ -11,12 +11,11 @@ from torch import nn
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.maddpg import MADDPG
-from sb3_maddpg.networks import StackedMLP
-from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, sharing_groups
+from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, StackedCritic, sharing_groups
 from sb3_maddpg.team import Team
 
 
-class IndependentCritic(Critic):
+class IndependentCritic(StackedCritic):
     """
     One multi-layer perceptron per agent that reads what its actor reads, and its own action: Q_i(z_i, a_i).
 
@@ -37,16 +36,13 @@ class IndependentCritic(Critic):
         groups: Sequence[int] | None = None,
         n_critics: int = 1,
     ):
-        super().__init__(actions, team.n_agents, n_critics=n_critics)
+        groups = groups or range(team.n_agents)
+        super().__init__(team, actions, team.obs_dim + actions.width, net_arch, activation_fn, groups, n_critics)
         self.obs_dim = team.obs_dim
-        groups = list(groups or range(team.n_agents))
-        networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
-        self.net = StackedMLP(networks, team.obs_dim + actions.width, 1, net_arch, activation_fn)
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         inputs = th.cat([obs[..., : self.obs_dim], actions], dim=2).permute(1, 2, 0)
-        values = self.net(inputs.repeat(self.n_critics, 1, 1))
-        return values.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
+        return self.by_critic(self.net(inputs.repeat(self.n_critics, 1, 1)))
 
     def forward_alternatives(
         self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
@@ -61,9 +57,6 @@ class IndependentCritic(Critic):
         first = th.bmm(weight[..., self.obs_dim :], chosen.flatten(2)).unflatten(2, shape) + seen.unsqueeze(2)
         values = self.net.after_first(first.flatten(2), layers, agents)
         return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
-
-    def clip_grad_norm_(self, max_norm: float) -> None:
-        self.net.clip_grad_norm_(max_norm)
 
 
 class IndependentPolicy(MADDPGPolicy):

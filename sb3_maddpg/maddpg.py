@@ -38,6 +38,7 @@ from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import record_metrics
+from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
     FILE_FORMAT,
@@ -97,11 +98,11 @@ class MADDPG(OffPolicyAlgorithm):
     observation ``Box(n_agents, obs_dim)``, a flat joint action (``MultiBinary``, ``Box`` or ``MultiDiscrete`` of length
     ``n_agents * k``), a scalar team reward, and, where agents differ, ``info["agent_rewards"]``,
     ``info["agent_terminated"]`` and ``info["agent_active"]``, all (n_agents,). Numbers in ``info["metrics"]`` are
-    logged as means. Of the environment's attributes it reads ``agent_names``, ``observation_layout`` (see
-    ``PairPolicy``) and, with ``use_action_cost``, ``action_cost``: what an action costs as long as the reward holds
-    that as a plain sum over the encoded action, a float or (n_agents, width).
+    logged as means. Of the environment's attributes it reads ``agent_names``, ``image_space`` (see ``CnnPolicy``),
+    ``observation_layout`` (see ``PairPolicy``) and, with ``use_action_cost``, ``action_cost``: what an action costs as
+    long as the reward holds that as a plain sum over the encoded action, a float or (n_agents, width).
 
-    :param policy: The policy model to use (MlpPolicy, PairPolicy, ...)
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param learning_rate: learning rate of all Adam optimizers,
         it can be a function of the current progress remaining (from 1 to 0)
@@ -144,7 +145,11 @@ class MADDPG(OffPolicyAlgorithm):
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MADDPGPolicy, "PairPolicy": PairPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MADDPGPolicy,
+        "CnnPolicy": CnnPolicy,
+        "PairPolicy": PairPolicy,
+    }
     # A class reads the files of its bases of the same name, see ``load``
     algorithm_name: ClassVar[str] = "MADDPG"
     arguments: ClassVar[type[Arguments]] = TrainingArguments

@@ -49,6 +49,8 @@ class TeamEnv(gymnasium.Env):
     MADDPG makes a ``TeamEnv`` of a ``ParallelEnv`` by itself. Stable-Baselines3's functions need one where they take an
     environment: ``evaluate_policy(model, Monitor(TeamEnv(env)))``, and likewise ``EvalCallback``.
 
+    Where all agents see images of one size, ``image_space`` is the space of one of them, which ``CnnPolicy`` reads.
+
     What the environment offers besides, such as ``observation_layout`` or a curriculum, is found by Gymnasium's
     ``get_wrapper_attr``, hence by ``get_attr`` and ``env_method`` of SB3's vector environments.
 
@@ -86,6 +88,8 @@ class TeamEnv(gymnasium.Env):
             self._observation_spaces = [
                 _masked_space(seen, space) for seen, space in zip(self._observation_spaces, action_spaces, strict=True)
             ]
+        if (images := _image_space(self._observation_spaces)) is not None:
+            self.image_space = images
         self.parallel_env = env
         self.metadata = {"render_modes": [], **getattr(env, "metadata", {})}
         self.render_mode = getattr(env, "render_mode", None)
@@ -595,6 +599,14 @@ def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
     if not np.prod(flat.shape):
         raise ValueError(f"The space that {what}, {space}, is empty: where there is nothing, give Box(0, 1, (1,)).")
     return flat
+
+
+def _image_space(observations: Sequence[spaces.Space]) -> spaces.Box | None:
+    """The space of each agent's image, None if they see different things, or no images."""
+    first = observations[0]
+    if isinstance(first, spaces.Box) and len(first.shape) == 3 and all(space == first for space in observations):
+        return first
+    return None
 
 
 def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:

@@ -235,7 +235,45 @@ class Critic(nn.Module):
         return self.per_value(self.sum_by_agent(cost)) / values_per_agent
 
 
-class MLPCritic(Critic):
+class StackedCritic(Critic):
+    """
+    Critics that are one multi-layer perceptron per agent.
+
+    :param team: the team
+    :param actions: how it acts
+    :param in_features: length of what each reads
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: between the layers
+    :param groups: for each agent the number of its network
+    :param n_critics: number of critics
+    """
+
+    def __init__(
+        self,
+        team: Team,
+        actions: TeamActions,
+        in_features: int,
+        net_arch: list[int],
+        activation_fn: type[nn.Module],
+        groups: Sequence[int],
+        n_critics: int,
+    ):
+        super().__init__(actions, team.n_agents, n_critics=n_critics)
+        networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
+        self.net = StackedMLP(networks, in_features, 1, net_arch, activation_fn)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        self.net.clip_grad_norm_(max_norm)
+
+    def by_critic(self, outputs: th.Tensor) -> th.Tensor:
+        """
+        :param outputs: of the networks, (n_critics * n_agents, 1, batch)
+        :return: (n_critics, batch, n_agents)
+        """
+        return outputs.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
+
+
+class MLPCritic(StackedCritic):
     """
     One multi-layer perceptron per agent, Q_i(z_1..z_n, a_1..a_n), or Q_i(s, a_1..a_n) with a global state s. Critics
     that share parameters read the agents in another order each: the own agent first, then those it shares with, then
@@ -261,26 +299,26 @@ class MLPCritic(Critic):
         groups: Sequence[int] | None = None,
         n_critics: int = 1,
     ):
-        super().__init__(actions, team.n_agents, n_critics=n_critics)
-        self.team = team
         n = team.n_agents
         groups = list(groups or range(n))
-        self.shared = len(set(groups)) < n
+        shared = len(set(groups)) < n
         parts = [team.obs_dim, actions.width] if team.state_dim == 0 else [actions.width]
         columns = np.arange(team.state_dim)[None].repeat(n, axis=0)
         for width in parts:
             block = columns.shape[1] + np.arange(n * width).reshape(n, width)
             # Where in the own view, if there is one, each agent stands
-            place = np.array([_places(groups, agent) if self.shared else np.arange(n) for agent in range(n)])
+            place = np.array([_places(groups, agent) if shared else np.arange(n) for agent in range(n)])
             columns = np.concatenate([columns, block[place].reshape(n, -1)], axis=1)
         own = columns.reshape(n, -1)[:, -n * actions.width :].reshape(n, n, -1)[np.arange(n), np.arange(n)]
-        self.tells_agent = self.shared and team.state_dim > 0
-        if self.tells_agent:
+        tells_agent = shared and team.state_dim > 0
+        if tells_agent:
             columns = np.concatenate([columns, columns.shape[1] + np.arange(n)[:, None]], axis=1)
+        super().__init__(team, actions, int(columns.max()) + 1, net_arch, activation_fn, groups, n_critics)
+        self.team = team
+        self.shared = shared
+        self.tells_agent = tells_agent
         self.register_buffer("columns", th.as_tensor(columns).repeat(n_critics, 1), persistent=False)
         self.register_buffer("own_columns", th.as_tensor(own), persistent=False)
-        networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
-        self.net = StackedMLP(networks, int(columns.max()) + 1, 1, net_arch, activation_fn)
 
     def _inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """:return: what all critics read, (features, batch)"""
@@ -302,11 +340,7 @@ class MLPCritic(Critic):
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         layers = self.net.layers()
-        values = self.net.after_first(self._first(self._inputs(obs, actions), layers[0]), layers)
-        return values.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
-
-    def clip_grad_norm_(self, max_norm: float) -> None:
-        self.net.clip_grad_norm_(max_norm)
+        return self.by_critic(self.net.after_first(self._first(self._inputs(obs, actions), layers[0]), layers))
 
     def forward_alternatives(
         self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None

@@ -103,13 +103,13 @@ def _name(cls: type) -> str:
 def _built_in() -> dict[str, type]:
     """The classes that files may name beside those of users: what models are made of."""
     from sb3_maddpg import buffers as own_buffers
-    from sb3_maddpg import iddpg, policies, relational
+    from sb3_maddpg import cnn_policy, iddpg, policies, relational
 
     classes = [
         *_PLAIN_OBJECTS,
         *(
             one
-            for module in (policies, relational, iddpg)
+            for module in (policies, relational, iddpg, cnn_policy)
             for one in vars(module).values()
             if _is_public_class(one, module)
         ),

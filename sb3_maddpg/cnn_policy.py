@@ -1,0 +1,189 @@
+"""Policies of teams whose agents see images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from torch import nn
+
+from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, MLPCritic
+from sb3_maddpg.utils import shown
+
+
+class ImageFeatures(nn.Module):
+    """
+    Images in rows of a team observation, to rows of features. All agents share the extractor.
+
+    :param space: of each agent's image, channels first or last
+    :param extractor_class: as in Stable-Baselines3, reads images with channels first
+    :param extractor_kwargs: its further arguments
+    :param normalize: divide by 255
+    """
+
+    def __init__(
+        self,
+        space: spaces.Box,
+        extractor_class: type[BaseFeaturesExtractor],
+        extractor_kwargs: dict[str, Any],
+        normalize: bool,
+    ):
+        super().__init__()
+        self.shape = space.shape
+        self.obs_dim = int(th.Size(space.shape).numel())
+        self.channels_last = len(space.shape) == 3 and not is_image_space_channels_first(space)
+        self.scale = 1 / 255 if normalize else 1.0
+        if self.channels_last:
+            low, high = (bound.transpose(2, 0, 1) for bound in (space.low, space.high))
+            space = spaces.Box(low, high, dtype=space.dtype.type)
+        self.extractor = extractor_class(space, **extractor_kwargs)
+        self.features_dim = self.extractor.features_dim
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (..., obs_dim or more); what comes after an agent's image is kept
+        :return: (..., features_dim or more)
+        """
+        images = obs[..., : self.obs_dim].reshape(-1, *self.shape) * self.scale
+        if self.channels_last:
+            images = images.permute(0, 3, 1, 2)
+        features = self.extractor(images).reshape(*obs.shape[:-1], -1)
+        return th.cat([features, obs[..., self.obs_dim :]], dim=-1)
+
+
+class CnnActor(Actor):
+    """
+    Features of the agents' images, then one multi-layer perceptron per agent.
+
+    :param features: of images
+    :param head: actors that read features
+    """
+
+    def __init__(self, features: ImageFeatures, head: MLPActor):
+        super().__init__(head.actions)
+        self.features = features
+        self.head = head
+
+    def logits(self, obs: th.Tensor) -> th.Tensor:
+        return self.head.logits(self.features(obs))
+
+    def single(self, agent: int) -> nn.Module:
+        return nn.Sequential(self.features, self.head.single(agent))
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        nn.utils.clip_grad_norm_(self.features.parameters(), max_norm)
+        self.head.clip_grad_norm_(max_norm)
+
+
+class CnnCritic(Critic):
+    """
+    Features of all agents' images, then centralised critics that read them and all actions.
+
+    :param features: of images
+    :param head: critics that read features
+    """
+
+    def __init__(self, features: ImageFeatures, head: MLPCritic):
+        super().__init__(head.factors, head.n_agents, n_critics=head.n_critics)
+        self.features = features
+        self.head = head
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return self.head(self.features(obs), actions)
+
+    def forward_alternatives(
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
+    ) -> th.Tensor:
+        return self.head.forward_alternatives(self.features(obs), actions, own, factors)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        nn.utils.clip_grad_norm_(self.features.parameters(), max_norm)
+        self.head.clip_grad_norm_(max_norm)
+
+
+class CnnPolicy(MADDPGPolicy):
+    """
+    Policy for teams of homogeneous agents that see images: a convolutional network for all agents' images, one for
+    actors and one for critics, and behind it what ``MADDPGPolicy`` has.
+
+    :param args: see ``MADDPGPolicy``
+    :param image_space: ``Box`` of each agent's image, (height, width, channels) or (channels, height, width); MADDPG
+        takes it from the environment unless given
+    :param features_extractor_class: as in Stable-Baselines3
+    :param features_extractor_kwargs: its further arguments, such as ``features_dim``
+    :param kwargs: see ``MADDPGPolicy``; ``normalize_images``: divide images by 255
+    :raises ValueError: agents that see different things, or no images
+    """
+
+    env_attributes: ClassVar[tuple[str, ...]] = ("agent_names", "image_space")
+
+    def __init__(
+        self,
+        *args: Any,
+        image_space: spaces.Box | None = None,
+        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        if image_space is None:
+            raise ValueError(
+                "CnnPolicy needs agents that see images of one size, or policy_kwargs with an `image_space`; use "
+                "MlpPolicy for other observations."
+            )
+        if not isinstance(features_extractor_class, type) or not issubclass(
+            features_extractor_class, BaseFeaturesExtractor
+        ):
+            raise ValueError(
+                f"features_extractor_class={shown(features_extractor_class)}: give a subclass of Stable-Baselines3's "
+                "BaseFeaturesExtractor, such as NatureCNN."
+            )
+        self.image_space = image_space
+        self._extractor_class = features_extractor_class
+        self._extractor_kwargs = dict(features_extractor_kwargs or {})
+        super().__init__(*args, **kwargs)
+
+    def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
+        size = int(th.Size(self.image_space.shape).numel())
+        if set(self.team.obs_dims) != {size} or self.team.masks:
+            raise ValueError(
+                f"image_space={self.image_space} has {size} numbers, the agents observe {self.team.obs_dims}"
+                f"{' with action masks' if self.team.masks else ''}: CnnPolicy is for teams that see one image each."
+            )
+        # Networks behind the extractors know the team by its features
+        of_actor, of_critic = self._make_features(), self._make_features()
+        team, width = self.team, of_actor.features_dim
+        self.team = replace(team, obs_dims=(width,) * team.n_agents, obs_dim=width)
+        actor, critic = super()._make_networks(actor_arch, critic_arch)
+        self.team = team
+        assert isinstance(actor, MLPActor)
+        assert isinstance(critic, MLPCritic)
+        return CnnActor(of_actor, actor), CnnCritic(of_critic, critic)
+
+    def _make_features(self) -> ImageFeatures:
+        if self._extractor_class is NatureCNN:
+            if not is_image_space(self.image_space, normalized_image=not self.normalize_images):
+                raise ValueError(
+                    f"image_space={self.image_space} is no image for NatureCNN: give uint8 from 0 to 255 and three "
+                    "axes, or normalize_images=False for images of floats, or a features_extractor_class of your own."
+                )
+            self._extractor_kwargs.setdefault("normalized_image", not self.normalize_images)
+        try:
+            return ImageFeatures(self.image_space, self._extractor_class, self._extractor_kwargs, self.normalize_images)
+        except (AssertionError, TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(
+                f"features_extractor_class={self._extractor_class.__name__} cannot be made for {self.image_space} with "
+                f"features_extractor_kwargs={self._extractor_kwargs}: {error}"
+            ) from error
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            **super()._get_constructor_parameters(),
+            "image_space": self.image_space,
+            "features_extractor_class": self._extractor_class,
+            "features_extractor_kwargs": self._extractor_kwargs,
+            "normalize_images": self.normalize_images,
+        }

@@ -1,0 +1,193 @@
+"""Agents that see images."""
+
+import io
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+
+from sb3_maddpg import MADDPG, MATD3, CnnPolicy, TeamEnv, allow_in_files
+from toys import Toy
+
+SIDE = 8
+
+
+@allow_in_files
+class SmallCNN(BaseFeaturesExtractor):
+    """A few filters and a layer."""
+
+    def __init__(self, observation_space: spaces.Box, features_dim: int = 8):
+        super().__init__(observation_space, features_dim)
+        channels = observation_space.shape[0]
+        self.net = th.nn.Sequential(
+            th.nn.Conv2d(channels, 2, 3), th.nn.Tanh(), th.nn.Flatten(), th.nn.LazyLinear(features_dim), th.nn.Tanh()
+        )
+        self.net(th.zeros(1, *observation_space.shape))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.net(observations)
+
+
+class BrightSide(ParallelEnv):
+    """Each agent sees a picture that is brighter on one side, and is rewarded for naming it."""
+
+    metadata: dict = {"name": "bright_side"}  # noqa: RUF012
+    possible_agents = ("a", "b")
+
+    def __init__(self, channels_last: bool = True, side: int = SIDE):
+        self.shape = (side, side, 1) if channels_last else (1, side, side)
+        self.side = side
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 255, self.shape, np.uint8)
+
+    def action_space(self, agent):
+        return spaces.Discrete(2)
+
+    def _draw(self):
+        self.right = dict(zip(self.agents, self.rng.integers(2, size=len(self.agents)), strict=True))
+        pictures = {}
+        for agent, right in self.right.items():
+            picture = self.rng.integers(0, 120, (self.side, self.side))
+            half = slice(self.side // 2, None) if right else slice(self.side // 2)
+            picture[:, half] += 100
+            pictures[agent] = picture.astype(np.uint8).reshape(self.shape)
+        return pictures
+
+    def reset(self, seed=None, options=None):
+        self.rng = np.random.default_rng(seed)
+        self.agents = list(self.possible_agents)
+        self.steps = 0
+        return self._draw(), {agent: {} for agent in self.agents}
+
+    def step(self, actions):
+        self.steps += 1
+        agents = self.agents
+        rewards = {agent: float(actions[agent] == self.right[agent]) for agent in agents}
+        over = dict.fromkeys(agents, self.steps == 10)
+        infos = {agent: {} for agent in agents}
+        pictures = self._draw()
+        if self.steps == 10:
+            self.agents = []
+        return pictures, rewards, dict.fromkeys(agents, False), over, infos
+
+
+ARGUMENTS = {
+    "learning_starts": 100,
+    "batch_size": 64,
+    "buffer_size": 3000,
+    "learning_rate": 2e-3,
+    "gamma": 0.0,
+    "train_freq": 2,
+    "seed": 0,
+}
+POLICY = {"features_extractor_class": SmallCNN, "net_arch": [16]}
+
+
+def made(algorithm=MADDPG, env=None, **policy_kwargs) -> MADDPG:
+    return algorithm("CnnPolicy", env or BrightSide(), **ARGUMENTS, policy_kwargs={**POLICY, **policy_kwargs})
+
+
+def drawn(model, batch: int = 5) -> tuple[th.Tensor, th.Tensor]:
+    th.manual_seed(0)
+    obs = th.randint(0, 256, (batch, *model.observation_space.shape)).float()
+    return obs, model.actor.act(obs, deterministic=False)
+
+
+@pytest.mark.parametrize("algorithm", [MADDPG, MATD3])
+def test_it_learns_to_see(algorithm):
+    model = made(algorithm).learn(800)
+    env = TeamEnv(BrightSide())
+    obs, _ = env.reset(seed=7)
+    rewards = []
+    while True:
+        obs, reward, terminated, truncated, _ = env.step(model.predict(obs, deterministic=True)[0])
+        rewards.append(reward)
+        if terminated or truncated:
+            if len(rewards) >= 200:
+                break
+            obs, _ = env.reset()
+    assert np.mean(rewards) > 0.9
+
+
+@pytest.mark.parametrize("state", [False, True])
+def test_an_actor_sees_its_own_picture_and_critics_see_all(state):
+    env = BrightSide()
+    if state:
+        env.state_space, env.state = spaces.Box(-1, 1, (3,)), lambda: np.zeros(3, np.float32)
+    model = made(env=TeamEnv(env, state=state))
+    obs, actions = drawn(model)
+    logits, values = model.actor.logits(obs), model.critic(obs, actions)
+    changed = obs.clone()
+    changed[:, 0, : SIDE * SIDE] = 255 - changed[:, 0, : SIDE * SIDE]
+    assert th.equal(model.actor.logits(changed)[:, 1], logits[:, 1])
+    assert not th.allclose(model.actor.logits(changed)[:, 0], logits[:, 0])
+    if state:  # in place of the agents' observations
+        changed = obs.clone()
+        changed[..., SIDE * SIDE :] += 1
+    assert not th.isclose(model.critic(changed, actions), values).any()
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_alternatives_have_the_values_of_the_action_replaced(share):
+    model = made(share_critic=share, share_actor=share)
+    obs, actions = drawn(model)
+    own = th.randn(5, 2, 3, model.policy.actions.width)
+    values = model.critic.forward_alternatives(obs, actions, own)
+    for agent in range(2):
+        for alternative in range(3):
+            replaced = actions.clone()
+            replaced[:, agent] = own[:, agent, alternative]
+            expected = model.critic(obs, replaced)[0, :, agent]
+            assert th.allclose(values[:, agent, alternative], expected, atol=1e-5)
+
+
+def test_channels_may_come_first_or_last():
+    last, first = made(), made(env=BrightSide(channels_last=False))
+    first.policy.load_state_dict(last.policy.state_dict())
+    picture = th.randint(0, 256, (4, 2, SIDE, SIDE, 2)).float()[..., :1]
+    seen_last, seen_first = picture.flatten(2), picture.permute(0, 1, 4, 2, 3).flatten(2)
+    assert th.allclose(last.actor.logits(seen_last), first.actor.logits(seen_first), atol=1e-6)
+
+
+def test_files_and_exported_policies_act_alike(tmp_path):
+    model = made().learn(200)
+    obs, _ = drawn(model)
+    obs = obs.numpy()
+    model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model")
+    assert isinstance(loaded.policy, CnnPolicy)
+    expected = model.predict(obs, deterministic=True)[0].reshape(5, 2)
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0].reshape(5, 2), expected)
+    agent = loaded.agent_policy("b")
+    np.testing.assert_array_equal(agent.predict(obs[:, 1]).ravel(), expected[:, 1])
+    agent.export(tmp_path / "b.pt")
+    script = th.jit.load(io.BytesIO((tmp_path / "b.pt").read_bytes()))
+    np.testing.assert_array_equal(script(th.as_tensor(obs[:, 1])).numpy().ravel(), expected[:, 1])
+
+
+def test_the_default_is_stable_baselines3s_network():
+    model = MADDPG("CnnPolicy", BrightSide(side=36), **ARGUMENTS, policy_kwargs={"net_arch": [8]})
+    assert isinstance(model.actor.features.extractor, NatureCNN)
+    model.learn(110)
+    assert model._n_updates > 0
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="agents that see images of one size"):
+        MADDPG("CnnPolicy", TeamEnv(Toy("mixed")), **ARGUMENTS)
+    with pytest.raises(ValueError, match="NatureCNN cannot be made"):
+        MADDPG("CnnPolicy", BrightSide(), **ARGUMENTS)  # too small for its filters
+    with pytest.raises(ValueError, match="BaseFeaturesExtractor"):
+        made(features_extractor_class=th.nn.Linear)
+    with pytest.raises(ValueError, match="has 12 numbers, the agents observe"):
+        made(image_space=spaces.Box(0, 255, (2, 6, 1), np.uint8))
+    with pytest.raises(ValueError, match="features_extractor_kwargs"):
+        made(features_extractor_kwargs={"width": 3})
+    floats = gymnasium.spaces.Box(0, 1, (SIDE, SIDE, 1))
+    with pytest.raises(ValueError, match="normalize_images=False"):
+        made(features_extractor_class=NatureCNN, image_space=floats)
