@@ -7,15 +7,23 @@ author = "The sb3-maddpg developers"
 project_copyright = f"2026 {author}"
 version = release = version_of("sb3-maddpg")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx-mathjax-offline", "sphinx.ext.viewcode", "sphinx_copybutton"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx-mathjax-offline",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "sb3-maddpg"
+html_logo = "images/logo.svg"
 html_theme_options = {"light_css_variables": {"code-font-size": "0.75rem"}}  # 98 columns fit beside the menu
 html_static_path = ["_static"]
 html_css_files = ["tables.css"]
 
-myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
+myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
 
 autodoc_member_order = "bysource"
