@@ -8,7 +8,6 @@ import {framed, Views} from "./scene.js";
 import {onTheme, setTheme, toggleTheme} from "./theme.js";
 
 const HOLD = 1.5; // s at the end before a loop begins anew
-const HEAD = 96; // pixels of a view that its title and counters may take
 const element = id => document.getElementById(id);
 const hash = new URLSearchParams(location.hash.slice(1));
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -45,7 +44,7 @@ function rects() {
 
 function layout() {
   const {width, height} = rects()[0];
-  return {aspect: width / height, head: Math.min(HEAD / height, 0.35)};
+  return {aspect: width / height, head: Math.min(0.9 * element("stage").querySelector(".head").offsetHeight / height, 0.35)};
 }
 
 function redraw() {
@@ -188,7 +187,7 @@ function begin3D() {
     if (robot === null) mark();
     else choose(undefined, robot === camera.robot ? null : robot);
   });
-  fill(element("view"), [["", "Free camera", true], ["perspective", "Perspective"], ["top", "From above"], ["side", "From the side"], ["chase", "Chase"]]);
+  fill(element("view"), [["", "Free camera", true], ["perspective", "Overview"], ["top", "From above"], ["side", "From the side"], ["chase", "Chase"]]);
   fill(element("follow"), [["", "All robots"], ...flights[0].goals.map((_, i) => [i, `Robot ${i}`])]);
   choose(presets.includes(hash.get("view")) ? hash.get("view") : "perspective");
   const robot = Number(hash.get("follow"));
@@ -257,7 +256,8 @@ function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
-// For scripts: pictures of any time, in seconds, that depend on nothing else.
+// For scripts: `prepare` returns how long the animation is (s), `renderFrame` the picture of a time (s) as a data URL,
+// which depends on nothing else.
 function beginHero() {
   document.body.className = "hero";
   let picture = null, still = null;
@@ -268,6 +268,9 @@ function beginHero() {
     picture = new Picture(views, width, height, ratio);
     still = framed("perspective", picture.layout.aspect, picture.layout.head);
     element("stage").replaceChildren(picture.canvas);
+    // Until shortly after the last arrival, or to the end where nobody arrives
+    const arrivals = flights.filter(flight => flight.arrival !== null).map(flight => flight.arrival);
+    return Math.min(last, (arrivals.length ? Math.max(...arrivals) : last) + 0.5 / data.dt) * data.dt;
   };
   window.renderFrame = time => {
     picture.draw(Math.min(time / data.dt, last), () => still);

@@ -6,9 +6,9 @@ import {
 import {drawRequests, drawSeparation, stepUnder, timeScale, top} from "./plots.js";
 import {drawTimeline, wordsAt} from "./timeline.js";
 
-const cell = `<h2></h2><p class="detail"></p>
-<p class="count"><b class="asked"></b> <span>requests<br><span class="share"></span> of all possible</span></p>
-<p class="apart"></p><p class="badge" hidden></p>`;
+const cell = `<div class="head"><div><h2></h2><p class="detail"></p></div>
+<p class="count"><b class="asked"></b> <span>requests<br><span class="share"></span> of all<span class="long"> possible</span></span></p>
+<p class="apart"></p></div><p class="badge" hidden></p>`;
 
 const details = `<h2></h2><p class="summary"></p>
 <figure><figcaption></figcaption><svg class="asks" role="list"></svg></figure>
@@ -96,7 +96,7 @@ function set(node, text) {
 }
 
 export const legend = [
-  ["arc", `asks for a plan: the arrow and a light run from the robot that asks to the one it asks, and the light comes back with the plan`],
+  ["arc", "request: from the robot that asks to the one it asks; a light runs there and returns with the plan"],
   ["tube", `plan for the next ${seconds((flights[0].plans[0][0].length - 1) * data.plan_stride)}`],
   ["goal", "goal of the robot of this colour"],
   ["bubble", `safety bubble, radius ${data.radius} m: two that touch are a collision`],

@@ -60,11 +60,13 @@ export function drawSeparation(svg, flight) {
   });
   add(svg, "path", {class: "curve", d: inside.join("")});
   if (clipped.length) add(svg, "path", {class: "clipped", d: clipped.join("")});
-  const {closest, closestStep} = flight, right = x(closestStep) > width - 120;
-  add(svg, "circle", {class: flight.collision === null ? "minimum" : "minimum collided", cx: x(closestStep), cy: y(closest), r: 4.5});
-  const above = closest > 0.25 * top || closest > contact;
-  const beside = {class: "minimum-label", x: x(closestStep) + (right ? -9 : 9), y: y(closest) + (above ? -8 : -10), "text-anchor": right ? "end" : "start"};
-  add(svg, "text", beside, closest > top ? `minimum ${closest.toFixed(2)} m, above the axis` : `minimum ${closest.toFixed(2)} m`);
+  const {closest, closestStep} = flight, at = x(closestStep), low_ = closest < 0.16 * top;
+  add(svg, "circle", {class: flight.collision === null ? "minimum" : "minimum collided", cx: at, cy: y(closest), r: 4.5});
+  // Below the dot, where the curve is not; beside it, where there is no room below
+  const aside = at > width - 130 ? [at - 10, "end"] : [at + 10, "start"];
+  const [left, anchor] = low_ ? aside : [Math.min(Math.max(at, LEFT + 60), width - RIGHT - 60), "middle"];
+  add(svg, "text", {class: "minimum-label", x: left, y: y(closest) + (low_ ? -4 : 19), "text-anchor": anchor},
+    `minimum ${closest.toFixed(2)} m${closest > top ? ", above the axis" : ""}`);
   timeAxis(svg, x, low, width);
   svg.setAttribute("aria-label", `Distance of the closest two robots over time: at least ${closest.toFixed(2)} metres, ` +
     `at ${seconds(closestStep, 2)}. Contact is at ${contact.toFixed(2)} metres.`);
@@ -82,8 +84,7 @@ export function drawRequests(svg, flight) {
   add(svg, "path", {class: "area", d: `${steps}L${x(flight.steps)} ${y(0)}L${x(0)} ${y(0)}Z`});
   add(svg, "path", {class: "curve", d: steps});
   const share = `${grouped(total)} (${percent(total, flight.steps * nPairs)})`, right = x(flight.steps) > width - 110;
-  const low_ = y(total) > 40;
-  add(svg, "text", {class: "minimum-label", x: x(flight.steps) + (right ? -4 : 8), y: y(total) + (low_ ? -8 : 16), "text-anchor": right ? "end" : "start"}, share);
+  add(svg, "text", {class: "minimum-label", x: x(flight.steps) + (right ? -4 : 8), y: y(total) + (y(total) > 40 || !right ? -6 : 16), "text-anchor": right ? "end" : "start"}, share);
   timeAxis(svg, x, low, width);
   svg.setAttribute("aria-label", `Requests so far over time: ${total} at the end.`);
   return cursor(svg, low);

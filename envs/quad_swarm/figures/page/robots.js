@@ -14,7 +14,7 @@ export const ALARM = "#e00000", WARNING = "#ffa000";
 const TRAIL = 2.5, TRAIL_POINTS = 32; // s behind a robot
 const SPIN = 41; // rad/s of a propeller as it is drawn: real ones would only flicker
 
-const arm = 0.62 * data.radius, rotor = 0.4 * data.radius, thick = 0.075 * data.radius;
+const arm = 0.66 * data.radius, rotor = 0.4 * data.radius, thick = 0.085 * data.radius;
 const tips = [[1, 1], [1, -1], [-1, -1], [-1, 1]].map(([x, y]) => [x * arm * Math.SQRT1_2, y * arm * Math.SQRT1_2]);
 
 // White parts take the robot's colour, dark ones stay dark.
@@ -26,20 +26,20 @@ function painted(geometry, shade) {
 
 function airframe() {
   const parts = [
-    painted(new SphereGeometry(0.24 * data.radius, 20, 12).scale(1.25, 1, 0.55), 1),
-    painted(new SphereGeometry(0.09 * data.radius, 10, 8).translate(0.26 * data.radius, 0, 0), 0.05), // the camera in front
+    painted(new SphereGeometry(0.27 * data.radius, 20, 12).scale(1.3, 0.9, 0.6), 1),
+    painted(new SphereGeometry(0.09 * data.radius, 10, 8).translate(0.31 * data.radius, 0, 0), 0.03), // the camera in front
   ];
   for (const [x, y] of tips) {
     parts.push(painted(new BoxGeometry(arm, 1.3 * thick, thick).rotateZ(Math.atan2(y, x)).translate(x / 2, y / 2, 0), 0.22));
     parts.push(painted(new CylinderGeometry(1.1 * thick, 1.3 * thick, 2.4 * thick, 10).rotateX(Math.PI / 2).translate(x, y, thick), 0.22));
     // Guards around the rotors; the front ones are brighter, so that the heading shows
-    parts.push(painted(new TorusGeometry(rotor, 0.55 * thick, 6, 28).translate(x, y, 1.6 * thick), x > 0 ? 1 : 0.55));
+    parts.push(painted(new TorusGeometry(rotor, 0.55 * thick, 6, 28).translate(x, y, 1.6 * thick), x > 0 ? 1 : 0.6));
   }
   return mergeGeometries(parts);
 }
 
 function propeller() {
-  const blade = new BoxGeometry(1.85 * rotor, 0.9 * thick, 0.2 * thick);
+  const blade = new BoxGeometry(1.85 * rotor, 0.6 * thick, 0.2 * thick);
   return mergeGeometries([blade, blade.clone().rotateZ(Math.PI / 2)]);
 }
 
@@ -99,8 +99,8 @@ class Robot {
     const frame = new Mesh(shared.airframe, tinted);
     frame.castShadow = true;
     this.body.add(frame);
-    this.blur = new MeshBasicMaterial({color: 0x888888, transparent: true, opacity: 0.22, side: DoubleSide, depthWrite: false});
-    const blades = new MeshStandardMaterial({color: 0x33373d, roughness: 0.6});
+    this.blur = new MeshBasicMaterial({color: this.colour, transparent: true, opacity: 0.45, side: DoubleSide, depthWrite: false});
+    const blades = new MeshStandardMaterial({color: this.colour.clone().multiplyScalar(0.35), roughness: 0.6});
     this.propellers = tips.map(([x, y]) => {
       const mesh = new Mesh(shared.propeller, blades), disc = new Mesh(shared.disc, this.blur);
       mesh.position.set(x, y, 2.6 * thick);
@@ -138,7 +138,6 @@ class Robot {
     this.group.position.set(...p);
     this.body.setRotationFromEuler(new Euler(roll, pitch, yaw, "ZYX"));
     this.propellers.forEach((mesh, k) => { mesh.rotation.z = (k % 2 ? -1 : 1) * SPIN * time + k; });
-    this.blur.color.set(dark ? 0xaab4c0 : 0x777f88);
     const {tint, core, rim} = this.bubble.material.uniforms;
     tint.value.set(state === "collision" ? ALARM : state === "close" ? WARNING : this.colour);
     core.value = state === "collision" ? 0.4 : state === "close" ? 0.2 : 0.05;

@@ -3,20 +3,23 @@
 import {
   AmbientLight, Color, DirectionalLight, HemisphereLight, PCFShadowMap, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
 } from "three";
-import {data, flights, position} from "./data.js";
+import {data, flights, nRobots, position} from "./data.js";
 import {Ground} from "./ground.js";
 import {Swarm} from "./robots.js";
 import {isDark} from "./theme.js";
 
 const FOV = 32;
-const LABEL = 21; // pixels
+const LABEL = nRobots > 8 ? 14 : 17; // pixels
 const PALETTES = {
   light: {background: "#e9edf2", floor: "#f8fafc", lines: "#b9c2cc", ink: "#5a6673", shadow: 0.3},
   dark: {background: "#0d1117", floor: "#171d26", lines: "#3a4654", ink: "#93a1b0", shadow: 0.55},
 };
 
-// Everything that must be in the picture: paths and goals, with the spheres around them
-const visited = flights.flatMap(flight => flight.positions.filter((_, k) => k % 3 === 0).flat().concat(flight.goals));
+// What must be in the picture: starts, goals and paths. A robot that strays far after a collision may leave it.
+const ends = flights[0].positions[0].concat(flights[0].goals);
+const near = [0, 1, 2].map(k => [Math.min(...ends.map(p => p[k])) - 2 * data.radius, Math.max(...ends.map(p => p[k])) + 2 * data.radius]);
+const visited = flights.flatMap(flight => flight.positions.filter((_, k) => k % 3 === 0).flat().concat(flight.goals))
+  .map(p => p.map((x, k) => k < 2 ? Math.min(Math.max(x, near[k][0]), near[k][1]) : x));
 const bounds = {
   low: [0, 1, 2].map(k => Math.min(...visited.map(p => p[k])) - data.radius),
   high: [0, 1, 2].map(k => Math.max(...visited.map(p => p[k])) + data.radius),
@@ -25,17 +28,20 @@ const middle = new Vector3(...bounds.low.map((low, k) => (low + bounds.high[k]) 
 
 // Azimuth and elevation of the presets (rad). From the right above the figures on the floor can be read.
 export const PRESETS = {
-  perspective: {azimuth: -1.05, elevation: 0.52},
+  perspective: {azimuth: -1.05, elevation: 0.5, tall: 0.85},
   top: {azimuth: -Math.PI / 2, elevation: Math.PI / 2 - 0.001},
   side: {azimuth: -Math.PI / 2, elevation: 0.06},
 };
 
-const direction = ({azimuth, elevation}) =>
-  new Vector3(Math.cos(azimuth) * Math.cos(elevation), Math.sin(azimuth) * Math.cos(elevation), Math.sin(elevation));
+// Tall pictures are filled by looking from higher up.
+const direction = ({azimuth, elevation: low, tall = low}, aspect) => {
+  const elevation = tall + (low - tall) * Math.min(1, Math.max(0, (aspect - 0.8) / 0.9));
+  return new Vector3(Math.cos(azimuth) * Math.cos(elevation), Math.sin(azimuth) * Math.cos(elevation), Math.sin(elevation));
+};
 
 // A camera from a direction that has the whole flight in the picture, below a head of the given share of its height.
 export function framed(preset, aspect, head) {
-  const away = direction(PRESETS[preset]), up = new Vector3(0, 0, 1);
+  const away = direction(PRESETS[preset], aspect), up = new Vector3(0, 0, 1);
   const right = new Vector3().crossVectors(up, away).normalize(), above = new Vector3().crossVectors(away, right);
   const tall = Math.tan(FOV * Math.PI / 360), wide = tall * aspect;
   const points = visited.map(p => new Vector3(...p).sub(middle));

@@ -24,7 +24,7 @@ export function drawTimeline(svg, flight) {
     const group = add(svg, "g", {role: "listitem"}), middle = laneTop(i, 0) + GROUP / 2, r = Math.min(9, GROUP / 2 + 1);
     add(group, "rect", {class: "track", x: x(0), y: laneTop(i, 0), width: x(flight.steps) - x(0), height: GROUP});
     add(group, "circle", {cx: 16, cy: middle, r, fill: colour(i)});
-    add(group, "text", {class: "number", x: 16, y: middle + 3.6, "text-anchor": "middle", fill: inkOn(colour(i)), "font-size": Math.min(11, 2 * r - 2)}, i);
+    add(group, "text", {class: "number", x: 16, y: middle + 3.6, "text-anchor": "middle", style: `fill: ${inkOn(colour(i))}; font-size: ${Math.min(11, 2 * r - 2)}px`}, i);
     let asked = 0, rank = 0;
     for (let j = 0; j < nRobots; j++) {
       if (j === i) continue;
@@ -37,6 +37,7 @@ export function drawTimeline(svg, flight) {
     }
     group.setAttribute("aria-label", `robot ${i} asks ${asked} times, ${percent(asked, flight.steps * (nRobots - 1))} of what it could`);
   }
+  if (steps.size === 0) add(svg, "text", {class: "nobody", x: x(flight.steps / 2), y: height / 2, "text-anchor": "middle"}, "nobody asks anybody");
   return cursor(svg, height);
 }
 
