@@ -52,19 +52,23 @@ def opened(page: str) -> Iterator[Any]:
         browser.close()
 
 
-def frames(tab: Any, size: tuple[int, int], theme: str, fps: int, until: float | None) -> Iterator[Image.Image]:
+def frames(
+    tab: Any, size: tuple[int, int], theme: str, fps: int, speed: float, until: float | None
+) -> Iterator[Image.Image]:
     """The frames of an animation.
 
     :param tab: see `opened`
     :param size: width and height (pixels)
     :param theme: light or dark
     :param fps: frames in a second
-    :param until: length (s); None: shortly after the last arrival
+    :param speed: seconds of the flight in a second
+    :param until: which part of the flight (s); None: until shortly after the last arrival
     """
     # Drawn twice as large and scaled down: thin lines stay smooth
     duration = tab.evaluate("prepare", {"width": size[0], "height": size[1], "ratio": 2, "theme": theme})
-    for k in tqdm(range(round((duration if until is None else until) * fps) + 1), desc=theme, leave=False):
-        data = tab.evaluate("renderFrame", k / fps)
+    count = round((duration if until is None else until) / speed * fps) + 1
+    for k in tqdm(range(count), desc=theme, leave=False):
+        data = tab.evaluate("renderFrame", k / fps * speed)
         with Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2]))) as picture:
             yield picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
 
@@ -91,7 +95,8 @@ def main() -> None:
     parser.add_argument("--format", nargs="+", choices=("webp", "gif"), default=["webp"])
     parser.add_argument("--size", type=int, nargs=2, default=(1080, 460), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--fps", type=int, default=20)
-    parser.add_argument("--seconds", type=float, help="length of the flight that is shown (default: until all arrived)")
+    parser.add_argument("--speed", type=float, default=0.5, help="of the flight (default 0.5: half as fast as real)")
+    parser.add_argument("--seconds", type=float, help="of the flight that are shown (default: until all arrived)")
     parser.add_argument("--quality", type=int, default=70, help="of the WebP (default 70)")
     args = parser.parse_args()
     conditions = make_conditions(args, [args.scenario])
@@ -100,7 +105,7 @@ def main() -> None:
     page = replay_page(conditions, args.seed, args.episode, args.preset)
     with opened(page) as tab:
         for theme in THEMES:
-            pictures = list(frames(tab, tuple(args.size), theme, args.fps, args.seconds))
+            pictures = list(frames(tab, tuple(args.size), theme, args.fps, args.speed, args.seconds))
             for suffix in args.format:
                 path = args.out / f"{args.name}-{theme}.{suffix}"
                 save(path, pictures, args.fps, args.quality)

@@ -110,6 +110,7 @@ function remember() {
 function seek(step) {
   state.now = Math.min(last, Math.max(0, step));
   state.held = 0;
+  element("time").value = Math.floor(state.now + 1e-6);
   if (!state.playing) remember();
   redraw();
 }
@@ -159,6 +160,8 @@ function fill(select, options) {
 function begin3D() {
   const canvas = element("canvas");
   try {
+    // Asked first on a canvas of its own, because three.js would fill the console
+    if (!document.createElement("canvas").getContext("webgl2")) throw new Error("no WebGL");
     views = new Views(canvas);
   } catch {
     element("stage").classList.add("flat");
@@ -268,8 +271,8 @@ function beginHero() {
     picture = new Picture(views, width, height, ratio);
     still = framed("perspective", picture.layout.aspect, picture.layout.head);
     element("stage").replaceChildren(picture.canvas);
-    // Until shortly after the last arrival, or to the end where nobody arrives
-    const arrivals = flights.filter(flight => flight.arrival !== null).map(flight => flight.arrival);
+    // Until shortly after the last arrival without a collision, or to the end where there is none
+    const arrivals = flights.filter(flight => flight.arrival !== null && flight.collision === null).map(flight => flight.arrival);
     return Math.min(last, (arrivals.length ? Math.max(...arrivals) : last) + 0.5 / data.dt) * data.dt;
   };
   window.renderFrame = time => {

@@ -1,7 +1,7 @@
 // The views with their titles and counters as one picture: for export, and for animations made by a script.
 
 import {
-  askedUntil, flights, grouped, hasArrived, hasCollided, percent, possibleUntil, seconds, separationAt, title,
+  askedUntil, flights, grouped, hasArrived, hasCollided, nRobots, percent, possibleUntil, seconds, separationAt, title,
 } from "./data.js";
 import {css, isDark} from "./theme.js";
 
@@ -19,7 +19,7 @@ export class Picture {
     const rows = Math.ceil(flights.length / columns), gap = 6, head = this.head = 34;
     const w = (width - gap * (columns - 1)) / columns, h = (height - head - gap * (rows - 1)) / rows;
     this.rects = flights.map((_, k) => ({
-      x: (k % columns) * (w + gap), y: head + Math.floor(k / columns) * (h + gap), width: w, height: h, label: 19,
+      x: (k % columns) * (w + gap), y: head + Math.floor(k / columns) * (h + gap), width: w, height: h, label: nRobots > 8 ? 13 : 16,
     }));
     this.banner = Math.min(104, 0.3 * h);
   }

@@ -10,6 +10,7 @@ import {attitude, colour, contact, data, nRobots, plan, position, touchingAt} fr
 import {Requests} from "./requests.js";
 import {Tubes} from "./tubes.js";
 
+export const LABEL_HEIGHT = data.radius + 0.12; // m above its robot
 export const ALARM = "#e00000", WARNING = "#ffa000";
 const TRAIL = 2.5, TRAIL_POINTS = 32; // s behind a robot
 const SPIN = 41; // rad/s of a propeller as it is drawn: real ones would only flicker
@@ -142,7 +143,7 @@ class Robot {
     tint.value.set(state === "collision" ? ALARM : state === "close" ? WARNING : this.colour);
     core.value = state === "collision" ? 0.4 : state === "close" ? 0.2 : 0.05;
     rim.value = state === "collision" ? 0.95 : state === "close" ? 0.9 : dark ? 0.5 : 0.45;
-    this.label.position.z = data.radius + 0.12;
+    this.label.position.z = LABEL_HEIGHT;
     this.label.scale.set(labelSize, labelSize, 1);
   }
 }

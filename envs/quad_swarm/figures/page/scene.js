@@ -5,7 +5,7 @@ import {
 } from "three";
 import {data, flights, nRobots, position} from "./data.js";
 import {Ground} from "./ground.js";
-import {Swarm} from "./robots.js";
+import {LABEL_HEIGHT, Swarm} from "./robots.js";
 import {isDark} from "./theme.js";
 
 const FOV = 32;
@@ -144,9 +144,12 @@ export class Views {
     camera.updateMatrixWorld();
     let best = null, nearest = 28;
     this.scenes[view].swarm.positions.forEach((p, i) => {
-      const at = new Vector3(...p).project(camera);
-      const away = Math.hypot((at.x + 1) / 2 * rect.width - x, (1 - at.y) / 2 * rect.height - y);
-      if (at.z < 1 && away < nearest) [best, nearest] = [i, away];
+      // Its body, or its number
+      for (const above of [0, LABEL_HEIGHT]) {
+        const at = new Vector3(p[0], p[1], p[2] + above).project(camera);
+        const away = Math.hypot((at.x + 1) / 2 * rect.width - x, (1 - at.y) / 2 * rect.height - y);
+        if (at.z < 1 && away < nearest) [best, nearest] = [i, away];
+      }
     });
     return best;
   }
