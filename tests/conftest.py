@@ -17,7 +17,7 @@ def browser():
         if path is None and not os.path.exists(driver.chromium.executable_path):
             pytest.skip("no Chromium: install one, or `playwright install chromium`")
         # WebGL without a graphics card
-        software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+        software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         arguments = ["--no-sandbox", "--disable-background-networking", "--no-first-run", *software]
         chromium = driver.chromium.launch(executable_path=path, args=arguments)
         yield chromium

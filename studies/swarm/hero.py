@@ -1,8 +1,8 @@
 """The animation that the README opens with: ``python -m studies.swarm.hero --policy none full MODEL.zip [--out DIR]``.
 
 All policies fly the same held-out episode; the page of `sb3-maddpg replay` draws every frame in a headless Chromium, by
-its function ``renderFrame(seconds)``, so that frames do not depend on how fast the machine is. Writes ``hero-light.webp``
-and ``hero-dark.webp``. Needs Playwright and a Chromium (extra `dev`); software rendering will do.
+its function ``renderFrame(seconds)``, so that frames do not depend on how fast the machine is. Writes
+``hero-light.webp`` and ``hero-dark.webp``. Needs Playwright (extra `dev`) and a Chromium; software rendering will do.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ THEMES = ("light", "dark")
 # s that the last frame stays
 HOLD = 2.5
 # WebGL without a graphics card
-SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import itertools
 import json
 import re
 from pathlib import Path
@@ -130,6 +131,10 @@ def drawn(page, step: int) -> None:
     page.wait_for_function(f"Number(document.body.dataset.drawn) === {step}")
 
 
+def painted(page) -> None:
+    page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
 def pixels(page, selector: str = "#canvas") -> np.ndarray:
     """What is drawn, as RGB."""
     box = page.locator(selector).bounding_box()
@@ -155,7 +160,8 @@ def test_counters_are_the_sums_of_what_was_asked(view, pages):
             until = flight["requests"][: step + 1]
             asked = sum(map(len, until))
             assert number(cell.locator(".asked").inner_text()) == asked
-            assert float(cell.locator(".share").inner_text()[:-1]) == pytest.approx(100 * asked / len(until) / 12, abs=0.05)
+            share = float(cell.locator(".share").inner_text()[:-1])
+            assert share == pytest.approx(100 * asked / len(until) / 12, abs=0.05)
     for article, flight in zip(page.locator("article").all(), data["flights"], strict=True):
         total = sum(map(len, flight["requests"]))
         summary = article.locator(".summary").inner_text()
@@ -175,7 +181,7 @@ def test_every_pair_of_eight_has_a_lane_that_can_be_seen(view):
     assert {(int(i), int(j)) for i, j, _, _ in lanes} == {(i, j) for i in range(8) for j in range(8) if i != j}
     ordered = sorted((y, y + height) for _, _, y, height in lanes)
     assert all(bottom - top_ >= 2 for top_, bottom in ordered)
-    assert all(here[1] <= after[0] for here, after in zip(ordered, ordered[1:], strict=False)), "none hides another"
+    assert all(here[1] <= after[0] for here, after in itertools.pairwise(ordered)), "none hides another"
     assert ordered[-1][1] <= full.bounding_box()["height"]
     assert [int(i) for i, _, _, _ in sorted(lanes, key=lambda lane: lane[2])] == sorted(list(range(8)) * 7), "grouped"
 
@@ -219,7 +225,9 @@ def reddish(picture: np.ndarray) -> int:
     return int(((red > 150) & (green < 90) & (blue < 90)).sum())
 
 
-@pytest.mark.parametrize(("size", "scheme"), [("phone", "dark"), ("tablet", "light"), ("desktop", "dark"), ("wide", "light")])
+@pytest.mark.parametrize(
+    ("size", "scheme"), [("phone", "dark"), ("tablet", "light"), ("desktop", "dark"), ("wide", "light")]
+)
 def test_page_fits_and_is_not_blank(view, size, scheme):
     page = view("four", "step=20", size, scheme)
     drawn(page, 20)
@@ -234,8 +242,30 @@ def test_page_fits_and_is_not_blank(view, size, scheme):
         assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200, "the picture is blank"
         assert (picture.mean() > 128) == (scheme == "light")
     page.click("#theme")
-    page.wait_for_function("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+    painted(page)
     assert (pixels(page).mean() > 128) == (scheme == "dark")
+
+
+def test_text_can_be_read_on_its_ground():
+    """WCAG 2's contrast, in both themes."""
+    style = (FIGURES / "page" / "page.css").read_text()
+    light, dark = (
+        dict(re.findall(r"--([\w-]+): (#\w{6});", block))
+        for block in re.findall(r":root.*?\{(.*?)\}", style, re.DOTALL)
+    )
+
+    def luminance(colour: str) -> float:
+        parts = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
+        linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+        return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
+
+    for theme in (light, dark):
+        pairs = itertools.product(("ink", "faint", "alarm"), ("ground", "panel", "view", "track"))
+        for ink, ground in (*pairs, ("ground", "accent")):
+            one, other = sorted((luminance(theme[ink]), luminance(theme[ground])))
+            assert (other + 0.05) / (one + 0.05) >= 4.5, (ink, ground)
+        for fill in ("alarm-fill", "good-fill"):
+            assert 1.05 / (luminance(theme[fill]) + 0.05) >= 4.5, fill
 
 
 def test_step_in_the_address(view):
@@ -283,11 +313,11 @@ def test_plays_by_itself_once_and_loops_on_request(view):
 
 
 def test_camera_turns_follows_and_has_presets(view):
-    page = view("four", "step=0")
+    page = view("four", "step=0", reduced_motion="reduce")
     seen = [pixels(page)]
 
     def changed(why: str) -> None:
-        page.wait_for_function("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+        painted(page)
         picture = pixels(page)
         assert all((picture != other).any() for other in seen), why
         seen.append(picture)
@@ -315,7 +345,7 @@ def test_camera_turns_follows_and_has_presets(view):
     assert "follow" not in page.url
 
     page.select_option("#view", "top")
-    page.wait_for_function("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+    painted(page)
     picture = pixels(page, "section.cell >> nth=0")
     rows, columns = np.nonzero(np.abs(picture - (0xCC, 0x79, 0xA7)).max(axis=-1) <= 2)  # the number of robot 3
     page.mouse.click(box["x"] + np.median(columns), box["y"] + np.median(rows))

@@ -6,6 +6,8 @@ import {flights, position} from "./data.js";
 import {chasing, framed} from "./scene.js";
 
 const TURN = 0.12, ZOOM = 1.12; // rad and ratio of a key
+const GLIDE = 450; // ms from one preset to another
+const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 export class Camera {
   // :param layout: () -> {aspect, head} of a view :param changed: called whenever another picture is due
@@ -41,6 +43,7 @@ export class Camera {
   }
 
   show(preset) {
+    this.glide();
     this.preset = preset;
     if (preset === "chase" && this.robot === null) this.robot = 0;
     this.frame();
@@ -48,6 +51,7 @@ export class Camera {
   }
 
   follow(robot) {
+    this.glide();
     this.robot = robot;
     if (robot === null && this.preset === "chase") this.preset = "perspective";
     this.preset ??= "perspective";
@@ -55,8 +59,19 @@ export class Camera {
     this.changed();
   }
 
+  // Moves to where it looks next instead of jumping there.
+  glide() {
+    if (calm || this.time === undefined) return;
+    const from = flights.map((_, view) => {
+      const {position: at, target} = this.eye(view, this.time);
+      return {position: at.clone(), target: target.clone()};
+    });
+    this.gliding = {from, begin: performance.now()};
+  }
+
   // From now on the camera stays where it is but for what hands do.
   release() {
+    this.gliding = null;
     if (this.preset === "chase") {
       const {position: from, target} = chasing(0, this.robot, this.time);
       const at = this.place(0);
@@ -73,6 +88,19 @@ export class Camera {
   // Where the camera of a view is at a time: around its own flight's robot, where one is followed.
   eye(view, t) {
     this.time = t;
+    const there = this.aim(view, t), {from, begin} = this.gliding ?? {};
+    if (!from) return there;
+    const share = (performance.now() - begin) / GLIDE, eased = share * share * (3 - 2 * share);
+    if (share >= 1) {
+      this.gliding = null;
+      return there;
+    }
+    this.changed();
+    const between = name => from[view][name].clone().lerp(there[name], eased);
+    return {position: between("position"), target: between("target")};
+  }
+
+  aim(view, t) {
     if (this.preset === "chase") return chasing(view, this.robot, t);
     if (this.robot === null) return {position: this.free.position, target: this.orbit.target};
     const target = this.place(view);

@@ -38,7 +38,8 @@ function rects() {
   const stage = element("stage").getBoundingClientRect();
   return panels.map(({cell}) => {
     const box = cell.getBoundingClientRect();
-    return {x: box.left - stage.left, y: box.top - stage.top, width: box.width, height: box.height};
+    const label = Math.min(1, box.width / 420) * (nRobots > 8 ? 14 : 17);
+    return {x: box.left - stage.left, y: box.top - stage.top, width: box.width, height: box.height, label};
   });
 }
 
@@ -228,6 +229,7 @@ async function savePicture() {
 
 async function saveVideo() {
   pause();
+  element("webm").disabled = true;
   const rate = Number(element("speed").value) / data.dt;
   try {
     await withPicture(...pictureSize(), 1, async picture => {
@@ -250,6 +252,8 @@ async function saveVideo() {
     say("");
   } catch (error) {
     say(`${error.message} “Picture” saves a still image.`);
+  } finally {
+    element("webm").disabled = false;
   }
 }
 

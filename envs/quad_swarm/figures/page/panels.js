@@ -8,7 +8,7 @@ import {drawTimeline, wordsAt} from "./timeline.js";
 
 const cell = `<div class="head"><div><h2></h2><p class="detail"></p></div>
 <p class="count"><b class="asked"></b> <span>requests<br><span class="share"></span> of all<span class="long"> possible</span></span></p>
-<p class="apart"></p></div><p class="badge" hidden></p>`;
+<p class="apart"></p></div><p class="badge" role="status" hidden></p>`;
 
 const details = `<h2></h2><p class="summary"></p>
 <figure><figcaption></figcaption><svg class="asks" role="list"></svg></figure>

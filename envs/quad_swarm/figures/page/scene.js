@@ -3,13 +3,12 @@
 import {
   AmbientLight, Color, DirectionalLight, HemisphereLight, PCFShadowMap, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
 } from "three";
-import {data, flights, nRobots, position} from "./data.js";
+import {data, flights, position} from "./data.js";
 import {Ground} from "./ground.js";
 import {LABEL_HEIGHT, Swarm} from "./robots.js";
 import {isDark} from "./theme.js";
 
 const FOV = 32;
-const LABEL = nRobots > 8 ? 14 : 17; // pixels
 const PALETTES = {
   light: {background: "#e9edf2", floor: "#f8fafc", lines: "#b9c2cc", ink: "#5a6673", shadow: 0.3},
   dark: {background: "#0d1117", floor: "#171d26", lines: "#3a4654", ink: "#93a1b0", shadow: 0.55},
@@ -110,7 +109,7 @@ export class Views {
     this.renderer.setSize(width, height, false);
   }
 
-  // :param rects: where each view is, {x, y, width, height}, CSS pixels from the upper left corner
+  // :param rects: where each view is, {x, y, width, height}, CSS pixels from the upper left corner, and the size of labels
   // :param eye: (view, positions) -> {position, target}, where the camera of a view is
   draw(t, rects, eye, {fades = false, border} = {}) {
     const {renderer, camera} = this, height = this.size[1];
@@ -121,7 +120,7 @@ export class Views {
     this.scenes.forEach(({scene, swarm}, view) => {
       const rect = rects[view], box = [rect.x, height - rect.y - rect.height, rect.width, rect.height];
       if (rect.width < 1 || rect.height < 1) return;
-      const labelSize = (rect.label ?? LABEL) / rect.height * 2 * Math.tan(FOV * Math.PI / 360);
+      const labelSize = rect.label / rect.height * 2 * Math.tan(FOV * Math.PI / 360);
       swarm.update(t, {fades, dark: this.dark, labelSize, size: [rect.width, rect.height]});
       const {position: from, target} = eye(view, swarm.positions);
       camera.position.copy(from);
