@@ -341,6 +341,7 @@ def test_camera_turns_follows_and_has_presets(view):
     page.select_option("#follow", "2")
     changed("following")
     assert "follow=2" in page.url
+    page.focus("#follow")
     page.keyboard.press("Escape")
     assert "follow" not in page.url
 

@@ -28,18 +28,18 @@ export const subtitle = `held-out episode ${data.episode} (set ${data.seed})`;
 export const fileName = `${data.scenario}_${nRobots}_robots`;
 export const fullName = flight => `${flight.name} (${flight.detail})`;
 
-export const seconds = (step, digits = 1) => `${(step * data.dt).toFixed(digits)} s`;
+export const seconds = (step, digits = 1) => `${(step * data.dt).toFixed(digits)}\u00a0s`;
 export const grouped = number => String(number).replace(/\B(?=(\d{3})+$)/g, "\u202f");
 export function percent(part, whole) {
   const share = 100 * part / whole;
-  return `${share === 0 || share >= 99.95 ? share.toFixed(0) : share.toFixed(1)} %`;
+  return `${share === 0 || share >= 99.95 ? share.toFixed(0) : share.toFixed(1)}\u00a0%`;
 }
 
 // Okabe and Ito's colours; after eight they come again, darker and then lighter.
 export function colour(i) {
   const base = data.colours[i % data.colours.length], round = Math.floor(i / data.colours.length) % 3;
   if (round === 0) return base;
-  const mixed = [1, 3, 5].map(k => parseInt(base.slice(k, k + 2), 16)).map(v => round === 1 ? 0.55 * v : 0.45 * v + 140);
+  const mixed = [1, 3, 5].map(k => parseInt(base.slice(k, k + 2), 16)).map(v => round === 1 ? 0.68 * v : 0.45 * v + 140);
   return `#${mixed.map(v => Math.round(v).toString(16).padStart(2, "0")).join("")}`;
 }
 

@@ -334,13 +334,15 @@ function beginPage() {
 
 function onKey(event) {
   const {key, target} = event, kind = target.tagName;
-  if (element("about").open || kind === "SELECT" || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (element("about").open || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (key === "Escape") choose(undefined, null);
+  if (kind === "SELECT") return;
   if (kind === "BUTTON" && (key === " " || key === "Enter")) return;
   if (kind === "INPUT" && key !== " " && !/^[a-z0-9+=-]$/i.test(key)) return;
   if (camera?.key(event)) { mark(); event.preventDefault(); return; }
   const actions = {
     " ": () => state.playing ? pause() : play(), ArrowLeft: () => step(-1), ArrowRight: () => step(1),
-    Home: () => { pause(); seek(0); }, End: () => { pause(); seek(last); }, Escape: () => choose(undefined, null),
+    Home: () => { pause(); seek(0); }, End: () => { pause(); seek(last); },
     1: () => choose(presets[0]), 2: () => choose(presets[1]), 3: () => choose(presets[2]), 4: () => choose(presets[3]),
   };
   if (!actions[key]) return;

@@ -20,7 +20,7 @@ function summary(flight) {
   const parts = [
     `${flight.steps} steps (${seconds(flight.steps)})`,
     `${grouped(asked)} of ${grouped(possible)} requests (${percent(asked, possible)})`,
-    `closest ${flight.closest.toFixed(2)} m`,
+    `closest ${flight.closest.toFixed(2)}\u00a0m`,
     flight.collision === null ? "no collision" : `collision at step ${flight.collision}`,
     flight.arrival === null ? "not all arrived" : `all arrived after ${seconds(flight.arrival)}`,
   ];
@@ -105,5 +105,5 @@ export const legend = [
 ];
 
 export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
-  `${seconds(1, 2)} and may ask others for their plans; those it does not ask it takes to fly straight on. ` +
+  `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
   `${flights.length > 1 ? "All policies fly the same episode, in step. " : ""}A request is one robot asking another in one step.`;

@@ -41,6 +41,11 @@ export class Picture {
     this.text(seconds(t), width - 10, 23, `600 17px ${FONT}`, ink, "right");
     flights.forEach((flight, k) => {
       const {x, y, width: wide} = this.rects[k], left = x + 12, counted = askedUntil(flight, t);
+      const veil = pen.createLinearGradient(0, y, 0, y + this.banner + 20);
+      veil.addColorStop(0.3, css("--view"));
+      veil.addColorStop(1, `${css("--view")}00`);
+      pen.fillStyle = veil;
+      pen.fillRect(x, y, wide, this.banner + 20);
       this.text(flight.name, left, y + 25, `700 19px ${FONT}`, ink, "left", wide - 24);
       this.text(flight.detail, left, y + 43, `400 13px ${FONT}`, faint, "left", wide - 24);
       const number = grouped(counted), used = this.text(number, left, y + 79, `700 30px ${FONT}`, ink);

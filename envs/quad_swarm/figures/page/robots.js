@@ -141,7 +141,7 @@ class Robot {
     this.propellers.forEach((mesh, k) => { mesh.rotation.z = (k % 2 ? -1 : 1) * SPIN * time + k; });
     const {tint, core, rim} = this.bubble.material.uniforms;
     tint.value.set(state === "collision" ? ALARM : state === "close" ? WARNING : this.colour);
-    core.value = state === "collision" ? 0.4 : state === "close" ? 0.2 : 0.05;
+    core.value = state === "collision" ? 0.4 : state === "close" ? 0.1 : 0.05;
     rim.value = state === "collision" ? 0.95 : state === "close" ? 0.9 : dark ? 0.5 : 0.45;
     this.label.position.z = LABEL_HEIGHT;
     this.label.scale.set(labelSize, labelSize, 1);

@@ -3,6 +3,7 @@
 import {BufferAttribute, BufferGeometry, DynamicDrawUsage, Mesh, MeshLambertMaterial} from "three";
 
 const SIDES = 6;
+const ROUND = Array.from({length: SIDES}, (_, s) => [Math.cos(2 * Math.PI * s / SIDES), Math.sin(2 * Math.PI * s / SIDES)]);
 
 export class Tubes {
   // `points` is the most that a tube may have; unused ones fold into its last.
@@ -49,11 +50,11 @@ export class Tubes {
       const bx = ty * nz - tz * ny, by = tz * nx - tx * nz, bz = tx * ny - ty * nx;
       const place = final ? m / final : 0, r = p > final ? 0 : radius(place), a = alpha(place);
       for (let s = 0; s < SIDES; s++) {
-        const c = Math.cos(2 * Math.PI * s / SIDES), d = Math.sin(2 * Math.PI * s / SIDES), v = (tube * this.points + p) * SIDES + s;
-        const ox = c * nx + d * bx, oy = c * ny + d * by, oz = c * nz + d * bz;
-        position.set([here[0] + r * ox, here[1] + r * oy, here[2] + r * oz], 3 * v);
-        normal.set([ox, oy, oz], 3 * v);
-        color.set([colour.r, colour.g, colour.b, a], 4 * v);
+        const [c, d] = ROUND[s], v = 3 * ((tube * this.points + p) * SIDES + s), w = v / 3 * 4;
+        position[v] = here[0] + r * (normal[v] = c * nx + d * bx);
+        position[v + 1] = here[1] + r * (normal[v + 1] = c * ny + d * by);
+        position[v + 2] = here[2] + r * (normal[v + 2] = c * nz + d * bz);
+        color[w] = colour.r; color[w + 1] = colour.g; color[w + 2] = colour.b; color[w + 3] = a;
       }
     }
   }
