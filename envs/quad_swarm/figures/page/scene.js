@@ -80,8 +80,8 @@ export class Views {
       sun.position.set(middle.x - 2, middle.y - 2.5, 11);
       sun.target.position.set(middle.x, middle.y, 0);
       sun.castShadow = true;
-      sun.shadow.mapSize.set(2048, 2048);
-      sun.shadow.radius = 4;
+      sun.shadow.mapSize.set(1024, 1024);
+      sun.shadow.radius = 2.5;
       sun.shadow.bias = -0.0005;
       Object.assign(sun.shadow.camera, {left: -reach, right: reach, bottom: -reach, top: reach, near: 1, far: 25});
       scene.add(swarm.group, ground.group, sky, sun, sun.target, new AmbientLight("#ffffff", 0.35));
