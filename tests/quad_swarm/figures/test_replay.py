@@ -180,7 +180,7 @@ def test_every_pair_of_eight_has_a_lane_that_can_be_seen(view):
     )
     assert {(int(i), int(j)) for i, j, _, _ in lanes} == {(i, j) for i in range(8) for j in range(8) if i != j}
     ordered = sorted((y, y + height) for _, _, y, height in lanes)
-    assert all(bottom - top_ >= 2 for top_, bottom in ordered)
+    assert all(bottom - top_ >= 3 for top_, bottom in ordered)
     assert all(here[1] <= after[0] for here, after in itertools.pairwise(ordered)), "none hides another"
     assert ordered[-1][1] <= full.bounding_box()["height"]
     assert [int(i) for i, _, _, _ in sorted(lanes, key=lambda lane: lane[2])] == sorted(list(range(8)) * 7), "grouped"
