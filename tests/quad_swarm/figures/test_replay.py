@@ -198,8 +198,9 @@ def test_axis_tells_a_contact_from_a_near_miss(view, pages):
     contact = float(plot.locator("line.contact").get_attribute("y1"))
     floor = max(float(line.get_attribute("y1")) for line in plot.locator("line.grid").all())
     assert 0.02 * (floor - contact) / 0.6 >= 2, "2 cm are two pixels"
-    assert f"minimum {closest:.2f} m" in plot.text_content()
-    assert "contact 0.60 m" in plot.text_content()
+    told = plot.text_content().replace("\N{NO-BREAK SPACE}", " ")
+    assert f"minimum {closest:.2f} m" in told
+    assert "contact 0.60 m" in told
     dot = float(plot.locator("circle.minimum").get_attribute("cy"))
     assert dot == pytest.approx(floor - (floor - contact) * closest / 0.6, abs=0.1)
     assert plot.locator("path.clipped").count() == 1, "robots begin farther apart than the axis reaches"
@@ -353,6 +354,24 @@ def test_camera_turns_follows_and_has_presets(view):
     assert page.input_value("#follow") == "3"
 
 
+def test_fingers_zoom(view):
+    page = view("four", size="phone", has_touch=True, reduced_motion="reduce")
+    before = pixels(page)
+    session = page.context.new_cdp_session(page)
+
+    def touch(kind: str, *columns: int) -> None:
+        points = [{"x": x, "y": 300, "id": finger} for finger, x in enumerate(columns)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", 150, 240)
+    touch("touchMove", 120, 270)
+    touch("touchMove", 90, 300)
+    touch("touchEnd")
+    painted(page)
+    assert (pixels(page) != before).any()
+    assert page.evaluate("[visualViewport.scale, scrollY]") == [1, 0], "the page itself stays"
+
+
 def test_pictures_and_videos_can_be_saved(view):
     page = view("four", "step=20", "wide")
     page.add_style_tag(content="#stage { grid-auto-rows: 200px !important }")
@@ -368,7 +387,7 @@ def test_pictures_and_videos_can_be_saved(view):
     assert saved.value.suggested_filename == "symmetric_swap_4_robots.webm"
     video = Path(saved.value.path()).read_bytes()
     assert video[:4] == b"\x1aE\xdf\xa3", "EBML, as all WebM"
-    assert len(video) > 20_000
+    assert len(video) > 2_000, "more than a header"
     page.evaluate("window.MediaRecorder = undefined")
     page.click("#webm")
     page.wait_for_selector("#message:not([hidden]) >> text=cannot record")

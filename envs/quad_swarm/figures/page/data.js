@@ -29,6 +29,8 @@ export const fileName = `${data.scenario}_${nRobots}_robots`;
 export const fullName = flight => `${flight.name} (${flight.detail})`;
 
 export const seconds = (step, digits = 1) => `${(step * data.dt).toFixed(digits)}\u00a0s`;
+// Centimetres, and millimetres where they decide on a collision
+export const metres = distance => `${distance.toFixed(Math.abs(distance - contact) < 0.01 ? 3 : 2)}\u00a0m`;
 export const grouped = number => String(number).replace(/\B(?=(\d{3})+$)/g, "\u202f");
 export function percent(part, whole) {
   const share = 100 * part / whole;

@@ -246,7 +246,7 @@ async function saveVideo() {
           else resolve();
         };
         requestAnimationFrame(next);
-      }));
+      }), () => draw_(last));
       save(blob, `${fileName}.${extension}`);
     });
     say("");
@@ -297,8 +297,10 @@ function beginPage() {
     item.append(Object.assign(document.createElement("i"), {className: kind}), text);
     element("legend").append(item);
   }
-  for (const id of ["stage", "details"]) element(id).style.setProperty("--columns", flights.length === 4 ? 2 : Math.min(flights.length, 3));
-  document.documentElement.style.setProperty("--flights", flights.length);
+  const columns = flights.length === 4 ? 2 : Math.min(flights.length, 3), style = document.documentElement.style;
+  style.setProperty("--columns", columns);
+  style.setProperty("--rows", Math.ceil(flights.length / columns));
+  style.setProperty("--flights", flights.length);
   element("time").max = last;
   begin3D();
 

@@ -1,7 +1,7 @@
 // What belongs to each flight on the page: its view with counters, and its timeline and plots.
 
 import {
-  askedUntil, contact, data, flights, fullName, grouped, hasArrived, hasCollided, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
+  askedUntil, contact, data, flights, fullName, grouped, hasArrived, hasCollided, metres, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
 } from "./data.js";
 import {drawRequests, drawSeparation, stepUnder, timeScale, top} from "./plots.js";
 import {drawTimeline, wordsAt} from "./timeline.js";
@@ -20,7 +20,7 @@ function summary(flight) {
   const parts = [
     `${flight.steps} steps (${seconds(flight.steps)})`,
     `${grouped(asked)} of ${grouped(possible)} requests (${percent(asked, possible)})`,
-    `closest ${flight.closest.toFixed(2)}\u00a0m`,
+    `closest ${metres(flight.closest)}`,
     flight.collision === null ? "no collision" : `collision at step ${flight.collision}`,
     flight.arrival === null ? "not all arrived" : `all arrived after ${seconds(flight.arrival)}`,
   ];
@@ -40,7 +40,7 @@ export class Panel {
     const find = name => this.cell.querySelector(name);
     find("h2").textContent = this.details.querySelector("h2").textContent = flight.name;
     find(".detail").textContent = flight.detail;
-    this.details.querySelector("h2").append(Object.assign(document.createElement("small"), {textContent: ` ${flight.detail}`}));
+    this.details.querySelector("h2").append(Object.assign(document.createElement("small"), {textContent: flight.detail}));
     this.details.querySelector(".summary").textContent = summary(flight);
     const captions = [
       "Who asks whom: a lane for each pair, one block for each robot that asks, in the colour of the robot that is asked",
@@ -62,7 +62,7 @@ export class Panel {
       if (event.buttons) seek(step(event));
       const box = svg.getBoundingClientRect(), k = Math.min(Math.max(step(event), 0), this.flight.steps);
       const words = svg.classList.contains("asks") ? wordsAt(svg, this.flight, event.clientX - box.left, event.clientY - box.top)?.text
-        : svg.classList.contains("separation") ? `step ${k}: ${this.flight.separation[k].toFixed(2)} m`
+        : svg.classList.contains("separation") ? `step ${k}: ${metres(this.flight.separation[k])}`
         : `step ${k}: ${grouped(this.flight.asked[k])} requests`;
       tooltip(words, event.clientX, event.clientY);
     });
@@ -79,7 +79,7 @@ export class Panel {
     const {flight} = this, counted = askedUntil(flight, t), collided = hasCollided(flight, t), arrived = hasArrived(flight, t);
     set(this.asked, grouped(counted));
     set(this.share, percent(counted, possibleUntil(flight, t)));
-    set(this.apart, `closest two ${separationAt(flight, t).toFixed(2)} m apart`);
+    set(this.apart, `closest two ${metres(separationAt(flight, t))} apart`);
     this.badge.hidden = !collided && !arrived;
     this.badge.classList.toggle("alarm", collided);
     set(this.badge, collided ? `collision at step ${flight.collision}` : arrived ? `all arrived after ${seconds(flight.arrival)}` : "");

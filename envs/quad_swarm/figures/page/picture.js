@@ -1,7 +1,7 @@
 // The views with their titles and counters as one picture: for export, and for animations made by a script.
 
 import {
-  askedUntil, flights, grouped, hasArrived, hasCollided, nRobots, percent, possibleUntil, seconds, separationAt, title,
+  askedUntil, flights, grouped, hasArrived, hasCollided, metres, nRobots, percent, possibleUntil, seconds, separationAt, title,
 } from "./data.js";
 import {css, isDark} from "./theme.js";
 
@@ -53,7 +53,7 @@ export class Picture {
       this.text(`${percent(counted, possibleUntil(flight, t))} of all possible`, left + used + 7, y + 82, `400 13px ${FONT}`, faint);
       if (hasCollided(flight, t)) this.badge(`Collision at ${seconds(flight.collision)}`, left, y + 92, css("--alarm-fill"), "#ffffff");
       else if (hasArrived(flight, t)) this.badge(`All arrived at ${seconds(flight.arrival)}`, left, y + 92, css("--good-fill"), "#ffffff");
-      else this.text(`closest two ${separationAt(flight, t).toFixed(2)} m apart`, left, y + 108, `400 13px ${FONT}`, faint);
+      else this.text(`closest two ${metres(separationAt(flight, t))} apart`, left, y + 108, `400 13px ${FONT}`, faint);
     });
     return this.canvas;
   }
@@ -84,8 +84,10 @@ export function download(url, name) {
   link.remove();
 }
 
-// Records a canvas while `play` draws on it. :raises Error: this browser cannot
-export async function record(canvas, play) {
+const MINIMUM = 2000, PATIENCE = 10; // bytes of a video that holds a picture; s that a slow encoder is given
+
+// Records a canvas while `play` draws on it. `draw` draws the end once more. :raises Error: this browser cannot
+export async function record(canvas, play, draw) {
   if (!canvas.captureStream || !window.MediaRecorder) throw new Error("This browser cannot record videos.");
   const type = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"].find(one => MediaRecorder.isTypeSupported(one));
   if (!type) throw new Error("This browser cannot write WebM videos.");
@@ -95,13 +97,19 @@ export async function record(canvas, play) {
     recorder.addEventListener("stop", resolve);
     recorder.addEventListener("error", event => reject(event.error));
   });
-  recorder.start();
+  const size = () => parts.reduce((sum, part) => sum + part.size, 0);
+  recorder.start(250);
   try {
     await play();
+    for (let waited = 0; size() < MINIMUM && waited < PATIENCE; waited += 0.1) {
+      draw();
+      await new Promise(done => setTimeout(done, 100));
+    }
   } finally {
     recorder.stop();
   }
   await stopped;
+  if (size() < MINIMUM) throw new Error("This browser recorded no picture.");
   return {blob: new Blob(parts, {type}), extension: type.startsWith("video/mp4") ? "mp4" : "webm"};
 }
 

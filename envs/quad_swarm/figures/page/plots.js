@@ -1,6 +1,6 @@
 // What is drawn below the views: closest two robots and requests so far, over time.
 
-import {contact, data, flights, grouped, last, nPairs, percent, seconds} from "./data.js";
+import {contact, data, flights, grouped, last, metres as inMetres, nPairs, percent, seconds} from "./data.js";
 
 const LEFT = 46, RIGHT = 10;
 export const top = 2 * contact; // m, where the axis of separation ends: 2 cm must be seen beside the contact distance
@@ -46,7 +46,6 @@ export function drawSeparation(svg, flight) {
     add(svg, "text", {x: LEFT - 6, y: y(metres) + 4, "text-anchor": "end"}, `${metres.toFixed(unit < 0.1 ? 2 : 1)}`);
   }
   add(svg, "line", {class: "contact", x1: LEFT, x2: width - RIGHT, y1: y(contact), y2: y(contact)});
-  add(svg, "text", {class: "contact-label", x: LEFT + 6, y: y(contact) + 15}, `contact ${contact.toFixed(2)} m`);
   const inside = [], clipped = [];
   flight.separation.forEach((metres, k) => {
     const before = flight.separation[k - 1];
@@ -62,11 +61,13 @@ export function drawSeparation(svg, flight) {
   if (clipped.length) add(svg, "path", {class: "clipped", d: clipped.join("")});
   const {closest, closestStep} = flight, at = x(closestStep), low_ = closest < 0.16 * top;
   add(svg, "circle", {class: flight.collision === null ? "minimum" : "minimum collided", cx: at, cy: y(closest), r: 4.5});
+  const [end, side] = at < width / 2 ? [width - RIGHT - 6, "end"] : [LEFT + 6, "start"];
+  add(svg, "text", {class: "contact-label", x: end, y: y(contact) + 15, "text-anchor": side}, `contact ${contact.toFixed(2)}\u00a0m`);
   // Below the dot, where the curve is not; beside it, where there is no room below
   const aside = at > width - 130 ? [at - 10, "end"] : [at + 10, "start"];
   const [left, anchor] = low_ ? aside : [Math.min(Math.max(at, LEFT + 60), width - RIGHT - 60), "middle"];
   add(svg, "text", {class: "minimum-label", x: left, y: y(closest) + (low_ ? -4 : 19), "text-anchor": anchor},
-    `minimum ${closest.toFixed(2)} m${closest > top ? ", above the axis" : ""}`);
+    `minimum ${inMetres(closest)}${closest > top ? ", above the axis" : ""}`);
   timeAxis(svg, x, low, width);
   svg.setAttribute("aria-label", `Distance of the closest two robots over time: at least ${closest.toFixed(2)} metres, ` +
     `at ${seconds(closestStep, 2)}. Contact is at ${contact.toFixed(2)} metres.`);
@@ -84,7 +85,7 @@ export function drawRequests(svg, flight) {
   add(svg, "path", {class: "area", d: `${steps}L${x(flight.steps)} ${y(0)}L${x(0)} ${y(0)}Z`});
   add(svg, "path", {class: "curve", d: steps});
   const share = `${grouped(total)} (${percent(total, flight.steps * nPairs)})`, right = x(flight.steps) > width - 110;
-  add(svg, "text", {class: "minimum-label", x: x(flight.steps) + (right ? -4 : 8), y: y(total) + (y(total) > 40 || !right ? -6 : 16), "text-anchor": right ? "end" : "start"}, share);
+  add(svg, "text", {class: "minimum-label", x: x(flight.steps) + (right ? -4 : 8), y: y(total) + (!right ? 4 : y(total) > 40 ? -6 : 16), "text-anchor": right ? "end" : "start"}, share);
   timeAxis(svg, x, low, width);
   svg.setAttribute("aria-label", `Requests so far over time: ${total} at the end.`);
   return cursor(svg, low);
