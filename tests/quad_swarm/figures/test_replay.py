@@ -313,7 +313,7 @@ def test_plays_by_itself_once_and_loops_on_request(view):
     assert still.locator("#play").get_attribute("aria-label") == "Play"
 
 
-def test_camera_turns_follows_and_has_presets(view):
+def test_camera_turns_follows_and_has_presets(view, pages):
     page = view("four", "step=0", reduced_motion="reduce")
     seen = [pixels(page)]
 
@@ -349,7 +349,9 @@ def test_camera_turns_follows_and_has_presets(view):
     page.select_option("#view", "top")
     painted(page)
     picture = pixels(page, "section.cell >> nth=0")
-    rows, columns = np.nonzero(np.abs(picture - (0xCC, 0x79, 0xA7)).max(axis=-1) <= 2)  # the number of robot 3
+    colour = data_of(pages["four"].read_text())["colours"][3]
+    rgb = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    rows, columns = np.nonzero(np.abs(picture - rgb).max(axis=-1) <= 2)  # behind the number of robot 3
     page.mouse.click(box["x"] + np.median(columns), box["y"] + np.median(rows))
     assert page.input_value("#follow") == "3"
 
