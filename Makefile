@@ -14,7 +14,7 @@ TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan 
 POLICIES ?= none full distance:4 cpa:0.65:1.5
 PEERS := agilerl benchmarl xuance
 
-.PHONY: help install train test lint docs bench bench-peers results results-quick clean
+.PHONY: help install train test lint docs page bench bench-peers results results-quick clean
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
@@ -43,6 +43,10 @@ lint: install  ## ruff and mypy
 
 docs: install  ## the documentation site, in docs/_build; a warning is an error
 	$(BIN)/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going --builder html docs docs/_build
+
+# Only after changes in envs/quad_swarm/figures/page; the built page is committed.
+page:  ## the page of `sb3-maddpg replay` (needs npm)
+	cd envs/quad_swarm/figures/page && npm ci --no-audit --no-fund && npm run build
 
 bench: install  ## speed of planner, environment and learner, and the estimators, as tables and as JSON
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done

@@ -16,7 +16,9 @@ def browser():
     with sync_api.sync_playwright() as driver:
         if path is None and not os.path.exists(driver.chromium.executable_path):
             pytest.skip("no Chromium: install one, or `playwright install chromium`")
-        arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+        # WebGL without a graphics card
+        software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        arguments = ["--no-sandbox", "--disable-background-networking", "--no-first-run", *software]
         chromium = driver.chromium.launch(executable_path=path, args=arguments)
         yield chromium
         chromium.close()

@@ -1,11 +1,15 @@
 """The scripts behind docs/results.md, with few episodes."""
 
+import itertools
 import json
+import shutil
+import subprocess
 import sys
 
 import gymnasium
 import numpy as np
 import pytest
+from PIL import Image
 
 from quad_swarm.evaluation.evaluation import fly_all
 from quad_swarm.evaluation.inference import Comparison
@@ -317,3 +321,21 @@ def test_the_papers_asymmetric_swap_has_a_robot_in_each_quadrant():
         starts, goals = SCENARIOS["asymmetric_swap"](4, job.config.space, np.random.default_rng(seed))
         assert [(x > 0, y > 0) for x, y, _ in starts] == [(True, True), (False, True), (False, False), (True, False)]
         assert (np.sign(goals[:, :2]) == -np.sign(starts[:, :2])).all()
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), reason="no Chromium")
+def test_hero_is_an_animation_in_two_themes(tmp_path):
+    # A process of its own: Playwright allows one driver in a process, and other tests have one
+    words = ["-m", "studies.swarm.hero", "--policy", "none", "full", "--n-robots", "2", "--size", "300", "200"]
+    words += ["--seconds", "0.4", "--speed", "0.5", "--fps", "5", "--format", "webp", "gif", "--out", str(tmp_path)]
+    subprocess.run([sys.executable, *words], check=True, cwd=protocol.ROOT, timeout=300)
+    first = {}
+    for theme, suffix in itertools.product(("light", "dark"), ("webp", "gif")):
+        with Image.open(tmp_path / f"hero-{theme}.{suffix}") as film:
+            assert (film.size, film.n_frames) == ((300, 200), 5)
+            first[theme, suffix] = np.asarray(film.convert("RGB")).astype(int)
+            film.seek(4)
+            assert np.abs(np.asarray(film.convert("RGB")) - first[theme, suffix]).max() > 50, "something moves"
+    assert first["light", "webp"].mean() > 160
+    assert first["dark", "webp"].mean() < 80
+    assert np.abs(first["dark", "webp"] - first["dark", "gif"]).mean() < 10

@@ -2,6 +2,8 @@
 
 One HTML file that needs no other: a view in three dimensions, a time slider, and for each policy who asked whom, how
 close the robots came and how often they asked. All policies fly the same held-out episode.
+
+The page is ``replay.html``, built from the sources in ``page/`` (``make page``); here it only gets its data.
 """
 
 from __future__ import annotations
@@ -18,17 +20,20 @@ import numpy as np
 
 from quad_swarm.evaluation.command import add_policy_arguments, make_conditions, run
 from quad_swarm.evaluation.flight import Condition, Flight, fly
-from quad_swarm.evaluation.policies import short_name
+from quad_swarm.evaluation.policies import is_model, short_name
 from quad_swarm.evaluation.rows import check_writable
 from quad_swarm.figures.colours import COLOURS
-from quad_swarm.quadrotor import POSITION
+from quad_swarm.geometry import length
+from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.scenarios import SCENARIOS
 
 # Steps shown after all robots have arrived
 _LINGER = 10
-# Digits behind the point of a metre: finer than a pixel
-_DIGITS = 3
+# Digits behind the point of a metre and a radian: finer than a pixel; plans are drawn less exactly
+_DIGITS, _PLAN_DIGITS = 3, 2
+# Every which stage of a plan is drawn
+_PLAN_STRIDE = 2
 
 # Shown by `sb3-maddpg --help`
 EXAMPLES = "  sb3-maddpg replay --policy full pretrained:quad-swarm-paper --scenario symmetric_swap --out replay.html"
@@ -50,10 +55,10 @@ def replay_page(conditions: Sequence[Condition], seed: int = 0, episode: int = 0
         "seed": seed,
         "episode": episode,
         "dt": config.planner.dt,
+        "plan_stride": _PLAN_STRIDE,
         "radius": config.radius,
         "goal_radius": config.goal_radius,
         "collision_distance": 2 * config.radius,
-        "room": [config.planner.workspace_low, config.planner.workspace_high],
         "colours": COLOURS,
         "flights": [_describe(one.policy, fly(one, seed, episode)) for one in conditions],
     }
@@ -63,18 +68,58 @@ def replay_page(conditions: Sequence[Condition], seed: int = 0, episode: int = 0
 
 
 def _describe(policy: str, flight: Flight) -> dict[str, Any]:
-    """What the page needs of a flight, until shortly after the arrival of all robots."""
-    end = len(flight.requests) if flight.arrival is None else flight.arrival + _LINGER
+    """What the page needs of a flight, until shortly after the arrival of all robots: T steps of n robots.
+
+    positions, attitudes (roll, pitch, yaw): (T + 1, n, 3) (m, rad); plans, those made in each step, which begin where
+    the robots were then: (T, n, K, 3) (m); goals: (n, 3) (m); requests: for each step the pairs (asker, asked);
+    separation, as the world counts it: (T + 1,) (m); arrival, collision: the first steps after which all had arrived,
+    and two collided, or None; colliding: (step, robot, robot) for every pair that collides in a step.
+    """
+    end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _LINGER, len(flight.requests))
     others = other_indices(flight.n_robots)
+    name, detail = _plain_name(policy)
     return {
         "policy": short_name(policy),
+        "name": name,
+        "detail": detail,
         "positions": flight.pos[: end + 1].round(_DIGITS).tolist(),
-        "plans": flight.plans[: end + 1, ..., POSITION].round(_DIGITS).tolist(),
+        "attitudes": flight.state[: end + 1, :, ATTITUDE].round(_DIGITS).tolist(),
+        "plans": flight.plans[1 : end + 1, :, ::_PLAN_STRIDE, POSITION].round(_PLAN_DIGITS).tolist(),
         "goals": flight.goal.round(_DIGITS).tolist(),
         "requests": [[[int(a), int(others[a, k])] for a, k in np.argwhere(step)] for step in flight.requests[:end]],
         "separation": flight.min_separation[: end + 1].round(_DIGITS).tolist(),
-        "collision": flight.collision is not None and flight.collision <= end,
+        "arrival": flight.arrival,
+        "collision": flight.collision if flight.collision is not None and flight.collision <= end else None,
+        "colliding": [pair for pair in _colliding(flight) if pair[0] <= end],
     }
+
+
+def _plain_name(policy: str) -> tuple[str, str]:
+    """What the page calls a policy, and what it adds in small letters."""
+    if policy == "none":
+        return "No communication", "nobody asks"
+    if policy == "full":
+        return "Full communication", "everybody asks everybody"
+    return ("Learned policy" if is_model(policy) else "Rule"), short_name(policy)
+
+
+def _colliding(flight: Flight) -> list[list[int]]:
+    """For every step, from 1, the pairs of robots that collide in it: (step, robot, robot).
+
+    What counts is `Flight.min_separation`. Where collisions are continuous it knows the sub-steps and a flight does
+    not, so distances on the straight line from step to step are shifted until the closest pair has it.
+    """
+    before, after = flight.relative_pos[:-1], flight.relative_pos[1:]
+    if flight.config.continuous_collisions:
+        move = after - before
+        share = -(before * move).sum(axis=-1) / np.maximum((move**2).sum(axis=-1), 1e-12)
+        after = before + np.clip(share, 0, 1)[..., None] * move
+    apart = length(after)
+    apart += (flight.min_separation[1:] - apart.min(axis=(1, 2)))[:, None, None]
+    limit = 2 * flight.config.radius - flight.config.collision_tolerance
+    others = other_indices(flight.n_robots)
+    pairs = ([int(step) + 1, int(a), int(others[a, k])] for step, a, k in np.argwhere(apart < limit))
+    return [pair for pair in pairs if pair[1] < pair[2]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,82 @@
+// The flights that the page shows, and what is read off them at a time. Times are in steps, fractional between steps.
+
+export const data = JSON.parse(document.getElementById("data").textContent);
+export const flights = data.flights;
+export const nRobots = flights[0].goals.length;
+export const nPairs = nRobots * (nRobots - 1);
+export const contact = data.collision_distance;
+export const last = Math.max(...flights.map(flight => flight.requests.length));
+
+for (const flight of flights) {
+  flight.steps = flight.requests.length;
+  // Requests made before each step
+  flight.asked = [0];
+  for (const step of flight.requests) flight.asked.push(flight.asked.at(-1) + step.length);
+  flight.closest = Math.min(...flight.separation);
+  flight.closestStep = flight.separation.indexOf(flight.closest);
+  flight.touching = new Map();
+  for (const [step, i, j] of flight.colliding) {
+    if (!flight.touching.has(step)) flight.touching.set(step, new Set());
+    flight.touching.get(step).add(i).add(j);
+  }
+}
+
+const capital = text => text[0].toUpperCase() + text.slice(1);
+export const scenario = capital(data.scenario.replaceAll("_", " "));
+export const title = `${scenario}, ${nRobots} robots`;
+export const subtitle = `held-out episode ${data.episode} (set ${data.seed})`;
+export const fileName = `${data.scenario}_${nRobots}_robots`;
+export const fullName = flight => `${flight.name} (${flight.detail})`;
+
+export const seconds = (step, digits = 1) => `${(step * data.dt).toFixed(digits)}\u00a0s`;
+// Centimetres, and millimetres where they decide on a collision
+export const metres = distance => `${distance.toFixed(Math.abs(distance - contact) < 0.01 ? 3 : 2)}\u00a0m`;
+export const grouped = number => String(number).replace(/\B(?=(\d{3})+$)/g, "\u202f");
+export function percent(part, whole) {
+  const share = 100 * part / whole;
+  return `${share === 0 || share >= 99.95 ? share.toFixed(0) : share.toFixed(1)}\u00a0%`;
+}
+
+// Okabe and Ito's colours; after eight they come again, darker and then lighter.
+export function colour(i) {
+  const base = data.colours[i % data.colours.length], round = Math.floor(i / data.colours.length) % 3;
+  if (round === 0) return base;
+  const mixed = [1, 3, 5].map(k => parseInt(base.slice(k, k + 2), 16)).map(v => round === 1 ? 0.68 * v : 0.45 * v + 140);
+  return `#${mixed.map(v => Math.round(v).toString(16).padStart(2, "0")).join("")}`;
+}
+
+const lerp = (a, b, s) => a + s * (b - a);
+const ends = (t, length) => {
+  const k = Math.min(Math.max(Math.floor(t), 0), length - 1);
+  return [k, Math.min(k + 1, length - 1), Math.min(Math.max(t - k, 0), 1)];
+};
+
+// Catmull-Rom between steps: velocities have no jumps, and at a step it is what was flown.
+export function position(flight, i, t, out) {
+  const p = flight.positions, [k, next, s] = ends(t, p.length);
+  const before = p[Math.max(k - 1, 0)][i], after = p[Math.min(next + 1, p.length - 1)][i], a = p[k][i], b = p[next][i];
+  for (let x = 0; x < 3; x++) {
+    out[x] = a[x] + 0.5 * s * (b[x] - before[x]
+      + s * (2 * before[x] - 5 * a[x] + 4 * b[x] - after[x] + s * (3 * (a[x] - b[x]) + after[x] - before[x])));
+  }
+  return out;
+}
+
+export function attitude(flight, i, t) {
+  const [k, next, s] = ends(t, flight.attitudes.length);
+  return flight.attitudes[k][i].map((angle, x) => lerp(angle, flight.attitudes[next][i][x], s));
+}
+
+// A plan begins where its robot is: between two steps it is blended with the next one.
+export function plan(flight, i, t) {
+  const [k, next, s] = ends(t, flight.plans.length);
+  return flight.plans[k][i].map((point, m) => point.map((x, axis) => lerp(x, flight.plans[next][i][m][axis], s)));
+}
+
+export const stepAt = (flight, t) => Math.min(Math.floor(t + 1e-6), flight.steps - 1);
+export const askedUntil = (flight, t) => flight.asked[stepAt(flight, t) + 1];
+export const possibleUntil = (flight, t) => (stepAt(flight, t) + 1) * nPairs;
+export const separationAt = (flight, t) => flight.separation[Math.min(Math.ceil(t - 1e-6), flight.steps)];
+export const hasCollided = (flight, t) => flight.collision !== null && Math.ceil(t - 1e-6) >= flight.collision;
+export const touchingAt = (flight, t) => flight.touching.get(Math.min(Math.ceil(t - 1e-6), flight.steps));
+export const hasArrived = (flight, t) => flight.arrival !== null && t >= flight.arrival;

@@ -1,0 +1,109 @@
+// What belongs to each flight on the page: its view with counters, and its timeline and plots.
+
+import {
+  askedUntil, contact, data, flights, fullName, grouped, hasArrived, hasCollided, metres, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
+} from "./data.js";
+import {drawRequests, drawSeparation, stepUnder, timeScale, top} from "./plots.js";
+import {drawTimeline, wordsAt} from "./timeline.js";
+
+const cell = `<div class="head"><div><h2></h2><p class="detail"></p></div>
+<p class="count"><b class="asked"></b> <span>requests<br><span class="share"></span> of all<span class="long"> possible</span></span></p>
+<p class="apart"></p></div><p class="badge" role="status" hidden></p>`;
+
+const details = `<h2></h2><p class="summary"></p>
+<figure><figcaption></figcaption><svg class="asks" role="list"></svg></figure>
+<figure><figcaption></figcaption><svg class="separation" role="img"></svg></figure>
+<figure><figcaption></figcaption><svg class="requests" role="img"></svg></figure>`;
+
+function summary(flight) {
+  const asked = flight.asked.at(-1), possible = flight.steps * nPairs;
+  const parts = [
+    `${flight.steps} steps (${seconds(flight.steps)})`,
+    `${grouped(asked)} of ${grouped(possible)} requests (${percent(asked, possible)})`,
+    `closest ${metres(flight.closest)}`,
+    flight.collision === null ? "no collision" : `collision at step ${flight.collision}`,
+    flight.arrival === null ? "not all arrived" : `all arrived after ${seconds(flight.arrival)}`,
+  ];
+  return parts.join(", ");
+}
+
+export class Panel {
+  // :param seek: called with the step that somebody points at
+  constructor(flight, stage, column, tooltip, seek) {
+    this.flight = flight;
+    this.cell = document.createElement("section");
+    this.cell.className = "cell";
+    this.cell.innerHTML = cell;
+    this.cell.setAttribute("aria-label", fullName(flight));
+    this.details = document.createElement("article");
+    this.details.innerHTML = details;
+    const find = name => this.cell.querySelector(name);
+    find("h2").textContent = this.details.querySelector("h2").textContent = flight.name;
+    find(".detail").textContent = flight.detail;
+    this.details.querySelector("h2").append(Object.assign(document.createElement("small"), {textContent: flight.detail}));
+    this.details.querySelector(".summary").textContent = summary(flight);
+    const captions = [
+      "Who asks whom: a lane for each pair, one block for each robot that asks, in the colour of the robot that is asked",
+      `Closest two robots (m)${Math.max(...flight.separation) > top ? `; dashed where it is more than ${top.toFixed(1)} m` : ""}`,
+      "Requests so far",
+    ];
+    this.details.querySelectorAll("figcaption").forEach((node, k) => { node.textContent = captions[k]; });
+    [this.asked, this.share, this.apart, this.badge] = [".asked", ".share", ".apart", ".badge"].map(find);
+    this.svgs = [...this.details.querySelectorAll("svg")];
+    stage.append(this.cell);
+    column.append(this.details);
+    for (const svg of this.svgs) this.listen(svg, tooltip, seek);
+  }
+
+  listen(svg, tooltip, seek) {
+    const step = event => Math.round(stepUnder(event.clientX - svg.getBoundingClientRect().left, svg.clientWidth));
+    svg.addEventListener("pointerdown", event => { svg.setPointerCapture(event.pointerId); seek(step(event)); });
+    svg.addEventListener("pointermove", event => {
+      if (event.buttons) seek(step(event));
+      const box = svg.getBoundingClientRect(), k = Math.min(Math.max(step(event), 0), this.flight.steps);
+      const words = svg.classList.contains("asks") ? wordsAt(svg, this.flight, event.clientX - box.left, event.clientY - box.top)?.text
+        : svg.classList.contains("separation") ? `step ${k}: ${metres(this.flight.separation[k])}`
+        : `step ${k}: ${grouped(this.flight.asked[k])} requests`;
+      tooltip(words, event.clientX, event.clientY);
+    });
+    for (const name of ["pointerleave", "pointercancel"]) svg.addEventListener(name, () => tooltip());
+  }
+
+  // Draws timeline and plots anew, at the width that they have.
+  draw() {
+    const [asks, separation, requests] = this.svgs;
+    this.cursors = [drawTimeline(asks, this.flight), drawSeparation(separation, this.flight), drawRequests(requests, this.flight)];
+  }
+
+  show(t) {
+    const {flight} = this, counted = askedUntil(flight, t), collided = hasCollided(flight, t), arrived = hasArrived(flight, t);
+    set(this.asked, grouped(counted));
+    set(this.share, percent(counted, possibleUntil(flight, t)));
+    set(this.apart, `closest two ${metres(separationAt(flight, t))} apart`);
+    this.badge.hidden = !collided && !arrived;
+    this.badge.classList.toggle("alarm", collided);
+    set(this.badge, collided ? `collision at step ${flight.collision}` : arrived ? `all arrived after ${seconds(flight.arrival)}` : "");
+    this.cursors?.forEach((line, k) => {
+      const at = timeScale(Math.max(this.svgs[k].clientWidth, 200))(t);
+      line.setAttribute("x1", at);
+      line.setAttribute("x2", at);
+    });
+  }
+}
+
+function set(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+export const legend = [
+  ["arc", "request: from the robot that asks to the one it asks; a light runs there and returns with the plan"],
+  ["tube", `plan for the next ${seconds((flights[0].plans[0][0].length - 1) * data.plan_stride)}`],
+  ["goal", "goal of the robot of this colour"],
+  ["bubble", `safety bubble, radius ${data.radius} m: two that touch are a collision`],
+  ["bubble close", `closer than ${(1.1 * contact).toFixed(2)} m to another`],
+  ["bubble alarm", "collision"],
+];
+
+export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
+  `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
+  `${flights.length > 1 ? "All policies fly the same episode, in step. " : ""}A request is one robot asking another in one step.`;
