@@ -1,4 +1,5 @@
-"""Pictures of the swarm, drawn with pygame, off-screen or in a window: robots, goals, trails, plans, who asks whom."""
+"""Pictures of the swarm, drawn with pygame, off-screen or in a window: robots, goals, trails, plans, who asks whom;
+rings around robots that are within a tenth of touching (amber), or collide (red)."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from quad_swarm.quadrotor import POSITION
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import SwarmConfig
 
-_BACKGROUND, _GRID, _INK, _REQUEST, _ALARM = "#FAFAFA", "#D9D9D9", "#333333", "#555555", "#D50000"
+_BACKGROUND, _GRID, _INK, _REQUEST = "#FAFAFA", "#D9D9D9", "#333333", "#555555"
+_NEAR, _COLLISION = "#F0A000", "#D50000"
 _TRAIL_STEPS = 40
 
 
@@ -117,8 +119,11 @@ class Renderer:
 
     def _draw_near_misses(self, pos: np.ndarray) -> None:
         distance = np.linalg.norm(pos[:, None] - pos[None], axis=-1) + np.diag(np.full(len(pos), np.inf))
-        for i in np.flatnonzero(distance.min(axis=1) < 1.1 * self.config.planner.separation):
-            self._ring(pos[i], self.config.radius, _ALARM)
+        contact = 2 * self.config.radius
+        for i, nearest in enumerate(distance.min(axis=1)):
+            if nearest < 1.1 * contact:
+                collides = nearest < contact - self.config.collision_tolerance
+                self._ring(pos[i], self.config.radius, _COLLISION if collides else _NEAR)
 
     def _draw_robots(self, state: np.ndarray) -> None:
         assert self._camera is not None

@@ -7,7 +7,7 @@ import numpy as np
 import pygame
 import pytest
 
-from quad_swarm.figures.render import _ALARM, Renderer, _Camera, _rotation
+from quad_swarm.figures.render import _COLLISION, _NEAR, Renderer, _Camera, _rotation
 from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.world.presets import make_config
 
@@ -54,9 +54,12 @@ def test_requests_and_text_are_drawn():
     assert columns.max() < 100
 
 
-def test_robots_that_are_too_near_wear_a_ring():
-    assert pixels_of(Renderer(CONFIG).draw(*scene(4.0), []), _ALARM) == 0
-    assert pixels_of(Renderer(CONFIG).draw(*scene(1.01 * CONFIG.planner.separation), []), _ALARM) > 20
+@pytest.mark.parametrize(("distance", "ring"), [(1.15, None), (1.05, _NEAR), (0.98, _COLLISION)])
+def test_robots_that_nearly_touch_wear_an_amber_ring_and_those_that_collide_a_red_one(distance, ring):
+    config = make_config("flight", n_robots=CONFIG.n_robots)  # where the planner keeps far more than contact
+    picture = Renderer(config).draw(*scene(2 * distance * config.radius), [])
+    for colour in (_NEAR, _COLLISION):
+        assert (pixels_of(picture, colour) > 20) == (colour == ring)
 
 
 def test_the_camera_sees_all_from_above():
