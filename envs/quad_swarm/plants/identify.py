@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from scipy.optimize import least_squares
 
-from quad_swarm.plants.base import make_plant
+from quad_swarm.plants.base import make_plant, simulated_vehicles
 from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams
 
 EXAMPLES = "  sb3-maddpg identify --plant crazyflow:cf21B_500 --out crazyflie.yml"
@@ -101,7 +101,7 @@ def identify(plant: str) -> Identification:
 def main(argv: list[str] | None = None) -> int:
     """The command line."""
     parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
-    parser.add_argument("--plant", required=True, help="simulator and vehicle, e.g. crazyflow:cf21B_500")
+    parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
     parser.add_argument("--out", type=Path, metavar="FILE", help="vehicle file to write, YAML")
     args = parser.parse_args(argv)
     found = identify(args.plant)
