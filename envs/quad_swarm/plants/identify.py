@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
-from scipy.optimize import least_squares
 
 from quad_swarm.plants.base import make_plant, simulated_vehicles
 from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams
@@ -59,7 +58,12 @@ def identify(plant: str) -> Identification:
 
     :param plant: see `parse_plant`
     :raises ValueError: unknown plant
+    :raises ImportError: the extra ``plants`` is not installed
     """
+    try:
+        from scipy.optimize import least_squares  # here, so that the help needs no extra
+    except ImportError as error:
+        raise ImportError(f"To identify a vehicle takes more: pip install 'sb3-maddpg[plants]' ({error}).") from error
     u = experiment()
     count = u.shape[1]
     params = QuadrotorParams()
