@@ -66,10 +66,10 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
     conditions = [Condition("model", name, config, linger=5) for name in SCENARIOS]
     asked, steps, collisions = requests_by_pair(conditions[-1], model)
     n = config.n_robots
-    flights = {
+    pictures: dict[str, Figure | float] = {
         f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5) for one in conditions
     }
-    return flights | {
+    return pictures | {
         "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), conditions[-1].scenario),
         "symmetric_swap/request_share": float(asked.sum() / max(steps * n * (n - 1), 1)),
         "symmetric_swap/collision_rate": collisions / EPISODES,

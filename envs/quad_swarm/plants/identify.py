@@ -62,8 +62,10 @@ def identify(plant: str) -> Identification:
     """
     try:
         from scipy.optimize import least_squares  # here, so that the help needs no extra
-    except ImportError as error:
-        raise ImportError(f"To identify a vehicle takes more: pip install 'sb3-maddpg[plants]' ({error}).") from error
+    except ImportError as missing:
+        raise ImportError(
+            f"To identify a vehicle takes more: pip install 'sb3-maddpg[plants]' ({missing})."
+        ) from missing
     u = experiment()
     count = u.shape[1]
     params = QuadrotorParams()
