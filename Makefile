@@ -36,10 +36,11 @@ train: install  ## train MADDPG on the swarm, then print the table of policies (
 test: install lint docs  ## every check: ruff, mypy, the site, pytest
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-lint: install  ## ruff and mypy
+lint: install  ## ruff, mypy and spelling
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/codespell
 
 docs: install  ## the documentation site, in docs/_build; a warning is an error
 	$(BIN)/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going --builder html docs docs/_build

@@ -140,13 +140,15 @@ class DashboardCallback(BaseCallback):
         return [one for one in self.logger.output_formats if isinstance(one, TensorBoardOutputFormat)]
 
 
-# For environments that say nothing about theirs
+# For environments that say nothing about theirs. One tag a chart: TensorBoard gives all tags of a run one colour
 LAYOUT: dict[str, dict[str, list[Any]]] = {
     "Learning": {
-        "return": ["Multiline", ["rollout/ep_rew_mean", "eval/mean_reward"]],
-        "critics": ["Multiline", ["train/critic_loss"]],
-        "actors": ["Multiline", ["train/actor_loss"]],
-        "probabilities": ["Multiline", ["train/probability_mean", "train/probability_std"]],
+        "training: return": ["Multiline", ["rollout/ep_rew_mean"]],
+        "evaluation: return": ["Multiline", ["eval/mean_reward"]],
+        "critics' loss": ["Multiline", ["train/critic_loss"]],
+        "actors' loss": ["Multiline", ["train/actor_loss"]],
+        "mean probability of an action": ["Multiline", ["train/probability_mean"]],
+        "its standard deviation": ["Multiline", ["train/probability_std"]],
         "steps per second": ["Multiline", ["time/fps"]],
     },
 }

@@ -15,10 +15,17 @@ from typing import NamedTuple, cast, get_args
 import gymnasium
 import yaml
 
-from sb3_maddpg.cli.options import PROG, check_writable, common_options, import_packages
-from sb3_maddpg.iddpg import IDDPG
+from sb3_maddpg.cli.options import (
+    PROG,
+    check_writable,
+    common_options,
+    did_you_mean,
+    helps,
+    import_packages,
+    nearest_options,
+)
+from sb3_maddpg.cli.overview import ALGORITHMS, overview
 from sb3_maddpg.maddpg import MADDPG, Lean
-from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.utils import suggest
@@ -32,15 +39,15 @@ Multi-agent reinforcement learning with MADDPG and MATD3 for Stable-Baselines3.
 {commands}
 
 `<command> --help` lists a command's options and shows an example. Those of train, tune, enjoy and record are rl_zoo3's.
-What differs: --algo is maddpg unless given (or matd3, iddpg), the packaged recipe is used unless --conf-file is given,
---env-kwargs are merged over the recipe's, --num-threads is 1 unless given, and -i MODEL.zip continues the training
-where it ended. Values of --env-kwargs and -params are written as in Python or YAML; nothing is evaluated.
+What differs: --algo is maddpg unless given, the packaged recipe is used unless --conf-file names another, --env-kwargs
+are merged over the recipe's, --num-threads is 1 unless given, and -i MODEL.zip continues the training where it ended.
+Values of --env-kwargs and -params are written as in Python or YAML; nothing is evaluated.
 --gym-packages PACKAGE ... imports packages that register environments, rules or scenarios, in every command.
 --env PACKAGE/MODULE is a PettingZoo environment (MODULE for a file in the present folder); its --env-kwargs are those
-of its parallel_env, `state:true` for critics that read the global state, and `wrappers` by SuperSuit. There, --algo
-ppo, a2c, dqn, sac or td3 trains one policy whose parameters all agents share. Where a command takes a model's zip,
-`latest:LOGDIR` is the newest one there and `pretrained:NAME` a pretrained one. --trust, with any command, loads files
-that may run code: models of earlier versions and of other algorithms."""
+of its parallel_env, `state:true` for critics that read the global state, and `wrappers` by SuperSuit. There, an
+algorithm of Stable-Baselines3's, such as --algo ppo, trains one policy whose parameters all agents share. Where a
+command takes a model's zip, `latest:LOGDIR` is the newest one there and `pretrained:NAME` a pretrained one. --trust,
+with any command, loads files that may run code: models of earlier versions and of other algorithms."""
 
 
 class Command(NamedTuple):
@@ -92,6 +99,8 @@ def _hand_over(group: str, argv: list[str]) -> int:
     if known.env not in offers.names:
         raise ValueError(suggest(f"environment with {group}", known.env, offers.names))
     main: Callable[[list[str]], int] = offers[known.env].load()
+    if helps(rest) and group != "identifiers":
+        print(f"Models: MODEL.zip, latest:LOGDIR, {', '.join(f'pretrained:{name}' for name in pretrained_models())}\n")
     rest = [_model(word, known.algo, known.env) for word in rest]
     if known.algo != "maddpg":
         from rl_zoo3.utils import ALGOS
@@ -117,6 +126,9 @@ def _model(word: str, algo: str, env_id: str) -> str:
         return latest_model(name, algo, env_id) + at + threshold
     if name.startswith("pretrained:"):
         return str(pretrained_folder(name.removeprefix("pretrained:")) / "model.zip") + at + threshold
+    kind, colon, _ = name.partition(":")
+    if colon and (hint := did_you_mean(kind, ("latest", "pretrained"), cutoff=0.8)):
+        raise ValueError(f"{word} names no model; latest:LOGDIR and pretrained:NAME do.{hint}")
     return word
 
 
@@ -177,11 +189,11 @@ def _convert(argv: list[str]) -> int:
     )
     parser.add_argument("old", type=Path, metavar="OLD.zip")
     parser.add_argument("new", type=Path, metavar="NEW.zip")
-    parser.add_argument("--algo", choices=sorted(_OWN), default="maddpg", help="whose model it is (%(default)s)")
+    parser.add_argument("--algo", choices=sorted(ALGORITHMS), default="maddpg", help="whose model it is (%(default)s)")
     parser.add_argument("--lean", choices=get_args(Lean), help="keep only the actors, or the critics too")
     args = parser.parse_args(argv)
     check_writable(args.new)
-    _OWN[args.algo].load(args.old, device="cpu").save(args.new, lean=args.lean)
+    ALGORITHMS[args.algo].load(args.old, device="cpu").save(args.new, lean=args.lean)
     print(f"wrote {args.new}")
     return 0
 
@@ -194,7 +206,7 @@ def _publish(argv: list[str]) -> int:
     )
     parser.add_argument("model", metavar="MODEL.zip", help="or latest:LOGDIR, pretrained:NAME")
     parser.add_argument("repository", metavar="NAME/REPOSITORY")
-    parser.add_argument("--algo", default="maddpg", choices=sorted(_OWN), help="default %(default)s")
+    parser.add_argument("--algo", default="maddpg", choices=sorted(ALGORITHMS), help="default %(default)s")
     parser.add_argument("--env", default="QuadSwarm-v0", help="for latest:LOGDIR (default %(default)s)")
     parser.add_argument("--whole", action="store_true", help="with all that a training goes on from")
     parser.add_argument("--private", action="store_true", help="make a new repository private")
@@ -203,16 +215,13 @@ def _publish(argv: list[str]) -> int:
     from sb3_maddpg import hub
 
     path = Path(_model(args.model, args.algo, args.env))
-    model, lean = _OWN[args.algo].load(path, device="cpu"), None if args.whole else "critic"
+    model, lean = ALGORITHMS[args.algo].load(path, device="cpu"), None if args.whole else "critic"
     if args.out is not None:
         hub.write_model_folder(model, args.out, args.repository, path.parent, cast("Lean | None", lean))
         print(f"wrote {args.out}")
     else:
         print(hub.publish(model, args.repository, path.parent, cast("Lean | None", lean), args.private))
     return 0
-
-
-_OWN: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 
 
 def _headline(readme: Path) -> str:
@@ -300,12 +309,19 @@ COMMANDS: dict[str, Command] = {
 }
 
 
+class _Parser(argparse.ArgumentParser):
+    """Looks at what is installed only for the help, for that takes a second."""
+
+    def format_help(self) -> str:
+        self.epilog = f"{overview()}\n\nexamples:\n" + "\n".join(map(examples, COMMANDS))
+        return super().format_help()
+
+
 def _parser() -> argparse.ArgumentParser:
     commands = "\n".join(f"  {name:11} {command.help}" for name, command in COMMANDS.items())
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=PROG,
         description=DESCRIPTION.format(commands=commands),
-        epilog="examples:\n" + "\n".join(command.examples for command in COMMANDS.values()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -352,17 +368,18 @@ def main(argv: list[str] | None = None) -> int:
     :param argv: arguments, those of the command line by default
     :return: exit status, 2 for a mistake in what the user gave
     """
-    arguments = _parser().parse_args(argv)
+    with nearest_options():
+        arguments = _parser().parse_args(argv)
     command, rest = arguments.command, arguments.arguments
     debug = arguments.debug or "--debug" in rest
     # What a package offers for its environment may have such an option, rl_zoo3 has none
     if command not in ("evaluate", "replay"):
         rest = [word for word in rest if word != "--debug"]
     trusts, rest = "--trust" in rest, [word for word in rest if word != "--trust"]
-    if {"-h", "--help"} & set(rest):
+    if helps(rest):
         print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
     try:
-        with _present_folder(rest), _trust() if trusts else nullcontext():
+        with _present_folder(rest), _trust() if trusts else nullcontext(), nearest_options():
             return COMMANDS[command].run(rest)
     except USER_ERRORS as error:
         if debug:

@@ -1,9 +1,15 @@
 """What all commands share: their name, the options that each of them looks at, and what is checked for each of them."""
 
 import argparse
+import difflib
 import importlib
-from collections.abc import Iterable
+import pkgutil
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 from sb3_maddpg.utils import shown
 
@@ -19,18 +25,88 @@ def common_options() -> argparse.ArgumentParser:
     return parser
 
 
+def helps(words: Iterable[str]) -> bool:
+    """
+    :param words: arguments of a command
+    :return: whether they ask for its help
+    """
+    return not {"-h", "--help"}.isdisjoint(words)
+
+
 def import_packages(names: Iterable[str]) -> None:
     """
     Import what ``--gym-packages`` names.
 
     :param names: of packages or modules
     :raises ValueError: no such name can be imported
-    :raises ImportError: the package is missing, or what it needs
+    :raises ImportError: the package is missing, with the nearest that is there, or what it needs
     """
     for name in names:
         if not all(part.isidentifier() for part in name.split(".")):
             raise ValueError(f"--gym-packages {shown(name)}: give the names of packages, as after `import`.")
-        importlib.import_module(name)
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if not f"{name}.".startswith(f"{error.name}."):
+                raise
+            raise ModuleNotFoundError(
+                f"--gym-packages {name}: there is no module {error.name}, neither installed nor in this folder."
+                f"{did_you_mean(str(error.name), modules_beside(str(error.name)))}",
+                name=error.name,
+            ) from None
+
+
+def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.7) -> str:
+    """
+    :param name: that is not known
+    :param known: the names that are
+    :param cutoff: how alike they must be, see ``difflib``
+    :return: the nearest as a question to end a message with, or nothing
+    """
+    nearest = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
+    return f" Did you mean '{nearest[0]}'?" if nearest else ""
+
+
+def modules_beside(name: str) -> set[str]:
+    """
+    :param name: of a module that need not exist
+    :return: the modules of its package, or of the present folder and all that are installed
+    """
+    package, dot, _ = name.rpartition(".")
+    try:
+        paths = list(importlib.import_module(package).__path__) if dot else [str(Path.cwd()), *sys.path]
+    except (ImportError, AttributeError):  # no package
+        return set()
+    return {package + dot + module.name for module in pkgutil.iter_modules(paths)}
+
+
+def files_beside(path: str, pattern: str) -> list[str]:
+    """
+    :param path: of a file that need not exist
+    :param pattern: of the names of files
+    :return: those in its folder
+    """
+    return [str(found) for found in Path(path).parent.glob(pattern)]
+
+
+@contextmanager
+def nearest_options() -> Iterator[None]:
+    """Let every parser, rl_zoo3's too, name the nearest option where one is unknown, and the nearest of its choices."""
+    error = argparse.ArgumentParser.error
+
+    def with_hint(self: argparse.ArgumentParser, message: str) -> NoReturn:
+        if unknown := re.match(r"unrecognized arguments: (--?[\w-]+)", message):
+            options = [option for action in self._actions for option in action.option_strings]
+            message += did_you_mean(unknown[1], options).replace(" D", "; d")
+        elif chosen := re.match(r"argument .*: invalid choice: '(.*?)' \(choose from (.*)\)", message):
+            message += did_you_mean(chosen[1], re.findall(r"[\w-]+", chosen[2]), cutoff=0.6).replace(" D", "; d")
+        error(self, message)
+
+    argparse.ArgumentParser.error = with_hint  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        argparse.ArgumentParser.error = error  # type: ignore[method-assign]
 
 
 def check_writable(path: Path) -> None:

@@ -33,6 +33,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.literals import parse_literal
+from sb3_maddpg.cli.options import did_you_mean, files_beside
+from sb3_maddpg.cli.overview import packaged_recipes
 from sb3_maddpg.utils import arguments_of, shown, suggest
 from sb3_maddpg.validation import Arguments, validated_as
 
@@ -222,7 +224,8 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
             raise ValueError(f"--conf-file {path!r} is neither a YAML file nor a module.")
         return
     if not Path(path).is_file():
-        raise FileNotFoundError(f"There is no recipe {path}: --conf-file names a YAML file.")
+        hint = did_you_mean(path, [*files_beside(path, "*.y*ml"), *packaged_recipes()])
+        raise FileNotFoundError(f"There is no recipe {path}: --conf-file names a YAML file.{hint}")
     try:
         recipes = yaml.safe_load(Path(path).read_text())
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
@@ -236,7 +239,9 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
         raise ValueError(f"{path} holds {_kind(recipes)} instead of recipes by environment. {form}")
     name = env_id if env_id in recipes else "default"
     if name not in recipes:
-        raise ValueError(f"{path} has no recipe for {env_id} and no `default`. {form}")
+        raise ValueError(
+            f"{path} has no recipe for {env_id} and no `default`. {form}{did_you_mean(env_id, map(str, recipes))}"
+        )
     if not isinstance(recipes[name], dict):
         raise ValueError(f"{path}: the recipe {name} is {_kind(recipes[name])}. {form}")
     for key in recipes[name]:

@@ -3,14 +3,11 @@
 import argparse
 import difflib
 import functools
-import importlib
 import json
 import os
 import runpy
 import sys
 from collections.abc import Callable
-from importlib.metadata import entry_points
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,34 +25,31 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, get_latest_run_id, get_saved_hyperparams
 
-from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg import parallel
 from sb3_maddpg.checkpoints import newest
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.experiment import CHECKPOINTS, COMMAND_FILE, Checkpoints, TeamExperimentManager
 from sb3_maddpg.cli.literals import StoreValues
-from sb3_maddpg.cli.options import PROG, common_options, import_packages
+from sb3_maddpg.cli.options import PROG, common_options, did_you_mean, helps, import_packages, modules_beside
+from sb3_maddpg.cli.overview import ALGORITHMS, load_environments, overview, packaged_recipes
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.recipes import LengthOption, check_options
 from sb3_maddpg.cli.safety import no_code_from_files
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
-from sb3_maddpg.iddpg import IDDPG
-from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.utils import suggest
 
 
 def register() -> None:
     """Make the algorithms and every installed environment known to rl_zoo3, whose command line reads these dicts."""
-    ALGOS.update({"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG})
-    HYPERPARAMS_SAMPLER.update(dict.fromkeys(("maddpg", "iddpg"), sample_maddpg_params))
+    ALGOS.update(ALGORITHMS)
+    HYPERPARAMS_SAMPLER.update(dict.fromkeys(ALGORITHMS, sample_maddpg_params))
     HYPERPARAMS_SAMPLER["matd3"] = sample_matd3_params
-    HYPERPARAMS_CONVERTER.update(dict.fromkeys(("maddpg", "matd3", "iddpg"), convert_params))
+    HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
     for module in (rl_zoo3.train, rl_zoo3.enjoy, rl_zoo3.utils):  # record takes it from the last
         module.StoreDict = StoreValues  # type: ignore[attr-defined]
-    importlib.import_module("sb3_maddpg.team_tasks")
-    for entry_point in entry_points(group="sb3_maddpg.environments"):
-        entry_point.load()
+    load_environments()
 
 
 def _call(function: Callable[[], Any], command: str, argv: list[str]) -> None:
@@ -74,21 +68,20 @@ def packaged_config(algo: str, env_id: str) -> str | None:
     :param env_id: Gymnasium id
     :return: path of the packaged recipe for the two, if there is one
     """
-    path = Path(str(files("sb3_maddpg.zoo_configs") / f"{algo}.yml"))
-    if path.is_file() and not {env_id, "default"}.isdisjoint(yaml.safe_load(path.read_text())):
+    path = packaged_recipes().get(f"{algo}.yml")
+    if path is not None and not {env_id, "default"}.isdisjoint(yaml.safe_load(path.read_text())):
         return str(path)
     return None
 
 
 def train(argv: list[str]) -> int:
     """Train as rl_zoo3 does, by the packaged recipe unless another is given, with checkpoints."""
-    resuming = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    resuming.add_argument("--checkpoint-every", type=int, metavar="STEPS")
-    resuming.add_argument("--resume", nargs="?", const="", metavar="RUN")
-    resuming.add_argument("-f", "--log-folder", default="logs")
-    resuming.add_argument("--seeds", metavar="0-9")
-    resuming.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    name = "tune" if "-optimize" in argv else "train"
+    resuming = _resuming(name)
     asked, argv = resuming.parse_known_args(argv)
+    if helps(argv):
+        import_packages(common_options().parse_known_args(argv)[0].gym_packages)
+        print(f"{overview()}\n\n{resuming.format_help()}\nrl_zoo3's options:\n")
     if asked.checkpoint_every is not None and asked.checkpoint_every < 0:
         raise ValueError(f"--checkpoint-every {asked.checkpoint_every}: give a number of steps, or 0 for none.")
     if asked.seeds is not None:
@@ -105,10 +98,13 @@ def train(argv: list[str]) -> int:
     parser = common_options()
     parser.add_argument("-conf", "--conf-file")
     known, rest = parser.parse_known_args(argv)
-    if not {"-h", "--help"} & set(rest):
+    if not helps(rest):
         _check(known)
     # One thread unless asked otherwise: small networks gain nothing by a second and lose badly where it is not free.
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
+    if known.conf_file is not None and not Path(known.conf_file).is_file():
+        packaged = packaged_recipes().get(known.conf_file)
+        argv += ["--conf-file", str(packaged)] if packaged is not None else []
     if known.env is not None and known.conf_file is None:
         path = packaged_config(known.algo, known.env)
         argv += ["--conf-file", path] if path is not None else []
@@ -116,10 +112,22 @@ def train(argv: list[str]) -> int:
     with_checkpoints: Any = functools.partial(cast(Any, manager), checkpoints=checkpoints)
     rl_zoo3.train.ExperimentManager = with_checkpoints  # type: ignore[misc]
     try:
-        _call(rl_zoo3.train.train, "train", argv)
+        _call(rl_zoo3.train.train, name, argv)
     finally:
         rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
     return 0
+
+
+def _resuming(name: str) -> argparse.ArgumentParser:
+    """The options that rl_zoo3 does not have."""
+    parser = argparse.ArgumentParser(prog=f"{PROG} {name}", add_help=False, allow_abbrev=False, usage=argparse.SUPPRESS)
+    group = parser.add_argument_group("options beside rl_zoo3's")
+    group.add_argument("--checkpoint-every", type=int, metavar="STEPS", help="0: never (default: by time)")
+    group.add_argument("--resume", nargs="?", const="", metavar="RUN", help="go on with a run (default: the newest)")
+    group.add_argument("-f", "--log-folder", default="logs", metavar="DIR", help="of the runs (default %(default)s)")
+    group.add_argument("--seeds", metavar="0-9", help="a training for each seed")
+    group.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trainings at once (default %(default)s)")
+    return parser
 
 
 def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, list[str]]:
@@ -153,7 +161,7 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     known, rest = parser.parse_known_args(argv)
     rest += ["--n-timesteps", str(known.n_timesteps)]
     algorithm = None
-    if not {"-h", "--help"} & set(rest):
+    if not helps(rest):
         check_options(known, LengthOption)
         _check(known)
         name = EnvironmentName(known.env)
@@ -207,6 +215,7 @@ def _check(known: argparse.Namespace) -> None:
         raise ValueError(
             f"Unknown environment '{known.env}': there is no module {known.env.replace('/', '.')} with a function "
             "parallel_env, as PettingZoo's have. Is its package installed, or in this folder?"
+            f"{did_you_mean(package, modules_beside(package))}"
         )
     if difflib.get_close_matches(known.env, ids, n=1):
         raise ValueError(suggest("environment", known.env, ids))

@@ -1,9 +1,7 @@
 """Put tables and figures into the pages of results: ``python -m studies.swarm.report [--data FOLDER]``.
 
 The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
-come from `studies/swarm/tune_rules.py`, `studies/swarm/tune_thresholds.py`, `studies/swarm/fly_tests.py`, of other learners
-from `studies/swarm/ppo.py` and `studies/swarm/counterfactual.py`, and how long trainings take from
-`studies/swarm/training_time.py`.
+come from the other modules of this study.
 """
 
 from __future__ import annotations

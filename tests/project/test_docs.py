@@ -1,6 +1,7 @@
 """The pages of the site: examples run, links lead somewhere, tables of arguments are those of the code."""
 
 import inspect
+import json
 import re
 from pathlib import Path
 
@@ -70,15 +71,57 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_links_lead_somewhere(page):
-    for link in re.findall(r"\]\(([^)\s]+)\)", FENCED.sub("", text_of(page))):
-        if re.match(r"\w+://", link):
+FOLDERS = ("benchmarks", "docs", "envs", "examples", "sb3_maddpg", "studies", "tests", "zoo_configs")
+EVERY_PAGE = sorted(
+    path.relative_to(ROOT).as_posix()
+    for folder in FOLDERS
+    for path in (*(ROOT / folder).rglob("*.md"), *(ROOT / folder).rglob("*.ipynb"))
+    if not {"_build", ".ipynb_checkpoints"} & set(path.parts)
+) + [path.name for path in ROOT.glob("*.md")]
+
+
+def prose(page: str) -> str:
+    """:return: a page, or a notebook's cells of text, without fenced code"""
+    text = text_of(page)
+    if page.endswith(".ipynb"):
+        cells = json.loads(text)["cells"]
+        text = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    return FENCED.sub("", text)
+
+
+@pytest.mark.parametrize("page", EVERY_PAGE)
+def test_links_and_pictures_lead_somewhere(page):
+    text = prose(page)
+    named = dict(re.findall(r"^\[([^\]]+)\]: *(\S+)", text, re.MULTILINE))
+    used = re.findall(r"\]\[([^\]]+)\]", text)
+    assert set(used) <= set(named), "links by names that are given nowhere"
+    inline = re.findall(r"\]\(<?([^)\s>]+)>?(?: +\"[^\"]*\")?\)", text)
+    html = re.findall(r"<(?:a|img|source)\b[^>]*?(?:href|src|srcset)=\"([^\"]+)\"", text)
+    for link in (*inline, *named.values(), *html):
+        if re.match(r"\w+:", link):
             continue
         path, _, anchor = link.partition("#")
         target = (ROOT / page).parent / path if path else ROOT / page
         assert target.exists(), link
-        assert not anchor or anchor in anchors(target), link
+        assert not anchor or target.suffix != ".md" or anchor in anchors(target), link
+
+
+NOT_FILES = {"quad_swarm/parallel_env"}  # an environment's id
+
+
+@pytest.mark.parametrize("page", EVERY_PAGE)
+def test_files_that_are_named_exist(page):
+    """From the project's folder, the page's, or `envs` for `quad_swarm/...`; the changelog names older ones too."""
+    code = re.findall(r"`([^`\n]+)`", prose(page))
+    for path in (path for one in code for path in re.findall(r"(?<![\w./:-])[\w.-]+(?:/[\w.-]+)+", one)):
+        placeholder = re.search(r"\b[A-Z]{3,}\b|_build", path.removesuffix("README.md"))
+        if path.split("/")[0] not in (*FOLDERS, "quad_swarm") or placeholder or path in NOT_FILES:
+            continue
+        found = any((base / path).exists() for base in (ROOT, ROOT / "envs", (ROOT / page).parent))
+        assert found or page == "CHANGELOG.md", path
+    for module in re.findall(r"python -m ((?:studies|benchmarks)(?:\.\w+)+)", text_of(page)):
+        path = module.replace(".", "/")
+        assert any((ROOT / f"{path}{end}").exists() for end in (".py", "")) or module.endswith("NAME"), module
 
 
 def table(page: str, heading: str) -> dict[str, str]:

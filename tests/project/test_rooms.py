@@ -22,7 +22,7 @@ ROOMS = {
     "world": {"", "native", "planner", "plants"},
     "task": {"", "native", "planner", "world"},
     "interfaces": {"", "planner", "world", "task"},
-    "evaluation": {"", "tasks", "planner", "world", "task"},
+    "evaluation": {"", "tasks", "planner", "plants", "world", "task"},
     "figures": {"", "planner", "world", "task", "evaluation"},
     "models": set(),
 }

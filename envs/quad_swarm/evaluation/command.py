@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from quad_swarm.errors import unknown_name
 from quad_swarm.evaluation.evaluation import evaluate, make_pool
 from quad_swarm.evaluation.flight import Condition
-from quad_swarm.evaluation.policies import is_model, load_model, short_name, trained_in
-from quad_swarm.evaluation.rows import check_writable, write_rows
+from quad_swarm.evaluation.policies import is_model, load_model, short_name, short_names, trained_in
+from quad_swarm.evaluation.rows import check_writable, write_csv, write_rows, write_text
 from quad_swarm.planner import SOLVERS, BuildError
+from quad_swarm.plants.base import MODEL, simulated_vehicles
 from quad_swarm.task.rules import RULES
 from quad_swarm.tasks import ENGINES
 from quad_swarm.tasks.journal import default_folder
-from quad_swarm.world.presets import PRESET_VERSION, PRESETS, make_config
+from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
@@ -28,41 +31,95 @@ from quad_swarm.world.swarm import Swarm
 EXAMPLES = "  sb3-maddpg evaluate --policy none full cpa:0.7:1.5 pretrained:quad-swarm-paper --scenario all --jobs 2"
 
 
-def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as a table to print; models by their short names where these tell them apart."""
-    names = {row["policy"]: short_name(row["policy"]) for row in rows}
-    if len(set(names.values())) < len(names):
-        names = {policy: policy for policy in names}
-    columns: list[tuple[str, Callable[[Mapping[str, Any]], str]]] = [
-        ("scenario", lambda r: r["scenario"]),
-        ("policy", lambda r: names[r["policy"]]),
-        ("collisions", lambda r: f"{r['collisions']}/{r['episodes']}"),
-        ("rate", lambda r: f"{r['collisions'] / r['episodes']:.1%}"),
-        ("95 % interval", lambda r: f"{r['collision_low']:.1%} - {r['collision_high']:.1%}"),
-        ("> 1 cm", lambda r: str(r["collisions_1cm"])),
-        ("at steps", lambda r: str(r["collisions_at_steps"])),
-        ("at any time", lambda r: str(r["collisions_continuous"])),
-        ("requests/step", lambda r: f"{r['requests_per_step']:.2f}"),
-        ("share", lambda r: f"{r['request_share']:.2%}"),
-        ("B/s", lambda r: f"{r['bytes_per_second']:.0f}"),
-        ("plans' age (s)", lambda r: f"{r['plan_age']:.2f}" if r["plan_age"] else "-"),
-        ("arrived", lambda r: f"{r['arrived']}/{r['episodes']}"),
-        ("steps", lambda r: "-" if r["steps_to_arrival"] is None else f"{r['steps_to_arrival']:.1f}"),
-        ("lost (s)", lambda r: "-" if r.get("time_lost") is None else f"{r['time_lost']:+.2f}"),
-        ("min. dist. (m)", lambda r: f"{r['min_separation_continuous']:.3f}"),
-        ("failures", lambda r: str(r["planner_failures"])),
-        ("us/solve", lambda r: f"{r['solve_us']:.0f}"),
-    ]  # fmt: skip
-    texts = [[title for title, _ in columns]] + [[text(row) for _, text in columns] for row in rows]
-    widths = [max(len(line[k]) for line in texts) for k in range(len(columns))]
-    lines = [
-        "  ".join(
-            text.ljust(w) if k < 2 else text.rjust(w) for k, (text, w) in enumerate(zip(line, widths, strict=True))
-        )
+class Column(NamedTuple):
+    """Of the table."""
+
+    title: str
+    text: Callable[[Mapping[str, Any]], str]
+    wide: bool = True
+    """Whether it is left out of a table that is not `wide`"""
+
+
+COLUMNS = [
+    Column("scenario", lambda r: r["scenario"], False),
+    Column("policy", lambda r: r["policy"], False),
+    Column("collided", lambda r: f"{r['collisions']}/{r['episodes']}"),
+    Column("collisions", lambda r: f"{r['collisions'] / r['episodes']:.1%}", False),
+    Column("95 % interval", lambda r: f"{100 * r['collision_low']:.1f} - {r['collision_high']:.1%}", False),
+    Column("> 1 cm", lambda r: str(r["collisions_1cm"])),
+    Column("at steps", lambda r: str(r["collisions_at_steps"])),
+    Column("any time", lambda r: f"{r['collisions_continuous'] / r['episodes']:.1%}", False),
+    Column("requests/step", lambda r: f"{r['requests_per_step']:.2f}"),
+    Column("requests", lambda r: f"{r['request_share']:.2%}", False),
+    Column("B/s", lambda r: f"{r['bytes_per_second']:.0f}"),
+    Column("plans' age (s)", lambda r: f"{r['plan_age']:.2f}" if r["plan_age"] else "-"),
+    Column("arrived", lambda r: f"{r['arrived']}/{r['episodes']}", False),
+    Column("steps", lambda r: "-" if r["steps_to_arrival"] is None else f"{r['steps_to_arrival']:.1f}", False),
+    Column("lost (s)", lambda r: "-" if r.get("time_lost") is None else f"{r['time_lost']:+.2f}"),
+    Column("min. dist. (m)", lambda r: f"{r['min_separation_continuous']:.3f}"),
+    Column("failures", lambda r: str(r["planner_failures"])),
+    Column("us/solve", lambda r: f"{r['solve_us']:.0f}"),
+]
+WIDTH = 100
+SHORTEST_NAME = 12
+
+
+def table_texts(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> list[list[str]]:
+    """The titles, then the cells of each row, as they are printed; models by the shortest names that differ.
+
+    :param rows: of `evaluate`
+    :param wide: all columns instead of the most important ones
+    """
+    columns = [column for column in COLUMNS if wide or not column.wide]
+    names = short_names(row["policy"] for row in rows)
+    shown = [{**row, "policy": names[row["policy"]]} for row in rows]
+    return [[column.title for column in columns], *([column.text(row) for column in columns] for row in shown)]
+
+
+def format_table(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> str:
+    """The rows as a table to print. Unless it is `wide` it fits 100 columns of text; longer names are wrapped.
+
+    :param rows: of `evaluate`
+    :param wide: see `table_texts`
+    """
+    texts = table_texts(rows, wide)
+    if not wide:
+        taken = sum(max(map(len, column)) + 2 for k, column in enumerate(zip(*texts, strict=True)) if k != 1)
+        texts = [line for text in texts for line in _wrapped(text, max(WIDTH - taken, SHORTEST_NAME))]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    texts.insert(1, ["-" * width for width in widths])
+    lines = (
+        "  ".join(t.rjust(w) if k > 1 else t.ljust(w) for k, (t, w) in enumerate(zip(line, widths, strict=True)))
         for line in texts
-    ]
-    lines.insert(1, "  ".join("-" * w for w in widths))
+    )
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _wrapped(texts: list[str], most: int) -> list[list[str]]:
+    """A line of the table, and further ones for what is left of the policy's name."""
+    scenario, name, *cells = texts
+    lines = [[scenario, name[:most], *cells]]
+    return lines + [["", name[k : k + most], *("" for _ in cells)] for k in range(most, len(name), most)]
+
+
+def _latex(texts: Sequence[Sequence[str]]) -> str:
+    """The texts of a table as LaTeX, for the package booktabs."""
+    escape = str.maketrans({
+        **{c: f"\\{c}" for c in "&%$#_{}"},
+        **{"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"},
+        **{c: f"${c}$" for c in "<>|"},
+    })  # fmt: skip
+    titles, *rows = ([text.replace(" - ", " -- ").translate(escape) for text in line] for line in texts)
+    lines = [
+        f"\\begin{{tabular}}{{ll{'r' * (len(titles) - 2)}}}",
+        r"\toprule",
+        " & ".join(titles) + r" \\",
+        r"\midrule",
+    ]
+    for k, row in enumerate(rows):
+        lines += [r"\addlinespace"] * (k > 0 and row[0] != rows[k - 1][0])
+        lines.append(" & ".join((row[0], f"\\texttt{{{row[1]}}}", *row[2:])) + r" \\")
+    return "\n".join((*lines, r"\bottomrule", r"\end{tabular}", ""))
 
 
 def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
@@ -91,12 +148,20 @@ def _rules_usage() -> str:
     return ", ".join(":".join((name, *arguments)) for name, (_, arguments) in RULES.items())
 
 
-def add_policy_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of every command that flies policies in a world."""
+def paper_policies() -> list[str]:
+    """Those of the paper's table: no and full communication, by distance, and a learned one."""
+    return ["none", "full", "distance:4", str(files("quad_swarm.models") / "quad-swarm-paper" / "model.zip")]
+
+
+def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """The options of every command that flies policies in a world.
+
+    :param required: whether --policy must be given
+    """
     parser.add_argument(
         "--policy",
         nargs="+",
-        required=True,
+        required=required,
         metavar="POLICY",
         help=f"a rule ({_rules_usage()}), rules joined by & (both) and | (either), a model's zip, MODEL.zip@THRESHOLD, "
         "latest:LOGDIR or pretrained:NAME",
@@ -107,10 +172,12 @@ def add_policy_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--n-robots", type=int, default=None, help="number of robots (default: the preset's)")
     parser.add_argument("--max-steps", type=int, help="time limit in steps (default: the preset's)")
+    names = ", ".join(field.name for field in dataclasses.fields(SwarmConfig))
     parser.add_argument(
-        "--world", nargs="+", default=[], metavar="NAME=VALUE", help="fields of SwarmConfig, e.g. noise.wind=1"
+        "--world", nargs="+", default=[], metavar="NAME=VALUE", help=f"fields of the preset, e.g. noise.wind=1: {names}"
     )
-    parser.add_argument("--plant", help="what is flown: model (default), or a simulator's vehicle: crazyflow:cf21B_500")
+    simulated = ", ".join(simulated_vehicles())
+    parser.add_argument("--plant", help=f"what is flown: {MODEL} (default), or a simulator's vehicle ({simulated})")
     parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="imported first: own scenarios and rules")
     parser.add_argument(
         "--algo",
@@ -171,11 +238,12 @@ def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace)
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-maddpg evaluate",
-        description="Fly the same held-out episodes with several policies and compare them.",
+        description="Fly the same held-out episodes with several policies and compare them. Without options: the "
+        "paper's table, four policies in all scenarios.",
         epilog=f"example:\n{EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_policy_arguments(parser)
+    add_policy_arguments(parser, required=False)
     parser.add_argument(
         "--scenario", nargs="+", default=["all"], metavar="NAME", help=f"all, or some of {', '.join(SCENARIOS)}"
     )
@@ -184,7 +252,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where processes run (default local)")
     parser.add_argument("--address", help="of a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
     parser.add_argument("--mixed", action="store_true", help="take results of machines unlike this one")
+    parser.add_argument("--wide", action="store_true", help="print all columns, in lines of any length")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a policy and scenario")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the same figures as comma-separated values")
+    parser.add_argument("--latex", type=Path, metavar="FILE", help="write the printed table for LaTeX with booktabs")
     parser.add_argument(
         "--plot", type=Path, metavar="DIR", help="draw collisions, requests and flights into this folder"
     )
@@ -199,9 +270,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _compare(args: argparse.Namespace) -> None:
     if "all" in args.scenario and len(args.scenario) > 1:
         raise ValueError(f"--scenario {' '.join(args.scenario)}: 'all' already names every scenario.")
+    args.policy = args.policy or paper_policies()
     conditions = make_conditions(args, list(SCENARIOS) if args.scenario == ["all"] else args.scenario)
-    if args.json:
-        check_writable(args.json, "--json")
+    for option in ("json", "csv", "latex"):
+        if path := getattr(args, option):
+            check_writable(path, f"--{option}")
     if args.plot:
         check_writable(args.plot / "plot", "--plot")
     elsewhere = args.engine != "local" or args.address is not None
@@ -214,10 +287,18 @@ def _compare(args: argparse.Namespace) -> None:
     solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name
     common = {"preset": args.preset, "preset_version": PRESET_VERSION, "seed": args.seed, "solver": solver}
     rows = [row | common | ({"world": _parse_world(args.world)} if args.world else {}) for row in rows]
-    print(format_table(rows))
+    print(format_table(rows, args.wide))
+    world = f" with {' '.join(args.world)}" if args.world else ""
+    robots = conditions[0].config.n_robots
+    print(f"\nepisodes: {args.episodes} each; robots: {robots}; preset: {args.preset}{world}; set: {args.seed}")
     if args.json:
         write_rows(args.json, rows)
-        print(f"\nwrote {args.json}")
+    if args.csv:
+        write_csv(args.csv, rows)
+    if args.latex:
+        write_text(args.latex, _latex(table_texts(rows, args.wide)))
+    for path in filter(None, (args.json, args.csv, args.latex)):
+        print(f"wrote {path}")
     if args.plot:
         from quad_swarm.figures.plots import draw_all  # matplotlib is needed only here
 

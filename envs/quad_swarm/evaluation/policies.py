@@ -6,10 +6,11 @@ A rule is one of `RULES`, see `quad_swarm.task.rules`. A model is loaded by the 
 
 from __future__ import annotations
 
+import difflib
 import functools
 import importlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,17 @@ def short_name(policy: str) -> str:
     return (Path(path).parent.name or name if name == "model.zip" else name) + at + threshold
 
 
+def short_names(policies: Iterable[str]) -> dict[str, str]:
+    """Policies by `short_name`, or by as much of the ends of their paths as tells them apart."""
+    policies = set(policies)
+    names = {policy: short_name(policy) for policy in policies}
+    for parts in range(1, max((policy.count(os.sep) for policy in policies), default=0) + 2):
+        if len(set(names.values())) == len(policies):
+            return names
+        names = {p: os.sep.join(p.split(os.sep)[-parts:]) if is_model(p) else p for p in policies}
+    return {policy: policy for policy in policies}
+
+
 def load_model(policy: str, algo: str) -> Any:
     """A trained model; read again only if its file has changed.
 
@@ -55,7 +67,9 @@ def load_model(policy: str, algo: str) -> Any:
     """
     path = policy.partition("@")[0]
     if not Path(path).is_file():
-        raise FileNotFoundError(f"No model at {path!r}: train one first, or give the zip's full path.")
+        near = difflib.get_close_matches(path, map(str, Path(path).parent.glob("*.zip")), n=1, cutoff=0.7)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise FileNotFoundError(f"No model at {path!r}: train one first, or give the zip's full path.{hint}")
     stat = Path(path).stat()
     return _load(policy, algo, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
 

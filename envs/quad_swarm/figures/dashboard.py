@@ -15,24 +15,38 @@ from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 
-# Of TensorBoard's page "Custom scalars": title -> chart -> kind and tags
+
+def _line(tag: str) -> list[Any]:
+    return ["Multiline", [tag]]
+
+
+# Of TensorBoard's page "Custom scalars": title -> chart -> kind and tags. One tag a chart, for the tags of a run have
+# one colour there. What is flat as long as all goes well comes last.
 LAYOUT: dict[str, dict[str, list[Any]]] = {
     "Safety": {
-        "episodes with a collision": ["Multiline", ["swarm/collision_rate", "symmetric_swap/collision_rate"]],
-        "smallest separation (m)": ["Multiline", ["swarm/min_separation"]],
-        "arrivals": ["Multiline", ["swarm/arrival_rate", "eval/success_rate"]],
-        "planner failures": ["Multiline", ["planner/failure_rate"]],
+        "training: episodes with a collision": _line("swarm/collision_rate"),
+        "evaluation: collisions, symmetric swap": _line("symmetric_swap/collision_rate"),
+        "training: smallest separation (m)": _line("swarm/min_separation"),
+        "training: arrivals": _line("swarm/arrival_rate"),
+        "evaluation: arrivals": _line("eval/success_rate"),
     },
     "Communication": {
-        "requests, of all possible": ["Multiline", ["comm/request_share", "symmetric_swap/request_share"]],
-        "reward for requests": ["Multiline", ["reward/requests"]],
-        "probabilities": ["Multiline", ["train/probability_mean", "train/probability_std"]],
+        "training: requests, of all possible": _line("comm/request_share"),
+        "evaluation: requests, symmetric swap": _line("symmetric_swap/request_share"),
+        "training: bytes/s that a robot sends": _line("comm/bytes_per_second"),
     },
     "Learning": {
-        "return": ["Multiline", ["rollout/ep_rew_mean", "eval/mean_reward"]],
-        "critics": ["Multiline", ["train/critic_loss"]],
-        "actors": ["Multiline", ["train/actor_loss"]],
-        "steps per second": ["Multiline", ["time/fps"]],
+        "training: return": _line("rollout/ep_rew_mean"),
+        "evaluation: return": _line("eval/mean_reward"),
+        "critics' loss": _line("train/critic_loss"),
+        "actors' loss": _line("train/actor_loss"),
+        "mean probability of a request": _line("train/probability_mean"),
+        "its standard deviation": _line("train/probability_std"),
+    },
+    "Checks": {
+        "steps per second": _line("time/fps"),
+        "training: reward for requests": _line("reward/requests"),
+        "training: planner failures": _line("planner/failure_rate"),
     },
 }
 # Episodes behind the heat map, a set of their own
@@ -52,8 +66,10 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
     conditions = [Condition("model", name, config, linger=5) for name in SCENARIOS]
     asked, steps, collisions = requests_by_pair(conditions[-1], model)
     n = config.n_robots
-    return {
-        "eval/flights": draw_flights(conditions, [fly(one, SET, model=model) for one in conditions]),
+    pictures: dict[str, Figure | float] = {
+        f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5) for one in conditions
+    }
+    return pictures | {
         "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), conditions[-1].scenario),
         "symmetric_swap/request_share": float(asked.sum() / max(steps * n * (n - 1), 1)),
         "symmetric_swap/collision_rate": collisions / EPISODES,

@@ -118,11 +118,14 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
 
 
 @rc_context(STYLE)
-def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight]) -> Figure:
-    """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2)."""
+def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight], size: float = 3.6) -> Figure:
+    """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2).
+
+    :param size: width and height of each flight's panel (inches)
+    """
     columns = min(len(conditions), 2)
     lines = math.ceil(len(conditions) / columns)
-    figure = Figure(figsize=(3.6 * columns, 3.6 * lines + 0.3), layout="constrained")
+    figure = Figure(figsize=(size * columns, size * lines + 0.3), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False)
     for axes in panels.flat[len(conditions) :]:
         axes.set_visible(False)

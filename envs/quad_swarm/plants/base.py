@@ -17,6 +17,11 @@ SIMULATORS: dict[str, tuple[str, ...]] = {
 }
 
 
+def simulated_vehicles() -> list[str]:
+    """All vehicles of `SIMULATORS`, as ``plant`` takes them."""
+    return [f"{simulator}:{vehicle}" for simulator, vehicles in SIMULATORS.items() for vehicle in vehicles]
+
+
 class Plant(Protocol):
     """Robots that fly. State (9) and input (4) are those of `quad_swarm.quadrotor`."""
 

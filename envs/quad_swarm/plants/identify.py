@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
-from scipy.optimize import least_squares
 
-from quad_swarm.plants.base import make_plant
+from quad_swarm.plants.base import make_plant, simulated_vehicles
 from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams
 
 EXAMPLES = "  sb3-maddpg identify --plant crazyflow:cf21B_500 --out crazyflie.yml"
@@ -59,7 +58,14 @@ def identify(plant: str) -> Identification:
 
     :param plant: see `parse_plant`
     :raises ValueError: unknown plant
+    :raises ImportError: the extra ``plants`` is not installed
     """
+    try:
+        from scipy.optimize import least_squares  # here, so that the help needs no extra
+    except ImportError as missing:
+        raise ImportError(
+            f"To identify a vehicle takes more: pip install 'sb3-maddpg[plants]' ({missing})."
+        ) from missing
     u = experiment()
     count = u.shape[1]
     params = QuadrotorParams()
@@ -101,7 +107,7 @@ def identify(plant: str) -> Identification:
 def main(argv: list[str] | None = None) -> int:
     """The command line."""
     parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
-    parser.add_argument("--plant", required=True, help="simulator and vehicle, e.g. crazyflow:cf21B_500")
+    parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
     parser.add_argument("--out", type=Path, metavar="FILE", help="vehicle file to write, YAML")
     args = parser.parse_args(argv)
     found = identify(args.plant)

@@ -312,8 +312,9 @@ def make_observation(
     """
     if observation == "paper":
         return PaperObservation(config.n_robots, scale_observation)
+    pairs = PairObservation(config, observation.split("+"), critics)
     if scale_observation:
         raise ValueError(
             f"scale_observation=True is for observation='paper' alone; observation={observation!r} is scaled already."
         )
-    return PairObservation(config, observation.split("+"), critics)
+    return pairs

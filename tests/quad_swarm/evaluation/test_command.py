@@ -1,12 +1,16 @@
 """``sb3-maddpg evaluate``: its table, its files, its messages."""
 
+import csv
 import json
 from pathlib import Path
 
 import pytest
 
-from quad_swarm.evaluation.command import main
+from quad_swarm.evaluation.command import COLUMNS, main
+from quad_swarm.plants.base import simulated_vehicles
 from quad_swarm.task.rules import RULES
+from quad_swarm.world.presets import PRESETS
+from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg.pretrained_models import pretrained_folder
 
 KEYS = {
@@ -48,13 +52,59 @@ def test_the_table_names_models_shortly_where_that_tells_them_apart(capsys, tmp_
         copy.write_bytes(Path(path).read_bytes())
     assert main(["--policy", *map(str, copies), *flags]) == 0
     printed = capsys.readouterr().out
-    assert all(str(copy) in printed for copy in copies)
+    assert "first/swarm.zip" in printed
+    assert "second/swarm.zip" in printed
+
+
+def test_a_table_fits_one_hundred_columns_unless_all_are_asked_for(capsys):
+    rules = ["cpa:0.8:1.5&stale:3|distance:1&event:0.25", "cpa:0.8:1.5&stale:3|distance:2&event:0.25"]
+    flags = ["--preset", "dense", "--scenario", "asymmetric_swap", "--episodes", "1", "--policy", "none", *rules]
+    assert main(flags) == 0
+    table = capsys.readouterr().out.partition("\n\n")[0]
+    lines = table.splitlines()
+    assert max(map(len, lines)) == 100
+    start, length = lines[0].index("policy"), len(lines[1].split()[1])
+    names = [line[start : start + length].rstrip() for line in lines[2:]]
+    assert "".join(names) == "none" + "".join(rules), "what does not fit goes on in the next line"
+    assert main([*flags, "--wide"]) == 0
+    printed = capsys.readouterr().out
+    titles = printed.splitlines()[0]
+    assert [column.title for column in COLUMNS] == [title.strip() for title in titles.split("  ") if title]
+    assert all(rule in printed for rule in rules)
+
+
+def test_the_table_goes_into_latex_and_csv(tmp_path, capsys):
+    flags = ["--policy", "none", "full|none", "--scenario", "random_swap", "random", "--episodes", "2"]
+    assert main([*flags, "--latex", str(tmp_path / "a.tex"), "--csv", str(tmp_path / "a.csv"), "--wide"]) == 0
+    printed = capsys.readouterr().out
+    tex = (tmp_path / "a.tex").read_text().splitlines()
+    assert tex[:2] == [f"\\begin{{tabular}}{{ll{'r' * (len(COLUMNS) - 2)}}}", r"\toprule"]
+    assert "$>$ 1 cm" in tex[2]
+    assert tex[-2:] == [r"\bottomrule", r"\end{tabular}"]
+    cells = [line.removesuffix(r" \\").split(" & ") for line in tex if line.endswith(r"\\")]
+    assert {len(line) for line in cells} == {len(COLUMNS)}
+    assert cells[2][:2] == [r"random\_swap", r"\texttt{full$|$none}"]
+    assert cells[2][9] == r"100.00\%"
+    assert tex.count(r"\addlinespace") == 1
+    with (tmp_path / "a.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["scenario"], row["policy"], float(row["request_share"])) for row in rows] == [
+        ("random_swap", "none", 0), ("random_swap", "full|none", 1), ("random", "none", 0), ("random", "full|none", 1)
+    ]  # fmt: skip
+    assert all(f"wrote {tmp_path / name}" in printed for name in ("a.csv", "a.tex"))
+
+
+def test_without_policies_it_is_the_papers_table(capsys):
+    assert main(["--episodes", "1", "--max-steps", "3"]) == 0
+    lines = [line.split()[:2] for line in capsys.readouterr().out.splitlines()[2:18]]
+    policies = ("none", "full", "distance:4", "quad-swarm-paper")
+    assert lines == [[scenario, policy] for scenario in SCENARIOS for policy in policies]
 
 
 def test_world_can_be_changed(capsys):
     arguments = ["--policy", "full", "--scenario", "random", "--episodes", "1", "--n-robots", "3", "--max-steps", "5"]
     assert main([*arguments, "--world", "noise.wind=1", "planner.separation=0.7", "memory=0.3"]) == 0
-    assert "6.00" in capsys.readouterr().out  # requests a step of three robots
+    assert "robots: 3; preset: paper with noise.wind=1 planner.separation=0.7 memory=0.3;" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -77,6 +127,8 @@ def test_world_can_be_changed(capsys):
         (["--policy", "none", "--scenario", "all", "random"], "'all' already names every scenario"),
         (["--policy", "pretrained:quad-swarm-paper"], "`sb3-maddpg evaluate` knows"),
         (["--policy", "none", "--json", "."], "--json . is a folder"),
+        (["--policy", "none", "--csv", "."], "--csv . is a folder"),
+        (["--policy", "none", "--latex", "."], "--latex . is a folder"),
         (["--policy", "none", "--json", "/proc/nowhere/table.json"], "choose another folder"),
     ],
 )
@@ -85,6 +137,13 @@ def test_errors_are_one_line_with_the_remedy(arguments, message, capsys):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_the_nearest_model_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("maddpg_swarm.zip").touch()
+    assert main(["--policy", "maddpg_swrm.zip@0.5"]) == 2
+    assert "Did you mean 'maddpg_swarm.zip'?" in capsys.readouterr().err
 
 
 def test_a_damaged_model_is_named(tmp_path, capsys):
@@ -112,7 +171,7 @@ def test_models_fly_in_the_world_that_they_were_trained_in(capsys):
     flags = ["--scenario", "random", "--episodes", "1", "--max-steps", "2"]
     assert main(["--policy", "full", dense, *flags]) == 0
     printed = capsys.readouterr()
-    assert "56.00" in printed.out  # requests a step of eight robots
+    assert "robots: 8; preset: dense;" in printed.out
     assert not printed.err
     assert main(["--policy", dense, *flags, "--preset", "paper"]) == 0
     assert "note: quad-swarm-dense was trained in 'dense', this is 'paper'" in capsys.readouterr().err
@@ -126,4 +185,5 @@ def test_the_help_names_every_rule_and_the_command(capsys):
         main(["--help"])
     printed = " ".join(capsys.readouterr().out.split())
     assert "usage: sb3-maddpg evaluate" in printed
-    assert all(name in printed for name in (*RULES, "cpa:DIST:LOOKAHEAD", "pretrained:NAME", "--gym-packages"))
+    known = (*RULES, *PRESETS, *SCENARIOS, *simulated_vehicles())
+    assert all(name in printed for name in (*known, "cpa:DIST:LOOKAHEAD", "pretrained:NAME", "--gym-packages"))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from quad_swarm.evaluation.rows import check_writable, read_rows, write_rows
+from quad_swarm.evaluation.rows import check_writable, read_rows, write_csv, write_rows
 
 
 def test_rows_come_back(tmp_path):
@@ -12,6 +12,11 @@ def test_rows_come_back(tmp_path):
     write_rows(path, rows)
     assert read_rows(path) == rows
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_table_as_comma_separated_values(tmp_path):
+    write_csv(tmp_path / "table.csv", [{"a": 1, "b": None}, {"a": "x, y", "c": {"d": 0.5}}])
+    assert (tmp_path / "table.csv").read_text() == 'a,b,c\n1,,\n"x, y",,"{""d"": 0.5}"\n'
 
 
 def test_nothing_is_left_of_a_table_that_cannot_be_written(tmp_path):

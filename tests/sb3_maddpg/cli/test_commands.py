@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from quad_swarm.task.rules import RULES
+from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli import commands
 from sb3_maddpg.cli.commands import COMMANDS, examples, main
-from sb3_maddpg.pretrained_models import pretrained_folder
+from sb3_maddpg.cli.overview import ALGORITHMS, packaged_recipes
+from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 
 
 @pytest.fixture(autouse=True)
@@ -27,6 +30,78 @@ def test_every_command_helps_with_an_example(name, capsys):
     assert "usage:" in shown
     assert examples(name).splitlines()[0].strip() in shown
     assert not any(word in COMMANDS[name].examples for word in ("Swarm", "swarm"))
+
+
+def test_the_help_names_what_is_installed(capsys):
+    for argv in (["--help"], ["train", "--help"], ["tune", "--help"]):
+        with pytest.raises(SystemExit):
+            main(argv)
+        shown = capsys.readouterr().out
+        known = (*ALGORITHMS, *pretrained_models(), *packaged_recipes(), "QuadSwarm-v0")
+        assert all(name in shown for name in known)
+        assert argv == ["--help"] or "--resume" in shown
+    for command in ("evaluate", "replay"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        shown = capsys.readouterr().out
+        assert all(f"pretrained:{name}" in shown for name in pretrained_models())
+
+
+def test_help_names_own_rules_and_scenarios(capsys):
+    known = dict(RULES), dict(SCENARIOS)
+    Path("own_rules.py").write_text(
+        "from quad_swarm.task.rules import RULES, none\n"
+        "from quad_swarm.world.scenarios import SCENARIOS\n"
+        'RULES["mine"] = none, ()\nSCENARIOS["two_rows"] = SCENARIOS["random"]\n'
+    )
+    try:
+        with pytest.raises(SystemExit):
+            main(["evaluate", "--gym-packages", "own_rules", "--help"])
+    finally:
+        for registry, entries in zip((RULES, SCENARIOS), known, strict=True):
+            registry.clear()
+            registry.update(entries)
+    shown = capsys.readouterr().out
+    assert "mine" in shown
+    assert "two_rows" in shown
+
+
+@pytest.mark.parametrize(
+    ("argv", "nearest"),
+    [
+        (["evalute"], "evaluate"),
+        (["evaluate", "--polcy", "none"], "--policy"),
+        (["train", "--env", "OwnBit-v0", "--tensorbord-log", "tb"], "--tensorboard-log"),
+        (["tune", "--env", "OwnBit-v0", "--sampler", "tpee"], "tpe"),
+    ],
+)
+def test_the_nearest_of_what_is_mistyped_is_named(argv, nearest, capsys):
+    with pytest.raises(SystemExit):
+        main(argv)
+    error = capsys.readouterr().err
+    assert f"did you mean '{nearest}'?" in error
+    assert f"sb3-maddpg {argv[0]}: error" in error or argv == ["evalute"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["evaluate", "--policy", "latst:logs"], "Did you mean 'latest'?"),
+        (["train", "--env", "mpe/simple_spread_v3"], "Did you mean 'mpe2'?"),
+        (["train", "--env", "OwnBit-v0", "--conf-file", "my_recipe.yml"], "Did you mean 'my_recipes.yml'?"),
+        (["train", "--env", "QuadSwarm-v0", "--conf-file", "quad_swarm_papr.yml"], "'quad_swarm_paper.yml'?"),
+    ],
+)
+def test_the_nearest_file_or_module_is_named(argv, message, capsys):
+    Path("my_recipes.yml").touch()
+    assert main(argv) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_packaged_recipes_are_found_by_their_names(capsys):
+    argv = ["train", "--env", "QuadSwarm-v0", "--conf-file", "quad_swarm_paper.yml", "--eval-freq", "-1", "-n", "100"]
+    assert main([*argv, "-params", "n_envs:4"]) == 0
+    assert str(packaged_recipes()["quad_swarm_paper.yml"]) in capsys.readouterr().out
 
 
 def test_pretrained_models_are_listed_shown_and_copied(capsys):

@@ -1,8 +1,10 @@
 """What all commands share: their options, and the check of files that they are going to write."""
 
+import argparse
+
 import pytest
 
-from sb3_maddpg.cli.options import check_writable, common_options, import_packages
+from sb3_maddpg.cli.options import check_writable, common_options, import_packages, nearest_options
 
 
 def test_what_is_not_common_is_left_to_others():
@@ -17,6 +19,40 @@ def test_what_is_not_common_is_left_to_others():
 def test_what_names_no_package_is_refused(name):
     with pytest.raises(ValueError, match=r"^--gym-packages .*: give the names of packages"):
         import_packages(["json", name])
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [("my_ruls", "my_rules"), ("sb3_madpg", "sb3_maddpg"), ("sb3_maddpg.estimator", "sb3_maddpg.estimators")],
+)
+def test_the_nearest_module_is_named(tmp_path, monkeypatch, name, nearest):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_rules.py").touch()
+    with pytest.raises(ModuleNotFoundError, match=rf"--gym-packages {name}: .*\. Did you mean '{nearest}'\?$"):
+        import_packages([name])
+
+
+def test_a_module_that_lacks_another_says_so(tmp_path, monkeypatch):
+    (tmp_path / "needy.py").write_text("import jsom")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match=r"^No module named 'jsom'$"):
+        import_packages(["needy"])
+
+
+def test_the_nearest_option_and_choice_are_named(capsys):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--policy", choices=["full", "none"])
+    for words, hint in (
+        (["--polcy", "none"], "--polcy none; did you mean '--policy'?"),
+        (["--policy", "ful"], "; did you mean 'full'?"),
+        (["--xyz"], "unrecognized arguments: --xyz\n"),
+    ):
+        with nearest_options(), pytest.raises(SystemExit):
+            parser.parse_args(words)
+        assert hint in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--polcy", "none"])
+    assert "did you mean" not in capsys.readouterr().err, "only inside"
 
 
 def test_a_file_that_can_be_written_is_left_as_it_is(tmp_path):

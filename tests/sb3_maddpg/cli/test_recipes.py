@@ -37,6 +37,7 @@ def refused(capsys, *argv: str) -> str:
         ("OwnBit-v0: 3", "the recipe OwnBit-v0 is int 3"),
         ("Other-v0: {n_timesteps: 3}", "has no recipe for OwnBit-v0 and no `default`"),
         (None, "There is no recipe r.yml"),
+        ("OwnBt-v0: {n_timesteps: 3}", "below it. Did you mean 'OwnBt-v0'?"),
     ],
 )
 def test_a_file_without_a_recipe_is_refused(capsys, text, message):

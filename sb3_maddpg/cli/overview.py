@@ -1,0 +1,65 @@
+"""What there is to name on the command line, for ``--help``: read from the registries, own entries among them."""
+
+import importlib
+import shutil
+import textwrap
+from importlib.metadata import entry_points
+from importlib.resources import files
+from pathlib import Path
+
+import gymnasium
+import yaml
+
+from sb3_maddpg.iddpg import IDDPG
+from sb3_maddpg.maddpg import MADDPG
+from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.pretrained_models import pretrained_models
+
+ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
+
+
+def load_environments() -> None:
+    """Import what registers environments: the toy tasks, and the packages that say so by an entry point."""
+    importlib.import_module("sb3_maddpg.team_tasks")
+    for entry_point in entry_points(group="sb3_maddpg.environments"):
+        entry_point.load()
+
+
+def environments() -> list[str]:
+    """
+    :return: the ids that are registered, without Gymnasium's and rl_zoo3's own
+    """
+    load_environments()
+    points = {env_id: spec.entry_point for env_id, spec in gymnasium.registry.items()}
+    modules = {
+        env_id: one if isinstance(one, str) else getattr(one, "__module__", "") for env_id, one in points.items()
+    }
+    return [env_id for env_id, module in modules.items() if not module.startswith(("gymnasium", "rl_zoo3"))]
+
+
+def packaged_recipes() -> dict[str, Path]:
+    """
+    :return: the files of ``zoo_configs`` by their names
+    """
+    folder = Path(str(files("sb3_maddpg.zoo_configs")))
+    return {path.name: path for path in sorted(folder.glob("*.yml"))}
+
+
+def overview() -> str:
+    """
+    :return: algorithms, environments, pretrained models and recipes
+    """
+    found = {
+        "algorithms": [*ALGORITHMS, "rl_zoo3's (`train --help`)"],
+        "environments": [*environments(), "PACKAGE/MODULE of PettingZoo"],
+        "models": [f"pretrained:{name}" for name in pretrained_models()],
+    }
+    for name, path in packaged_recipes().items():
+        env_ids = yaml.safe_load(path.read_text())
+        found[f"--conf-file {name}"] = ["any other" if env_id == "default" else env_id for env_id in env_ids]
+    width, indent = min(shutil.get_terminal_size((100, 24)).columns, 120), max(map(len, found)) + 4
+    lines = [
+        textwrap.fill(", ".join(some), width, initial_indent=f"  {name}".ljust(indent), subsequent_indent=" " * indent)
+        for name, some in found.items()
+    ]
+    return "there are:\n" + "\n".join(lines)
