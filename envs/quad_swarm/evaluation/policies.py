@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium import spaces
 
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
-from quad_swarm.task.request_task import RequestTask
+from quad_swarm.task.request_task import RequestTask, requests_of
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import SwarmConfig
@@ -141,6 +141,7 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
     n = config.n_robots
     observation = make_observation(config, **arguments, critics=False)
     expected, trained = (n, observation.size), tuple(model.observation_space.shape)
+    n_bits = 2 if trained_in(model).get("announcements") else 1
     predictor = model
     if trained != expected:
         if not hasattr(model, "policy_for") or not hasattr(model.policy, "observation_layout"):
@@ -152,12 +153,15 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
             )
         # A policy that looks at its neighbours one by one fits any number of them
         predictor = model.policy_for(
-            spaces.Box(-np.inf, np.inf, expected, np.float32), spaces.MultiBinary(n * (n - 1)), observation.layout
+            spaces.Box(-np.inf, np.inf, expected, np.float32),
+            spaces.MultiBinary(n * (n - 1) * n_bits),
+            observation.layout,
         )
 
     def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
         bits, _ = predictor.predict(task.observe(), deterministic=True)
-        return np.asarray(bits).reshape(-1, n, n - 1) > 0.5
+        bits = np.asarray(bits).reshape(-1, n, n - 1, n_bits) > 0.5
+        return requests_of(bits)
 
     return request, observation
 

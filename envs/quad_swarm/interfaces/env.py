@@ -11,9 +11,9 @@ from gymnasium import spaces
 from pydantic import PositiveInt
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.interfaces.shared import TaskAttributes, checked_options, checked_seed, need_reset, request_matrices
+from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, checked_seed, need_reset
 from quad_swarm.states import generator_of, generator_state, like
-from quad_swarm.task.request_task import make_task
+from quad_swarm.task.request_task import make_task, requests_of
 from quad_swarm.validation import checked_arguments
 
 
@@ -70,6 +70,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     :param world: any fields of `SwarmConfig` to replace, nested ones by mappings, for example ``{"radius": 0.12,
         "quadrotor": {"drag_x": 0.3}}``; what has an argument of its own may be given here or there
     :param solver: "auto" or a name of `planner.SOLVERS`
+    :param announcements: robots may also send their plans unasked: two bits for each of the others, the first to ask it
+        for its plan, the second to send it the own one
     :param render_mode: None, "rgb_array", or "human" for a window that shows every step in real time
     :raises ValueError: a wrong value; the message names it and the remedy
 
@@ -99,6 +101,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         space: Mapping[str, Any] | None = None,
         world: Mapping[str, Any] | None = None,
         solver: str = "auto",
+        announcements: bool = False,
         render_mode: str | None = None,
     ):
         self.task = make_task(
@@ -119,10 +122,11 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
             space=space,
             world=world,
             solver=solver,
+            announcements=announcements,
         )
         n = self.n_agents
         self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
-        self.action_space = spaces.MultiBinary(n * (n - 1))
+        self.action_space = spaces.MultiBinary(n * (n - 1) * self.task.n_bits)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
@@ -164,8 +168,10 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         """
         if not self._is_reset:
             raise need_reset()
-        self._requests = request_matrices(action, (self._requests.size,), self.n_agents)
-        outcome = self.task.step(self._requests[None])
+        shape = (self._requests.size * self.task.n_bits,)
+        bits = checked_bits(action, shape, self.n_agents, self.task.n_bits)
+        self._requests = requests_of(bits)
+        outcome = self.task.act(bits[None])
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = info_of(self.task.info(outcome), 0)
         if terminated or truncated:

@@ -96,12 +96,16 @@ def need_reset() -> gym.error.ResetNeeded:
     return gym.error.ResetNeeded("step() was called before reset(): reset the environment first.")
 
 
-def request_matrices(actions: Any, shape: tuple[int, ...], n_robots: int, whose: str = "The action") -> np.ndarray:
-    """Actions as whom each robot asks, (..., n - 1) bool with one row for each robot that acts.
+def checked_bits(
+    actions: Any, shape: tuple[int, ...], n_robots: int, n_bits: int = 1, whose: str = "The action"
+) -> np.ndarray:
+    """Actions as bits of each robot for each of the others, (..., n - 1, n_bits) bool with one row for each robot that
+    acts.
 
     :param actions: bits
     :param shape: of the action space, whose last axis holds whole robots' bits
     :param n_robots: number of robots n
+    :param n_bits: of each robot for each of the others
     :param whose: whose action it is, for messages
     :raises ValueError: another shape, or anything but zeros and ones
     """
@@ -109,7 +113,7 @@ def request_matrices(actions: Any, shape: tuple[int, ...], n_robots: int, whose:
     if bits.shape != shape:
         raise ValueError(
             f"{whose} has shape {bits.shape}; the action space has {shape}: "
-            f"{n_robots - 1} bits for each robot, one for each of the others."
+            f"{n_bits * (n_robots - 1)} bits for each robot, {n_bits} for each of the others."
         )
     asked = bits == 1
     if not (asked | (bits == 0)).all():
@@ -117,4 +121,4 @@ def request_matrices(actions: Any, shape: tuple[int, ...], n_robots: int, whose:
         raise ValueError(
             f"{whose} contains {shown(wrong)}; every entry must be 0 or 1. Threshold scores before acting."
         )
-    return asked.reshape(*shape[:-1], -1, n_robots - 1)
+    return asked.reshape(*shape[:-1], -1, n_robots - 1, n_bits)

@@ -110,6 +110,8 @@ _STAGES = (0.2, 0.5, 1.0)
 # Of what the planner keeps: plans that come no nearer than this are hardly changed by each other. 1.1 is enough for
 # eight robots; in a crowd of sixteen it leaves twice as many collisions.
 _CONFLICT = 1.8
+# Who would come nearer than this many separations within so many seconds
+_ENCOUNTER, _LOOK_AHEAD = 1.2, 3.0
 
 
 def _stages(horizon: int) -> list[int]:
@@ -215,9 +217,12 @@ def _told(pair: PairView) -> np.ndarray:
 
 
 def _mask(pair: PairView) -> np.ndarray:
-    """Whom there is any use in asking: who comes near the own plan, as far as is known."""
+    """Whom there is any use in telling or asking: who comes near the own plan as far as is known, or would soon come
+    near if both kept their velocities."""
     view = pair.view
-    return view.plan_approach.least[..., None] < _CONFLICT * view.separation
+    in_the_way = view.plan_approach.least < _CONFLICT * view.separation
+    ahead = view.approach(_LOOK_AHEAD)[0] < _ENCOUNTER * view.separation
+    return (in_the_way | ahead)[..., None]
 
 
 def _critic(pair: PairView) -> np.ndarray:

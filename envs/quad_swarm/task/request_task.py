@@ -13,6 +13,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.validation import checked, checked_arguments, replaced
+from quad_swarm.world.beliefs import other_indices, reverse_indices
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm
@@ -71,6 +72,19 @@ class Outcome(NamedTuple):
     report: StepReport
 
 
+def requests_of(bits: np.ndarray) -> np.ndarray:
+    """Who gets whose plan.
+
+    :param bits: of each robot for each of the others, (..., n, n - 1, 1 or 2) bool: whether it asks it for its plan
+        and, with announcements, whether it sends it the own one
+    :return: (..., n, n - 1) bool, as if all of these plans had been asked for
+    """
+    if bits.shape[-1] == 1:
+        return bits[..., 0]
+    n = bits.shape[-3]
+    return bits[..., 0] | bits[..., other_indices(n), reverse_indices(n), 1]
+
+
 class RequestTask:
     """Episodes of E swarms.
 
@@ -85,6 +99,7 @@ class RequestTask:
         the world says
     :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
     :param end_at_collision: end episodes at collisions; otherwise they fly on, to see how deep a collision gets
+    :param announcements: robots may send their plans unasked too, see `act`
     :raises ValueError: near misses are looked for beyond the plans' end
     """
 
@@ -98,6 +113,7 @@ class RequestTask:
         continuous_collisions: bool | None = None,
         end_at_arrival: bool = False,
         end_at_collision: bool = True,
+        announcements: bool = False,
     ):
         last = swarm.config.planner.horizon - 1
         if reward.near_miss_ahead > last:
@@ -116,6 +132,7 @@ class RequestTask:
         self.continuous_collisions = continuous_collisions
         self.end_at_arrival = end_at_arrival
         self.end_at_collision = end_at_collision
+        self.n_bits = 2 if announcements else 1
         n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, swarm.config)
@@ -189,8 +206,22 @@ class RequestTask:
         """What every robot observes, (E, n, observation_size) float32; of some swarms only if there is a mask."""
         return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))
 
-    def step(self, requests: np.ndarray) -> Outcome:
-        """One step of every swarm; ``requests`` as in `Swarm.step`."""
+    def act(self, bits: np.ndarray) -> Outcome:
+        """One step of every swarm. An announcement arrives as an answer would, and is counted as a request.
+
+        :param bits: (E, n, n - 1, n_bits) bool, see `requests_of`
+        """
+        return self.step(requests_of(bits), bits.sum(axis=-1))
+
+    def step(self, requests: np.ndarray, messages: np.ndarray | None = None) -> Outcome:
+        """One step of every swarm.
+
+        :param requests: who gets whose plan, as in `Swarm.step`
+        :param messages: how many messages each robot sends because of each of the others, (E, n, n - 1); None: it asks
+            for all plans that it gets
+        """
+        if messages is None:
+            messages = requests
         report = self.swarm.step(requests)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
@@ -199,7 +230,7 @@ class RequestTask:
         terms = {
             "goal": self.reward.goal * report.at_goal.all(axis=1),
             "collision": -self.reward.collision * collided,
-            "requests": -self.reward.request * n_requests,
+            "requests": -self.reward.request * messages.sum(axis=(1, 2)),
         }
         near_misses = np.zeros_like(report.separation)
         if self.reward.near_miss:
@@ -212,7 +243,7 @@ class RequestTask:
         return Outcome(
             reward=sum(terms.values(), start=np.zeros(len(n_requests))),
             pair_rewards=(
-                share[:, None, None] - self.reward.collision * colliding - self.reward.request * requests - near_misses
+                share[:, None, None] - self.reward.collision * colliding - self.reward.request * messages - near_misses
             ).astype(np.float32),
             reward_terms=terms,
             terminated=terminated,
@@ -274,6 +305,7 @@ def make_task(
     space: Mapping[str, Any] | None = None,
     world: Mapping[str, Any] | None = None,
     solver: str = "auto",
+    announcements: bool = False,
 ) -> RequestTask:
     """The task of an environment; arguments as in `QuadSwarmEnv`.
 
@@ -287,4 +319,6 @@ def make_task(
     weights = replaced(RewardConfig(), reward or {}, "reward")
     swarm = Swarm(config, n_swarms, solver)
     seen = make_observation(config, observation, scale_observation)
-    return RequestTask(swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival)
+    return RequestTask(
+        swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival, announcements=announcements
+    )

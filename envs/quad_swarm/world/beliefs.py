@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -28,15 +29,22 @@ class BeliefSource(IntEnum):
     REQUESTED = 2
 
 
+@cache
 def other_indices(n_robots: int) -> np.ndarray:
-    """For each robot the indices of the others, ascending: (n, n - 1)."""
-    return np.array([[j for j in range(n_robots) if j != i] for i in range(n_robots)], dtype=np.int64)
+    """For each robot the indices of the others, ascending: (n, n - 1), read-only."""
+    others = np.array([[j for j in range(n_robots) if j != i] for i in range(n_robots)], dtype=np.int64)
+    others.setflags(write=False)
+    return others
 
 
+@cache
 def reverse_indices(n_robots: int) -> np.ndarray:
-    """For each robot its own place among the others of each of its others, see `other_indices`: (n, n - 1)."""
+    """For each robot its place among the others of each of its others, see `other_indices`: (n, n - 1), read-only."""
     others = other_indices(n_robots)
-    return np.array([[row.tolist().index(i) for row in others[others[i]]] for i in range(n_robots)], dtype=np.int64)
+    places = [[row.tolist().index(i) for row in others[others[i]]] for i in range(n_robots)]
+    reverse = np.array(places, dtype=np.int64)
+    reverse.setflags(write=False)
+    return reverse
 
 
 def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import pytest
 
 import quad_swarm
 from quad_swarm.interfaces.env import QuadSwarmEnv
-from quad_swarm.interfaces.shared import checked_seed, request_matrices
+from quad_swarm.interfaces.shared import checked_bits, checked_seed
 
 INTERFACES = {
     "team": QuadSwarmEnv,
@@ -51,12 +51,12 @@ def test_a_step_before_the_reset_is_refused(env):
 
 def test_actions_become_rows_of_whom_each_robot_asks():
     bits = [[1, 0, 0, 1, 0, 1], [0, 0, 1, 1, 1, 1]]
-    asked = request_matrices(bits, (2, 6), 3)
+    asked = checked_bits(bits, (2, 6), 3)
     assert asked.dtype == bool
     assert asked.astype(int).tolist() == [[[1, 0], [0, 1], [0, 1]], [[0, 0], [1, 1], [1, 1]]]
-    assert np.array_equal(request_matrices(np.array(bits, np.float32), (2, 6), 3), asked)
-    assert np.array_equal(request_matrices(np.array(bits, bool), (2, 6), 3), asked)
-    assert request_matrices([1, 0], (2,), 3).tolist() == [[True, False]], "one robot's own"
+    assert np.array_equal(checked_bits(np.array(bits, np.float32), (2, 6), 3), asked)
+    assert np.array_equal(checked_bits(np.array(bits, bool), (2, 6), 3), asked)
+    assert checked_bits([1, 0], (2,), 3).tolist() == [[True, False]], "one robot's own"
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_actions_become_rows_of_whom_each_robot_asks():
 )
 def test_what_is_no_action_is_named(actions, message):
     with pytest.raises(ValueError, match=message):
-        request_matrices(actions, (6,), 3, "Whose")
+        checked_bits(actions, (6,), 3, "Whose")
 
 
 def test_what_learners_read_is_the_team_s():
