@@ -2,12 +2,14 @@
 
 import shutil
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 
-from quad_swarm.evaluation.flight import Condition, run_episodes
+from quad_swarm.evaluation.flight import Condition, first_episode, fly, run_episodes
 from quad_swarm.evaluation.policies import load_model, make_policy, short_name, trained_in
+from quad_swarm.task.request_task import requests_of
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
 from sb3_maddpg.pretrained_models import pretrained_folder
@@ -62,3 +64,18 @@ def test_names():
 def test_a_model_tells_its_world(model):
     assert trained_in(load_model(model, ALGO))["preset"] == "paper"
     assert trained_in(object()) == {}
+
+
+def test_a_model_that_announces_flies_as_in_its_environment(tmp_path):
+    kwargs = {"preset": "flight", "n_robots": 3, "observation": "state+approach+mask", "announcements": True}
+    env = gym.make("QuadSwarm-v0", scenario="symmetric_swap", **kwargs)
+    model = MADDPG("PairPolicy", env, buffer_size=500, seed=0)
+    model.save(tmp_path / "model.zip")
+    one = Condition(str(tmp_path / "model.zip"), "symmetric_swap", make_config("flight", n_robots=3))
+    flight = fly(one, seed=1)
+    observation, _ = env.reset(seed=first_episode(1))
+    for asked in flight.requests[:30]:
+        bits, _ = model.predict(observation, deterministic=True)
+        assert np.array_equal(requests_of(bits.reshape(3, 2, 2) > 0), asked)
+        observation, *_ = env.step(bits)
+    assert 0 < flight.requests.sum() < flight.requests.size

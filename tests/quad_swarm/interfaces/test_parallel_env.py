@@ -19,13 +19,14 @@ def test_parallel_api():
         parallel_api_test(quad_swarm.parallel_env(max_steps=20), num_cycles=60)
 
 
-def test_both_interfaces_fly_the_same_episode():
-    team, parallel = QuadSwarmEnv(), quad_swarm.parallel_env()
+@pytest.mark.parametrize("announcements", [False, True])
+def test_both_interfaces_fly_the_same_episode(announcements):
+    team, parallel = QuadSwarmEnv(announcements=announcements), quad_swarm.parallel_env(announcements=announcements)
     observation, _ = team.reset(seed=3)
     rows, _ = parallel.reset(seed=3)
     rng = np.random.default_rng(0)
     while parallel.agents:
-        bits = rng.integers(0, 2, (4, 3), dtype=np.int8)
+        bits = rng.integers(0, 2, (4, 6 if announcements else 3), dtype=np.int8)
         assert np.array_equal(observation, np.stack([rows[f"robot_{i}"] for i in range(4)]))
         assert np.array_equal(parallel.state(), observation.ravel())
         observation, reward, terminated, truncated, _ = team.step(bits.ravel())

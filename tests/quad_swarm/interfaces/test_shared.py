@@ -49,14 +49,16 @@ def test_a_step_before_the_reset_is_refused(env):
         env.step({} if hasattr(env, "possible_agents") else np.zeros(env.action_space.shape))
 
 
-def test_actions_become_rows_of_whom_each_robot_asks():
+def test_actions_become_bits_of_each_robot_for_each_of_the_others():
     bits = [[1, 0, 0, 1, 0, 1], [0, 0, 1, 1, 1, 1]]
     asked = checked_bits(bits, (2, 6), 3)
     assert asked.dtype == bool
-    assert asked.astype(int).tolist() == [[[1, 0], [0, 1], [0, 1]], [[0, 0], [1, 1], [1, 1]]]
+    assert asked[..., 0].astype(int).tolist() == [[[1, 0], [0, 1], [0, 1]], [[0, 0], [1, 1], [1, 1]]]
+    both = checked_bits(bits[0] + bits[1], (12,), 3, 2)
+    assert both.astype(int).tolist() == [[[1, 0], [0, 1]], [[0, 1], [0, 0]], [[1, 1], [1, 1]]]
     assert np.array_equal(checked_bits(np.array(bits, np.float32), (2, 6), 3), asked)
     assert np.array_equal(checked_bits(np.array(bits, bool), (2, 6), 3), asked)
-    assert checked_bits([1, 0], (2,), 3).tolist() == [[True, False]], "one robot's own"
+    assert checked_bits([1, 0], (2,), 3).tolist() == [[[True], [False]]], "one robot's own"
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,7 @@ def test_actions_become_rows_of_whom_each_robot_asks():
 )
 def test_what_is_no_action_is_named(actions, message):
     with pytest.raises(ValueError, match=message):
-        checked_bits(actions, (6,), 3, "Whose")
+        checked_bits(actions, (6,), 3, whose="Whose")
 
 
 def test_what_learners_read_is_the_team_s():

@@ -33,6 +33,7 @@ EVERYTHING = {"preset": "dense", "observation": "state+approach+memory+plan+told
         {"max_steps": 12},
         {"max_steps": 9, "n_robots": 3, "noise": {"vel": 0.05}},
         {"max_steps": 7, "n_robots": 3, **EVERYTHING},
+        {"max_steps": 7, "n_robots": 3, "announcements": True},
     ],
 )
 def test_flies_what_single_environments_fly(kwargs):

@@ -115,10 +115,12 @@ def test_the_side_on_which_the_other_would_pass_is_seen_although_the_frame_is_mi
     np.testing.assert_allclose(left[:, 1:], -right[:, 1:], atol=1e-6)
 
 
-def test_the_mask_names_those_who_come_near_the_own_plan():
+def test_the_mask_names_those_who_come_near_the_own_plan_or_will_soon_be_near():
     observation, swarm = make_observation(CONFIG, EVERYTHING + "+mask"), flown()
     mask = observation(swarm)[..., observation.layout["action_mask"]]
-    near = View(swarm).plan_approach.least < 1.8 * CONFIG.planner.separation
-    assert np.array_equal(mask, near)
-    assert 0 < near.mean() < 1
+    view = View(swarm)
+    near = view.plan_approach.least < 1.8 * CONFIG.planner.separation
+    ahead = view.approach(3.0)[0] < 1.2 * CONFIG.planner.separation
+    assert np.array_equal(mask, near | ahead)
+    assert 0 < near.mean() < (near | ahead).mean() < 1
     assert "action_mask" not in make_observation(CONFIG, EVERYTHING).layout

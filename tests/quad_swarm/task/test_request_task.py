@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quad_swarm.interfaces.env import QuadSwarmEnv
-from quad_swarm.task.request_task import RewardConfig, make_task
+from quad_swarm.task.request_task import RewardConfig, make_task, requests_of
 
 
 @pytest.mark.parametrize(
@@ -153,6 +153,31 @@ def test_collisions_between_steps_can_end_episodes():
         assert info["min_separation_continuous"] < 0.1
         ends[continuous] = terminated
     assert ends == {False: False, True: True}
+
+
+def test_an_announcement_arrives_as_an_answer_and_costs_who_sends_it():
+    tasks = [make_task(n_robots=3, announcements=announcements) for announcements in (False, True)]
+    for task in tasks:
+        task.reset(0, np.random.default_rng(0))
+    asked = np.zeros((1, 3, 2), bool)
+    asked[0, 0, 1] = asked[0, 2, 1] = True  # robot 0 gets the plan of 2, robot 2 that of 1
+    bits = np.zeros((1, 3, 2, 2), bool)
+    bits[0, 0, 1, 0] = True  # 0 asks 2
+    bits[0, 1, 1, 1] = True  # 1 sends its plan to 2
+    assert np.array_equal(requests_of(bits), asked)
+    for _ in range(5):
+        by_requests, announced = tasks[0].step(asked), tasks[1].act(bits)
+        assert np.array_equal(by_requests.report.belief_source, announced.report.belief_source)
+        assert np.array_equal(tasks[0].swarm.state, tasks[1].swarm.state)
+    assert by_requests.reward == announced.reward
+    assert by_requests.n_requests == announced.n_requests == 2
+    costs = tasks[1].reward.request
+    np.testing.assert_allclose(by_requests.pair_rewards, [[[0, -costs], [0, 0], [0, -costs]]], atol=1e-6)
+    np.testing.assert_allclose(announced.pair_rewards, [[[0, -costs], [0, -costs], [0, 0]]], atol=1e-6)
+    bits[0, 2, 1, 0] = True  # and 2 asks for it as well: one plan, two messages
+    both = tasks[1].act(bits)
+    assert both.n_requests == 2
+    assert both.reward_terms["requests"] == pytest.approx(-3 * costs)
 
 
 def test_near_misses_cost_in_proportion():
