@@ -69,7 +69,7 @@ def test_a_model_tells_its_world(model):
 def test_a_model_that_announces_flies_as_in_its_environment(tmp_path):
     kwargs = {"preset": "flight", "n_robots": 3, "observation": "state+approach+mask", "announcements": True}
     env = gym.make("QuadSwarm-v0", scenario="symmetric_swap", **kwargs)
-    model = MADDPG("PairPolicy", env, buffer_size=500, seed=0)
+    model = MADDPG("PairPolicy", env, buffer_size=2000, seed=0)
     model.save(tmp_path / "model.zip")
     one = Condition(str(tmp_path / "model.zip"), "symmetric_swap", make_config("flight", n_robots=3))
     flight = fly(one, seed=1)
