@@ -352,7 +352,8 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
-            raise ValueError(f"{self.policy_class.__name__} is no policy of a team: use MlpPolicy, CnnPolicy or PairPolicy.")
+            name = self.policy_class.__name__
+            raise ValueError(f"{name} is no policy of a team: use MlpPolicy, CnnPolicy or PairPolicy.")
         if not isinstance(self.estimator, str) or self.estimator not in ESTIMATORS:
             raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
         names = self.arguments.model_fields

@@ -357,12 +357,12 @@ def replay(
     policy, task, rngs = begin(one, [first_episode(seed) + number])
 
     def with_more(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
-        requests = policy(task, rngs)
+        requests = policy(task, rngs)[..., 0]
         if int(task.statistics.steps[0]) in when and more is not None:
             asked = np.zeros((n, n), dtype=bool)
             asked[rows, others] = requests[0]
             requests = more(asked, *pair)[rows, others][None]
-        return requests
+        return requests[..., None]
 
     for step in fly_steps(with_more, task, rngs):
         separation = step.outcome.report.separation[0]

@@ -12,7 +12,7 @@ import numpy as np
 from quad_swarm.evaluation.policies import RequestPolicy, make_policy, policy_of
 from quad_swarm.geometry import length
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig
+from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, requests_of
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
@@ -96,13 +96,15 @@ class Step(NamedTuple):
     """One step of a batch of episodes.
 
     :param episodes: which of the episodes are still flying, (E,)
-    :param requests: who asked whom, (E, n, n - 1) bool
+    :param requests: who got whose plan, (E, n, n - 1) bool
+    :param announced: which of these plans came unasked, (E, n, n - 1) bool
     :param outcome: what came of it
     :param over: which of them end with this step, (E,) bool
     """
 
     episodes: np.ndarray
     requests: np.ndarray
+    announced: np.ndarray
     outcome: Outcome
     over: np.ndarray
 
@@ -118,13 +120,14 @@ def fly_steps(
     since_arrival = np.zeros(episodes.size, dtype=int)
     rngs = list(rngs)
     while episodes.size:
-        requests = policy(task, rngs)
+        bits = policy(task, rngs)
+        requests = requests_of(bits)
         outcome = task.step(requests)
         since_arrival += task.statistics.reached
         over = outcome.terminated | outcome.truncated
         if linger is not None:
             over |= since_arrival > linger
-        yield Step(episodes, requests, outcome, over)
+        yield Step(episodes, requests, requests & ~bits[..., 0], outcome, over)
         if over.any():
             task.keep(~over)
             episodes, since_arrival = episodes[~over], since_arrival[~over]
@@ -153,7 +156,8 @@ class Flight:
     :param state: states, (T + 1, n, 9)
     :param plans: planned states as of each step, stages 0..N, (T + 1, n, N + 1, 9)
     :param goal: goals, (n, 3), world frame (m)
-    :param requests: who asked whom in each step, (T, n, n - 1) bool
+    :param requests: who got whose plan in each step, (T, n, n - 1) bool
+    :param announced: which of these plans came unasked, (T, n, n - 1) bool
     :param other_requests: whom a second rule would have asked in each step, which was not executed, (T, n, n - 1) bool
     :param min_separation: smallest distance between two robots at the start and in each step: at any time of it where
         the world's collisions are continuous, else after it, (T + 1,) (m)
@@ -164,6 +168,7 @@ class Flight:
     plans: np.ndarray
     goal: np.ndarray
     requests: np.ndarray
+    announced: np.ndarray
     other_requests: np.ndarray
     min_separation: np.ndarray
 
@@ -233,6 +238,7 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     rule, other_rngs = parse_rule(other_rule), [np.random.default_rng([episode, 2])]
     state, plans = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()]
     requests: list[np.ndarray] = []
+    announced: list[np.ndarray] = []
     other_requests: list[np.ndarray] = []
 
     def recorded(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
@@ -244,10 +250,11 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         report = step.outcome.report
         closest.append((report.min_separation_continuous if task.continuous_collisions else report.min_separation)[0])
         requests.append(step.requests[0])
+        announced.append(step.announced[0])
         state.append(task.swarm.state[0].copy())
         plans.append(task.swarm.plans[0].copy())
         goal = task.swarm.goal[0].copy()
     start = state[0][:, POSITION]
     closest.insert(0, length(start[other_indices(len(start))] - start[:, None]).min())
-    arrays = map(np.array, (state, plans, goal, requests, other_requests, closest))
+    arrays = map(np.array, (state, plans, goal, requests, announced, other_requests, closest))
     return Flight(condition.config, *arrays)

@@ -18,12 +18,13 @@ import numpy as np
 from gymnasium import spaces
 
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
-from quad_swarm.task.request_task import RequestTask, requests_of
+from quad_swarm.task.request_task import RequestTask
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import SwarmConfig
 
-# From the present state of E swarms, and a generator for each, to who asks whom, (E, n, n - 1) bool
+# From the present state of E swarms, and a generator for each, to bits of each robot for each of the others, (E, n,
+# n - 1, 1 or 2) bool, see `requests_of`
 RequestPolicy = Callable[[RequestTask, list[np.random.Generator]], np.ndarray]
 
 # Arguments of the environment that shape what a model observes: they are the model's, all others the evaluation's.
@@ -128,7 +129,7 @@ def make_policy(policy: str, config: SwarmConfig, algo: str) -> tuple[RequestPol
         if policy.startswith(("pretrained:", "latest:")):
             hint += "; `sb3-maddpg evaluate` knows latest:LOGDIR and pretrained:NAME too"
         raise ValueError(f"{error} {hint}.") from None
-    return (lambda task, rngs: rule(View(task.swarm, rngs))), PaperObservation(config.n_robots)
+    return (lambda task, rngs: rule(View(task.swarm, rngs))[..., None]), PaperObservation(config.n_robots)
 
 
 def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:
@@ -160,8 +161,7 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
 
     def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
         bits, _ = predictor.predict(task.observe(), deterministic=True)
-        bits = np.asarray(bits).reshape(-1, n, n - 1, n_bits) > 0.5
-        return requests_of(bits)
+        return np.asarray(bits).reshape(-1, n, n - 1, n_bits) > 0.5
 
     return request, observation
 

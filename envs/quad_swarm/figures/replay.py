@@ -71,9 +71,10 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
     """What the page needs of a flight, until shortly after the arrival of all robots: T steps of n robots.
 
     positions, attitudes (roll, pitch, yaw): (T + 1, n, 3) (m, rad); plans, those made in each step, which begin where
-    the robots were then: (T, n, K, 3) (m); goals: (n, 3) (m); requests: for each step the pairs (asker, asked);
-    separation, as the world counts it: (T + 1,) (m); arrival, collision: the first steps after which all had arrived,
-    and two collided, or None; colliding: (step, robot, robot) for every pair that collides in a step.
+    the robots were then: (T, n, K, 3) (m); goals: (n, 3) (m); requests: for each step who gets whose plan, as (robot,
+    the other), or (robot, the other, 1) if the plan came unasked; separation, as the world counts it: (T + 1,) (m);
+    arrival, collision: the first steps after which all had arrived, and two collided, or None; colliding: (step, robot,
+    robot) for every pair that collides in a step.
     """
     end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _LINGER, len(flight.requests))
     others = other_indices(flight.n_robots)
@@ -86,12 +87,18 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
         "attitudes": flight.state[: end + 1, :, ATTITUDE].round(_DIGITS).tolist(),
         "plans": flight.plans[1 : end + 1, :, ::_PLAN_STRIDE, POSITION].round(_PLAN_DIGITS).tolist(),
         "goals": flight.goal.round(_DIGITS).tolist(),
-        "requests": [[[int(a), int(others[a, k])] for a, k in np.argwhere(step)] for step in flight.requests[:end]],
+        "requests": [_pairs(*step, others) for step in zip(flight.requests[:end], flight.announced[:end], strict=True)],
         "separation": flight.min_separation[: end + 1].round(_DIGITS).tolist(),
         "arrival": flight.arrival,
         "collision": flight.collision if flight.collision is not None and flight.collision <= end else None,
         "colliding": [pair for pair in _colliding(flight) if pair[0] <= end],
     }
+
+
+def _pairs(requests: np.ndarray, announced: np.ndarray, others: np.ndarray) -> list[list[int]]:
+    """The requests of a step as the page knows them."""
+    pairs = [[int(a), int(others[a, k]), int(announced[a, k])] for a, k in np.argwhere(requests)]
+    return [pair if pair[2] else pair[:2] for pair in pairs]
 
 
 def _plain_name(policy: str) -> tuple[str, str]:

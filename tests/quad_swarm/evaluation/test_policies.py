@@ -1,5 +1,7 @@
 """Policies by their names: rules, and models by their files."""
 
+import json
+import re
 import shutil
 
 import gymnasium as gym
@@ -9,6 +11,7 @@ import torch as th
 
 from quad_swarm.evaluation.flight import Condition, first_episode, fly, run_episodes
 from quad_swarm.evaluation.policies import load_model, make_policy, short_name, trained_in
+from quad_swarm.figures.replay import replay_page
 from quad_swarm.task.request_task import requests_of
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
@@ -74,8 +77,13 @@ def test_a_model_that_announces_flies_as_in_its_environment(tmp_path):
     one = Condition(str(tmp_path / "model.zip"), "symmetric_swap", make_config("flight", n_robots=3))
     flight = fly(one, seed=1)
     observation, _ = env.reset(seed=first_episode(1))
-    for asked in flight.requests[:30]:
-        bits, _ = model.predict(observation, deterministic=True)
-        assert np.array_equal(requests_of(bits.reshape(3, 2, 2) > 0), asked)
-        observation, *_ = env.step(bits)
-    assert 0 < flight.requests.sum() < flight.requests.size
+    for got, unasked in zip(flight.requests[:30], flight.announced[:30], strict=True):
+        action, _ = model.predict(observation, deterministic=True)
+        bits = action.reshape(3, 2, 2) > 0
+        assert np.array_equal(requests_of(bits), got)
+        assert np.array_equal(unasked, got & ~bits[..., 0])
+        observation, *_ = env.step(action)
+    assert 0 < flight.announced.sum() < flight.requests.sum() < flight.requests.size
+    pairs = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', replay_page([one], seed=1), re.DOTALL)[1])
+    sent = [pair for step in pairs["flights"][0]["requests"] for pair in step]
+    assert sum(len(pair) == 3 for pair in sent) == flight.announced[: len(pairs["flights"][0]["requests"])].sum()

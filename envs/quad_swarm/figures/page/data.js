@@ -12,6 +12,7 @@ for (const flight of flights) {
   // Requests made before each step
   flight.asked = [0];
   for (const step of flight.requests) flight.asked.push(flight.asked.at(-1) + step.length);
+  flight.announces = flight.requests.some(step => step.some(pair => pair[2]));
   flight.closest = Math.min(...flight.separation);
   flight.closestStep = flight.separation.indexOf(flight.closest);
   flight.touching = new Map();

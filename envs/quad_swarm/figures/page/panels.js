@@ -43,7 +43,9 @@ export class Panel {
     this.details.querySelector("h2").append(Object.assign(document.createElement("small"), {textContent: flight.detail}));
     this.details.querySelector(".summary").textContent = summary(flight);
     const captions = [
-      "Who asks whom: a lane for each pair, one block for each robot that asks, in the colour of the robot that is asked",
+      this.flight.announces
+        ? "Who gets whose plan, asked for or sent unasked: a lane for each pair, one block for each robot that gets it, in the colour of the robot whose plan it is"
+        : "Who asks whom: a lane for each pair, one block for each robot that asks, in the colour of the robot that is asked",
       `Closest two robots (m)${Math.max(...flight.separation) > top ? `; dashed where it is more than ${top.toFixed(1)} m` : ""}`,
       "Requests so far",
     ];
@@ -97,6 +99,7 @@ function set(node, text) {
 
 export const legend = [
   ["arc", "request: from the robot that asks to the one it asks; a light runs there and returns with the plan"],
+  ...(flights.some(flight => flight.announces) ? [["arc", "plan sent unasked: from the robot whose plan it is"]] : []),
   ["tube", `plan for the next ${seconds((flights[0].plans[0][0].length - 1) * data.plan_stride)}`],
   ["goal", "goal of the robot of this colour"],
   ["bubble", `safety bubble, radius ${data.radius} m: two that touch are a collision`],

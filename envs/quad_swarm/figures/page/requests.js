@@ -1,5 +1,5 @@
 // Who asks whom: arcs with an arrowhead at the one who is asked. A light runs along in the asker's colour, and back in
-// that of the one who is asked: its plan. All arcs of a view are one instanced mesh, bent by the vertex shader.
+// that of the one who is asked: its plan. One that is sent unasked runs from its owner, in its colour. All arcs of a view are one instanced mesh, bent by the vertex shader.
 
 import {
   BufferAttribute, Color, DynamicDrawUsage, InstancedBufferAttribute, InstancedBufferGeometry, Mesh, ShaderMaterial, Vector2,
@@ -91,16 +91,16 @@ export class Requests {
     const step = stepAt(flight, t), strengths = new Map(), reach = fades ? Math.ceil(FADE / dt) : 0;
     for (let k = Math.max(0, step - reach); k <= step; k++) {
       const left = k === step ? 1 : 1 - (t - k - 1) * dt / FADE;
-      if (left > 0) for (const [i, j] of flight.requests[k]) strengths.set(i * nRobots + j, left);
+      if (left > 0) for (const [i, j, announced] of flight.requests[k]) strengths.set(i * nRobots + j, [left, announced]);
     }
     const {from, to, asker, asked, strength, phase} = this.geometry.attributes;
     let count = 0;
-    for (const [pair, left] of strengths) {
-      const i = Math.floor(pair / nRobots), j = pair % nRobots;
+    for (const [pair, [left, announced]] of strengths) {
+      const gets = Math.floor(pair / nRobots), gives = pair % nRobots, [i, j] = announced ? [gives, gets] : [gets, gives];
       from.setXYZ(count, ...positions[i]);
       to.setXYZ(count, ...positions[j]);
       asker.setXYZ(count, this.colours[i].r, this.colours[i].g, this.colours[i].b);
-      asked.setXYZ(count, this.colours[j].r, this.colours[j].g, this.colours[j].b);
+      asked.setXYZ(count, this.colours[gives].r, this.colours[gives].g, this.colours[gives].b);
       strength.setX(count, left);
       phase.setX(count, 0.618 * pair % 1);
       count++;

@@ -1,4 +1,4 @@
-// Who asks whom: a lane for each pair, grouped by the robot that asks, in the colour of the one that is asked.
+// Who gets whose plan: a lane for each pair, grouped by the robot that gets it, in the colour of the one whose it is.
 
 import {colour, nRobots, percent} from "./data.js";
 import {add, begin, cursor, stepUnder, timeScale} from "./plots.js";
@@ -46,7 +46,8 @@ export function wordsAt(svg, flight, x, y) {
   const step = Math.floor(stepUnder(x, svg.clientWidth)), i = Math.floor((y - 2) / (GROUP + GAP));
   const rank = Math.floor((y - laneTop(i, 0)) / LANE);
   if (step < 0 || step >= flight.steps || i < 0 || i >= nRobots || rank < 0 || rank >= nRobots - 1) return null;
-  const j = rank < i ? rank : rank + 1, asks = flight.requests[step].some(([a, b]) => a === i && b === j);
-  return {step, text: `step ${step}: robot ${i} ${asks ? "asks" : "does not ask"} robot ${j}`};
+  const j = rank < i ? rank : rank + 1, asked = flight.requests[step].find(([a, b]) => a === i && b === j);
+  if (asked?.[2]) return {step, text: `step ${step}: robot ${j} sends its plan to robot ${i}`};
+  return {step, text: `step ${step}: robot ${i} ${asked ? "asks" : "does not ask"} robot ${j}`};
 }
 
