@@ -259,6 +259,8 @@ class StackedCritic(Critic):
         n_critics: int,
     ):
         super().__init__(actions, team.n_agents, n_critics=n_critics)
+        # Raises at once if so many do not fit into memory, where the list below would fill it first
+        th.empty(n_critics, team.n_agents, in_features, *net_arch[:1])
         networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
         self.net = StackedMLP(networks, in_features, 1, net_arch, activation_fn)
 

@@ -187,7 +187,7 @@ def _fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequenc
     rngs = [np.random.default_rng(seed) for seed in episodes]
     for k, rng in enumerate(rngs):
         task.reset(k, rng)
-    everybody = np.ones((1, config.n_robots, config.n_robots - 1), dtype=bool)
+    everybody = np.ones((1, config.n_robots, config.n_robots - 1, 1), dtype=bool)
     rows: dict[int, dict[str, Any]] = {}
     for step in fly_steps(lambda task, _: everybody.repeat(task.swarm.n_swarms, 0), task, rngs, LINGER):
         rows |= {int(step.episodes[k]): task.statistics.row(int(k)) for k in np.flatnonzero(step.over)}
