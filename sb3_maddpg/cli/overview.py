@@ -59,7 +59,14 @@ def overview() -> str:
         found[f"--conf-file {name}"] = ["any other" if env_id == "default" else env_id for env_id in env_ids]
     width, indent = min(shutil.get_terminal_size((100, 24)).columns, 120), max(map(len, found)) + 4
     lines = [
-        textwrap.fill(", ".join(some), width, initial_indent=f"  {name}".ljust(indent), subsequent_indent=" " * indent)
+        textwrap.fill(
+            ", ".join(some),
+            width,
+            initial_indent=f"  {name}".ljust(indent),
+            subsequent_indent=" " * indent,
+            break_long_words=False,
+            break_on_hyphens=False,  # names have them
+        )
         for name, some in found.items()
     ]
     return "there are:\n" + "\n".join(lines)

@@ -16,8 +16,11 @@ def test_everything_that_is_registered_is_named(monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     text = overview()
     assert max(map(len, text.splitlines())) <= 100
-    for name in ("Mine-v0", *ALGORITHMS, *pretrained_models(), *packaged_recipes()):
-        assert name in text
+    for columns in range(60, 121):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        text = overview()
+        for name in ("Mine-v0", *ALGORITHMS, *pretrained_models(), *packaged_recipes()):
+            assert name in text, columns
 
 
 def test_packaged_recipes_are_those_files():
