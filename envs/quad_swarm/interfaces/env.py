@@ -162,7 +162,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Let every robot ask, plan and fly for one step.
 
-        :param action: bits, (n(n - 1),)
+        :param action: bits, (n(n - 1),), with announcements twice as many
         :raises ValueError: the action has another shape or other entries; a solver's failure never raises
         :raises gymnasium.error.ResetNeeded: before the first reset
         """

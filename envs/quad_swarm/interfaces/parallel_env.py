@@ -44,7 +44,7 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space:
-        """Action space of one robot, n - 1 bits."""
+        """Action space of one robot, n - 1 bits, with announcements twice as many."""
         return self.action_spaces[agent]
 
     def reset(
@@ -69,7 +69,7 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
     def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
         """See `QuadSwarmEnv.step`; once the episode is over there are no agents left, and all five are empty.
 
-        :param actions: bits of each agent, (n - 1,)
+        :param actions: bits of each agent, (n - 1,), with announcements twice as many
         :raises ValueError: an agent's action is missing or has another shape or other entries
         :raises gymnasium.error.ResetNeeded: before the first reset
         """

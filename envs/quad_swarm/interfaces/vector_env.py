@@ -76,7 +76,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of every swarm; see `QuadSwarmEnv.step`.
 
-        :param actions: bits, (E, n(n - 1))
+        :param actions: bits, (E, n(n - 1)), with announcements twice as many
         :raises ValueError: the actions have another shape or other entries
         :raises gymnasium.error.ResetNeeded: before the first reset
         """
