@@ -27,7 +27,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
 
     ## Action Space
     `MultiBinary(n * (n - 1))`: robot 0's bits for robots 1..n-1, robot 1's bits for robots 0, 2..n-1, and so on; 1
-    asks.
+    asks. With `announcements` two bits for each of them, side by side: to ask it, and to send it the own plan.
 
     ## Observation Space
     `Box(n, 6n)`, one row a robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the
