@@ -71,7 +71,9 @@ class Journal:
             return
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile("w", dir=self._folder, suffix=".part", delete=False) as file:
+            with tempfile.NamedTemporaryFile(
+                "w", dir=self._folder, prefix=f"{key}.", suffix=".part", delete=False
+            ) as file:
                 try:
                     json.dump({"value": value}, file)
                     file.flush()
@@ -81,6 +83,8 @@ class Journal:
                 except BaseException:
                     Path(file.name).unlink(missing_ok=True)
                     raise
+        except FileNotFoundError:  # another process has done the same work, and dropped it
+            return
         except OSError as error:
             warnings.warn(
                 f"Finished pieces cannot be kept in {self._folder} ({error.strerror or error}): a run that is killed "
@@ -91,11 +95,14 @@ class Journal:
             self._folder = None
 
     def drop(self, keys: Iterable[str]) -> None:
-        """Forget pieces, because what they are part of is done."""
-        if self._folder is not None:
-            for key in keys:
+        """Forget pieces, and what kills have left of them, because what they are part of is done."""
+        if self._folder is None:
+            return
+        names = set(keys)
+        for path in self._folder.glob("*.*"):
+            if path.name.partition(".")[0] in names:
                 with contextlib.suppress(OSError):
-                    self._path(key).unlink()
+                    path.unlink()
 
     def _path(self, key: str) -> Path:
         assert self._folder is not None

@@ -2,6 +2,8 @@
 
 import os
 import time
+import warnings
+from pathlib import Path
 
 import pytest
 
@@ -48,6 +50,39 @@ def test_a_full_disk_leaves_no_half_written_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.warns(RuntimeWarning, match="No space left"):
+        Journal(tmp_path).keep("key", 1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_kill_left_of_a_piece_goes_with_it(tmp_path, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def die(*_, **__):
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", die)
+        patch.setattr(Path, "unlink", die)  # the dead clear nothing away
+        with pytest.raises(Killed):
+            Journal(tmp_path).keep("key", 1)
+    journal = Journal(tmp_path)
+    journal.keep("other", 2)
+    assert len(list(tmp_path.glob("key.*.part"))) == 1
+    journal.drop(["key"])
+    assert [path.name for path in tmp_path.iterdir()] == ["other.json"]
+
+
+def test_two_that_do_the_same_work_may_both_finish(tmp_path, monkeypatch):
+    replace = os.replace
+
+    def beaten(source, target):
+        Journal(tmp_path).drop(["key"])
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", beaten)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         Journal(tmp_path).keep("key", 1)
     assert not list(tmp_path.iterdir())
 
