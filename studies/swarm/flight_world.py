@@ -25,7 +25,7 @@ from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
 from studies.swarm import delay_check
-from studies.swarm.fly_flight import best_rule, tuned_models
+from studies.swarm.fly_flight import PAPERS, best_rule, tuned_models
 from studies.swarm.protocol import (
     DATA,
     DBCP,
@@ -77,7 +77,7 @@ def jobs(part: str) -> Iterator[Job]:
             changed = {"radio": {"delay": delay, "jitter": 0}, "planner": {"right_of_way": right_of_way}}
             yield Job(part, "flight", changed, name, policy)
     elif part == "paper":
-        for policy, name in itertools.product(("full", DBCP, "none", *models("faithful_flight")), NAMES):
+        for policy, name in itertools.product(("full", DBCP, "none", *models(PAPERS)), NAMES):
             yield Job(part, "flight", {"n_robots": 4}, name, policy)
     else:
         policies = ("none", "full", best_rule(), tuned_models()[0])

@@ -1,7 +1,8 @@
 """Fly the sealed test set of `flight`: ``python -m studies.swarm.fly_flight [--n-robots ...] [--quick] [--json F]``.
 
-Full and no communication, the best rule with one setting, and all models with theirs, each in every scenario; what the
-file already holds is not flown again. Who flies is read from ``flight_tuning.json``, which `studies.swarm.tune_flight`
+Full and no communication, the best rule with one setting, and all models with theirs, each in every scenario, and with
+four robots also the models that were trained with the paper's settings; what the file already holds is not flown again.
+Who flies is read from ``flight_tuning.json``, which `studies.swarm.tune_flight`
 writes: commit it first. JSON: one row for each condition with the keys of
 `summarise`, its episodes' outcomes as text (1: a collision) for paired comparisons, and scenario, policy, n_robots.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from quad_swarm.evaluation.evaluation import make_pool, summarise
@@ -35,6 +36,8 @@ from studies.swarm.tune_flight import FULL, OWN_SWAPS, PRESET
 # Episodes of each condition by the number of robots
 EPISODES = {8: 12000, 4: 4000, 12: 4000, 16: 4000}
 QUICK = 10
+# The models of the paper's settings, which fly with the number of robots that they were trained with alone
+PAPERS = "faithful_flight"
 
 
 class Job(NamedTuple):
@@ -53,15 +56,22 @@ def tuned() -> Iterator[dict[str, Any]]:
 
 def best_rule() -> str:
     """The rule that is safe everywhere with the fewest requests in both swaps of eight robots."""
+    return _cheapest("rule", lambda setting: not is_model(setting))
+
+
+def best_model() -> str:
+    """The model, with its threshold, of which the same is true: the one that is shipped."""
+    return _cheapest("model", is_model)
+
+
+def _cheapest(what: str, is_one: Callable[[str], bool]) -> str:
     shares: dict[str, list[float]] = {}
     for row in tuned():
-        if not is_model(row["setting"]) and (row["n_robots"], row["scenario"]) in OWN_SWAPS:
+        if is_one(row["setting"]) and (row["n_robots"], row["scenario"]) in OWN_SWAPS:
             shares.setdefault(row["setting"], []).append(row["request_share"])
     if not shares:
-        raise ValueError(
-            f"{DATA / 'flight_tuning.json'} holds no safe rule: run `studies.swarm.tune_flight rules` first."
-        )
-    return min(shares, key=lambda rule: sum(shares[rule]))
+        raise ValueError(f"{DATA / 'flight_tuning.json'} holds no safe {what}: run `studies.swarm.tune_flight` first.")
+    return min(shares, key=lambda setting: sum(shares[setting]))
 
 
 def tuned_models() -> list[str]:
@@ -72,11 +82,11 @@ def tuned_models() -> list[str]:
 
 def jobs(sizes: list[int], quick: bool) -> list[Job]:
     """All conditions, the most robots last."""
-    policies = ["full", "none", best_rule(), *tuned_models()]
+    everywhere = ["full", "none", best_rule(), *tuned_models()]
     return [
         Job(n, name, policy, QUICK if quick else EPISODES[n])
         for n in sorted(sizes)
-        for policy in policies
+        for policy in (*everywhere, *(models(PAPERS) if n == 4 else ()))
         for name in NAMES
     ]
 

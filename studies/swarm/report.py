@@ -21,7 +21,9 @@ from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.beliefs import other_indices
 from studies.swarm.figures import NAMES, draw_asking, draw_fronts, draw_trajectories, flights, rate_of
+from studies.swarm.fly_flight import PAPERS, best_rule
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, absolute_path, best_rules, models
+from studies.swarm.tune_flight import families
 
 RESULTS = ("results", "results/swarm_tables", "results/teams", "results/robustness", "results/asking", "lab_notebook")
 PAGES = (ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in (*RESULTS, "swarm_learning", "flight")))
@@ -242,9 +244,9 @@ def share_of_rule(rows: Rows, row: dict[str, Any]) -> float:
 
 def family_table(rules: Rows, preset: str) -> str:
     """The cheapest safe rule of each family, in validation."""
-    families = list(dict.fromkeys(row["family"] for row in rules if row["preset"] == preset))
+    names = list(dict.fromkeys(row["family"] for row in rules if row["preset"] == preset))
     lines = []
-    for family in families:
+    for family in names:
         line = [family]
         for name in NAMES:
             safe = [
@@ -385,6 +387,43 @@ def flight_targets(rows: Rows) -> str:
     )
 
 
+def headline_table(rows: Rows, best: str) -> str:
+    """The sealed flights of `flight` in five rows: eight robots, but for the paper's settings; seeds as ranges.
+
+    :param best: the rule
+    """
+    eight, four = ([row for row in rows if row["n_robots"] == n] for n in (8, 4))
+    rule = f"best of {sum(map(len, families().values()))} hand-made rules ({label(best)})"
+    groups = {
+        "nobody asks (`none`)": [row for row in eight if row["policy"] == "none"],
+        "everybody asks everybody (`full`)": [row for row in eight if row["policy"] == "full"],
+        rule: [row for row in eight if row["policy"] == best],
+        "MADDPG, the paper's settings (four robots)": [row for row in four if f"/{PAPERS}_seed" in row["policy"]],
+        "MADDPG, `quad_swarm_flight.yml`": [row for row in eight if "/flight_seed" in row["policy"]],
+    }
+    lines = []
+    for what, chosen in groups.items():
+        policies = dict.fromkeys(row["policy"] for row in chosen)
+        line = [what + (f", {len(policies)} seeds" if len(policies) > 1 else "")]
+        for name in ("symmetric_swap", "asymmetric_swap"):
+            line.append(seeds_rate([row for row in chosen if row["scenario"] == name]))
+        by_seed = [[row for row in chosen if row["policy"] == policy] for policy in policies]
+        line.append(spread([f"{share:.2%}" for share in sorted(map(pooled, by_seed))]) if chosen else "-")
+        sent = sorted(float(np.mean([row["bytes_per_second"] for row in one])) for one in by_seed)
+        lines.append([*line, spread([f"{value:,.0f}" for value in sent]) if chosen else "-"])
+    head = ["", "collisions, symmetric swap", "collisions, asymmetric swap", "plans sent, of all possible"]
+    return table([*head, "bytes/s a robot sends"], lines)
+
+
+def seeds_rate(rows: Rows) -> str:
+    """Collisions of some seeds in the same episodes, and the widest interval of any of them."""
+    if not rows:
+        return "-"
+    counts = spread([str(count) for count in sorted(row["collisions"] for row in rows)])
+    low, high = 100 * min(row["collision_low"] for row in rows), 100 * max(row["collision_high"] for row in rows)
+    return f"{counts} of {rows[0]['episodes']:,} [{low:.2f}, {high:.2f}] %"
+
+
 def changes(changed: Any, path: str = "") -> str:
     """Nested fields as they are written on the command line."""
     if isinstance(changed, dict):
@@ -495,6 +534,7 @@ def main() -> None:
         "ppo": reference_table(rows["ppo"], "price", "threshold"),
         "counterfactual": reference_table(rows["counterfactual"], "price"),
         "training": training_table(rows["training"]),
+        "headline": headline_table(rows["flight"], best_rule()) if rows["flight"] else "Not flown yet.",
         "flight": flight_table(rows["flight"]),
         "flight targets": flight_targets(rows["flight"]),
         "world": worlds_table(rows["flight_world"], "world"),

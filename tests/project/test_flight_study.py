@@ -205,6 +205,23 @@ def test_the_tables_of_the_sealed_flights_compare_with_full_and_the_rule():
     assert report.flight_table([]) == report.flight_targets([]) == "Not flown yet."
 
 
+def test_the_headline_table_has_five_rows_and_gives_seeds_as_ranges():
+    def row(policy: str, collisions: int, n_robots: int = 8, name: str = "symmetric_swap") -> dict:
+        figures = {"n_robots": n_robots, "scenario": name, "policy": policy, "requests": 10 * collisions}
+        figures |= {"possible_requests": 1000, "episodes": 12000, "collisions": collisions, "bytes_per_second": 2000.0}
+        return figures | {"collision_low": collisions / 24000, "collision_high": collisions / 6000}
+
+    rows = [row("full", 0), row("none", 9000), row("cpa:1:2|push:0.1", 2), row("d/flight_seed0.zip@0.4", 3)]
+    rows += [row("d/flight_seed0.zip@0.4", 6, name="asymmetric_swap"), row("d/flight_seed1.zip@0.3", 1)]
+    rows += [row("d/faithful_flight_seed0.zip", 99, n_robots=4), row("d/flight_seed0.zip@0.4", 77, n_robots=4)]
+    lines = [line.split(" | ")[1:] for line in report.headline_table(rows, "cpa:1:2|push:0.1").splitlines()[2:]]
+    assert len(lines) == 5
+    assert lines[0][:3] == ["9000 of 12,000 [37.50, 150.00] %", "-", "9000.00%"]
+    assert lines[2][0] == "2 of 12,000 [0.01, 0.03] %"
+    assert lines[3][0].startswith("99 of 12,000")
+    assert lines[4] == ["1 to 3 of 12,000 [0.00, 0.05] %", "6 of 12,000 [0.03, 0.10] %", "1.00% to 4.50%", "2,000 |"]
+
+
 def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown(tmp_path, monkeypatch):
     monkeypatch.setattr(fly_flight, "DATA", tmp_path)
     with pytest.raises(ValueError, match="holds no safe rule"):
@@ -216,6 +233,8 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
     ]
     write_rows(tmp_path / "flight_tuning.json", rules)
     assert fly_flight.best_rule() == "cpa:0.8:1"
+    with pytest.raises(ValueError, match="holds no safe model"):
+        fly_flight.best_model()
     assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
     monkeypatch.setattr(fly_flight, "NAMES", NAMES[:1])
     monkeypatch.setattr(fly_flight, "tuned_models", list)
