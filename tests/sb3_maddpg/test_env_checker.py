@@ -76,7 +76,7 @@ class Wrong(team_tasks.OwnBit):
         (Wrong({"n_curriculum_levels": 0, "set_curriculum_level": print}), "n_curriculum_levels=0"),
         (Wrong({"n_curriculum_levels": 2, "set_curriculum_level": print}), "is_success"),
         (Wrong({"observation_layout": {"own": [0]}}), "needs `own` and `neighbours`"),
-        (Wrong({"action_space": spaces.MultiBinary(10)}), "10 numbers cannot be shared out evenly"),
+        (Wrong({"action_space": spaces.MultiBinary(10)}), "10 numbers cannot be divided evenly"),
         (
             Wrong({"draw": unseeded}),
             "different observations",

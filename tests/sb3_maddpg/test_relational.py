@@ -161,14 +161,14 @@ def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
 @pytest.mark.parametrize(
     ("layout", "message"),
     [
-        (None, "PairPolicy has to know .*`observation_layout`"),
+        (None, "PairPolicy needs to know .*`observation_layout`"),
         ({"own": [0]}, r"has entries \['own'\], but needs `own` and `neighbours`"),
-        ({**LAYOUT, "owns": [0]}, "`action_mask` and `complete` only"),
+        ({**LAYOUT, "owns": [0]}, "`action_mask` and `complete`\\."),
         ({**LAYOUT, "own": [10]}, "each from 0 to 9"),
-        ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "as many columns as the next"),
-        ({**LAYOUT, "neighbours": []}, "as many columns as the next"),
+        ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "the same number of columns"),
+        ({**LAYOUT, "neighbours": []}, "the same number of columns"),
         ({**LAYOUT, "neighbours": [[2], [3]]}, r"2 neighbours, but the 5 agents have \[4, 4, 4, 4, 4\]"),
-        ({**LAYOUT, "who": [[0, 1, 2, 3]] * 5}, "must name others, by numbers from 0 to 4"),
+        ({**LAYOUT, "who": [[0, 1, 2, 3]] * 5}, "must name other agents, by indices from 0 to 4"),
     ],
 )
 def test_a_layout_that_does_not_fit_is_refused(layout, message):
@@ -189,9 +189,9 @@ def test_only_binary_actions_on_neighbours_are_masked(space):
 
 def test_spaces_that_do_not_fit_are_refused():
     for space in (spaces.MultiBinary(N * 3), spaces.MultiDiscrete([3, 3, 3, 2] * N)):
-        with pytest.raises(ValueError, match=r"act on 4 neighbours, but .* does not fall into as many equal parts"):
+        with pytest.raises(ValueError, match=r"act on 4 neighbours, but .* cannot be split into as many equal parts"):
             policy(space)
-    with pytest.raises(ValueError, match=r"net_arch=\[\]: PairPolicy needs a hidden layer"):
+    with pytest.raises(ValueError, match=r"net_arch=\[\]: PairPolicy needs at least one hidden layer"):
         policy(net_arch=[])
     with pytest.raises(ValueError, match="agent_0 and agent_4 have different spaces: use MlpPolicy"):
         policy(spaces.MultiDiscrete([3] * 4 * (N - 1) + [2] * 4))

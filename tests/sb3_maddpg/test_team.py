@@ -163,9 +163,9 @@ def test_agents_are_found_by_name_and_number():
     [
         (spaces.Dict({"a": SHORT}), spaces.MultiBinary(4), "Flatten each agent's dictionary"),
         (SHORT, spaces.MultiBinary(4), r"\(n_agents, obs_dim\)"),
-        (spaces.Box(-1, 1, (2, 3)), spaces.Discrete(4), "A team action is flat"),
-        (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary((2, 2)), "A team action is flat"),
-        (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(5), "5 numbers cannot be shared out evenly among 2"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.Discrete(4), "A team action is a flat"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary((2, 2)), "A team action is a flat"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(5), "5 numbers cannot be divided evenly among 2"),
         (spaces.Box(-1, 1, (2, 3)), spaces.MultiDiscrete([3, 3], start=[0, 1]), r"start=\[0, 1\].*add it in step"),
         (spaces.Box(-1, 1, (2, 3)), spaces.Box(-np.inf, 1, (2,)), "'agent_0' has the action space .*without bounds"),
         (spaces.Box(-1, 1, (2, 3)), spaces.Box(-3e38, 3e38, (2,)), "'agent_0' .*too large for single precision"),
