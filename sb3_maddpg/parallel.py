@@ -271,7 +271,7 @@ class TeamEnv(gymnasium.Env):
             with suppress(TypeError, ValueError, OverflowError):
                 return float(reward)
         raise ValueError(
-            f"{self.parallel_env} returned the reward {shown(reward)} for agent {agent!r} {self._when}: a reward must "
+            f"{self.parallel_env} returned a reward of {shown(reward)} for agent {agent!r} {self._when}: a reward must "
             "be a number."
         )
 
@@ -430,7 +430,7 @@ class TeamEnv(gymnasium.Env):
             name: reward for name, reward in zip(self.agent_names, rewards, strict=True) if not math.isfinite(reward)
         }
         wrong = ", ".join(f"{reward} for agent {name!r}" for name, reward in found.items())
-        raise ValueError(f"{self.parallel_env} returned the reward {wrong} {self._when}: rewards must be finite.")
+        raise ValueError(f"{self.parallel_env} returned a reward of {wrong} {self._when}: rewards must be finite.")
 
 
 class TurnBased(ParallelEnv):

@@ -259,7 +259,7 @@ def test_a_value_out_of_range_is_refused_in_one_line(name, value):
     ("kwargs", "message"),
     [
         ({"buffer_size": 100, "batch_size": 101}, r"batch_size=101 is larger than buffer_size=100.*Lower batch_size"),
-        ({"buffer_size": 100, "batch_size": 10, "n_steps": 101}, "n_steps=101 is more than buffer_size=100 keeps"),
+        ({"buffer_size": 100, "batch_size": 10, "n_steps": 101}, "n_steps=101 is more than buffer_size=100 stores"),
         ({"policy_kwargs": {"net_arhc": [8]}}, "Unknown argument in policy_kwargs 'net_arhc': did you mean 'net_arch'"),
         ({"policy_kwargs": {"net_arch": [0]}}, r"net_arch=\[0\] must be a list of widths"),
         ({"policy_kwargs": {"net_arch": {"pi": [8]}}}, r"net_arch=.* must be a list of widths"),
@@ -407,7 +407,7 @@ def test_a_short_training_logs_its_episodes_once():
         ({"buffer_size": 10**400}, r"buffer_size=10* \.\.\. 0* is too large: it must be less than 2\*\*63"),
         ({"train_freq": 10**400}, r"train_freq=10* \.\.\. 0* is too large"),
         ({"gradient_steps": 10**5000}, "gradient_steps=<int> is too large"),
-        ({"optimize_memory_usage": True}, "optimize_memory_usage=True forgets"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage=True drops"),
         ({"replay_buffer_kwargs": {"handle_timeout_termination": 5}}, "handle_timeout_termination=5 must be"),
     ],
 )

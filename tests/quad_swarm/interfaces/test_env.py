@@ -109,7 +109,7 @@ def test_a_hopeless_planner_never_raises():
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.ones(11), r"shape \(11,\); the action space has \(12,\): 3 bits for each"),
+        (np.ones(11), r"shape \(11,\); the action space has \(12,\): 3 bits per robot"),
         (np.full(12, 0.5), r"contains .*0\.5.*Threshold"),
         (np.full(12, np.nan), "contains .*nan"),
         (np.full(12, 2), "must be 0 or 1"),

@@ -89,7 +89,7 @@ def test_the_separation_follows_the_radius_unless_it_is_given():
         ({"space": {"spacing": 1e300}}, r"space\.spacing=1e\+300: it must be less than or equal to 10000"),
         ({"space": {"half_width": 1e300}}, r"space\.half_width=1e\+300: it must be less than"),
         ({"space": {"half_width": 0}}, r"space\.half_width=0: it must be greater than 0"),
-        ({"space": {"heights": [2, 1]}}, r"space\.heights=\[2, 1\]: it must be lowest first"),
+        ({"space": {"heights": [2, 1]}}, r"space\.heights=\[2, 1\]: it must be the lowest value first"),
         ({"goal_radius": 1e300}, r"goal_radius=1e\+300: it must be less than or equal to 10000"),
         ({"radius": 10**400}, r"radius=10* \.\.\. 0*: it must be"),
         ({"radius": 10**5000}, "radius=<int>: it must be"),
