@@ -87,7 +87,7 @@ def test_a_state_of_something_else_is_refused():
 def test_a_foreign_simulator_has_no_state_to_tell():
     env = gymnasium.make("QuadSwarm-v0").unwrapped
     object.__setattr__(env.task.swarm.config, "plant", "rotorpy:hummingbird")
-    with pytest.raises(ValueError, match="plant='rotorpy:hummingbird' keeps its state to itself"):
+    with pytest.raises(ValueError, match="plant='rotorpy:hummingbird' does not provide its state"):
         env.state_dict()
 
 

@@ -1,7 +1,7 @@
-"""What is computed for every pair of robots in every step: by compiled code where there is a compiler, else by NumPy.
+"""Computations for every pair of robots in every step, in compiled code if there is a compiler, otherwise in NumPy.
 
-Both give the same numbers to the last bit. ``pairs`` below stands for any leading axes that end with the robots and
-their others; N are the stages of a plan.
+Both give bit-identical results. ``pairs`` stands for any leading axes that end with the robots and their others; N is
+the number of stages of a plan.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _FUNCTIONS = {
 
 @functools.cache
 def compiled() -> ctypes.CDLL | None:
-    """The compiled functions; None where they cannot be compiled, of which the planner warns."""
+    """Return the compiled functions, None if they cannot be compiled, of which the planner warns."""
     try:
         text = (Path(__file__).parent / _SOURCE).read_text(encoding="utf-8")
         library = load(str(build("pairs", _SOURCE, {_SOURCE: text})), *_FUNCTIONS)
@@ -43,14 +43,14 @@ def compiled() -> ctypes.CDLL | None:
 def remember(
     remembered: np.ndarray, age: np.ndarray, pos: np.ndarray, memory: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Plans received earlier, one step later.
+    """Advance remembered plans by a step.
 
     :param remembered: positions from the last step on, (pairs, N + 1, 3) (m)
-    :param age: steps since they were made, N or more: there is none, (pairs) int64
-    :param pos: where the others are seen now, (pairs, 3) (m)
-    :param memory: how far off a plan may be that is still believed (m)
-    :return: positions from now on, the last piece going on in a straight line; ages; how far off they are (m); and
-        which are believed, bool
+    :param age: steps since the plans were made, N or more without a plan, (pairs) int64
+    :param pos: observed current positions of the others, (pairs, 3) (m)
+    :param memory: maximum error of plans that are still believed (m)
+    :return: positions from now on, whose last segment continues in a straight line, ages, errors (m), and which plans
+        are believed, bool
     """
     n_stages = remembered.shape[-2] - 1
     if (library := compiled()) is None:
@@ -74,14 +74,14 @@ def believe(
     dt: float,
     stages: Sequence[int] | None = None,
 ) -> np.ndarray:
-    """Trajectories that are believed: remembered ones, else those of constant velocities.
+    """Compute believed trajectories: remembered ones, or otherwise constant velocities.
 
-    :param pos: positions now, (pairs, 3) (m)
-    :param vel: velocities now, (pairs, 3) (m/s)
+    :param pos: current positions, (pairs, 3) (m)
+    :param vel: current velocities, (pairs, 3) (m/s)
     :param remembered: remembered positions from now on, (pairs, N + 1, 3) (m)
-    :param remembers: which of those are believed, (pairs) bool
+    :param remembers: which remembered trajectories are believed, (pairs) bool
     :param dt: length of a stage (s)
-    :param stages: which of the next N steps, from 0 on; None: all
+    :param stages: indices among the next N steps, counting from 0; None for all
     :return: positions, (pairs, stages, 3) (m)
     """
     chosen = np.arange(remembered.shape[-2] - 1) if stages is None else np.array(stages, dtype=np.int64)
@@ -105,12 +105,13 @@ def approach(
     remembers: np.ndarray,
     dt: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How close the robots' plans come to what they believe, see there for the other arguments.
+    """Compute the distances between the robots' plans and believed trajectories. The other arguments are those of
+    `believe`.
 
     :param own: positions of the robots, (E, n, 3) (m)
-    :param plan: their positions at the next N steps relative to that, (E, n, N, 3) (m)
-    :return: the least distance (m), the first stage at which it is reached, from 0 on, and the distance at the last
-        stage (m), (E, n, n - 1) each
+    :param plan: planned positions at the next N steps relative to ``own``, (E, n, N, 3) (m)
+    :return: the smallest distance (m), the first stage at which it is reached, counting from 0, and the distance at the
+        last stage (m), each (E, n, n - 1)
     """
     n_stages = plan.shape[-2]
     if (library := compiled()) is None:
@@ -127,10 +128,11 @@ def approach(
 
 
 def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
-    """See trajectories at later times, in place: linear in between, and the last piece goes on in a straight line.
+    """Resample trajectories at later times, in place, by linear interpolation. The last segment continues in a straight
+    line.
 
-    :param trajectories: what each robot believes of the others, contiguous, (E, n, n - 1, N, 3) (m)
-    :param later: by how much later, as a share of a step, (E, n) in [0, 1)
+    :param trajectories: believed trajectories of each robot's others, contiguous, (E, n, n - 1, N, 3) (m)
+    :param later: time shift as a fraction of a step, (E, n) in [0, 1)
     """
     if (library := compiled()) is None:
         pieces = np.diff(trajectories, axis=-2)
@@ -146,16 +148,16 @@ def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
 def keep_right(
     x: np.ndarray, others: np.ndarray, known: np.ndarray, width: float, dt: float, fade: float, slow: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Others that have grown to one side, see `quad_swarm.planner.right_of_way`.
+    """Enlarge other robots on one side, see `quad_swarm.planner.right_of_way`.
 
     :param x: states of B robots, (B, 9)
     :param others: positions of their others, (B, m, N, 3) (m)
     :param known: which others' plans are known, (B, m) bool
-    :param width: by how much they grow (m)
+    :param width: distance by which the others are enlarged (m)
     :param dt: length of a stage (s)
-    :param fade: time before the closest approach from which on they grow less and less (s)
-    :param slow: closing speed below which they grow less (m/s)
-    :return: where they seem to be then (m), and how much more clearance they need (m), (B, m, N)
+    :param fade: time before the closest approach from which the effect fades (s)
+    :param slow: closing speed below which the effect is reduced (m/s)
+    :return: shifted positions of the others, (B, m, N, 3) (m), and additional clearances, (B, m, N) (m)
     """
     if (library := compiled()) is not None:
         others = np.array(others, dtype=float, order="C")
@@ -176,7 +178,7 @@ def keep_right(
 
 
 def advance(trajectory: np.ndarray) -> np.ndarray:
-    """A trajectory (..., K, 3) seen one step later; its last piece goes on in a straight line."""
+    """Advance trajectories (..., K, 3) by a step; the last segment continues in a straight line."""
     end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
     return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
 

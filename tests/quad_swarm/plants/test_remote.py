@@ -22,7 +22,7 @@ def make(dt: float = 0.01) -> RemotePlant:
 
 
 def test_what_the_simulator_refuses_arrives_as_it_is():
-    with pytest.raises(ValueError, match=r"crazyflow moves in steps of 2 ms"):
+    with pytest.raises(ValueError, match=r"crazyflow needs sub-steps that are multiples of 2 ms"):
         make(0.005001)
 
 

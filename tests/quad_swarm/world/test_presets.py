@@ -58,7 +58,7 @@ def test_the_separation_follows_the_radius_unless_it_is_given():
         lambda: make_config("paper", planner={"separation": 0.59}),
         lambda: SwarmConfig(radius=0.5, planner=PlannerConfig()),
     ):
-        with pytest.raises(ValueError, match=r"^planner\.separation=0\.[569]+: it must be at least 2 radius"):
+        with pytest.raises(ValueError, match=r"^planner\.separation=0\.[569]+: it must be at least 2 \* radius"):
             make()
 
 
@@ -76,7 +76,7 @@ def test_the_separation_follows_the_radius_unless_it_is_given():
         ({"planner": 5}, "planner=5: it must be a mapping"),
         ({"radius": float("nan")}, "radius=nan: it must be a finite number"),
         ({"radius": -1}, "radius=-1: it must be greater than 0"),
-        ({"collision_tolerance": 5}, r"collision_tolerance=5\.0: it must be less than 2 radius = 0\.6"),
+        ({"collision_tolerance": 5}, r"collision_tolerance=5\.0: it must be less than 2 \* radius = 0\.6"),
         ({"memory": {"far": 1}}, "memory={'far': 1}: it must be a valid number"),
         ({"noise": -1}, "noise=-1: it must be a mapping"),
         ({"noise": {"pos": -1}}, r"noise\.pos=-1: it must be greater than or equal to 0"),
