@@ -246,7 +246,9 @@ def test_another_machine_is_named(tmp_path, monkeypatch):
 def test_other_callbacks_and_other_environments_are_refused(tmp_path):
     make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
     model, callback = resume(tmp_path, Replayable(OwnBit()))
-    with pytest.raises(ValueError, match=r"The run had the callbacks .* these are .*CurriculumCallback.*: resume with"):
+    with pytest.raises(
+        ValueError, match=r"The run had the callbacks .* now they are .*CurriculumCallback.*: resume with"
+    ):
         model.learn(100, [callback, CurriculumCallback()], reset_num_timesteps=False)
     model, callback = resume(tmp_path, OwnBit())
     with pytest.raises(ValueError, match="The state belongs to a Replayable, but this is a OwnBit"):

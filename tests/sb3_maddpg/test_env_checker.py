@@ -67,7 +67,10 @@ class Wrong(team_tasks.OwnBit):
         (Wrong(agent_rewards=[0.0, np.nan, 0.0]), "'agent_rewards'.* of agent agent_1 in step 1 is not finite"),
         (Wrong(agent_reward=[0.0] * 3), "Unknown entry 'agent_reward': did you mean 'agent_rewards'"),
         (Wrong(agent_active=[0.5, 1, 1]), "must hold True or False for each agent"),
-        (Wrong(agent_terminated=[True, False, False], agent_active=[True] * 3), "agent_0 acts in step 2, although it"),
+        (
+            Wrong(agent_terminated=[True, False, False], agent_active=[True] * 3),
+            "agent_0 is active in step 2, although it",
+        ),
         (Wrong(pair_rewards=np.zeros(3)[None]), "each of its neighbours"),
         (Wrong(metrics={"x": {"y": 1}}), "flat dict of numbers"),
         (Wrong({"agent_names": ["a", "b"]}), "2 names, a, b, for 3 agents"),

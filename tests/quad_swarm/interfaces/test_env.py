@@ -145,7 +145,7 @@ def test_refuses_senseless_arguments(kwargs, message):
     ("options", "message"),
     [
         ({"start": np.zeros((4, 3))}, "reset option 'start'"),
-        ({"starts": np.zeros((4, 3))}, "give both"),
+        ({"starts": np.zeros((4, 3))}, "pass both"),
         ({"starts": np.full((4, 3), np.nan), "goals": np.zeros((4, 3))}, "finite points"),
     ],
 )

@@ -111,7 +111,7 @@ def test_nonsense_is_refused_in_one_line(values, message):
 
 
 def test_what_is_given_twice_is_refused():
-    with pytest.raises(ValueError, match=r"radius is given twice, 0\.5 in `world` and 0\.4 beside it"):
+    with pytest.raises(ValueError, match=r"radius is given twice, as 0\.5 in `world` and as the argument 0\.4"):
         make_config("paper", {"radius": 0.5}, radius=0.4)
     with pytest.raises(ValueError, match=r"planner\.dt is given twice"):
         make_config("paper", {"planner": {"dt": 0.1}}, planner={"dt": 0.05})
