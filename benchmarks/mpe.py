@@ -1,13 +1,14 @@
-"""It learns what others learn: the particle worlds of Lowe et al. (2017), by the packaged recipes.
+"""Train with the packaged recipes in the particle worlds of Lowe et al. (2017).
 
 ``python benchmarks/mpe.py [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
-runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes
-without noise every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json. Finished runs in
-``--log-folder`` that were trained by the present recipe are not trained again. Actions are continuous, except where the
-environment is followed by ``:discrete``.
+runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes without noise
+every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json. Finished runs in ``--log-folder``
+that used the current recipe are not repeated. Actions are continuous, except for environments followed by
+``:discrete``.
 
-Returns are means over the agents, as the zoo evaluates them: of teams with opponents (tag, adversary) the mean tells
-little, since all learn. Hence each run also says what the agents get by the last policy, ``agents``.
+Returns are means over the agents, as in the zoo's evaluation. With opponents (tag, adversary), the mean is not
+informative, since all agents learn. Therefore each run also has the returns of the individual agents with the last
+policy, ``agents``.
 """
 
 import argparse
@@ -37,7 +38,7 @@ MODULES = {
 ENVS = (*MODULES, "simple_spread:discrete")
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
 SHOWN = (50_000, 100_000)
-# What a new implementation should reach, mean of the seeds: a little worse than XuanCe and a plain PyTorch loop
+# Mean returns that an implementation should reach, slightly worse than those of XuanCe and a plain PyTorch loop
 BARS = {("simple_spread", 50_000): -21.0, ("simple_spread", 100_000): -19.5}
 PACKAGES = ("sb3-maddpg", "stable-baselines3", "rl_zoo3", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2")
 
@@ -56,7 +57,7 @@ class Run(NamedTuple):
 
     @property
     def folder(self) -> Path:
-        """Its own log folder."""
+        """Log folder of this training."""
         return self.log_folder / f"{self.env}-{self.actions}-{self.algo}-seed{self.seed}"
 
     @property
@@ -66,14 +67,14 @@ class Run(NamedTuple):
 
     @property
     def command(self) -> list[str]:
-        """The command line behind ``python``, but for the log folder."""
+        """Command line after ``python``, without the log folder."""
         command = ["-m", "sb3_maddpg", "train", "--algo", self.algo, "--env", MODULES[self.env]]
         command += ["--seed", str(self.seed), "-n", str(self.steps), "--eval-freq", str(EVAL_FREQ)]
         command += ["--eval-episodes", str(EVAL_EPISODES), "--log-interval", "-2"]
         return command if self.continuous else [*command, "--env-kwargs", "continuous_actions:False"]
 
     def finished(self) -> Path | None:
-        """Where it was trained to the end by the present recipe, if it was."""
+        """:return: folder of the finished training with the current recipe, None if there is none"""
         name = MODULES[self.env].replace("/", "-")
         recipe = {**_recipe(self.algo, MODULES[self.env]), "env_kwargs": {"continuous_actions": self.continuous}}
         beside = {"eval_env_kwargs"} | ({"estimator", "temperature"} if self.continuous else set())
@@ -81,7 +82,9 @@ class Run(NamedTuple):
             model, curve, config = (folder / part for part in (f"{name}.zip", "evaluations.npz", f"{name}/config.yml"))
             if not (model.exists() and curve.exists() and config.exists()):
                 continue
-            trained_by = yaml.load(config.read_text(), yaml.UnsafeLoader)  # our own; rl_zoo3 writes an OrderedDict
+            trained_by = yaml.load(
+                config.read_text(), yaml.UnsafeLoader
+            )  # written by us; rl_zoo3 writes an OrderedDict
             if any(trained_by.get(key) != recipe.get(key) for key in (trained_by.keys() | recipe.keys()) - beside):
                 continue
             timesteps, results = (np.load(curve)[key] for key in ("timesteps", "results"))
@@ -92,12 +95,12 @@ class Run(NamedTuple):
 
     def train(self) -> None:
         """
-        Train, unless that is done.
+        Train, unless the training is finished.
 
-        :raises RuntimeError: it failed
+        :raises RuntimeError: if the training failed
         """
         if self.finished():
-            print(f"{self.label}: done before", flush=True)
+            print(f"{self.label}: already finished", flush=True)
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "commit").write_text(_commit())
@@ -113,11 +116,11 @@ class Run(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What to call it."""
+        """Name of the training in messages."""
         return f"{self.env} {self.actions} {self.algo} seed {self.seed}"
 
     def row(self) -> Row | None:
-        """What is reported of it, once it is finished."""
+        """:return: the row of the training, None if it is not finished"""
         folder = self.finished()
         if folder is None:
             return None
@@ -150,8 +153,8 @@ def _commit() -> str:
 
 def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
     """
-    :param model: a trained model
-    :param run: how it was trained
+    :param model: path of a trained model
+    :param run: its training
     :return: each agent's mean return over ``EVAL_EPISODES`` episodes without noise
     """
     from sb3_maddpg import MADDPG, parallel
@@ -174,14 +177,14 @@ def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """:return: half of the 95 % interval of the mean, by Student's t"""
+    """:return: the half-width of the 95 % t-interval of the mean"""
     from scipy.stats import t
 
     return float(t.ppf(0.975, len(values) - 1)) * stdev(values) / len(values) ** 0.5 if len(values) > 1 else np.nan
 
 
 def grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
-    """:return: the seeds of each environment, kind of actions and algorithm"""
+    """:return: rows of all seeds by environment, kind of actions and algorithm"""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["env"], row["actions"], row["algo"]), []).append(row)
@@ -207,7 +210,7 @@ def report(rows: Sequence[Row]) -> None:
 
 
 def plot(rows: Sequence[Row], file: Path) -> None:
-    """Draw the learning curves, a panel an environment, with 95 % t-intervals."""
+    """Draw the learning curves with 95 % t-intervals, with a panel per environment."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -240,7 +243,7 @@ def plot(rows: Sequence[Row], file: Path) -> None:
 
 
 def write(rows: Sequence[Row], file: Path) -> None:
-    """Write the results, and with what they were obtained."""
+    """Write the results with the versions and recipes that produced them."""
     about = {
         "command": " ".join(["python", *sys.argv]),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
@@ -263,11 +266,11 @@ def main() -> None:
     parser.add_argument("--algos", nargs="+", default=["maddpg"], choices=["maddpg", "matd3"])
     parser.add_argument("--seeds", nargs="+", type=int, default=range(5))
     parser.add_argument("--steps", type=int, default=100_000, help="length of each training (default 100,000)")
-    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, each with one thread")
-    parser.add_argument("--log-folder", type=Path, default=Path("logs/mpe2"), help="where the trainings are")
+    parser.add_argument("--jobs", type=int, default=1, help="parallel trainings, each with one thread")
+    parser.add_argument("--log-folder", type=Path, default=Path("logs/mpe2"), help="folder of the trainings")
     parser.add_argument("--json", type=Path, default=ROOT / "benchmarks/results/mpe2.json", metavar="FILE")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the learning curves")
-    parser.add_argument("--report", action="store_true", help="train nothing, report what is finished")
+    parser.add_argument("--report", action="store_true", help="only report finished trainings")
     args = parser.parse_args()
 
     folder = args.log_folder.resolve()
@@ -282,7 +285,7 @@ def main() -> None:
     failures = []
     if not args.report:
         with ThreadPoolExecutor(args.jobs) as pool:
-            # Seed by seed, so that an early end leaves as many seeds of each
+            # Seed by seed, so that an early end leaves equal numbers of seeds
             for future in [pool.submit(run.train) for run in sorted(runs, key=lambda run: run.seed)]:
                 try:
                     future.result()

@@ -141,13 +141,15 @@ MIXTURES = ("mixed", "curriculum")
 
 
 class ScenarioSampler:
-    """Draws episodes of one scenario, or of a mixture of all.
+    """Sampler of episodes of a scenario or a mixture of scenarios.
 
-    :param name: a name of `SCENARIOS`; "mixed" draws uniformly among them; "curriculum" draws uniformly among the first
-        ``level + 1`` of them; names with weights, as in ``{"symmetric_swap": 3, "random": 1}``, draw in proportion
+    :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among all of them; "curriculum" to draw uniformly
+        among the first ``level + 1`` of them; or a mapping of names to weights, such as ``{"symmetric_swap": 3,
+        "random": 1}``
     :param n_robots: number of robots, at least 2
     :param space: the room
-    :raises ValueError: unknown name, fewer than two robots, or more robots than fit (`DoesNotFit`)
+    :raises ValueError: if a name is unknown, weights are invalid, there are fewer than two robots, or they do not fit
+        (`DoesNotFit`)
     """
 
     def __init__(self, name: str | Mapping[str, float], n_robots: int, space: ScenarioSpace):
