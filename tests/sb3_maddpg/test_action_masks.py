@@ -255,7 +255,7 @@ def test_a_game_with_turns_is_played_by_its_rules(capfd):
 def test_turns_are_for_discrete_actions_and_real_turns():
     from mpe2 import simple_spread_v3
 
-    with pytest.raises(ValueError, match="is parallelizable, .*: use its parallel_env"):
+    with pytest.raises(ValueError, match=r"is parallelizable, .*: use its parallel_env"):
         TurnBased(simple_spread_v3.env())
     env = tictactoe_v3.env()
     env.action_space = lambda agent: spaces.MultiBinary(9)
