@@ -492,7 +492,7 @@ class MADDPG(OffPolicyAlgorithm):
 
             # Optimize the centralised critics
             losses, q_value = self._critic_loss(replay_data, obs, actions)
-            critic_losses.append(self._descend(self.critic, losses, self.critic.agent_of_value))
+            critic_losses.append(self._descend(self.critic, losses))
             q_values.append(q_value)
 
             # Delayed policy updates
@@ -525,7 +525,7 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> tuple[th.Tensor, th.Tensor]:
         """:return: the loss of each value head, (n_values,), and each agent's mean Q-value, (n_agents,)"""
         critic, action_cost = self.critic, self._scaled_action_cost()
-        rewards = replay_data.rewards
+        rewards = critic.rewards(replay_data.rewards)
         if len(critic.agent_of_value) > critic.n_agents and replay_data.pair_rewards is not None:
             rewards = replay_data.pair_rewards.flatten(1)
         with th.no_grad():
@@ -565,7 +565,7 @@ class MADDPG(OffPolicyAlgorithm):
             q_values = critic.forward_alternatives(obs, actions, own, factors)
             if action_cost is None:
                 return q_values
-            cost = critic.factored(action_cost.unsqueeze(0))[0]
+            cost = critic.cost_of_factors(action_cost)
             return q_values - (own * (cost if factors is None else cost[factors]).unsqueeze(1)).sum(dim=-1)
 
         logits = self.actor.logits(obs)
@@ -581,12 +581,11 @@ class MADDPG(OffPolicyAlgorithm):
         losses = _mean_over_batch(losses, replay_data.active, replay_data.weights)
         return losses, joint.squash(logits.detach())[:, joint.discrete_columns]
 
-    def _descend(self, network: Actor | Critic, losses: th.Tensor, agents: th.Tensor | None = None) -> float:
+    def _descend(self, network: Actor | Critic, losses: th.Tensor) -> float:
         """
         A step of gradient descent.
 
-        :param losses: (n,)
-        :param agents: whose they are, (n,); each agent's own one by default
+        :param losses: of agents or of value heads, (n,)
         :return: their sum
         :raises ValueError: it is not finite
         """
@@ -594,7 +593,7 @@ class MADDPG(OffPolicyAlgorithm):
         value = loss.item()
         if not math.isfinite(value):
             diverged = (~losses.isfinite()).nonzero().squeeze(1)
-            owners = diverged if agents is None else agents[diverged]
+            owners = network.owners(diverged) if isinstance(network, Critic) else diverged
             names = [self.policy.team.names[agent] for agent in sorted(set(owners.tolist()))]
             raise self._diverged(f"the loss of the {_role(network)} of {', '.join(names) or 'the team'} is {value}")
         network.optimizer.zero_grad()

@@ -2,8 +2,7 @@
 
 Forced: the critic of an agent sees the global state and the actions of its own group, so in a task with two sides not
 the other side's; the limit on the gradient is that of a group's networks together; it learns from the first batch of
-``train_freq`` steps on. A shared critic has one value for the whole group and no agent's id: a third of the work of
-the other libraries.
+``train_freq`` steps on. A shared critic has one value for the whole group and no agent's id: ``--networks team``.
 """
 
 from pathlib import Path

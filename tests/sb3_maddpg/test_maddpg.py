@@ -399,6 +399,10 @@ def test_a_short_training_logs_its_episodes_once():
         ({"policy_kwargs": {"optimizer_kwargs": 5}}, "optimizer_kwargs=5 must be a dict"),
         ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "do not fit Adam: .*'x'"),
         ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or lists of agents"),
+        (
+            {"policy_kwargs": {"share_critic": "all"}},
+            "share_critic='all' must be True, False or .*may also be \"team\"",
+        ),
         ({"policy_kwargs": {"agent_names": 5}}, "agent_names=5 must be a list of names"),
         ({"policy_kwargs": {"n_critics": 10**400}}, r"n_critics=10* \.\.\. 0* is too large: it must be less than"),
         ({"policy_kwargs": {"n_critics": 10**9}}, "the networks need too much memory"),
