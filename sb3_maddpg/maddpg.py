@@ -457,6 +457,11 @@ class MADDPG(OffPolicyAlgorithm):
         self.policy.check_finite(self._last_obs)
         return th.as_tensor(self._last_obs, dtype=th.float32, device=self.device)
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last rollout may exceed total_timesteps, where schedules would go on below their last values
+        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
     @property
     def noise_std(self) -> float:
         """Present standard deviation of the exploration noise."""
