@@ -20,7 +20,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from quad_swarm.evaluation.evaluation import make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import summarise
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
@@ -107,10 +108,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each condition")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=absolute_path, default=DATA / "flight_world.json", metavar="FILE")
     args = parser.parse_args()
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         for part in args.parts or PARTS:
             known = {row.get("condition") for row in read_rows(args.json)} if part == "plants" else set()
             work = [job for job in jobs(part) if str(job) not in known]

@@ -22,7 +22,8 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.flight import first_episode, run_episodes
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.rows import read_rows
@@ -276,13 +277,13 @@ def main() -> None:
     parser.add_argument("what", choices=("rules", "thresholds"))
     parser.add_argument("models", nargs="*", metavar="MODEL.zip")
     parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, default=DATA / "flight_tuning.json", metavar="FILE")
     args = parser.parse_args()
     if args.what == "thresholds" and not args.models:
         parser.error("name the models whose thresholds are to be tuned")
     stages = QUICK_STAGES if args.quick else STAGES
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         full = fly_full(pool, args.json, stages)
         if args.what == "rules":
             ladders = [by_requests(pool, args.json, stages, args.quick)]

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from importlib.resources import files
 from pathlib import Path
@@ -248,10 +249,7 @@ def _parser() -> argparse.ArgumentParser:
         "--scenario", nargs="+", default=["all"], metavar="NAME", help=f"all, or some of {', '.join(SCENARIOS)}"
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes of each policy and scenario (default 200)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes; the result does not depend on it (default 1)")
-    parser.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where processes run (default local)")
-    parser.add_argument("--address", help="of a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
-    parser.add_argument("--mixed", action="store_true", help="take results of machines unlike this one")
+    add_worker_arguments(parser, jobs=1)
     parser.add_argument("--wide", action="store_true", help="print all columns, in lines of any length")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a policy and scenario")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the same figures as comma-separated values")
@@ -260,6 +258,24 @@ def _parser() -> argparse.ArgumentParser:
         "--plot", type=Path, metavar="DIR", help="draw collisions, requests and flights into this folder"
     )
     return parser
+
+
+def add_worker_arguments(parser: argparse.ArgumentParser, jobs: int) -> None:
+    """The options that say who flies: ``--jobs``, ``--engine``, ``--address`` and ``--mixed``, see `workers`.
+
+    :param jobs: default number of processes
+    """
+    parser.add_argument(
+        "--jobs", type=int, default=jobs, help="processes; the result does not depend on it (default %(default)s)"
+    )
+    parser.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where processes run (default local)")
+    parser.add_argument("--address", help="of a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
+    parser.add_argument("--mixed", action="store_true", help="take results of machines unlike this one")
+
+
+def workers(args: argparse.Namespace) -> Executor:
+    """What the options of `add_worker_arguments` name, see `make_executor`."""
+    return make_pool(args.jobs, args.engine, args.address, args.mixed)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -279,7 +295,7 @@ def _compare(args: argparse.Namespace) -> None:
         check_writable(args.plot / "plot", "--plot")
     elsewhere = args.engine != "local" or args.address is not None
     try:
-        with make_pool(args.jobs, args.engine, args.address, args.mixed) if elsewhere else nullcontext() as executor:
+        with workers(args) if elsewhere else nullcontext() as executor:
             rows = evaluate(conditions, args.episodes, args.seed, args.jobs, default_folder(), executor)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from here", file=sys.stderr)
