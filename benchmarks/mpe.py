@@ -11,7 +11,9 @@ little, since all learn. Hence each run also says what the agents get by the las
 """
 
 import argparse
+import importlib
 import json
+import math
 import os
 import platform
 import subprocess
@@ -26,6 +28,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from quad_swarm.figures.colours import RULES, STYLE, colour_of
+from sb3_maddpg.parallel import TeamEnv
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = {
@@ -206,37 +214,56 @@ def report(rows: Sequence[Row]) -> None:
         print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))
 
 
+def random_return(env: str, actions: str) -> float:
+    """Return of random actions, mean over agents and 500 episodes.
+
+    :param env: as in rows, such as mpe2/simple_spread_v3
+    :param actions: continuous or discrete
+    """
+    module = importlib.import_module(env.replace("/", "."))
+    team_env = TeamEnv(module.parallel_env(continuous_actions=actions == "continuous"))
+    team_env.action_space.seed(0)
+    total = 0.0
+    for seed in range(500):
+        team_env.reset(seed=seed)
+        ended = False
+        while not ended:
+            _, reward, terminated, truncated, _ = team_env.step(team_env.action_space.sample())
+            total, ended = total + float(reward), terminated or truncated
+    return total / 500
+
+
 def plot(rows: Sequence[Row], file: Path) -> None:
-    """Draw the learning curves, a panel an environment, with 95 % t-intervals."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    """Draw the learning curves, a panel an environment, with 95 % t-intervals and the return of random actions."""
     groups = grouped(rows)
     envs = list(dict.fromkeys(env for env, _, _ in groups))
-    # Okabe and Ito's colours
-    kinds = [("continuous", "maddpg"), ("discrete", "maddpg"), ("continuous", "matd3"), ("discrete", "matd3")]
-    styles = dict(zip(kinds, [("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#CC79A7", ":")], strict=True))
-    figure, axes = plt.subplots(1, len(envs), figsize=(3.6 * len(envs), 3.2), squeeze=False, layout="constrained")
-    for axis, env in zip(axes[0], envs, strict=True):
-        for (of, actions, algo), seeds in groups.items():
-            if of != env:
-                continue
-            colour, style = styles[actions, algo]
-            steps = np.array(seeds[0]["timesteps"]) / 1000
-            curves = np.array([row["mean_return"] for row in seeds])
-            middle, half = curves.mean(axis=0), [interval(values.tolist()) for values in curves.T]
-            name = f"{algo.upper()}, {actions} ({len(seeds)} seeds)"
-            axis.plot(steps, middle, style, color=colour, label=name)
-            axis.fill_between(steps, middle - half, middle + half, color=colour, alpha=0.2, linewidth=0)
-        axis.set(title=env.removeprefix("mpe2/"), xlabel="thousand steps")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize="x-small")
-    axes[0, 0].set_ylabel("return, mean over agents")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=150)
+    labels = list(dict.fromkeys((algo, actions) for _, actions, algo in groups))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8, 2.6 * math.ceil(len(envs) / 2)), layout="constrained")
+        panels = list(figure.subplots(math.ceil(len(envs) / 2), min(len(envs), 2), squeeze=False).flat)
+        for axes, env in zip(panels, envs, strict=False):
+            for (of, actions, algo), seeds in groups.items():
+                if of == env:
+                    _draw_curve(axes, seeds, f"{algo.upper()}, {actions} actions", labels.index((algo, actions)))
+            level = random_return(env, "continuous")
+            axes.axhline(level, color=RULES, linewidth=1, linestyle=(0, (2, 2)), label="random actions (continuous)")
+            axes.set_title(env.removeprefix("mpe2/"))
+            axes.set_ylabel("return, mean over agents")
+            axes.set_xlabel("environment steps (thousands)")
+        shown = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(file)
     print(f"Figure: {file}")
+
+
+def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> None:
+    steps = np.array(seeds[0]["timesteps"]) / 1000
+    curves = np.array([row["mean_return"] for row in seeds])
+    middle, half = curves.mean(axis=0), np.array([interval(values.tolist()) for values in curves.T])
+    style = ("-", "--", "-.", (0, (1, 1)))[index % 4]
+    axes.plot(steps, middle, linestyle=style, color=colour_of(index), label=f"{label}, {len(seeds)} seeds")
+    axes.fill_between(steps, middle - half, middle + half, color=colour_of(index), alpha=0.15, linewidth=0)
 
 
 def write(rows: Sequence[Row], file: Path) -> None:
