@@ -2,9 +2,10 @@
 
 ``python benchmarks/mpe.py [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
 runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes
-without noise every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json. Finished runs in
-``--log-folder`` that were trained by the present recipe are not trained again. Actions are continuous, except where the
-environment is followed by ``:discrete``.
+without noise every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json, beside those that are
+there of other runs. Finished runs in ``--log-folder`` that were trained by the present recipe are not trained again.
+Actions are continuous, except where the environment is followed by ``:discrete``. ``ppo`` is PPO with one policy for
+all agents; its recipes have discrete actions.
 
 Returns are means over the agents, as the zoo evaluates them: of teams with opponents (tag, adversary) the mean tells
 little, since all learn. Hence each run also says what the agents get by the last policy, ``agents``.
@@ -33,6 +34,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from quad_swarm.figures.colours import RULES, STYLE, colour_of
+from sb3_maddpg import IDDPG, MADDPG, MATD3, parallel
 from sb3_maddpg.parallel import TeamEnv
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -43,12 +45,14 @@ MODULES = {
     "simple_adversary": "mpe2/simple_adversary_v3",
 }
 ENVS = (*MODULES, "simple_spread:discrete")
+ALGOS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
 SHOWN = (50_000, 100_000)
 # What a new implementation should reach, mean of the seeds: a little worse than XuanCe and a plain PyTorch loop
 BARS = {("simple_spread", 50_000): -21.0, ("simple_spread", 100_000): -19.5}
 PACKAGES = ("sb3-maddpg", "stable-baselines3", "rl_zoo3", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2")
 
+KEYS = ("env", "actions", "algo", "seed")  # of a run
 Row = dict[str, Any]
 
 
@@ -73,17 +77,24 @@ class Run(NamedTuple):
         return self.actions == "continuous"
 
     @property
+    def counted(self) -> int:
+        """How often an environment step is counted: PPO counts it for each agent."""
+        return len(_team(self).agent_names) if self.algo == "ppo" else 1
+
+    @property
     def command(self) -> list[str]:
         """The command line behind ``python``, but for the log folder."""
         command = ["-m", "sb3_maddpg", "train", "--algo", self.algo, "--env", MODULES[self.env]]
-        command += ["--seed", str(self.seed), "-n", str(self.steps), "--eval-freq", str(EVAL_FREQ)]
+        command += ["--seed", str(self.seed), "-n", str(self.counted * self.steps)]
+        command += ["--eval-freq", str(self.counted * EVAL_FREQ)]
         command += ["--eval-episodes", str(EVAL_EPISODES), "--log-interval", "-2"]
         return command if self.continuous else [*command, "--env-kwargs", "continuous_actions:False"]
 
     def finished(self) -> Path | None:
         """Where it was trained to the end by the present recipe, if it was."""
         name = MODULES[self.env].replace("/", "-")
-        recipe = {**_recipe(self.algo, MODULES[self.env]), "env_kwargs": {"continuous_actions": self.continuous}}
+        recipe = _recipe(self.algo, MODULES[self.env])
+        recipe["env_kwargs"] = {**recipe["env_kwargs"], "continuous_actions": self.continuous}
         beside = {"eval_env_kwargs"} | ({"estimator", "temperature"} if self.continuous else set())
         for folder in sorted((self.folder / self.algo).glob(f"{name}_*")):
             model, curve, config = (folder / part for part in (f"{name}.zip", "evaluations.npz", f"{name}/config.yml"))
@@ -92,9 +103,8 @@ class Run(NamedTuple):
             trained_by = yaml.load(config.read_text(), yaml.UnsafeLoader)  # our own; rl_zoo3 writes an OrderedDict
             if any(trained_by.get(key) != recipe.get(key) for key in (trained_by.keys() | recipe.keys()) - beside):
                 continue
-            timesteps, results = (np.load(curve)[key] for key in ("timesteps", "results"))
-            expected = np.arange(EVAL_FREQ, self.steps + 1, EVAL_FREQ)
-            if np.array_equal(timesteps, expected) and results.shape[1] == EVAL_EPISODES:
+            results = np.load(curve)["results"]
+            if results.shape == (self.steps // EVAL_FREQ, EVAL_EPISODES * self.counted):
                 return folder
         return None
 
@@ -131,6 +141,8 @@ class Run(NamedTuple):
             return None
         evaluations = np.load(folder / "evaluations.npz")
         agents = folder / "agents.json"
+        if self.algo == "ppo":  # one policy, which acts for one agent at a time
+            agents.write_text("{}")
         if not agents.exists():
             returns = returns_by_agent(next(folder.glob("mpe2-*.zip")), self)
             agents.write_text(json.dumps(returns))
@@ -139,7 +151,7 @@ class Run(NamedTuple):
             "actions": self.actions,
             "algo": self.algo,
             "seed": self.seed,
-            "timesteps": evaluations["timesteps"].tolist(),
+            "timesteps": list(range(EVAL_FREQ, self.steps + 1, EVAL_FREQ)),
             "mean_return": evaluations["results"].mean(axis=1).round(4).tolist(),
             "agents": json.loads(agents.read_text()),
             "command": " ".join(["python", *self.command]),
@@ -149,6 +161,10 @@ class Run(NamedTuple):
 
 def _recipe(algo: str, env_id: str) -> Row:
     return yaml.safe_load((ROOT / "zoo_configs" / f"{algo}.yml").read_text())[env_id]
+
+
+def _team(run: Run) -> TeamEnv:
+    return parallel.make(MODULES[run.env].replace("/", "."), continuous_actions=run.continuous)
 
 
 def _commit() -> str:
@@ -162,12 +178,8 @@ def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
     :param run: how it was trained
     :return: each agent's mean return over ``EVAL_EPISODES`` episodes without noise
     """
-    from sb3_maddpg import MADDPG, parallel
-    from sb3_maddpg.matd3 import MATD3
-
-    team = parallel.make(MODULES[run.env].replace("/", "."), continuous_actions=run.continuous)
-    algorithm: type[MADDPG] = MATD3 if run.algo == "matd3" else MADDPG
-    policy = algorithm.load(model, device="cpu")
+    team = _team(run)
+    policy = ALGOS[run.algo].load(model, device="cpu")
     totals = np.zeros(len(team.agent_names))
     for episode in range(EVAL_EPISODES):
         obs, _ = team.reset(seed=EVAL_EPISODES * (run.seed + 1000) + episode)
@@ -210,8 +222,8 @@ def report(rows: Sequence[Row]) -> None:
                 cell += f" ({'better' if mean(values) > bar else 'WORSE'} than {bar:g})"
             line += f"{cell:>24}" if len(cell) < 24 else f"  {cell}"
         print(line)
-        last = {name: [row["agents"][name] for row in seeds] for name in seeds[0]["agents"]}
-        print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))
+        if last := {name: [row["agents"][name] for row in seeds] for name in seeds[0]["agents"]}:
+            print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))
 
 
 def random_return(env: str, actions: str) -> float:
@@ -287,7 +299,7 @@ def write(rows: Sequence[Row], file: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=ENVS, choices=[*MODULES, *(f"{env}:discrete" for env in MODULES)])
-    parser.add_argument("--algos", nargs="+", default=["maddpg"], choices=["maddpg", "matd3"])
+    parser.add_argument("--algos", nargs="+", default=["maddpg"], choices=[*ALGOS, "ppo"])
     parser.add_argument("--seeds", nargs="+", type=int, default=range(5))
     parser.add_argument("--steps", type=int, default=100_000, help="length of each training (default 100,000)")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, each with one thread")
@@ -319,6 +331,9 @@ def main() -> None:
     rows = [row for run in runs if (row := run.row())]
     if not rows:
         sys.exit("Nothing is finished.")
+    trained = {tuple(row[key] for key in KEYS) for row in rows}
+    known = json.loads(args.json.read_text())["runs"] if args.json.exists() else []
+    rows = [*(row for row in known if tuple(row[key] for key in KEYS) not in trained), *rows]
     report(rows)
     write(rows, args.json)
     if args.plot:
