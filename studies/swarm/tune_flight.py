@@ -54,8 +54,9 @@ class Setting(NamedTuple):
 PRESET = "flight"
 SWAPS = ("symmetric_swap", "asymmetric_swap")
 # Episodes that decide, by the number of robots, and the cells in which all are tuned, where most goes wrong first:
-# hardly anything does in the random scenarios of other teams than the preset's
-SIZES = {16: 2000, 12: 2000, 8: 4000, 4: 2000}
+# hardly anything does in the random scenarios of other teams than the preset's. No more robots than in training: with
+# sixteen neither a rule that asks for less than a tenth of the plans nor a model is safe (docs/flight.md).
+SIZES = {12: 2000, 8: 4000, 4: 2000}
 CELLS: list[Cell] = [
     *itertools.product(SIZES, SWAPS),
     *((8, name) for name in NAMES if name not in SWAPS),
