@@ -2,9 +2,9 @@
 
 ``python benchmarks/mpe.py [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
 runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes without noise
-every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json. Finished runs in ``--log-folder``
-that used the current recipe are not repeated. Actions are continuous, except for environments followed by
-``:discrete``.
+every 10,000 steps. It adds the learning curves to benchmarks/results/mpe2.json. Finished runs in ``--log-folder`` that
+used the current recipe are not repeated. Actions are continuous, except for environments followed by ``:discrete``.
+``ppo`` is PPO with one policy for all agents; its recipes have discrete actions.
 
 Returns are means over the agents, as in the zoo's evaluation. With opponents (tag, adversary), the mean is not
 informative, since all agents learn. Therefore each run also has the returns of the individual agents with the last
@@ -12,7 +12,9 @@ policy, ``agents``.
 """
 
 import argparse
+import importlib
 import json
+import math
 import os
 import platform
 import subprocess
@@ -27,6 +29,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from quad_swarm.figures.colours import RULES, STYLE, colour_of
+from sb3_maddpg import IDDPG, MADDPG, MATD3, parallel
+from sb3_maddpg.parallel import TeamEnv
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = {
@@ -36,12 +45,14 @@ MODULES = {
     "simple_adversary": "mpe2/simple_adversary_v3",
 }
 ENVS = (*MODULES, "simple_spread:discrete")
+ALGOS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
 SHOWN = (50_000, 100_000)
 # Mean returns that an implementation should reach, slightly worse than those of XuanCe and a plain PyTorch loop
 BARS = {("simple_spread", 50_000): -21.0, ("simple_spread", 100_000): -19.5}
 PACKAGES = ("sb3-maddpg", "stable-baselines3", "rl_zoo3", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2")
 
+KEYS = ("env", "actions", "algo", "seed")  # identify a run
 Row = dict[str, Any]
 
 
@@ -66,30 +77,35 @@ class Run(NamedTuple):
         return self.actions == "continuous"
 
     @property
+    def counted(self) -> int:
+        """Number of timesteps counted per environment step: PPO counts one per agent."""
+        return len(_team(self).agent_names) if self.algo == "ppo" else 1
+
+    @property
     def command(self) -> list[str]:
         """Command line after ``python``, without the log folder."""
         command = ["-m", "sb3_maddpg", "train", "--algo", self.algo, "--env", MODULES[self.env]]
-        command += ["--seed", str(self.seed), "-n", str(self.steps), "--eval-freq", str(EVAL_FREQ)]
+        command += ["--seed", str(self.seed), "-n", str(self.counted * self.steps)]
+        command += ["--eval-freq", str(self.counted * EVAL_FREQ)]
         command += ["--eval-episodes", str(EVAL_EPISODES), "--log-interval", "-2"]
         return command if self.continuous else [*command, "--env-kwargs", "continuous_actions:False"]
 
     def finished(self) -> Path | None:
         """:return: folder of the finished training with the current recipe, None if there is none"""
         name = MODULES[self.env].replace("/", "-")
-        recipe = {**_recipe(self.algo, MODULES[self.env]), "env_kwargs": {"continuous_actions": self.continuous}}
+        recipe = _recipe(self.algo, MODULES[self.env])
+        recipe["env_kwargs"] = {**recipe["env_kwargs"], "continuous_actions": self.continuous}
         beside = {"eval_env_kwargs"} | ({"estimator", "temperature"} if self.continuous else set())
         for folder in sorted((self.folder / self.algo).glob(f"{name}_*")):
             model, curve, config = (folder / part for part in (f"{name}.zip", "evaluations.npz", f"{name}/config.yml"))
             if not (model.exists() and curve.exists() and config.exists()):
                 continue
-            trained_by = yaml.load(
-                config.read_text(), yaml.UnsafeLoader
-            )  # written by us; rl_zoo3 writes an OrderedDict
+            # rl_zoo3 writes an OrderedDict. The file is our own, so the unsafe loader is safe here.
+            trained_by = yaml.load(config.read_text(), yaml.UnsafeLoader)
             if any(trained_by.get(key) != recipe.get(key) for key in (trained_by.keys() | recipe.keys()) - beside):
                 continue
-            timesteps, results = (np.load(curve)[key] for key in ("timesteps", "results"))
-            expected = np.arange(EVAL_FREQ, self.steps + 1, EVAL_FREQ)
-            if np.array_equal(timesteps, expected) and results.shape[1] == EVAL_EPISODES:
+            results = np.load(curve)["results"]
+            if results.shape == (self.steps // EVAL_FREQ, EVAL_EPISODES * self.counted):
                 return folder
         return None
 
@@ -126,6 +142,8 @@ class Run(NamedTuple):
             return None
         evaluations = np.load(folder / "evaluations.npz")
         agents = folder / "agents.json"
+        if self.algo == "ppo":  # a single-agent policy, which returns_by_agent cannot run
+            agents.write_text("{}")
         if not agents.exists():
             returns = returns_by_agent(next(folder.glob("mpe2-*.zip")), self)
             agents.write_text(json.dumps(returns))
@@ -134,7 +152,7 @@ class Run(NamedTuple):
             "actions": self.actions,
             "algo": self.algo,
             "seed": self.seed,
-            "timesteps": evaluations["timesteps"].tolist(),
+            "timesteps": list(range(EVAL_FREQ, self.steps + 1, EVAL_FREQ)),
             "mean_return": evaluations["results"].mean(axis=1).round(4).tolist(),
             "agents": json.loads(agents.read_text()),
             "command": " ".join(["python", *self.command]),
@@ -144,6 +162,10 @@ class Run(NamedTuple):
 
 def _recipe(algo: str, env_id: str) -> Row:
     return yaml.safe_load((ROOT / "zoo_configs" / f"{algo}.yml").read_text())[env_id]
+
+
+def _team(run: Run) -> TeamEnv:
+    return parallel.make(MODULES[run.env].replace("/", "."), continuous_actions=run.continuous)
 
 
 def _commit() -> str:
@@ -157,12 +179,8 @@ def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
     :param run: its training
     :return: each agent's mean return over ``EVAL_EPISODES`` episodes without noise
     """
-    from sb3_maddpg import MADDPG, parallel
-    from sb3_maddpg.matd3 import MATD3
-
-    team = parallel.make(MODULES[run.env].replace("/", "."), continuous_actions=run.continuous)
-    algorithm: type[MADDPG] = MATD3 if run.algo == "matd3" else MADDPG
-    policy = algorithm.load(model, device="cpu")
+    team = _team(run)
+    policy = ALGOS[run.algo].load(model, device="cpu")
     totals = np.zeros(len(team.agent_names))
     for episode in range(EVAL_EPISODES):
         obs, _ = team.reset(seed=EVAL_EPISODES * (run.seed + 1000) + episode)
@@ -205,41 +223,60 @@ def report(rows: Sequence[Row]) -> None:
                 cell += f" ({'better' if mean(values) > bar else 'WORSE'} than {bar:g})"
             line += f"{cell:>24}" if len(cell) < 24 else f"  {cell}"
         print(line)
-        last = {name: [row["agents"][name] for row in seeds] for name in seeds[0]["agents"]}
-        print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))
+        if last := {name: [row["agents"][name] for row in seeds] for name in seeds[0]["agents"]}:
+            print("    at the end: " + ", ".join(f"{name} {mean(values):.2f}" for name, values in last.items()))
+
+
+def random_return(env: str, actions: str) -> float:
+    """
+    :param env: environment as in rows, such as mpe2/simple_spread_v3
+    :param actions: continuous or discrete
+    :return: mean return of random actions over agents and 500 episodes
+    """
+    module = importlib.import_module(env.replace("/", "."))
+    team_env = TeamEnv(module.parallel_env(continuous_actions=actions == "continuous"))
+    team_env.action_space.seed(0)
+    total = 0.0
+    for seed in range(500):
+        team_env.reset(seed=seed)
+        ended = False
+        while not ended:
+            _, reward, terminated, truncated, _ = team_env.step(team_env.action_space.sample())
+            total, ended = total + float(reward), terminated or truncated
+    return total / 500
 
 
 def plot(rows: Sequence[Row], file: Path) -> None:
-    """Draw the learning curves with 95 % t-intervals, with a panel per environment."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    """Draw the learning curves with 95 % t-intervals and the return of random actions, with a panel per environment."""
     groups = grouped(rows)
     envs = list(dict.fromkeys(env for env, _, _ in groups))
-    # Okabe and Ito's colours
-    kinds = [("continuous", "maddpg"), ("discrete", "maddpg"), ("continuous", "matd3"), ("discrete", "matd3")]
-    styles = dict(zip(kinds, [("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#CC79A7", ":")], strict=True))
-    figure, axes = plt.subplots(1, len(envs), figsize=(3.6 * len(envs), 3.2), squeeze=False, layout="constrained")
-    for axis, env in zip(axes[0], envs, strict=True):
-        for (of, actions, algo), seeds in groups.items():
-            if of != env:
-                continue
-            colour, style = styles[actions, algo]
-            steps = np.array(seeds[0]["timesteps"]) / 1000
-            curves = np.array([row["mean_return"] for row in seeds])
-            middle, half = curves.mean(axis=0), [interval(values.tolist()) for values in curves.T]
-            name = f"{algo.upper()}, {actions} ({len(seeds)} seeds)"
-            axis.plot(steps, middle, style, color=colour, label=name)
-            axis.fill_between(steps, middle - half, middle + half, color=colour, alpha=0.2, linewidth=0)
-        axis.set(title=env.removeprefix("mpe2/"), xlabel="thousand steps")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize="x-small")
-    axes[0, 0].set_ylabel("return, mean over agents")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=150)
+    labels = list(dict.fromkeys((algo, actions) for _, actions, algo in groups))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8, 2.6 * math.ceil(len(envs) / 2)), layout="constrained")
+        panels = list(figure.subplots(math.ceil(len(envs) / 2), min(len(envs), 2), squeeze=False).flat)
+        for axes, env in zip(panels, envs, strict=False):
+            for (of, actions, algo), seeds in groups.items():
+                if of == env:
+                    _draw_curve(axes, seeds, f"{algo.upper()}, {actions} actions", labels.index((algo, actions)))
+            level = random_return(env, "continuous")
+            axes.axhline(level, color=RULES, linewidth=1, linestyle=(0, (2, 2)), label="random actions (continuous)")
+            axes.set_title(env.removeprefix("mpe2/"))
+            axes.set_ylabel("return, mean over agents")
+            axes.set_xlabel("environment steps (thousands)")
+        shown = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(file)
     print(f"Figure: {file}")
+
+
+def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> None:
+    steps = np.array(seeds[0]["timesteps"]) / 1000
+    curves = np.array([row["mean_return"] for row in seeds])
+    middle, half = curves.mean(axis=0), np.array([interval(values.tolist()) for values in curves.T])
+    style = ("-", "--", "-.", (0, (1, 1)))[index % 4]
+    axes.plot(steps, middle, linestyle=style, color=colour_of(index), label=f"{label}, {len(seeds)} seeds")
+    axes.fill_between(steps, middle - half, middle + half, color=colour_of(index), alpha=0.15, linewidth=0)
 
 
 def write(rows: Sequence[Row], file: Path) -> None:
@@ -263,7 +300,7 @@ def write(rows: Sequence[Row], file: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=ENVS, choices=[*MODULES, *(f"{env}:discrete" for env in MODULES)])
-    parser.add_argument("--algos", nargs="+", default=["maddpg"], choices=["maddpg", "matd3"])
+    parser.add_argument("--algos", nargs="+", default=["maddpg"], choices=[*ALGOS, "ppo"])
     parser.add_argument("--seeds", nargs="+", type=int, default=range(5))
     parser.add_argument("--steps", type=int, default=100_000, help="length of each training (default 100,000)")
     parser.add_argument("--jobs", type=int, default=1, help="parallel trainings, each with one thread")
@@ -295,6 +332,9 @@ def main() -> None:
     rows = [row for run in runs if (row := run.row())]
     if not rows:
         sys.exit("Nothing is finished.")
+    trained = {tuple(row[key] for key in KEYS) for row in rows}
+    known = json.loads(args.json.read_text())["runs"] if args.json.exists() else []
+    rows = [*(row for row in known if tuple(row[key] for key in KEYS) not in trained), *rows]
     report(rows)
     write(rows, args.json)
     if args.plot:

@@ -28,6 +28,12 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS, REFERENCE, PEERS = "ours", "plain", ("agilerl", "benchmarl", "xuance")
+# Who has which kind of networks, see `benchmarks.peers.common.Task`
+HAVE = {
+    "separate": (OURS, REFERENCE, *PEERS),
+    "shared": (OURS, "agilerl", "xuance"),
+    "team": (OURS, "benchmarl"),
+}
 RATES = ("updates_per_s", "steps_per_s_100", "steps_per_s_1")
 AMOUNTS = {"updates": 300, "steps-100": 5_000, "steps-1": 400}
 QUICK = {"updates": 60, "steps-100": 1_000, "steps-1": 60}
@@ -104,7 +110,7 @@ def report(rounds: Rounds) -> list[Row]:
     for row in rows:
         labels = f"{row['library']:14} {row['version']:12} {row['networks']:9}"
         print(labels + "".join(f"{row[rate]:17.{0 if row[rate] >= 100 else 1}f}" for rate in RATES))
-    for networks in ("separate", "shared"):
+    for networks in HAVE:
         for rate in RATES:
             times = ratios(rounds, networks, rate)
             if peers := {name: times[name] for name in PEERS if name in times}:
@@ -119,7 +125,7 @@ def main() -> None:
     everything = (OURS, REFERENCE, *PEERS)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
     parser.add_argument("--only", nargs="+", choices=everything, default=everything, help="only these libraries")
-    parser.add_argument("--networks", nargs="+", choices=("separate", "shared"), default=("separate", "shared"))
+    parser.add_argument("--networks", nargs="+", choices=HAVE, default=list(HAVE))
     parser.add_argument("--rounds", type=int, default=3, help="number of rounds (default 3)")
     parser.add_argument("--quick", action="store_true", help="a fifth of the work, as a test")
     parser.add_argument("--core", type=int, help="core to pin to (default: the last allowed one)")
@@ -132,10 +138,7 @@ def main() -> None:
         else:
             names.append(name)
     rounds: dict[tuple[str, str], list[Row]] = {
-        (name, networks): []
-        for networks in args.networks
-        for name in names
-        if (name, networks) != (REFERENCE, "shared")
+        (name, networks): [] for networks in args.networks for name in names if name in HAVE[networks]
     }
     amounts = QUICK if args.quick else AMOUNTS
     failures = []

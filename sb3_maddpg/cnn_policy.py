@@ -11,7 +11,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
-from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, MLPCritic
+from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, StackedCritic
 from sb3_maddpg.utils import shown
 
 
@@ -87,7 +87,7 @@ class CnnCritic(Critic):
     :param head: critics that read features
     """
 
-    def __init__(self, features: ImageFeatures, head: MLPCritic):
+    def __init__(self, features: ImageFeatures, head: StackedCritic):
         super().__init__(head.factors, head.n_agents, n_critics=head.n_critics)
         self.features = features
         self.head = head
@@ -161,7 +161,7 @@ class CnnPolicy(MADDPGPolicy):
         actor, critic = super()._make_networks(actor_arch, critic_arch)
         self.team = team
         assert isinstance(actor, MLPActor)
-        assert isinstance(critic, MLPCritic)
+        assert isinstance(critic, StackedCritic)
         return CnnActor(of_actor, actor), CnnCritic(of_critic, critic)
 
     def _make_features(self) -> ImageFeatures:

@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.maddpg import MADDPG
-from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, StackedCritic, sharing_groups
+from sb3_maddpg.policies import Critic, MADDPGPolicy, StackedCritic, sharing_groups
 from sb3_maddpg.team import Team
 
 
@@ -62,12 +62,14 @@ class IndependentCritic(StackedCritic):
 class IndependentPolicy(MADDPGPolicy):
     """``MADDPGPolicy`` with critics that read only their own agent's observation and action."""
 
-    def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
-        actor, _ = super()._make_networks(actor_arch, critic_arch)
-        assert isinstance(actor, MLPActor)
+    def _make_critic(self, actions: TeamActions, net_arch: list[int]) -> Critic:
+        if isinstance(self.share_critic, str):
+            raise ValueError(
+                f"share_critic={self.share_critic!r} requires a centralised critic, but IDDPG has independent critics. "
+                "Pass True, False or a list of lists of agents, or use MADDPG."
+            )
         groups = sharing_groups(self.share_critic, self.team, "share_critic")
-        critic = IndependentCritic(self.team, actor.actions, critic_arch, self.activation_fn, groups, self.n_critics)
-        return actor, critic
+        return IndependentCritic(self.team, actions, net_arch, self.activation_fn, groups, self.n_critics)
 
 
 class IDDPG(MADDPG):

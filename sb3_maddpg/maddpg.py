@@ -469,6 +469,11 @@ class MADDPG(OffPolicyAlgorithm):
         self.policy.check_finite(self._last_obs)
         return th.as_tensor(self._last_obs, dtype=th.float32, device=self.device)
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last rollout may exceed total_timesteps, and schedules must not go below their final values
+        self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
+
     @property
     def noise_std(self) -> float:
         """Current standard deviation of the exploration noise."""
@@ -504,7 +509,7 @@ class MADDPG(OffPolicyAlgorithm):
 
             # Optimize the critics
             losses, q_value = self._critic_loss(replay_data, obs, actions)
-            critic_losses.append(self._descend(self.critic, losses, self.critic.agent_of_value))
+            critic_losses.append(self._descend(self.critic, losses))
             q_values.append(q_value)
 
             # Delayed policy updates
@@ -537,7 +542,7 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> tuple[th.Tensor, th.Tensor]:
         """:return: the loss of each value head, (n_values,), and each agent's mean Q-value, (n_agents,)"""
         critic, action_cost = self.critic, self._scaled_action_cost()
-        rewards = replay_data.rewards
+        rewards = critic.rewards(replay_data.rewards)
         if len(critic.agent_of_value) > critic.n_agents and replay_data.pair_rewards is not None:
             rewards = replay_data.pair_rewards.flatten(1)
         with th.no_grad():
@@ -577,7 +582,7 @@ class MADDPG(OffPolicyAlgorithm):
             q_values = critic.forward_alternatives(obs, actions, own, factors)
             if action_cost is None:
                 return q_values
-            cost = critic.factored(action_cost.unsqueeze(0))[0]
+            cost = critic.cost_of_factors(action_cost)
             return q_values - (own * (cost if factors is None else cost[factors]).unsqueeze(1)).sum(dim=-1)
 
         logits = self.actor.logits(obs)
@@ -593,12 +598,11 @@ class MADDPG(OffPolicyAlgorithm):
         losses = _mean_over_batch(losses, replay_data.active, replay_data.weights)
         return losses, joint.squash(logits.detach())[:, joint.discrete_columns]
 
-    def _descend(self, network: Actor | Critic, losses: th.Tensor, agents: th.Tensor | None = None) -> float:
+    def _descend(self, network: Actor | Critic, losses: th.Tensor) -> float:
         """
         Take a step of gradient descent.
 
-        :param losses: the losses, (n,)
-        :param agents: the agent that each loss belongs to, (n,); by default there is one loss per agent, in order
+        :param losses: losses of the agents or value heads, (n,)
         :return: the sum of the losses
         :raises ValueError: if the sum is not finite
         """
@@ -606,7 +610,7 @@ class MADDPG(OffPolicyAlgorithm):
         value = loss.item()
         if not math.isfinite(value):
             diverged = (~losses.isfinite()).nonzero().squeeze(1)
-            owners = diverged if agents is None else agents[diverged]
+            owners = network.owners(diverged) if isinstance(network, Critic) else diverged
             names = [self.policy.team.names[agent] for agent in sorted(set(owners.tolist()))]
             raise self._diverged(f"the loss of the {_role(network)} of {', '.join(names) or 'the team'} is {value}")
         network.optimizer.zero_grad()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import torch as th
 from torch import nn
@@ -114,8 +114,9 @@ class StackedMLP(nn.Module):
 
         :param max_norm: maximum Euclidean norm
         """
-        gradients = [parameter.grad for parameter in self.parameters() if parameter.grad is not None]
-        norm = th.stack([gradient.square().sum(dim=(1, 2)) for gradient in gradients]).sum(dim=0).sqrt()
+        gradients = [parameter.grad for parameter in chain(*self.layers()) if parameter.grad is not None]
+        norms = [th.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]
+        norm = th.linalg.vector_norm(th.stack(norms), dim=0)
         scale = (max_norm / (norm + 1e-6)).clamp(max=1.0).view(-1, 1, 1)
         for gradient in gradients:
             gradient.mul_(scale)

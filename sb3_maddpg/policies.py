@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
@@ -38,10 +38,13 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
         lists = [list(range(team.n_agents))] if share else []
     else:
         try:
+            if isinstance(share, str):
+                raise TypeError
             lists = [[team.index(agent) for agent in agents] for agents in share]
         except TypeError:
             raise ValueError(
-                f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network."
+                f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network; "
+                'share_critic may also be "team".'
             ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
@@ -219,6 +222,13 @@ class Critic(nn.Module):
         """
         return actions.reshape(len(actions), -1, self.factors.width)
 
+    def rewards(self, of_agents: th.Tensor) -> th.Tensor:
+        """
+        :param of_agents: rewards of the agents, (batch, n_agents)
+        :return: rewards of the value heads, (batch, n_values)
+        """
+        return of_agents
+
     def per_value(self, of_agents: th.Tensor) -> th.Tensor:
         """
         Broadcast values of agents to their value heads.
@@ -228,6 +238,20 @@ class Critic(nn.Module):
         """
         one_each = len(self.agent_of_value) == self.n_agents
         return of_agents if one_each else of_agents[..., self.agent_of_value]
+
+    def owners(self, values: th.Tensor) -> th.Tensor:
+        """
+        :param values: indices of value heads, (n,)
+        :return: indices of the agents whose values these heads predict
+        """
+        return self.agent_of_value[values]
+
+    def cost_of_factors(self, action_cost: th.Tensor) -> th.Tensor:
+        """
+        :param action_cost: costs of the agents' actions, (n_agents, width)
+        :return: costs of the factors' actions in units of a value head, (n_factors, factor width)
+        """
+        return self.factored(action_cost.unsqueeze(0))[0]
 
     def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
         """
@@ -287,6 +311,32 @@ class StackedCritic(Critic):
     def clip_grad_norm_(self, max_norm: float) -> None:
         self.net.clip_grad_norm_(max_norm)
 
+    def values_of_changes(
+        self,
+        changes: th.Tensor,
+        first: th.Tensor,
+        own_weight: th.Tensor,
+        layers: Sequence[tuple[th.Tensor, th.Tensor]],
+        networks: th.Tensor | None,
+    ) -> th.Tensor:
+        """
+        Evaluate alternative actions, given the first layer's output for the original actions.
+
+        :param changes: differences of the alternatives from the original actions, (batch, n, M, width)
+        :param first: output of the first layer for the original actions, (n, hidden, batch)
+        :param own_weight: weights of the first layer for the changed actions, (n, hidden, width)
+        :param layers: layers of the networks, see ``StackedMLP.after_first``
+        :param networks: indices of the networks, None for all
+        :return: values of the alternatives, (batch, n, M)
+        """
+        # With the batch as the last axis, the sum below is contiguous in memory. Later layers change it in place, so
+        # it must not be a view.
+        changes = changes.permute(1, 3, 2, 0)
+        shape = changes.shape[2:]
+        first = first.repeat(1, 1, shape[0]) if shape[0] > 1 else first
+        values = self.net.after_first(th.baddbmm(first, own_weight, changes.flatten(2)), layers, networks)
+        return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
+
     def by_critic(self, outputs: th.Tensor) -> th.Tensor:
         """
         :param outputs: outputs of the networks, (n_critics * n_agents, 1, batch)
@@ -345,8 +395,7 @@ class MLPCritic(StackedCritic):
 
     def _inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """:return: the joint input of all critics, (features, batch)"""
-        seen = obs[..., self.team.obs_dim :] if self.team.state_dim else obs[..., : self.team.obs_dim]
-        inputs = [seen.flatten(1)[:, : self.team.state_dim or None], actions.flatten(1)]
+        inputs = _joint_inputs(self.team, obs, actions)
         if self.tells_agent:
             inputs.append(actions.new_ones(len(actions), 1))
         return th.cat(inputs, dim=1).T
@@ -375,12 +424,77 @@ class MLPCritic(StackedCritic):
         first = self._first(self._inputs(obs, actions), layers[0], networks)
         weight = self.net.of_networks(layers[0][0], networks)
         own_weight = weight.gather(2, self.own_columns[agents].unsqueeze(1).expand(-1, weight.shape[1], -1))
-        # With the batch as the last axis, the sum below is contiguous in memory
-        change = (own - actions[:, agents].unsqueeze(2)).permute(1, 3, 2, 0)
-        shape = change.shape[2:]
-        change = th.bmm(own_weight, change.flatten(2)).unflatten(2, shape)
-        values = self.net.after_first(change.add_(first.unsqueeze(2)).flatten(2), layers, networks)
-        return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
+        return self.values_of_changes(own - actions[:, agents].unsqueeze(2), first, own_weight, layers, networks)
+
+
+class TeamCritic(StackedCritic):
+    """
+    Multi-layer perceptron with a single value for the whole team, Q(z_1..z_n, a_1..a_n), trained on the mean of the
+    agents' rewards. It is meant for cooperative teams, in which all agents get the same reward or maximise that of the
+    team. With n agents, a critic update takes about 1/n of the time that it takes with one value per agent. The value
+    bootstraps until all agents have terminated.
+
+    :param team: the team
+    :param actions: the team's actions
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: activation function between the layers
+    :param n_critics: number of critics
+    """
+
+    def __init__(
+        self,
+        team: Team,
+        actions: TeamActions,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 1,
+    ):
+        self.seen_dim = team.state_dim or team.n_agents * team.obs_dim
+        n_inputs = self.seen_dim + team.n_agents * actions.width
+        super().__init__(team, actions, n_inputs, net_arch, activation_fn, [0], n_critics)
+        self.team = team
+        self.agent_of_value = th.zeros(1, dtype=th.long)
+
+    def rewards(self, of_agents: th.Tensor) -> th.Tensor:
+        return of_agents.mean(dim=-1, keepdim=True)
+
+    def per_value(self, of_agents: th.Tensor) -> th.Tensor:
+        return of_agents.amax(dim=-1, keepdim=True)
+
+    def owners(self, values: th.Tensor) -> th.Tensor:
+        return th.arange(self.n_agents)
+
+    def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
+        return values.expand(*values.shape[:-1], self.n_agents)
+
+    def known_cost(self, actions: th.Tensor, action_cost: th.Tensor) -> th.Tensor:
+        return self.rewards((actions * action_cost).sum(dim=-1))
+
+    def cost_of_factors(self, action_cost: th.Tensor) -> th.Tensor:
+        return super().cost_of_factors(action_cost) / self.n_agents
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        inputs = th.cat(_joint_inputs(self.team, obs, actions), dim=1).T
+        return self.by_critic(self.net(inputs.expand(self.n_critics, -1, -1)))
+
+    def forward_alternatives(
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
+    ) -> th.Tensor:
+        # The first layer is linear, so it processes the joint input once and adds the changes of each alternative
+        agents = th.arange(self.n_agents, device=own.device) if factors is None else factors
+        layers = self.net.layers()
+        weight, bias = (parameter[0] for parameter in layers[0])
+        first = th.addmm(bias, weight, th.cat(_joint_inputs(self.team, obs, actions), dim=1).T)
+        first = first.expand(len(agents), -1, -1)
+        own_weight = weight[:, self.seen_dim :].unflatten(1, (self.n_agents, -1))[:, agents].transpose(0, 1)
+        changes = own - actions[:, agents].unsqueeze(2)
+        return self.values_of_changes(changes, first, own_weight, layers, th.zeros_like(agents))
+
+
+def _joint_inputs(team: Team, obs: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
+    """:return: inputs of centralised critics: the global state if there is one, else all observations; all actions"""
+    seen = obs[..., team.obs_dim :] if team.state_dim else obs[..., : team.obs_dim]
+    return [seen.flatten(1)[:, : team.state_dim or None], actions.flatten(1)]
 
 
 def _places(groups: Sequence[int], agent: int) -> list[int]:
@@ -405,7 +519,8 @@ class MADDPGPolicy(BasePolicy):
     :param activation_fn: activation function between the layers
     :param share_actor: parameter sharing of actors: True for one network for all agents, False for one network per
         agent, or lists of the agents (names or indices) that share a network
-    :param share_critic: parameter sharing of critics, like ``share_actor``
+    :param share_critic: parameter sharing of critics, like ``share_actor``, or "team" for a single value for the whole
+        team, see ``TeamCritic``
     :param threshold: delta in [0, 1): a binary action is 1 if its probability exceeds delta. For ``MultiBinary`` only.
     :param random_thresholds: fraction of the thresholds that are drawn at random during exploration, the others
         are delta
@@ -431,7 +546,7 @@ class MADDPGPolicy(BasePolicy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
         share_actor: Sharing = False,
-        share_critic: Sharing = False,
+        share_critic: Sharing | Literal["team"] = False,
         threshold: float = 0.5,
         random_thresholds: float = 1.0,
         n_critics: int = 1,
@@ -499,11 +614,14 @@ class MADDPGPolicy(BasePolicy):
             masks=self.team.masks,
         )
         actor_groups = sharing_groups(self.share_actor, self.team, "share_actor")
-        critic_groups = sharing_groups(self.share_critic, self.team, "share_critic")
-        return (
-            MLPActor(self.team, actions, actor_arch, self.activation_fn, actor_groups),
-            MLPCritic(self.team, actions, critic_arch, self.activation_fn, critic_groups, self.n_critics),
-        )
+        actor = MLPActor(self.team, actions, actor_arch, self.activation_fn, actor_groups)
+        return actor, self._make_critic(actions, critic_arch)
+
+    def _make_critic(self, actions: TeamActions, net_arch: list[int]) -> Critic:
+        if self.share_critic == "team":
+            return TeamCritic(self.team, actions, net_arch, self.activation_fn, self.n_critics)
+        groups = sharing_groups(self.share_critic, self.team, "share_critic")
+        return MLPCritic(self.team, actions, net_arch, self.activation_fn, groups, self.n_critics)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
@@ -531,9 +649,10 @@ class MADDPGPolicy(BasePolicy):
         for name, parameter in parameters.items():
             finite = parameter.isfinite()
             if not finite.all():
-                network = getattr(getattr(self, name.split(".")[0], None), "net", None)
+                module = getattr(self, name.split(".")[0], None)
+                network = getattr(module, "net", None)
                 agents: Iterable[int] = range(self.team.n_agents)
-                if isinstance(network, StackedMLP):
+                if isinstance(network, StackedMLP) and not isinstance(module, TeamCritic):
                     groups = finite.flatten(1).all(dim=1)[network.groups.to(finite.device)].tolist()
                     agents = sorted({index % self.team.n_agents for index, good in enumerate(groups) if not good})
                 names = ", ".join(self.team.names[agent] for agent in agents)

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.flight import begin, first_episode, fly_steps
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.planner import Problems, Solution, Solver
@@ -90,13 +91,13 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     work = [(name, 0.0, "none") for name in SCENARIOS]
     work += [(name, share, kind) for share in SHARES for kind in KINDS for name in SCENARIOS]
     rows = []
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         done = pool.map(row, *zip(*work, strict=True), [args.episodes] * len(work))
         for one in progress(done, "faults", len(work)):
             rows.append(one)

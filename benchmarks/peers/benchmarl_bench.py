@@ -2,8 +2,8 @@
 
 Forced: an agent's critic sees the global state and the actions of its own group only, so in a task with two sides not
 those of the other side; gradients are clipped by the norm of all networks of a group together; learning starts after
-the first batch of ``train_freq`` steps. A shared critic has a single value for the whole group without an agent id,
-which is a third of the work of the other libraries.
+the first batch of ``train_freq`` steps. A shared critic has a single value for the whole group without an agent id:
+``--networks team``.
 """
 
 from pathlib import Path

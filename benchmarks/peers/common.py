@@ -51,15 +51,21 @@ class Task:
     :param env: name of a module of mpe2
     :param steps: environment steps of the whole training, over which exploration is annealed
     :param train_freq: environment steps per update
-    :param shared: whether all agents share one network
+    :param networks: "separate" for an actor and a critic per agent, "shared" for one of each for all agents, "team" for
+        the shared actor and a critic with one value for the whole team
     :param seed: seed of environment, networks and exploration
     """
 
     env: str
     steps: int
     train_freq: int
-    shared: bool
+    networks: str
     seed: int
+
+    @property
+    def shared(self) -> bool:
+        """Whether agents share networks."""
+        return self.networks != "separate"
 
 
 class Clock:
@@ -216,11 +222,10 @@ def speed(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
     """Measure updates per second, and steps per second of the library's loop with an update every 100 steps and every
     step."""
     result: dict[str, Any] = {"networks": arguments.networks}
-    shared = arguments.networks == "shared"
     clock = Clock()
     for train_freq, steps in ((100, arguments.steps_100), (1, arguments.steps_1)):
         warm_up = make.first_update + 100
-        driver = make(Task("simple_spread_v3", warm_up + steps, train_freq, shared, arguments.seed))
+        driver = make(Task("simple_spread_v3", warm_up + steps, train_freq, arguments.networks, arguments.seed))
         driver.train(warm_up, clock)
         result |= rates(f"steps_per_s_{train_freq}", steps, clock)
         if train_freq == 100:
@@ -239,8 +244,7 @@ def speed(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
 def learn(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
     """Train with an update every ``--train-freq`` steps, then measure the return of each agent without exploration."""
     clock = Clock()
-    shared = arguments.networks == "shared"
-    driver = make(Task(arguments.env, arguments.steps, arguments.train_freq, shared, arguments.seed))
+    driver = make(Task(arguments.env, arguments.steps, arguments.train_freq, arguments.networks, arguments.seed))
     driver.train(0, clock)
     returns = evaluate(driver, arguments.env)
     if arguments.export:
@@ -279,11 +283,11 @@ def main(library: str, distribution: str, make: type[Driver]) -> None:
     training.add_argument("--export", type=lambda path: Path(path).resolve(), metavar="FOLDER",
                           help="folder for the agents' policies, for separate networks only")  # fmt: skip
     for mode in (measure, training):
-        mode.add_argument("--networks", choices=("separate", "shared"), default="separate")
+        mode.add_argument("--networks", choices=("separate", "shared", "team"), default="separate")
         mode.add_argument("--seed", type=int, default=0)
         mode.add_argument("--core", type=int, help="core to pin to (default: the last allowed one)")
     arguments = parser.parse_args()
-    if arguments.mode == "learn" and arguments.export and arguments.networks == "shared":
+    if arguments.mode == "learn" and arguments.export and arguments.networks != "separate":
         parser.error("--export is for separate networks")
 
     if hasattr(os, "sched_setaffinity"):

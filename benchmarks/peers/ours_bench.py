@@ -34,7 +34,7 @@ class Ours:
             policy_kwargs={
                 "net_arch": list(common.HIDDEN),
                 "share_actor": task.shared,
-                "share_critic": task.shared,
+                "share_critic": "team" if task.networks == "team" else task.shared,
             },
             tensorboard_log=str(Path.cwd()),
             seed=task.seed,

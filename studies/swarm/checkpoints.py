@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 import torch as th
 
-from quad_swarm.evaluation.evaluation import make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import summarise
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
@@ -81,14 +82,14 @@ def main() -> None:
     parser.add_argument(
         "--episodes", type=int, default=2000, help="episodes per scenario for the test (default %(default)s)"
     )
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument(
         "--models", type=Path, default=Path("logs"), help="folder for averaged models (default %(default)s)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     choices: list[tuple[str, str, str]] = []
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         for run in args.runs:
             tried = checkpoints(run)
             count = len(tried)

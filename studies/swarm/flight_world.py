@@ -22,7 +22,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from quad_swarm.evaluation.evaluation import make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import summarise
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
@@ -109,10 +110,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="parts to fly (default: all)")
     parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=absolute_path, default=DATA / "flight_world.json", metavar="FILE")
     args = parser.parse_args()
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         for part in args.parts or PARTS:
             known = {row.get("condition") for row in read_rows(args.json)} if part == "plants" else set()
             work = [job for job in jobs(part) if str(job) not in known]

@@ -14,7 +14,8 @@ import os
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-from quad_swarm.evaluation.evaluation import make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import summarise
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
@@ -105,14 +106,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n-robots", nargs="+", type=int, default=list(EPISODES), choices=list(EPISODES))
     parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=absolute_path, default=DATA / "flight.json", metavar="FILE")
     args = parser.parse_args()
     os.chdir(ROOT)
     keys = ("n_robots", "scenario", "policy")
     flown = {tuple(row[key] for key in keys) for row in read_rows(args.json)}
     work = [job for job in jobs(args.n_robots, args.quick) if (job.n_robots, job.scenario, job.policy) not in flown]
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         for row in progress(pool.map(fly, work), "flight", len(work)):
             replace_rows(args.json, [row], keys)
 

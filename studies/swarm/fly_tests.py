@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.evaluation.evaluation import make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import summarise
 from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, fly_steps
 from quad_swarm.evaluation.inference import Comparison
 from quad_swarm.evaluation.rows import read_rows
@@ -426,13 +427,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--n-robots", nargs="+", type=int, default=TEAMS, choices=TEAMS, help="numbers of robots in the part teams"
     )
     parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument(
         "--out", type=absolute_path, default=DATA, help="folder of the JSON files (default %(default)s)"
     )
     args = parser.parse_args(argv)
     os.chdir(ROOT)
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         for part in args.parts or PARTS:
             make_jobs, run = PARTS[part]
             path = args.out / f"{part}.json"

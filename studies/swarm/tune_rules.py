@@ -16,7 +16,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.world.presets import PRESETS
 from quad_swarm.world.scenarios import SCENARIOS
 from studies.swarm.protocol import (
@@ -126,7 +127,7 @@ def main() -> None:
     parser.add_argument(
         "--quick", action="store_true", help="fly few episodes and rules, to check that everything runs"
     )
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     work = [
@@ -136,7 +137,7 @@ def main() -> None:
         for scenario in args.scenario
     ]
     keys = ("preset", "scenario", "family", "n_robots")
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         for table in progress(pool.map(tune, *zip(*work, strict=True)), "rules", len(work)):
             if args.json:
                 replace_rows(args.json, table, keys if "n_robots" in table[0] else keys[:-1])

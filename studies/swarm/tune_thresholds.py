@@ -18,7 +18,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from quad_swarm.evaluation.evaluation import Rows, make_pool, summarise
+from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.inference import Comparison
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
@@ -89,7 +90,7 @@ def main() -> None:
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS)[::-1], choices=list(SCENARIOS))
     parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="default: the preset's")
     parser.add_argument("--quick", action="store_true", help="fly few episodes, to check that everything runs")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--write", action="store_true", help="write each model's threshold into its file")
     args = parser.parse_args()
@@ -104,7 +105,7 @@ def main() -> None:
         for path in paths
     ]
     rows: list[dict[str, Any]] = []
-    with make_pool(args.jobs) as pool:
+    with workers(args) as pool:
         for table in progress(pool.map(tune, *zip(*work, strict=True)), "thresholds", len(work)):
             rows += table
             if args.json:

@@ -64,7 +64,7 @@ def flown(monkeypatch):
     def fly(policies, preset, scenario, episodes, n_robots=None, skip=0):
         (policy,) = policies
         flown.append((policy, (n_robots, scenario), skip, episodes))
-        collides = policy.startswith("bad") and (n_robots, scenario) == (16, "asymmetric_swap")
+        collides = policy.startswith("bad") and (n_robots, scenario) == (12, "asymmetric_swap")
         requests = float(policy.split()[-1]) if " " in policy else 1.0
         return {policy: [{"collided": collides and k % 5 == 0, "requests": requests} for k in range(skip, episodes)]}
 
@@ -82,8 +82,8 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     # Piece by piece, in every scenario
     stages = [0, *tune_flight.STAGES]
     assert [one[2:] for one in flown if one[:2] == ("good", (8, "random"))] == list(pairwise(stages))
-    assert [one[2:] for one in flown if one[:2] == ("good", (16, "symmetric_swap"))] == list(pairwise(stages))[:-1]
-    swaps = itertools.product((4, 8, 12, 16), ("symmetric_swap", "asymmetric_swap"))
+    assert [one[2:] for one in flown if one[:2] == ("good", (12, "symmetric_swap"))] == list(pairwise(stages))[:-1]
+    swaps = itertools.product((4, 8, 12), ("symmetric_swap", "asymmetric_swap"))
     assert {one[1] for one in flown if one[0] == "good"} == {*swaps, *((8, name) for name in NAMES)}
     hardest, other = (
         {one[3] for one in flown if one[0] == "bad" and (one[1] == tune_flight.CELLS[0]) == same}
@@ -91,7 +91,7 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     )
     assert max(hardest) == tune_flight.FIRST
     assert max(other) == tune_flight.STAGES[0], "what cannot turn out to be safe is not flown on"
-    assert tune_flight.CELLS[0] == (16, "symmetric_swap")
+    assert tune_flight.CELLS[0] == (12, "symmetric_swap")
 
 
 def test_what_collides_where_others_do_is_not_flown_on(flown, monkeypatch):
@@ -103,7 +103,7 @@ def test_what_collides_where_others_do_is_not_flown_on(flown, monkeypatch):
 
     monkeypatch.setattr(tune_flight, "run_episodes", collide)
     trial = tune_flight.try_out("bad", FULL, tune_flight.STAGES, hard=(7, 4, 9, 1501))
-    assert flights == [("symmetric_swap", 16, [7, 4, 9, 1501])]
+    assert flights == [("symmetric_swap", 12, [7, 4, 9, 1501])]
     assert (trial.safe, trial.selected, trial.collided) == (False, True, [7, 9, 1501])
     assert not flown, "three collisions in 2,000 episodes are too many"
     # Two are not, so it flies as all do

@@ -132,9 +132,9 @@ def test_an_actor_sees_its_own_picture_and_critics_see_all(state):
     assert not th.isclose(model.critic(changed, actions), values).any()
 
 
-@pytest.mark.parametrize("share", [False, True])
+@pytest.mark.parametrize("share", [False, True, "team"])
 def test_alternatives_have_the_values_of_the_action_replaced(share):
-    model = made(share_critic=share, share_actor=share)
+    model = made(share_critic=share, share_actor=bool(share))
     obs, actions = drawn(model)
     own = th.randn(5, 2, 3, model.policy.actions.width)
     values = model.critic.forward_alternatives(obs, actions, own)
@@ -142,7 +142,7 @@ def test_alternatives_have_the_values_of_the_action_replaced(share):
         for alternative in range(3):
             replaced = actions.clone()
             replaced[:, agent] = own[:, agent, alternative]
-            expected = model.critic(obs, replaced)[0, :, agent]
+            expected = model.critic(obs, replaced)[0, :, 0 if share == "team" else agent]
             assert th.allclose(values[:, agent, alternative], expected, atol=1e-5)
 
 

@@ -66,6 +66,11 @@ def test_alternatives_have_the_values_of_the_action_replaced(factors, n_critics,
             assert th.allclose(values[:, place, alternative], expected, atol=1e-6)
 
 
+def test_one_value_for_the_team_is_refused():
+    with pytest.raises(ValueError, match="share_critic='team' requires a centralised critic"):
+        IDDPG("MlpPolicy", Neighbours(), policy_kwargs={"share_critic": "team"})
+
+
 def test_it_learns_what_needs_no_others():
     model = IDDPG(
         "MlpPolicy", OwnBit(), learning_rate=3e-3, learning_starts=200, batch_size=128, train_freq=2, seed=0

@@ -54,6 +54,12 @@ def test_only_expected_finds_bits_that_pay_together_or_not_at_all(estimator):
     assert learned(AllBits, estimator=estimator) == pytest.approx(none)
 
 
+@pytest.mark.parametrize("algorithm", [MADDPG, MATD3])
+@pytest.mark.parametrize("task", [OwnBit, OwnCategory, AllBits])
+def test_one_value_for_the_team_is_enough_for_cooperative_tasks(task, algorithm):
+    assert learned(task, 2500, algorithm, policy_kwargs={"share_critic": "team"}) > 0.97
+
+
 @pytest.mark.parametrize("task", [OwnBit, OwnCategory])
 def test_shared_networks_solve_tasks_with_equal_agents(task):
     assert learned(task, policy_kwargs=SHARED) > 0.97

@@ -271,6 +271,22 @@ def test_arguments_that_do_not_fit_are_refused(kwargs, message):
         MADDPG("MlpPolicy", "OwnBit-v0", **kwargs)
 
 
+def test_schedules_end_with_the_training_even_if_its_last_rollout_does_not():
+    seen: list[float] = []
+
+    def temperature(progress: float) -> float:
+        seen.append(progress)
+        return 1.0
+
+    env = TeamEnv(Toy("heterogeneous"))
+    numbers = {"exploration_noise": (0.5, 0.0), "learning_rate": lambda progress: 1e-3 * progress}
+    model = learned(env, 70, **numbers, train_freq=50, temperature=temperature, estimator="gumbel_softmax")
+    assert model.num_timesteps == 100
+    assert model.noise_std == 0.0
+    assert seen[-1] == 0.0
+    assert model.actor.optimizer.param_groups[0]["lr"] == 0.0
+
+
 def test_numbers_of_numpy_are_numbers():
     numbers = {"exploration_noise": np.float32(0.25), "batch_size": np.int64(16), "gamma": np.float32(0.5)}
     model = learned(TeamEnv(Toy("continuous")), 60, **numbers)
@@ -399,6 +415,10 @@ def test_a_short_training_logs_its_episodes_once():
         ({"policy_kwargs": {"optimizer_kwargs": 5}}, "optimizer_kwargs=5 must be a dict"),
         ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "cannot be passed to Adam: .*'x'"),
         ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or a list of lists of agents"),
+        (
+            {"policy_kwargs": {"share_critic": "all"}},
+            "share_critic='all' must be True, False or .*may also be \"team\"",
+        ),
         ({"policy_kwargs": {"agent_names": 5}}, "agent_names=5 must be a list of names"),
         ({"policy_kwargs": {"n_critics": 10**400}}, r"n_critics=10* \.\.\. 0* is too large: it must be less than"),
         ({"policy_kwargs": {"n_critics": 10**9}}, "the networks need more memory"),

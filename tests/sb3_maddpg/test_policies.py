@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.parallel import TeamEnv
-from sb3_maddpg.policies import MADDPGPolicy, MLPActor, MLPCritic, sharing_groups
+from sb3_maddpg.policies import MADDPGPolicy, MLPActor, MLPCritic, TeamCritic, sharing_groups
 from sb3_maddpg.team import Team, TeamObservation
 from toys import Toy
 
@@ -38,6 +38,11 @@ def critic(groups=None, state_dim: int = 0, net_arch=(16,), n_critics: int = 1) 
     return MLPCritic(built, TeamActions(built.action_spaces), list(net_arch), nn.ReLU, groups, n_critics)
 
 
+def team_critic(state_dim: int = 0, net_arch=(16,), n_critics: int = 1) -> TeamCritic:
+    built = team(state_dim)
+    return TeamCritic(built, TeamActions(built.action_spaces), list(net_arch), n_critics=n_critics)
+
+
 def policy(action_space: spaces.Space | None = None, **kwargs) -> MADDPGPolicy:
     observation_space = spaces.Box(-np.inf, np.inf, (N, D), np.float32)
     return MADDPGPolicy(observation_space, action_space or spaces.MultiBinary(N * K), lambda _: 1e-3, **kwargs)
@@ -60,6 +65,46 @@ def test_alternatives_equal_substituted_actions(groups, net_arch, n_critics, sta
             substituted = actions.clone()
             substituted[:, agent] = own[:, row, alternative]
             assert th.allclose(values[:, row, alternative], built(obs, substituted)[0, :, agent], atol=1e-5)
+
+
+@pytest.mark.parametrize("factors", [None, [2], [3, 0]])
+@pytest.mark.parametrize("net_arch", [[], [16, 16]])
+@pytest.mark.parametrize("n_critics", [1, 2])
+@pytest.mark.parametrize("state_dim", [0, 6])
+def test_alternatives_of_a_team_critic_equal_substituted_actions(net_arch, n_critics, state_dim, factors):
+    built = team_critic(state_dim, net_arch, n_critics)
+    obs, actions = batch(columns=D + 2 * (state_dim > 0))
+    agents = range(N) if factors is None else factors
+    own = th.rand(B, len(agents), 5, K)
+    values = built.forward_alternatives(obs, actions, own, None if factors is None else th.tensor(factors))
+    assert values.shape == (B, len(agents), 5)
+    assert built(obs, actions).shape == (n_critics, B, 1)
+    for row, agent in enumerate(agents):
+        for alternative in range(5):
+            substituted = actions.clone()
+            substituted[:, agent] = own[:, row, alternative]
+            assert th.allclose(values[:, row, alternative], built(obs, substituted)[0, :, 0], atol=1e-5)
+
+
+def test_a_team_critic_values_means_and_goes_on_with_the_last_agent():
+    built = team_critic()
+    of_agents = th.tensor([[1.0, 2.0, 3.0, 6.0], [0.0, 0.0, 0.0, 0.0]])
+    assert built.rewards(of_agents).tolist() == [[3.0], [0.0]]
+    assert built.per_value((of_agents > 5).float()).tolist() == [[1.0], [0.0]]
+    actions, cost = batch()[1], th.rand(N, K)
+    spent = (actions * cost).sum(dim=(1, 2)) / N
+    assert th.allclose(built.known_cost(actions, cost)[:, 0], spent)
+    # What each agent's own action takes from the value adds up to the same
+    assert th.allclose((actions * built.cost_of_factors(cost)).sum(dim=(1, 2)), spent)
+    assert built.owners(th.tensor([0])).tolist() == list(range(N))
+
+
+@pytest.mark.parametrize("n_critics", [1, 2])
+def test_a_team_critic_that_is_not_finite_belongs_to_all(n_critics):
+    built = policy(share_critic="team", n_critics=n_critics)
+    with th.no_grad():
+        built.critic.net.weights[0][-1, 0, 0] = th.nan
+    assert "agent(s) agent_0, agent_1, agent_2, agent_3" in built.not_finite(built.state_dict())
 
 
 @each_sharing
@@ -152,6 +197,7 @@ def test_groups_by_name_and_number():
         ([[0, 6]], "There is no agent 6.*0 to 5"),
         ([["mixed_0", 1], [0]], "share_actor.* names an agent twice"),
         ([[2, 2]], "names an agent twice"),
+        ("team", "share_actor='team' must be True, False or a list of lists"),
         (True, "mixed_0 and mixed_1 have different spaces.*Pass lists of homogeneous agents, or False"),
         ([["mixed_0", "mixed_4"]], "mixed_0 and mixed_4 have different spaces"),
     ],

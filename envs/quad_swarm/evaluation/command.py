@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from importlib.resources import files
 from pathlib import Path
@@ -252,12 +253,7 @@ def _parser() -> argparse.ArgumentParser:
         "--scenario", nargs="+", default=["all"], metavar="NAME", help=f"all, or some of {', '.join(SCENARIOS)}"
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
-    parser.add_argument(
-        "--jobs", type=int, default=1, help="number of processes; results do not depend on it (default 1)"
-    )
-    parser.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where processes run (default local)")
-    parser.add_argument("--address", help="a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
-    parser.add_argument("--mixed", action="store_true", help="accept results of machines that differ from this one")
+    add_worker_arguments(parser, jobs=1)
     parser.add_argument("--wide", action="store_true", help="print all columns, in long lines")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per policy and scenario")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the same results as comma-separated values")
@@ -266,6 +262,27 @@ def _parser() -> argparse.ArgumentParser:
         "--plot", type=Path, metavar="DIR", help="write figures of collisions, requests and flights to this folder"
     )
     return parser
+
+
+def add_worker_arguments(parser: argparse.ArgumentParser, jobs: int) -> None:
+    """Add the options that choose the processes: ``--jobs``, ``--engine``, ``--address`` and ``--mixed``.
+
+    :param jobs: default number of processes
+    """
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=jobs,
+        help="number of processes; results do not depend on it (default %(default)s)",
+    )
+    parser.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where processes run (default local)")
+    parser.add_argument("--address", help="a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
+    parser.add_argument("--mixed", action="store_true", help="accept results of machines that differ from this one")
+
+
+def workers(args: argparse.Namespace) -> Executor:
+    """Make the executor that the options of ``add_worker_arguments`` choose, see ``make_pool``."""
+    return make_pool(args.jobs, args.engine, args.address, args.mixed)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -285,7 +302,7 @@ def _compare(args: argparse.Namespace) -> None:
         check_writable(args.plot / "plot", "--plot")
     elsewhere = args.engine != "local" or args.address is not None
     try:
-        with make_pool(args.jobs, args.engine, args.address, args.mixed) if elsewhere else nullcontext() as executor:
+        with workers(args) if elsewhere else nullcontext() as executor:
             rows = evaluate(conditions, args.episodes, args.seed, args.jobs, default_folder(), executor)
     except KeyboardInterrupt:
         print("interrupted; repeat the command to continue", file=sys.stderr)

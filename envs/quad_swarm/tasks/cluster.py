@@ -64,7 +64,9 @@ class Cluster(Executor):
         """
         result: Future[Any] = Future()
         result.set_running_or_notify_cancel()
-        reference = self._run.remote(pickle.dumps(partial(function, *args, **kwargs)), self._modules)
+        # Unlike pickle, cloudpickle accepts functions defined in a script or in a module run with python -m
+        piece = self._ray.cloudpickle.dumps(partial(function, *args, **kwargs))
+        reference = self._run.remote(piece, self._modules)
         self._open[result] = reference
         reference.future().add_done_callback(partial(self._settle, result))
         return result

@@ -66,6 +66,13 @@ def untimed(flown):
     return {key: [{**row, "solve_seconds": 0.0} for row in rows] for key, rows in flown.items()}
 
 
+def test_functions_of_scripts_are_worked_off_too():
+    names: dict = {"__name__": "__main__"}
+    exec("def shifted(x):\n    return x + offset\n\noffset = 3", names)  # as in a script
+    with Cluster(2) as executor:
+        assert list(executor.map(names["shifted"], range(3))) == [3, 4, 5]
+
+
 def test_flights_are_those_of_this_process():
     conditions = [Condition(policy, "symmetric_swap", make_config("flight", n_robots=3)) for policy in ("none", "full")]
     with Cluster(2) as executor:
