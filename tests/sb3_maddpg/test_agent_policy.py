@@ -182,7 +182,7 @@ def test_agents_have_the_names_of_the_environment():
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        (np.zeros(3), r"An observation of binary_2 has length 4, not shape \(3,\)"),
+        (np.zeros(3), r"An observation of binary_2 has shape \(4,\), not \(3,\)"),
         (np.zeros((2, 5)), r"not \(2, 5\)"),
         (np.zeros((1, 2, 4)), r"not \(1, 2, 4\)"),
         (np.array(0.0), r"not \(\)"),

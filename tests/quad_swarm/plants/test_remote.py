@@ -32,7 +32,7 @@ def test_all_plants_share_one_process_until_it_dies():
     state, u, air = np.zeros((1, 2, 9)), np.zeros((1, 2, 4)), np.zeros((1, 2, 2))
     assert np.isfinite(first.step(state, u, air, None)).all()
     os.kill(first._server.process.pid, signal.SIGKILL)
-    with pytest.raises(RuntimeError, match="The simulator's process ended with -9"):
+    with pytest.raises(RuntimeError, match="The simulator's process exited with -9"):
         first.step(state, u, air, None)
     third = make()
     assert third._server is not first._server
