@@ -14,6 +14,7 @@ from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.validation import checked, checked_arguments, replaced
 from quad_swarm.world.beliefs import other_indices, reverse_indices
+from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm
@@ -72,15 +73,18 @@ class Outcome(NamedTuple):
     report: StepReport
 
 
-def requests_of(bits: np.ndarray) -> np.ndarray:
+def requests_of(bits: np.ndarray, neighbours: Neighbours | None = None) -> np.ndarray:
     """Who gets whose plan.
 
     :param bits: of each robot for each of the others, (..., n, n - 1, 1 or 2) bool: whether it asks it for its plan
         and, with announcements, whether it sends it the own one
+    :param neighbours: whom robots perceive; then there is one leading axis, of swarms; None: everybody
     :return: (..., n, n - 1) bool, as if all of these plans had been asked for
     """
     if bits.shape[-1] == 1:
         return bits[..., 0]
+    if neighbours is not None:
+        return bits[..., 0] | neighbours.of_the_other(bits[..., 1])
     n = bits.shape[-3]
     return bits[..., 0] | bits[..., other_indices(n), reverse_indices(n), 1]
 
@@ -133,10 +137,9 @@ class RequestTask:
         self.end_at_arrival = end_at_arrival
         self.end_at_collision = end_at_collision
         self.n_bits = 2 if announcements else 1
-        n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, swarm.config)
-        self.observation = observation or PaperObservation(n, scaled=False)
+        self.observation = observation or PaperObservation(swarm.config.n_others, scaled=False)
 
     @property
     def agent_names(self) -> tuple[str, ...]:
@@ -211,7 +214,20 @@ class RequestTask:
 
         :param bits: (E, n, n - 1, n_bits) bool, see `requests_of`
         """
-        return self.step(requests_of(bits), bits.sum(axis=-1))
+        bits = self.sent(bits)
+        return self.step(requests_of(bits, self.swarm.neighbours), bits.sum(axis=-1))
+
+    def sent(self, bits: np.ndarray) -> np.ndarray:
+        """What is sent of an action: nothing to an empty place, and no announcement to who does not perceive the
+        sender. It costs nothing to try.
+
+        :param bits: (E, n, n - 1, 1 or 2) bool, see `requests_of`
+        """
+        neighbours = self.swarm.neighbours
+        if neighbours.present is None:
+            return bits
+        reached = np.stack([neighbours.present, neighbours.reverse >= 0], axis=-1)
+        return bits & reached[..., : bits.shape[-1]]
 
     def step(self, requests: np.ndarray, messages: np.ndarray | None = None) -> Outcome:
         """One step of every swarm.
@@ -234,16 +250,17 @@ class RequestTask:
         }
         near_misses = np.zeros_like(report.separation)
         if self.reward.near_miss:
-            near_misses = self.reward.near_miss * self._near_misses(report.separation)
+            near_misses = self.reward.near_miss * self._near_misses(report)
             terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
         terminated = collided if self.end_at_collision else np.zeros_like(collided)
         if self.end_at_arrival:
             terminated = terminated | self.statistics.arrived
-        share = terms["goal"] / max(requests.shape[2], 1)
+        present = np.broadcast_to(report.others >= 0, requests.shape)
+        share = terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1)
         return Outcome(
             reward=sum(terms.values(), start=np.zeros(len(n_requests))),
             pair_rewards=(
-                share[:, None, None] - self.reward.collision * colliding - self.reward.request * messages - near_misses
+                present * share[..., None] - self.reward.collision * colliding - self.reward.request * messages - near_misses
             ).astype(np.float32),
             reward_terms=terms,
             terminated=terminated,
@@ -252,21 +269,22 @@ class RequestTask:
             report=report,
         )
 
-    def _near_misses(self, separation: np.ndarray) -> np.ndarray:
+    def _near_misses(self, report: StepReport) -> np.ndarray:
         """How near each miss is, 0 to 1, (E, n, n - 1)."""
         reward, ahead, distance = self.reward, self.reward.near_miss_ahead, self.reward.near_miss_distance
         assert distance is not None  # filled in above
-        shortfall = distance - separation
+        shortfall = distance - report.separation
         if ahead:
             limits = distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
-            planned = (limits - self.swarm.planned_separation(ahead)).max(axis=-1)
+            planned = (limits - self.swarm.planned_separation(ahead, report.others)).max(axis=-1)
             shortfall = np.maximum(shortfall, planned)
         return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0) ** reward.near_miss_exponent
 
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """The last step for `info`: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
         report = outcome.report
-        return {
+        who = {"neighbours": report.others} if self.swarm.neighbours.limited else {}
+        return who | {
             "scenario": np.array(self.scenario),
             "pair_rewards": outcome.pair_rewards,
             "reward_terms": outcome.reward_terms,

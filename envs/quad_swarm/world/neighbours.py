@@ -1,0 +1,162 @@
+"""Whom each robot perceives: all others or, in large swarms, only the nearest of those within a range.
+
+A robot has a place for each of the others that it perceives: m = n - 1 of them, or fewer where its neighbourhood is
+limited. Wherever an axis of an array is said to list the n - 1 others of a robot, it lists these m places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import PositiveInt
+
+from quad_swarm.native import pairs
+from quad_swarm.states import like
+from quad_swarm.validation import PositiveLength, checked
+from quad_swarm.world.beliefs import other_indices, reverse_indices
+
+
+@checked
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Whom a robot perceives, predicts and may ask: by default everybody.
+
+    :param max_others: so many others at most, the nearest; None: all
+    :param range: others within this distance, of sensors and radio alike (m); None: any
+    :raises ValueError: a value is not positive
+    """
+
+    max_others: PositiveInt | None = None
+    range: PositiveLength | None = None
+
+
+class Neighbours:
+    """Whom the robots of E swarms perceive now.
+
+    One that stays in the neighbourhood keeps its place, so that whatever is remembered about it needs not be moved. Who
+    comes takes the first place that is free, of several who come at once the one with the lowest number first.
+
+    :ivar others: who has each place, (n, n - 1) ascending where everybody perceives everybody, else (E, n, m); an empty
+        place has the robot's own number
+    :ivar reverse: place of a robot at each of those, of the same shape; -1 where that one does not perceive the robot
+    :ivar present: which places are taken, (E, n, m) bool; None: always all
+
+    :param n_swarms: number of swarms E
+    :param n_robots: robots in a swarm n
+    :param n_places: places of a robot m, at most n - 1
+    :param limit: range within which robots perceive each other (m); None: any
+    """
+
+    def __init__(self, n_swarms: int, n_robots: int, n_places: int, limit: float | None = None):
+        self.present: np.ndarray | None = None
+        self._n_robots, self._limit = n_robots, np.inf if limit is None else limit
+        if limit is None and n_places == n_robots - 1:
+            self.others, self.reverse = other_indices(n_robots), reverse_indices(n_robots)
+        else:
+            self.others, self.present = self._empty(n_swarms, n_places)
+            self.reverse = np.full(self.others.shape, -1)
+
+    def _empty(self, n_swarms: int, n_places: int) -> tuple[np.ndarray, np.ndarray]:
+        shape = (n_swarms, self._n_robots, n_places)
+        own = np.arange(self._n_robots)[:, None]
+        return np.broadcast_to(own, shape).astype(np.int64), np.zeros(shape, dtype=bool)
+
+    @property
+    def limited(self) -> bool:
+        """Whether robots may miss others."""
+        return self.present is not None
+
+    def update(self, pos: np.ndarray) -> np.ndarray | None:
+        """Look who is near now.
+
+        :param pos: positions, (E, n, 3) (m)
+        :return: the places whose robot has changed or gone, (E, n, m) bool; None where that never happens
+        """
+        if self.present is None:
+            return None
+        before = self.others
+        self.others, self.present, self.reverse = pairs.neighbours(pos, self.others, self.present, self._limit)
+        return self.others != before
+
+    def reset(self, swarm: int, pos: np.ndarray) -> None:
+        """Fill the places of one swarm anew.
+
+        :param pos: positions, (n, 3) (m)
+        """
+        if self.present is None:
+            return
+        fresh = pairs.neighbours(pos[None], *self._empty(1, self.others.shape[-1]), self._limit)
+        for mine, new in zip((self.others, self.present, self.reverse), fresh, strict=True):
+            mine[swarm] = new[0]
+
+    def keep(self, swarms: np.ndarray) -> None:
+        """Drop all but the given swarms (mask)."""
+        if self.present is not None:
+            self.others, self.present = self.others[swarms], self.present[swarms]
+            self.reverse = self.reverse[swarms]
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Who has each place, see `load_state_dict`; nothing where that never changes."""
+        if self.present is None:
+            return {}
+        return {"others": self.others.copy(), "present": self.present.copy(), "reverse": self.reverse.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state_dict` gave.
+
+        :raises ValueError: the state of other swarms
+        """
+        if self.present is not None:
+            self.others = like(self.others, state["others"], "neighbours")
+            self.present = like(self.present, state["present"], "which neighbours are present")
+            self.reverse = like(self.reverse, state["reverse"], "places at the neighbours")
+
+    def perceived(self, places: np.ndarray) -> np.ndarray:
+        """Some places (mask), (E, n, m) bool, without those that are empty."""
+        return places if self.present is None else places & self.present
+
+    def number_perceived(self, n_swarms: int) -> np.ndarray:
+        """How many others the robots of each swarm perceive, all together, (E,)."""
+        if self.present is None:
+            return np.full(n_swarms, self.others.size)
+        return self.present.sum(axis=(1, 2))
+
+    def of_the_other(self, field: np.ndarray, otherwise: Any = 0) -> np.ndarray:
+        """What each of the others has about a robot, of something that robots have about others, (E, n, m, ...).
+
+        :param otherwise: what counts for those that do not perceive the robot, broadcast to that shape
+        """
+        if self.present is None:
+            return field[:, self.others, self.reverse]
+        theirs = field[np.arange(len(field))[:, None, None], self.others, self.reverse]
+        unseen = (self.reverse < 0).reshape(self.reverse.shape + (1,) * (field.ndim - 3))
+        return np.where(unseen, np.asarray(otherwise, dtype=field.dtype), theirs)
+
+    def numbers(self) -> np.ndarray:
+        """Who has each place, -1 for nobody, (E, n, m), or (n, n - 1) where it is the same for all swarms."""
+        return self.others if self.present is None else np.where(self.present, self.others, -1)
+
+    def numbers_in(self, swarm: int) -> np.ndarray:
+        """The same in one swarm, (n, m)."""
+        numbers = self.numbers()
+        return numbers if self.present is None else numbers[swarm]
+
+
+def spread(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """What is known of the places of each robot by the number of the other instead: of all n - 1 others, in ascending
+    order, (..., n, n - 1).
+
+    :param places: bool, (..., n, m)
+    :param numbers: see `Neighbours.numbers`
+    """
+    n = places.shape[-2]
+    if numbers is other_indices(n):
+        return places
+    all_others = np.zeros((*places.shape[:-1], n - 1), dtype=bool)
+    *where, place = np.nonzero(places & (numbers >= 0))
+    other = numbers[(*where, place)]
+    all_others[(*where, other - (other > where[-1]))] = True
+    return all_others
