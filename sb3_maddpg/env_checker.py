@@ -15,7 +15,7 @@ from sb3_maddpg.relational import NeighbourViews
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
 
-_FLAGS = ("agent_terminated", "agent_active")
+_FLAGS = ("agent_terminated", "agent_active", "pair_terminated")
 
 
 def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed: int = 0) -> Team:
@@ -97,11 +97,12 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
             raise ValueError(f"info {where}: {suggest('entry', name, known)}")
     for name in known & info.keys() - {"is_success", "metrics"}:
         value = np.asarray(info[name])
-        shape = value.shape[:1] if name == "pair_rewards" and value.ndim == 2 else value.shape
+        of_pairs = name in ("pair_rewards", "pair_terminated")
+        shape = value.shape[:1] if of_pairs and value.ndim == 2 else value.shape
         if shape != (team.n_agents,) or value.dtype.kind not in "biuf":
             raise ValueError(
                 f"info['{name}'] {where} is {shown(info[name])}: it must hold a number for each of the {team.n_agents} "
-                f"agents{' and each of its neighbours' if name == 'pair_rewards' else ''}."
+                f"agents{' and each of its neighbours' if of_pairs else ''}."
             )
         if (index := not_finite_at(value)) is not None:
             raise ValueError(f"info['{name}'] of agent {team.names[index[0]]} {where} is not finite.")

@@ -28,7 +28,8 @@ class ObservationLayout(TypedDict, total=False):
     - ``neighbours``: for each neighbour the columns about it, all of one length, in one order;
     - ``who``: for each agent the numbers of its neighbours; all others in ascending order, unless given;
     - ``who_columns``: instead of ``who``, where neighbours change: for each neighbour the column that holds its number,
-      -1 for nobody, which critics read and actors do not. Who stays a neighbour stays where it is;
+      counted from 1, and 0 for nobody. Critics read it and actors do not. Who stays a neighbour stays where it is, and
+      ``info["pair_terminated"]`` says who does not;
     - ``acts_on_neighbours``: the action falls into equal parts, one for each neighbour;
     - ``critic``: for each neighbour further columns that critics read and actors do not, because no agent knows them
       when it acts;
@@ -182,7 +183,7 @@ class NeighbourViews(nn.Module):
 
     def _who(self, obs: th.Tensor) -> th.Tensor:
         """:return: numbers of the neighbours, -1 for nobody, (batch, n_agents, n_neighbours)"""
-        return self.numbers(obs).squeeze(-1).round().long()
+        return self.numbers(obs).squeeze(-1).round().long() - 1
 
 
 def _batch(what: th.Tensor) -> th.Tensor:

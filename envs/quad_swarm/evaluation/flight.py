@@ -124,7 +124,7 @@ def fly_steps(
         bits = task.sent(policy(task, rngs))
         requests = requests_of(bits, task.swarm.neighbours)
         announced = requests & ~bits[..., 0]
-        outcome = task.step(requests)
+        outcome = task.act(bits)
         since_arrival += task.statistics.reached
         over = outcome.terminated | outcome.truncated
         if linger is not None:

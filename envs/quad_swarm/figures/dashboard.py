@@ -79,8 +79,8 @@ def requests_by_pair(condition: Condition, model: Any) -> tuple[np.ndarray, int,
     """Who asks whom, until a collision or the arrival of all.
 
     :param condition: scenario and world
-    :return: how often robot i asked robot j, (n, n); the number of requests that were possible; the number of steps; the
-        number of episodes with a collision
+    :return: how often robot i asked robot j, (n, n); how many requests were possible; the number of steps; the number
+        of episodes with a collision
     """
     policy, task, rngs = begin(condition, [first_episode(SET) + k for k in range(EPISODES)], model)
     n = condition.config.n_robots

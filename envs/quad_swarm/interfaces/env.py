@@ -50,8 +50,9 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     `reward_terms`, `pair_rewards` (n, n - 1: the part of the reward that belongs to a robot and one of the others),
     `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
     `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and at the end `is_success`
-    and `metrics`. Where the neighbourhood is limited, `neighbours` (n, m) says who was in each place of the action and
-    of the entries for each of the others, -1: nobody.
+    and `metrics`. Where the neighbourhood is limited, `neighbours` (n, m) says who had each place of the action and of
+    the entries for each of the others, -1: nobody, and `pair_terminated` (n, m) which of them somebody
+    else has now, or nobody.
 
     ## Arguments
     :param preset: "paper" or "dense" (`presets.PRESETS`)
@@ -129,7 +130,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         )
         n = self.n_agents
         self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
-        self.action_space = spaces.MultiBinary(n * self.config.n_others * self.task.n_bits)
+        self._n_bits = n * self.config.n_others * self.task.n_bits
+        self.action_space = spaces.MultiBinary(self._n_bits)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
@@ -171,7 +173,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         """
         if not self._is_reset:
             raise need_reset()
-        bits = checked_bits(action, self.action_space.shape, self.config.n_others, self.task.n_bits)[None]
+        bits = checked_bits(action, (self._n_bits,), self.config.n_others, self.task.n_bits)[None]
         neighbours = self.task.swarm.neighbours
         self._requests = spread(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
         outcome = self.task.act(bits)

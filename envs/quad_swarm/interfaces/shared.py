@@ -99,8 +99,8 @@ def need_reset() -> gym.error.ResetNeeded:
 def checked_bits(
     actions: Any, shape: tuple[int, ...], n_others: int, n_bits: int = 1, whose: str = "The action"
 ) -> np.ndarray:
-    """Actions as bits of each robot for each of the others, (..., n_others, n_bits) bool with one row for each robot that
-    acts.
+    """Actions as bits of each robot for each of the others, (..., n_others, n_bits) bool with one row for each robot
+    that acts.
 
     :param actions: bits
     :param shape: of the action space, whose last axis holds whole robots' bits

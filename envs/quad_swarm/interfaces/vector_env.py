@@ -82,7 +82,8 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """
         if not self._rngs:
             raise need_reset()
-        outcome = self.task.act(checked_bits(actions, (self.num_envs, self._n_bits), self.config.n_others, self.task.n_bits))
+        bits = checked_bits(actions, (self.num_envs, self._n_bits), self.config.n_others, self.task.n_bits)
+        outcome = self.task.act(bits)
         info = self.task.info(outcome)
         infos = self._with_masks(info)
         done = outcome.terminated | outcome.truncated

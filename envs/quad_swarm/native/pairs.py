@@ -231,23 +231,27 @@ def separations(positions: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, 
     """
     if (library := compiled()) is not None:
         positions, others = np.ascontiguousarray(positions), np.ascontiguousarray(others)
-        least = [np.empty(len(others)) for _ in range(2)]
-        apart = [np.empty(others.shape) for _ in range(2)]
-        library.quad_swarm_separations(len(positions) - 1, *others.shape, *_addresses(positions, others, *least, *apart))
-        return (*least, *apart)
+        least, least_during = np.empty(len(others)), np.empty(len(others))
+        apart, apart_during = np.empty(others.shape), np.empty(others.shape)
+        library.quad_swarm_separations(
+            len(positions) - 1,
+            *others.shape,
+            *_addresses(positions, others, least, least_during, apart, apart_during),
+        )
+        return least, least_during, apart, apart_during
     between = positions[:, :, :, None] - positions[:, :, None]
     start, change = between[:-1], np.diff(between, axis=0)
     along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
     closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
-    squared = _dot(between[-1], between[-1]), _dot(closest, closest).min(axis=0)
+    after, during = np.sqrt(_dot(between[-1], between[-1])), np.sqrt(_dot(closest, closest).min(axis=0))
     own = np.arange(positions.shape[2])
-    for each in squared:
-        each[:, own, own] = np.inf
-    of_all, of_others = zip(
-        *((np.sqrt(each.min(axis=(1, 2))), np.sqrt(np.take_along_axis(each, others, axis=2))) for each in squared),
-        strict=True,
+    after[:, own, own] = during[:, own, own] = np.inf
+    return (
+        after.min(axis=(1, 2)),
+        during.min(axis=(1, 2)),
+        np.take_along_axis(after, others, axis=2),
+        np.take_along_axis(during, others, axis=2),
     )
-    return (*of_all, *of_others)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -264,8 +264,8 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
 class PairObservation:
     """A row of a robot: six numbers of its own, then for each of the others the features of some groups.
 
-    Where the neighbourhood is limited, an empty place is all zero, and the numbers of the others follow, -1 for nobody:
-    critics need them to find the other's own part, and actors do not see them.
+    Where the neighbourhood is limited, an empty place is all zero, and at the end stand the numbers of the others, from
+    1 on, 0: nobody. Critics need them to find the other's own part; robots only act on those that are there.
 
     :param config: the world
     :param groups: names of `GROUPS`; "critic" holds what only critics may read
@@ -294,7 +294,7 @@ class PairObservation:
         seen, hidden = blocks[:, : self._seen], blocks[:, self._seen :]
         layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True}
         if self.config.is_limited:
-            layout["who_columns"] = list(range(self._numbers, self.size))
+            layout["who_columns"] = layout["action_mask"] = list(range(self._numbers, self.size))
         else:
             layout["complete"] = True
         if "mask" in self.groups:
@@ -315,7 +315,7 @@ class PairObservation:
                 column += features.shape[-1]
         if pair.view.present is not None:
             blocks[~pair.view.present] = 0.0
-            observed[..., self._numbers :] = swarm.neighbours.numbers()
+            observed[..., self._numbers :] = swarm.neighbours.numbers() + 1
         return observed
 
 

@@ -210,38 +210,41 @@ class RequestTask:
         return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))
 
     def act(self, bits: np.ndarray) -> Outcome:
-        """One step of every swarm. An announcement arrives as an answer would, and is counted as a request.
+        """One step of every swarm. An announcement arrives as an answer would, and is counted as a request. To one that
+        does not perceive the robot it is sent in vain.
 
         :param bits: (E, n, n - 1, n_bits) bool, see `requests_of`
         """
-        bits = self.sent(bits)
-        return self.step(requests_of(bits, self.swarm.neighbours), bits.sum(axis=-1))
+        bits, neighbours = self.sent(bits), self.swarm.neighbours
+        requests = requests_of(bits, neighbours)
+        unheard = bits[..., 1:] & (neighbours.reverse < 0)[..., None]
+        return self.step(requests, bits.sum(axis=-1), requests.sum(axis=(1, 2)) + unheard.sum(axis=(1, 2, 3)))
 
     def sent(self, bits: np.ndarray) -> np.ndarray:
-        """What is sent of an action: nothing to an empty place, and no announcement to who does not perceive the
-        sender. It costs nothing to try.
+        """What is sent of an action: nothing to an empty place.
 
         :param bits: (E, n, n - 1, 1 or 2) bool, see `requests_of`
         """
-        neighbours = self.swarm.neighbours
-        if neighbours.present is None:
-            return bits
-        reached = np.stack([neighbours.present, neighbours.reverse >= 0], axis=-1)
-        return bits & reached[..., : bits.shape[-1]]
+        present = self.swarm.neighbours.present
+        return bits if present is None else bits & present[..., None]
 
-    def step(self, requests: np.ndarray, messages: np.ndarray | None = None) -> Outcome:
+    def step(
+        self, requests: np.ndarray, messages: np.ndarray | None = None, n_requests: np.ndarray | None = None
+    ) -> Outcome:
         """One step of every swarm.
 
         :param requests: who gets whose plan, as in `Swarm.step`
         :param messages: how many messages each robot sends because of each of the others, (E, n, n - 1); None: it asks
             for all plans that it gets
+        :param n_requests: how many requests to count, (E,); None: ``requests``
         """
         if messages is None:
             messages = requests
         report = self.swarm.step(requests)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
-        n_requests = requests.sum(axis=(1, 2))
+        if n_requests is None:
+            n_requests = requests.sum(axis=(1, 2))
         self.statistics.add(report, n_requests, collided)
         terms = {
             "goal": self.reward.goal * report.at_goal.all(axis=1),
@@ -256,11 +259,11 @@ class RequestTask:
         if self.end_at_arrival:
             terminated = terminated | self.statistics.arrived
         present = np.broadcast_to(report.others >= 0, requests.shape)
-        share = terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1)
+        share = present * (terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1))[..., None]
         return Outcome(
             reward=sum(terms.values(), start=np.zeros(len(n_requests))),
             pair_rewards=(
-                present * share[..., None] - self.reward.collision * colliding - self.reward.request * messages - near_misses
+                share - self.reward.collision * colliding - self.reward.request * messages - near_misses
             ).astype(np.float32),
             reward_terms=terms,
             terminated=terminated,
@@ -283,7 +286,7 @@ class RequestTask:
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """The last step for `info`: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
         report = outcome.report
-        who = {"neighbours": report.others} if self.swarm.neighbours.limited else {}
+        who = {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
         return who | {
             "scenario": np.array(self.scenario),
             "pair_rewards": outcome.pair_rewards,

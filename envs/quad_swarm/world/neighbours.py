@@ -69,14 +69,13 @@ class Neighbours:
         """Whether robots may miss others."""
         return self.present is not None
 
-    def update(self, pos: np.ndarray) -> np.ndarray | None:
-        """Look who is near now.
+    def update(self, pos: np.ndarray) -> np.ndarray:
+        """Look who is near now, where robots may miss others.
 
         :param pos: positions, (E, n, 3) (m)
-        :return: the places whose robot has changed or gone, (E, n, m) bool; None where that never happens
+        :return: the places that somebody else has now, or nobody, (E, n, m) bool
         """
-        if self.present is None:
-            return None
+        assert self.present is not None
         before = self.others
         self.others, self.present, self.reverse = pairs.neighbours(pos, self.others, self.present, self._limit)
         return self.others != before
@@ -118,12 +117,6 @@ class Neighbours:
         """Some places (mask), (E, n, m) bool, without those that are empty."""
         return places if self.present is None else places & self.present
 
-    def number_perceived(self, n_swarms: int) -> np.ndarray:
-        """How many others the robots of each swarm perceive, all together, (E,)."""
-        if self.present is None:
-            return np.full(n_swarms, self.others.size)
-        return self.present.sum(axis=(1, 2))
-
     def of_the_other(self, field: np.ndarray, otherwise: Any = 0) -> np.ndarray:
         """What each of the others has about a robot, of something that robots have about others, (E, n, m, ...).
 
@@ -156,7 +149,8 @@ def spread(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     if numbers is other_indices(n):
         return places
     all_others = np.zeros((*places.shape[:-1], n - 1), dtype=bool)
-    *where, place = np.nonzero(places & (numbers >= 0))
-    other = numbers[(*where, place)]
-    all_others[(*where, other - (other > where[-1]))] = True
+    where = np.nonzero(places & (numbers >= 0))
+    other = numbers[where]
+    column = (*where[:-1], other - (other > where[-2]))
+    all_others[column] = True
     return all_others

@@ -41,6 +41,8 @@ class StepReport(NamedTuple):
     :param colliding_continuous: the same at any time during the step
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
     :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
+    :param changed: places that somebody else has after the step, or nobody, (E, n, n - 1) bool; None where that never
+        happens
     :param moved: distance that each robot flew, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
@@ -58,6 +60,7 @@ class StepReport(NamedTuple):
     colliding_continuous: np.ndarray
     collision: np.ndarray
     collision_continuous: np.ndarray
+    changed: np.ndarray | None
     moved: np.ndarray
     at_goal: np.ndarray
     belief_source: np.ndarray
@@ -276,17 +279,20 @@ class Swarm:
         self._plans = self.planner.plan(self._problems(believed, source), self._plans)
         solve_seconds = time.perf_counter() - started
         report = self._report(self._fly(), source, solve_seconds)
-        self._look_around()
-        return report
+        return report if self.neighbours.present is None else report._replace(changed=self._look_around())
 
-    def _look_around(self) -> None:
+    def _look_around(self) -> np.ndarray:
         """Forget those who are out of reach now, and begin with those who have come: what a robot knew of one that it
-        loses sight of is of no use when they meet again."""
+        loses sight of is of no use when they meet again.
+
+        :return: places that somebody else has now, or nobody, (E, n, m) bool
+        """
         changed = self.neighbours.update(self.pos)
-        if changed is not None and changed.any():
+        if changed.any():
             for beliefs in {self.beliefs, self.presumed_beliefs}:
                 beliefs.forget_others(changed)
-            self.chance.meet(changed & self.neighbours.perceived(changed))
+            self.chance.meet(self.neighbours.perceived(changed))
+        return changed
 
     def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What robots believe once answers have arrived, see `Beliefs.update`."""
@@ -351,6 +357,7 @@ class Swarm:
             colliding_continuous=separation_continuous < limit,
             collision=least < limit,
             collision_continuous=least_continuous < limit,
+            changed=None,
             moved=np.sqrt(_dot(pos - before, pos - before)),
             at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
             belief_source=source,
