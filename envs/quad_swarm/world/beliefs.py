@@ -169,10 +169,9 @@ class Beliefs:
 
     def forget_others(self, places: np.ndarray) -> None:
         """Forget what was received from some of the others, (E, n, n - 1) bool."""
-        if places.any():
-            self._age = np.where(places, self.horizon, self._age)
-            self._remembered = np.where(places[..., None, None], 0.0, self._remembered)
-            self._known = None
+        self._age[places] = self.horizon
+        self._remembered[places] = 0.0
+        self._known = None
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (indices or mask)."""

@@ -125,8 +125,9 @@ class Neighbours:
         if self.present is None:
             return field[:, self.others, self.reverse]
         theirs = field[np.arange(len(field))[:, None, None], self.others, self.reverse]
-        unseen = (self.reverse < 0).reshape(self.reverse.shape + (1,) * (field.ndim - 3))
-        return np.where(unseen, np.asarray(otherwise, dtype=field.dtype), theirs)
+        unseen = self.reverse < 0
+        theirs[unseen] = np.broadcast_to(otherwise, theirs.shape)[unseen]
+        return theirs
 
     def numbers(self) -> np.ndarray:
         """Who has each place, -1 for nobody, (E, n, m), or (n, n - 1) where it is the same for all swarms."""
