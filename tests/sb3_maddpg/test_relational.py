@@ -154,6 +154,20 @@ def test_neighbours_that_are_named_in_columns_may_stand_anywhere(layout, space):
     assert not named.critic.of_pairs(moved, moved_actions)[0].unflatten(-1, (N, M))[:, 0, 1].any()
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"complete": True}, "leave out `who` and `complete`"),
+        ({"who": [others(agent) for agent in range(N)]}, "leave out `who`"),
+        ({"who_columns": [10, 11]}, "every neighbour needs as many columns"),
+        ({"who_columns": [10, 11, 12, 99]}, "each from 0 to 13"),
+    ],
+)
+def test_refuses_columns_of_numbers_that_do_not_fit(change, message):
+    with pytest.raises(ValueError, match=message):
+        policy(layout={**CHANGING, **change}, columns=10 + M)
+
+
 def test_numbers_of_neighbours_reach_critics_alone():
     built = policy(layout=CHANGING, columns=10 + M)
     obs, _ = batch(built, 10 + M)

@@ -129,7 +129,7 @@ def make_policy(policy: str, config: SwarmConfig, algo: str) -> tuple[RequestPol
         if policy.startswith(("pretrained:", "latest:")):
             hint += "; `sb3-maddpg evaluate` knows latest:LOGDIR and pretrained:NAME too"
         raise ValueError(f"{error} {hint}.") from None
-    return (lambda task, rngs: rule(View(task.swarm, rngs))[..., None]), PaperObservation(config.n_others)
+    return (lambda task, rngs: rule(View(task.swarm, rngs))[..., None]), PaperObservation(config)
 
 
 def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:

@@ -47,33 +47,46 @@ class PaperObservation:
     """z_i = [v_i, p_ig, {p_ij}, {v_ij}] (Sec. IV-B): own velocity, goal relative to the robot, then all relative
     positions of the others, then all their relative velocities, others in ascending order; length 6n.
 
-    Where the neighbourhood is limited to m others, the length is 6 (m + 1), and an empty place is all zero.
+    Where the neighbourhood is limited to m others there are m of them, an empty place is all zero, and their numbers
+    follow as in `PairObservation`; length 7 m + 6.
 
-    :param n_others: number of others of a robot, n - 1 or m
+    :param config: the world
     :param scaled: divide distances by 4 m and velocities by 4 m/s
     """
 
-    def __init__(self, n_others: int, scaled: bool = False):
-        self.n_others, self.size = n_others, 6 * (n_others + 1)
+    def __init__(self, config: SwarmConfig, scaled: bool = False):
+        self.config = config
+        self._numbers = 6 * (config.n_others + 1)  # where the numbers of the others begin, if there are any
+        self.size = self._numbers + (config.n_others if config.is_limited else 0)
         distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
-        others = 3 * n_others
+        others = 3 * config.n_others
         self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, others, others])
 
     @property
     def layout(self) -> dict[str, Any]:
-        m = self.n_others
+        m = self.config.n_others
         others = [[6 + 3 * k + axis + part for part in (0, 3 * m) for axis in range(3)] for k in range(m)]
-        return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+        layout = {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+        return layout | (_numbered(self._numbers, self.size) if self.config.is_limited else {})
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
         estimate, (others_pos, others_vel) = swarm.estimate(), swarm.observe()
         pos, vel = estimate[..., POSITION], estimate[..., VELOCITY]
         flat = (*pos.shape[:2], -1)
         relative_pos, relative_vel = others_pos - pos[:, :, None], others_vel - vel[:, :, None]
-        if (present := swarm.neighbours.present) is not None:
+        present = swarm.neighbours.present
+        if present is not None:
             relative_pos[~present], relative_vel[~present] = 0.0, 0.0
         parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
-        return (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        observed = (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        if present is None:
+            return observed
+        return np.concatenate([observed, swarm.neighbours.numbers() + 1], axis=-1, dtype=np.float32)
+
+
+def _numbered(first: int, end: int) -> dict[str, Any]:
+    """What a layout says of the columns with the numbers of others: also that nobody acts on an empty place."""
+    return {"who_columns": list(range(first, end)), "action_mask": list(range(first, end))}
 
 
 class PairView:
@@ -293,10 +306,7 @@ class PairObservation:
         blocks = np.arange(6, self._numbers).reshape(self.config.n_others, -1)
         seen, hidden = blocks[:, : self._seen], blocks[:, self._seen :]
         layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True}
-        if self.config.is_limited:
-            layout["who_columns"] = layout["action_mask"] = list(range(self._numbers, self.size))
-        else:
-            layout["complete"] = True
+        layout |= _numbered(self._numbers, self.size) if self.config.is_limited else {"complete": True}
         if "mask" in self.groups:
             layout["action_mask"] = seen[:, -1].tolist()  # the last group that robots see
         return layout | ({"critic": hidden.tolist()} if hidden.size else {})
@@ -331,7 +341,7 @@ def make_observation(
     :raises ValueError: unknown name, or scaling of what is scaled
     """
     if observation == "paper":
-        return PaperObservation(config.n_others, scale_observation)
+        return PaperObservation(config, scale_observation)
     pairs = PairObservation(config, observation.split("+"), critics)
     if scale_observation:
         raise ValueError(

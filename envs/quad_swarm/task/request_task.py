@@ -139,7 +139,7 @@ class RequestTask:
         self.n_bits = 2 if announcements else 1
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, swarm.config)
-        self.observation = observation or PaperObservation(swarm.config.n_others, scaled=False)
+        self.observation = observation or PaperObservation(swarm.config, scaled=False)
 
     @property
     def agent_names(self) -> tuple[str, ...]:

@@ -44,7 +44,8 @@ def placed(*points: tuple[float, float], neighbourhood: dict, preset: str = "pap
 @pytest.mark.parametrize("preset", ["dense", "flight", "flight-hard"])
 def test_who_perceives_everybody_flies_as_without_a_limit(preset):
     plain, limited = make_swarm({}, preset), make_swarm(EVERYBODY, preset)
-    assert limited.neighbours.limited and not plain.neighbours.limited
+    assert limited.neighbours.limited
+    assert not plain.neighbours.limited
     rng = np.random.default_rng(0)
     for _ in range(60):
         requests = asked(limited, rng)
@@ -155,7 +156,7 @@ def test_nobody_plans_around_an_empty_place(solver):
     swarm = Swarm(config, 2, solver)
     for k, away in enumerate((4.5, -4.5)):
         starts = np.array([[0.0, 0.0, 1.5], [away, 0.0, 1.5]])
-        swarm.reset(k, starts, starts + [0.0, 1.0, 0.0], noise_seed=0)
+        swarm.reset(k, starts, starts + np.array([0.0, 1.0, 0.0]), noise_seed=0)
     for _ in range(5):
         swarm.step(np.zeros((2, 2, 1), dtype=bool))
     assert not swarm.neighbours.present.any()
@@ -207,7 +208,8 @@ def test_who_does_not_perceive_a_robot_is_taken_to_expect_a_constant_velocity():
     presumed = View(swarm).presumed([0, 4])
     step = swarm.config.planner.dt * np.array([0.1, 0.2, 0.3])
     np.testing.assert_allclose(presumed.believed[0, 0, 0], swarm.pos[0, 0] + [step, 5 * step])
-    assert not presumed.remembers[0, 0, 0] and presumed.age[0, 0, 0] >= swarm.config.planner.horizon
+    assert not presumed.remembers[0, 0, 0]
+    assert presumed.age[0, 0, 0] >= swarm.config.planner.horizon
 
 
 def test_robots_that_do_not_perceive_each_other_collide_all_the_same():
@@ -219,7 +221,8 @@ def test_robots_that_do_not_perceive_each_other_collide_all_the_same():
     swarm.state[0, 2:, 0] = 0.5
     report = swarm._report([before, swarm.pos], np.zeros((1, 4, 1)), 0.0)
     assert report.min_separation[0] == pytest.approx(0.5)
-    assert report.collision[0] and report.collision_continuous[0]
+    assert report.collision[0]
+    assert report.collision_continuous[0]
     assert not report.colliding.any()
     np.testing.assert_allclose(report.separation, 0.8)
 
