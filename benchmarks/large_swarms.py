@@ -1,13 +1,13 @@
 """Steps per second and memory of large swarms, with and without a limited neighbourhood.
 
-``python benchmarks/large_swarms.py [--json F]`` flies the preset `flight` with 4 to 128 robots, as many to a square metre
-as there, observed as for the recipe of `flight`, with random bits. ``all``: everybody perceives everybody. ``planned``:
-plans consider the nearest few only. ``limited``: robots perceive the nearest few within a range, and plan as in
-``planned``. A critic's pass is that of `PairPolicy`, forwards and backwards, over a batch of the recipe's size.
+``python benchmarks/large_swarms.py [--json F]`` flies the preset `flight` with 4 to 128 robots, as many to a square
+metre as there, observed as for the recipe of `flight`, with random bits. ``all``: everybody perceives everybody.
+``planned``: plans consider the nearest few only. ``limited``: robots perceive the nearest few within a range, and plan
+as in ``planned``. A critic's pass is that of `PairPolicy`, forwards and backwards, over a batch of the recipe's size.
 
-Each cell has a process of its own, one after the other, pinned to a core where the system allows. Memory is the growth of
-the process's peak. JSON: one row a cell with the keys perceived, n_robots, n_others, n_envs, steps_per_s, memory_mb (of the
-environments), critic_ms, critic_mb, and the ratios steps_ratio and critic_ratio to ``all`` with as many robots.
+Each cell has a process of its own, one after the other, pinned to a core where the system allows. Memory is the growth
+of the process's peak. JSON: one row a cell with the keys perceived, n_robots, n_others, n_envs, steps_per_s, memory_mb
+(of the environments), critic_ms, critic_mb, and the ratios steps_ratio and critic_ratio to ``all`` with as many robots.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sb3_maddpg.relational import PairPolicy
 
 SIZES = (4, 8, 16, 32, 64, 128)
 PERCEIVED = ("all", "planned", "limited")
-NEIGHBOURHOOD = {"max_others": 16, "range": 8.0}
+NEIGHBOURHOOD = {"max_others": 16, "range": 8.0, "look_ahead": 1.0}
 PLANNED = 8
 BATCH = 96
 OBSERVATION = "state+approach+side+memory+plan+told+mask+critic"

@@ -159,18 +159,27 @@ EXPORT void quad_swarm_keep_right(Integer n_robots, Integer n_others, Integer n_
   }
 }
 
-EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_places, double limit, const double* pos,
-                                  Integer* others, Flag* present, Integer* reverse) {
+EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_places, double limit, double look_ahead,
+                                  const double* pos, const double* vel, Integer* others, Flag* present,
+                                  Integer* reverse) {
   std::vector<std::pair<double, Integer>> near;
   std::vector<Flag> comes(n_robots);
   for (Integer swarm = 0; swarm < n_swarms; swarm++) {
-    const double* swarm_pos = pos + 3 * n_robots * swarm;
+    const double *swarm_pos = pos + 3 * n_robots * swarm, *swarm_vel = vel + 3 * n_robots * swarm;
     const Integer first = n_places * n_robots * swarm;
     for (Integer robot = 0; robot < n_robots; robot++) {
       near.clear();
       for (Integer other = 0; other < n_robots; other++) {
-        const double squared = squared_distance(swarm_pos + 3 * robot, swarm_pos + 3 * other);
-        if (other != robot && squared <= limit * limit) near.emplace_back(squared, other);
+        double apart[3], along[3];
+        for (int i = 0; i < 3; i++) {
+          apart[i] = swarm_pos[3 * robot + i] - swarm_pos[3 * other + i];
+          along[i] = swarm_vel[3 * robot + i] - swarm_vel[3 * other + i];
+        }
+        if (other == robot || dot(apart, apart) > limit * limit) continue;
+        const double time =
+            std::min(std::max(-dot(apart, along) / std::max(dot(along, along), 1e-12), 0.0), look_ahead);
+        for (int i = 0; i < 3; i++) apart[i] += time * along[i];
+        near.emplace_back(dot(apart, apart), other);
       }
       if (static_cast<Integer>(near.size()) > n_places) {
         std::nth_element(near.begin(), near.begin() + n_places, near.end());

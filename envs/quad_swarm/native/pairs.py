@@ -24,7 +24,7 @@ _FUNCTIONS = {
     "quad_swarm_approach": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 9],
     "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
     "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
-    "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 4],
+    "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 5],
     "quad_swarm_separations": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, *[_ARRAY] * 6],
 }
 
@@ -178,30 +178,34 @@ def keep_right(
 
 
 def neighbours(
-    pos: np.ndarray, others: np.ndarray, present: np.ndarray, limit: float
+    pos: np.ndarray, vel: np.ndarray, others: np.ndarray, present: np.ndarray, limit: float, look_ahead: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Who is near each robot; one that was before keeps its place, see `quad_swarm.world.neighbours`.
 
     :param pos: positions, (E, n, 3) (m)
+    :param vel: velocities, (E, n, 3) (m/s)
     :param others: who had each place, (E, n, m) int64; empty ones have the robot's own number
     :param present: which places were taken, (E, n, m) bool
     :param limit: how far a neighbour may be away (m); infinity: any distance
+    :param look_ahead: how far ahead to look for the least distance, which decides who is nearest, with the present
+        velocities (s); 0: the present distance decides
     :return: the same now, and the place of the robot at each of its neighbours, -1 without any, (E, n, m)
     """
     if (library := compiled()) is not None:
         others, present = np.array(others, order="C"), np.array(present, order="C")
-        pos, reverse = np.ascontiguousarray(pos), np.empty_like(others)
-        library.quad_swarm_neighbours(*others.shape, limit, *_addresses(pos, others, present, reverse))
+        pos, vel, reverse = np.ascontiguousarray(pos), np.ascontiguousarray(vel), np.empty_like(others)
+        library.quad_swarm_neighbours(*others.shape, limit, look_ahead, *_addresses(pos, vel, others, present, reverse))
         return others, present, reverse
     n_swarms, n, m = others.shape
     numbers = np.arange(n)
-    x, y, z = np.moveaxis(pos[:, :, None] - pos[:, None], -1, 0)
-    squared = x * x + y * y + z * z
-    squared[:, numbers, numbers] = np.inf
-    near = np.zeros(squared.shape, dtype=bool)
-    nearest = np.argsort(squared, axis=-1, kind="stable")[..., :m]
-    np.put_along_axis(near, nearest, np.take_along_axis(squared, nearest, axis=-1) <= limit * limit, axis=-1)
-    near[:, numbers, numbers] = False
+    apart, along = (each[:, :, None] - each[:, None] for each in (pos, vel))
+    within = _dot(apart, apart) <= limit * limit
+    within[:, numbers, numbers] = False
+    time = np.minimum(np.maximum(-_dot(apart, along) / np.maximum(_dot(along, along), 1e-12), 0.0), look_ahead)
+    apart = apart + time[..., None] * along
+    nearest = np.argsort(np.where(within, _dot(apart, apart), np.inf), axis=-1, kind="stable")[..., :m]
+    near = np.zeros(within.shape, dtype=bool)
+    np.put_along_axis(near, nearest, np.take_along_axis(within, nearest, axis=-1), axis=-1)
 
     stays = present & np.take_along_axis(near, others, axis=-1)
     swarms, robots, places = np.nonzero(stays)

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 
 from quad_swarm.native import pairs
 from quad_swarm.states import like
@@ -26,11 +26,14 @@ class Neighbourhood:
 
     :param max_others: so many others at most, the nearest; None: all
     :param range: others within this distance, of sensors and radio alike (m); None: any
-    :raises ValueError: a value is not positive
+    :param look_ahead: who is nearest is decided by how near they would come within so long, with the present velocities
+        (s); 0: by the present distance. In a crowd the nearest are not those that matter
+    :raises ValueError: a value is negative, not finite or, but for the look ahead, zero
     """
 
     max_others: PositiveInt | None = None
     range: PositiveLength | None = None
+    look_ahead: Annotated[float, Field(ge=0, le=1e3)] = 0.0
 
 
 class Neighbours:
@@ -46,14 +49,16 @@ class Neighbours:
 
     :param n_swarms: number of swarms E
     :param n_robots: robots in a swarm n
-    :param n_places: places of a robot m, at most n - 1
-    :param limit: range within which robots perceive each other (m); None: any
+    :param limit: whom they may perceive; None: everybody
     """
 
-    def __init__(self, n_swarms: int, n_robots: int, n_places: int, limit: float | None = None):
+    def __init__(self, n_swarms: int, n_robots: int, limit: Neighbourhood | None = None):
+        limit = limit or Neighbourhood()
+        n_places = min(limit.max_others or n_robots, n_robots - 1)
         self.present: np.ndarray | None = None
-        self._n_robots, self._limit = n_robots, np.inf if limit is None else limit
-        if limit is None and n_places == n_robots - 1:
+        self._n_robots, self._look_ahead = n_robots, limit.look_ahead
+        self._range = np.inf if limit.range is None else limit.range
+        if limit.range is None and n_places == n_robots - 1:
             self.others, self.reverse = other_indices(n_robots), reverse_indices(n_robots)
         else:
             self.others, self.present = self._empty(n_swarms, n_places)
@@ -69,25 +74,29 @@ class Neighbours:
         """Whether robots may miss others."""
         return self.present is not None
 
-    def update(self, pos: np.ndarray) -> np.ndarray:
+    def update(self, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
         """Look who is near now, where robots may miss others.
 
         :param pos: positions, (E, n, 3) (m)
+        :param vel: velocities, (E, n, 3) (m/s)
         :return: the places that somebody else has now, or nobody, (E, n, m) bool
         """
         assert self.present is not None
         before = self.others
-        self.others, self.present, self.reverse = pairs.neighbours(pos, self.others, self.present, self._limit)
+        self.others, self.present, self.reverse = pairs.neighbours(
+            pos, vel, self.others, self.present, self._range, self._look_ahead
+        )
         return self.others != before
 
     def reset(self, swarm: int, pos: np.ndarray) -> None:
-        """Fill the places of one swarm anew.
+        """Fill the places of one swarm, which is at rest, anew.
 
         :param pos: positions, (n, 3) (m)
         """
         if self.present is None:
             return
-        fresh = pairs.neighbours(pos[None], *self._empty(1, self.others.shape[-1]), self._limit)
+        empty = self._empty(1, self.others.shape[-1])
+        fresh = pairs.neighbours(pos[None], np.zeros((1, *pos.shape)), *empty, self._range, self._look_ahead)
         for mine, new in zip((self.others, self.present, self.reverse), fresh, strict=True):
             mine[swarm] = new[0]
 

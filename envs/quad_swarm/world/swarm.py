@@ -92,7 +92,7 @@ class Swarm:
         self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
         self.state = np.zeros((n_swarms, n, 9))
         self.goal = np.zeros((n_swarms, n, 3))
-        self.neighbours = Neighbours(n_swarms, n, config.n_others, config.neighbourhood.range)
+        self.neighbours = Neighbours(n_swarms, n, config.neighbourhood)
         self.chance = Realisation(config, n_swarms)
         beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others)
         self.beliefs = Beliefs(*beliefs)
@@ -287,7 +287,7 @@ class Swarm:
 
         :return: places that somebody else has now, or nobody, (E, n, m) bool
         """
-        changed = self.neighbours.update(self.pos)
+        changed = self.neighbours.update(self.pos, self.vel)
         if changed.any():
             for beliefs in {self.beliefs, self.presumed_beliefs}:
                 beliefs.forget_others(changed)

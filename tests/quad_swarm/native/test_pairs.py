@@ -36,6 +36,7 @@ def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace
         own=rng.normal(size=(n_swarms, n, 3)),
         plan=rng.normal(size=(n_swarms, n, horizon, 3)).cumsum(axis=-2),
         later=rng.random((n_swarms, n)),
+        vels=rng.normal(size=(n_swarms, n, 3)),
         path=rng.normal(size=(1, n_swarms, n, 3)) + 0.2 * rng.normal(size=(4, n_swarms, n, 3)).cumsum(axis=0),
     )
 
@@ -47,7 +48,7 @@ def neighbourhoods(s: SimpleNamespace) -> list[tuple[np.ndarray, np.ndarray, np.
     others = np.broadcast_to(np.arange(n)[:, None], (n_swarms, n, m)).astype(np.int64)
     present, steps = np.zeros(others.shape, dtype=bool), []
     for pos, limit in zip(s.path, (np.inf, 1.0, 2.0, 1.5), strict=True):
-        others, present, reverse = pairs.neighbours(pos, others, present, limit)
+        others, present, reverse = pairs.neighbours(pos, s.vels, others, present, limit, 0.5 * (limit < 2))
         steps.append((others, present, reverse))
     return steps
 

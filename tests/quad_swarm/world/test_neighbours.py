@@ -7,7 +7,7 @@ from quad_swarm.task.request_task import make_task
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import BeliefSource, other_indices, reverse_indices
-from quad_swarm.world.neighbours import Neighbours, spread
+from quad_swarm.world.neighbours import Neighbourhood, Neighbours, spread
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -81,7 +81,7 @@ def test_refuses_senseless_neighbourhoods(neighbourhood, message):
 def test_places_belong_to_the_nearest_and_are_kept():
     rng = np.random.default_rng(1)
     n, m, reach = 9, 4, 1.5
-    neighbours = Neighbours(3, n, m, reach)
+    neighbours = Neighbours(3, n, Neighbourhood(m, reach))
     pos = rng.normal(size=(3, n, 3))
     for k in range(3):
         neighbours.reset(k, pos[k])
@@ -89,7 +89,7 @@ def test_places_belong_to_the_nearest_and_are_kept():
     for _ in range(200):
         before = neighbours.numbers()
         pos = pos + 0.1 * rng.normal(size=pos.shape)
-        changed = neighbours.update(pos)
+        changed = neighbours.update(pos, rng.normal(size=pos.shape))
         now = neighbours.numbers()
         distance = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1) + np.diag(np.full(n, np.inf))
         for swarm, robot in np.ndindex(3, n):
@@ -109,8 +109,21 @@ def test_places_belong_to_the_nearest_and_are_kept():
     assert min(came, left) > 100
 
 
+def test_who_would_soon_be_nearest_may_come_before_who_is_now():
+    pos = np.array([[[0.0, 0, 1], [1.5, 0, 1], [4.0, 0, 1], [0, 5, 1]]])
+    vel = np.array([[[0.0, 0, 0], [0, 1, 0], [-3, 0, 0], [0, -1, 0]]])
+    nearest = {}
+    for look_ahead in (0.0, 1.0, 9.0):
+        neighbours = Neighbours(1, 4, Neighbourhood(1, 4.5, look_ahead))
+        neighbours.reset(0, pos[0])
+        assert neighbours.numbers()[0, 0].tolist() == [1], "all are at rest"
+        neighbours.update(pos, vel)
+        nearest[look_ahead] = neighbours.numbers()[0, 0, 0]
+    assert nearest == {0.0: 1, 1.0: 2, 9.0: 2}, "robot 3 is out of range"
+
+
 def test_places_are_filled_in_ascending_order_at_first():
-    neighbours = Neighbours(1, 6, 5, 100.0)
+    neighbours = Neighbours(1, 6, Neighbourhood(range=100.0))
     neighbours.reset(0, np.random.default_rng(0).normal(size=(6, 3)))
     assert np.array_equal(neighbours.others[0], other_indices(6))
     assert np.array_equal(neighbours.reverse[0], reverse_indices(6))
@@ -273,7 +286,7 @@ def test_a_flight_goes_on_from_its_state_and_a_fork_on_its_own():
     assert np.array_equal(flights[0], flights[1])
     assert np.array_equal(flights[0], flights[2])
     with pytest.raises(ValueError, match="neighbours"):
-        other.load_state_dict({**swarm.state_dict(), "neighbours": Neighbours(2, 8, 4).state_dict()})
+        other.load_state_dict({**swarm.state_dict(), "neighbours": Neighbours(2, 8, Neighbourhood(4)).state_dict()})
 
 
 def test_a_swarm_does_not_depend_on_its_company():
