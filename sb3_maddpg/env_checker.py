@@ -74,6 +74,7 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         where = f"in step {step}"
         if (index := not_finite_at(np.asarray(obs))) is not None:
             raise ValueError(f"The observation of agent {team.names[index[0]]} {where} holds NaN or infinity.")
+        _check_numbers_of_neighbours(env, np.asarray(obs), team, where)
         if not math.isfinite(reward):
             raise ValueError(f"The team's reward {where} is {reward}: it must be finite.")
         _check_info(info, team, where)
@@ -88,6 +89,17 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
             if env.has_wrapper_attr("n_curriculum_levels") and "is_success" not in info:
                 raise ValueError('CurriculumCallback needs info["is_success"] in the last step of an episode.')
             return
+
+
+def _check_numbers_of_neighbours(env: gymnasium.Env, obs: np.ndarray, team: Team, where: str) -> None:
+    layout = env.get_wrapper_attr("observation_layout") if env.has_wrapper_attr("observation_layout") else {}
+    for agent, row in enumerate(obs[:, layout.get("who_columns", [])]):
+        named = row[row != 0]
+        if not set(named) <= set(range(1, team.n_agents + 1)) - {agent + 1} or len(set(named)) < len(named):
+            raise ValueError(
+                f"The neighbours of agent {team.names[agent]} {where}, in `who_columns` of its observation, are "
+                f"{shown(row.tolist())}: each must be another agent's number, counted from 1, or 0 for nobody."
+            )
 
 
 def _check_info(info: dict[str, Any], team: Team, where: str) -> None:

@@ -78,6 +78,10 @@ class Wrong(team_tasks.OwnBit):
         (Wrong({"n_curriculum_levels": 0, "set_curriculum_level": print}), "n_curriculum_levels=0"),
         (Wrong({"n_curriculum_levels": 2, "set_curriculum_level": print}), "is_success"),
         (Wrong({"observation_layout": {"own": [0]}}), "needs `own` and `neighbours`"),
+        (
+            Wrong({"observation_layout": {"own": [0], "neighbours": [[0]], "who_columns": [1]}}),
+            "neighbours of agent agent_0 in step 1, .* another agent's number",
+        ),
         (Wrong({"action_space": spaces.MultiBinary(10)}), "10 numbers cannot be shared out evenly"),
         (
             Wrong({"draw": unseeded}),

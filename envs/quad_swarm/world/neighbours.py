@@ -35,6 +35,14 @@ class Neighbourhood:
     range: PositiveLength | None = None
     look_ahead: Annotated[float, Field(ge=0, le=1e3)] = 0.0
 
+    def places(self, n_robots: int) -> int:
+        """Of how many others a robot perceives something at most."""
+        return min(self.max_others or n_robots, n_robots - 1)
+
+    def limits(self, n_robots: int) -> bool:
+        """Whether robots may miss others."""
+        return self.range is not None or self.places(n_robots) < n_robots - 1
+
 
 class Neighbours:
     """Whom the robots of E swarms perceive now.
@@ -54,15 +62,14 @@ class Neighbours:
 
     def __init__(self, n_swarms: int, n_robots: int, limit: Neighbourhood | None = None):
         limit = limit or Neighbourhood()
-        n_places = min(limit.max_others or n_robots, n_robots - 1)
         self.present: np.ndarray | None = None
         self._n_robots, self._look_ahead = n_robots, limit.look_ahead
         self._range = np.inf if limit.range is None else limit.range
-        if limit.range is None and n_places == n_robots - 1:
-            self.others, self.reverse = other_indices(n_robots), reverse_indices(n_robots)
-        else:
-            self.others, self.present = self._empty(n_swarms, n_places)
+        if limit.limits(n_robots):
+            self.others, self.present = self._empty(n_swarms, limit.places(n_robots))
             self.reverse = np.full(self.others.shape, -1)
+        else:
+            self.others, self.reverse = other_indices(n_robots), reverse_indices(n_robots)
 
     def _empty(self, n_swarms: int, n_places: int) -> tuple[np.ndarray, np.ndarray]:
         shape = (n_swarms, self._n_robots, n_places)

@@ -118,12 +118,12 @@ class SwarmConfig:
     @property
     def n_others(self) -> int:
         """Of how many others a robot perceives something at most."""
-        return min(self.neighbourhood.max_others or self.n_robots, self.n_robots - 1)
+        return self.neighbourhood.places(self.n_robots)
 
     @property
     def is_limited(self) -> bool:
         """Whether robots may miss others."""
-        return self.neighbourhood.range is not None or self.n_others < self.n_robots - 1
+        return self.neighbourhood.limits(self.n_robots)
 
     @property
     def is_random(self) -> bool:
