@@ -33,13 +33,16 @@ class TeamInfo(TypedDict, total=False):
     pair_rewards: np.ndarray
     """(n_agents, n_neighbours), the part of an agent's reward that belongs to each of its neighbours. If left out:
     ``pair_credit`` is refused"""
+    pair_terminated: np.ndarray
+    """(n_agents, n_neighbours) bool, whether what follows in this place is about another neighbour, or none. If left
+    out: ``pair_credit`` is refused where neighbours change"""
     is_success: bool
     """In the last step of an episode, for ``rollout/success_rate`` and ``CurriculumCallback``"""
     metrics: dict[str, float]
     """Numbers, averaged and logged under their names"""
 
 
-InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards"]
+InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards", "pair_terminated"]
 
 
 class TeamEnvironment(Protocol):

@@ -16,6 +16,7 @@ from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, req
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.neighbours import spread
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -96,7 +97,7 @@ class Step(NamedTuple):
     """One step of a batch of episodes.
 
     :param episodes: which of the episodes are still flying, (E,)
-    :param requests: who got whose plan, (E, n, n - 1) bool
+    :param requests: who got whose plan, (E, n, n - 1) bool, whoever perceives whom
     :param announced: which of these plans came unasked, (E, n, n - 1) bool
     :param outcome: what came of it
     :param over: which of them end with this step, (E,) bool
@@ -120,14 +121,16 @@ def fly_steps(
     since_arrival = np.zeros(episodes.size, dtype=int)
     rngs = list(rngs)
     while episodes.size:
-        bits = policy(task, rngs)
-        requests = requests_of(bits)
-        outcome = task.step(requests)
+        bits = task.sent(policy(task, rngs))
+        requests = requests_of(bits, task.swarm.neighbours)
+        announced = requests & ~bits[..., 0]
+        outcome = task.act(bits)
         since_arrival += task.statistics.reached
         over = outcome.terminated | outcome.truncated
         if linger is not None:
             over |= since_arrival > linger
-        yield Step(episodes, requests, requests & ~bits[..., 0], outcome, over)
+        others = outcome.report.others
+        yield Step(episodes, spread(requests, others), spread(announced, others), outcome, over)
         if over.any():
             task.keep(~over)
             episodes, since_arrival = episodes[~over], since_arrival[~over]
@@ -158,7 +161,8 @@ class Flight:
     :param goal: goals, (n, 3), world frame (m)
     :param requests: who got whose plan in each step, (T, n, n - 1) bool
     :param announced: which of these plans came unasked, (T, n, n - 1) bool
-    :param other_requests: whom a second rule would have asked in each step, which was not executed, (T, n, n - 1) bool
+    :param other_requests: whom a second rule would have asked in each step, which was not executed, (T, n, n - 1) bool;
+        like the above of all others in ascending order, whoever perceives whom
     :param min_separation: smallest distance between two robots at the start and in each step: at any time of it where
         the world's collisions are continuous, else after it, (T + 1,) (m)
     """
@@ -242,7 +246,9 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     other_requests: list[np.ndarray] = []
 
     def recorded(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
-        other_requests.append(rule(View(task.swarm, other_rngs))[0])
+        neighbours = task.swarm.neighbours
+        asked = neighbours.perceived(rule(View(task.swarm, other_rngs)))
+        other_requests.append(spread(asked, neighbours.numbers())[0])
         return policy(task, rngs)
 
     closest: list[float] = []

@@ -97,14 +97,14 @@ def need_reset() -> gym.error.ResetNeeded:
 
 
 def checked_bits(
-    actions: Any, shape: tuple[int, ...], n_robots: int, n_bits: int = 1, whose: str = "The action"
+    actions: Any, shape: tuple[int, ...], n_others: int, n_bits: int = 1, whose: str = "The action"
 ) -> np.ndarray:
-    """Actions as bits of each robot for each of the others, (..., n - 1, n_bits) bool with one row for each robot that
-    acts.
+    """Actions as bits of each robot for each of the others, (..., n_others, n_bits) bool with one row for each robot
+    that acts.
 
     :param actions: bits
     :param shape: of the action space, whose last axis holds whole robots' bits
-    :param n_robots: number of robots n
+    :param n_others: number of others of a robot
     :param n_bits: of each robot for each of the others
     :param whose: whose action it is, for messages
     :raises ValueError: another shape, or anything but zeros and ones
@@ -113,7 +113,7 @@ def checked_bits(
     if bits.shape != shape:
         raise ValueError(
             f"{whose} has shape {bits.shape}; the action space has {shape}: "
-            f"{n_bits * (n_robots - 1)} bits for each robot, {n_bits} for each of the others."
+            f"{n_bits * n_others} bits for each robot, {n_bits} for each of the others."
         )
     asked = bits == 1
     if not (asked | (bits == 0)).all():
@@ -121,4 +121,4 @@ def checked_bits(
         raise ValueError(
             f"{whose} contains {shown(wrong)}; every entry must be 0 or 1. Threshold scores before acting."
         )
-    return asked.reshape(*shape[:-1], -1, n_robots - 1, n_bits)
+    return asked.reshape(*shape[:-1], -1, n_others, n_bits)

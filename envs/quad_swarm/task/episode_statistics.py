@@ -34,6 +34,7 @@ class EpisodeStatistics:
     :ivar steps: steps flown
     :ivar steps_counted: steps in which requests and path counted
     :ivar requests: requests made in them
+    :ivar possible_requests: how many could have been made in them: of each robot to each that it perceives
     :ivar peak_requests: most requests in one of them
     :ivar plans_used: plans of others that were believed in them, and
     :ivar plan_ages: the sum of their ages when they were (steps)
@@ -54,6 +55,7 @@ class EpisodeStatistics:
         "steps": 0,
         "steps_counted": 0,
         "requests": 0,
+        "possible_requests": 0,
         "peak_requests": 0,
         "plans_used": 0,
         "plan_ages": 0,
@@ -73,6 +75,7 @@ class EpisodeStatistics:
     steps: np.ndarray
     steps_counted: np.ndarray
     requests: np.ndarray
+    possible_requests: np.ndarray
     peak_requests: np.ndarray
     plans_used: np.ndarray
     plan_ages: np.ndarray
@@ -123,6 +126,8 @@ class EpisodeStatistics:
         self.steps += 1
         self.steps_counted += counted
         self.requests += counted * n_requests
+        # The same in every swarm where nobody is missed
+        self.possible_requests += counted * (report.others >= 0).sum(axis=(-2, -1))
         self.peak_requests = np.maximum(self.peak_requests, counted * n_requests)
         used = report.belief_source.reshape(len(counted), -1) != _NO_PLAN
         self.plans_used += counted * used.sum(axis=1)
@@ -153,12 +158,11 @@ class EpisodeStatistics:
         """Figures of the episodes so far, each (E,), by the names under which they are logged."""
         n, dt = self.config.n_robots, self.config.planner.dt
         plans = self.steps * n
-        possible = self.steps_counted * n * (n - 1)
         return {
             "swarm/collision_rate": self.collided.astype(float),
             "swarm/arrival_rate": self.success.astype(float),
             "swarm/min_separation": self.min_separation.copy(),
-            "comm/request_share": self.requests / possible,
+            "comm/request_share": self.requests / np.maximum(self.possible_requests, 1),
             "comm/peak_requests": self.peak_requests.astype(float),
             "comm/bytes_per_second": exchange_bytes(self.config) * self.requests / (self.steps_counted * n * dt),
             "comm/plan_age": dt * self.plan_ages / np.maximum(self.plans_used, 1),

@@ -36,7 +36,8 @@ class Observation(Protocol):
     def layout(self) -> dict[str, Any]:
         """Which columns are about the robot itself and which about each of the others: `own`, `neighbours`,
         `acts_on_neighbours`, `critic`, those about each of the others that no robot knows when it decides, and
-        `action_mask`, whom it may ask."""
+        `action_mask`, whom it may ask, `complete` unless neighbours may be absent, and `who_columns`, who the others
+        are, where that changes."""
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
         """What every robot observes, (E, n, size) float32."""
@@ -46,29 +47,46 @@ class PaperObservation:
     """z_i = [v_i, p_ig, {p_ij}, {v_ij}] (Sec. IV-B): own velocity, goal relative to the robot, then all relative
     positions of the others, then all their relative velocities, others in ascending order; length 6n.
 
-    :param n_robots: number of robots n
+    Where the neighbourhood is limited to m others there are m of them, an empty place is all zero, and their numbers
+    follow as in `PairObservation`; length 7 m + 6.
+
+    :param config: the world
     :param scaled: divide distances by 4 m and velocities by 4 m/s
     """
 
-    def __init__(self, n_robots: int, scaled: bool = False):
-        self.n_robots, self.size = n_robots, 6 * n_robots
+    def __init__(self, config: SwarmConfig, scaled: bool = False):
+        self.config = config
+        self._numbers = 6 * (config.n_others + 1)  # where the numbers of the others begin, if there are any
+        self.size = self._numbers + (config.n_others if config.is_limited else 0)
         distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
-        others = 3 * (n_robots - 1)
+        others = 3 * config.n_others
         self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, others, others])
 
     @property
     def layout(self) -> dict[str, Any]:
-        m = self.n_robots - 1
+        m = self.config.n_others
         others = [[6 + 3 * k + axis + part for part in (0, 3 * m) for axis in range(3)] for k in range(m)]
-        return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+        layout = {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+        return layout | (_numbered(self._numbers, self.size) if self.config.is_limited else {})
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
         estimate, (others_pos, others_vel) = swarm.estimate(), swarm.observe()
         pos, vel = estimate[..., POSITION], estimate[..., VELOCITY]
         flat = (*pos.shape[:2], -1)
         relative_pos, relative_vel = others_pos - pos[:, :, None], others_vel - vel[:, :, None]
+        present = swarm.neighbours.present
+        if present is not None:
+            relative_pos[~present], relative_vel[~present] = 0.0, 0.0
         parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
-        return (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        observed = (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        if present is None:
+            return observed
+        return np.concatenate([observed, swarm.neighbours.numbers() + 1], axis=-1, dtype=np.float32)
+
+
+def _numbered(first: int, end: int) -> dict[str, Any]:
+    """What a layout says of the columns with the numbers of others: also that nobody acts on an empty place."""
+    return {"who_columns": list(range(first, end)), "action_mask": list(range(first, end))}
 
 
 class PairView:
@@ -228,18 +246,17 @@ def _mask(pair: PairView) -> np.ndarray:
 def _critic(pair: PairView) -> np.ndarray:
     """What no robot knows: how wrong the two are about each other, and how close their plans are."""
     view, stages = pair.view, _stages(pair.horizon)
-    prediction, others = view.prediction, pair.swarm.beliefs.others
-    certain = replace(prediction, remembered=view.absolute_plans[:, others], remembers=np.ones(view.age.shape, bool))
+    prediction, plans = view.prediction, view.of_others(view.absolute_plans)
+    certain = replace(prediction, remembered=plans, remembers=np.ones(view.age.shape, bool))
     surprise = certain.believed(stages) - view.own_pos[:, :, None, None] - view.expected(stages)
-    reverse = pair.swarm.beliefs.reverse  # the other's view of this robot: the same numbers with the two exchanged
     size = length(surprise)
     parts = (
         np.clip(2 * _flat(pair.turn(surprise), 3), -2, 2),
         np.tanh(size / 0.1),
-        np.tanh(size[:, others, reverse] / 0.1),
+        np.tanh(view.of_the_other(size) / 0.1),  # the other's view of this robot
         pair.closeness(certain.approach(view.own_pos, view.plan).least),
         pair.closeness(view.plan_approach.least),
-        prediction.remembers[:, others, reverse, None],
+        view.of_the_other(prediction.remembers)[..., None],
     )
     return np.concatenate(parts, axis=-1)
 
@@ -260,6 +277,9 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
 class PairObservation:
     """A row of a robot: six numbers of its own, then for each of the others the features of some groups.
 
+    Where the neighbourhood is limited, an empty place is all zero, and at the end stand the numbers of the others, from
+    1 on, 0: nobody. Critics need them to find the other's own part; robots only act on those that are there.
+
     :param config: the world
     :param groups: names of `GROUPS`; "critic" holds what only critics may read
     :param critics: whether there are any; otherwise their columns are zeros
@@ -274,7 +294,8 @@ class PairObservation:
         self.groups = [name for name in GROUPS if name in groups]
         sizes = [GROUPS[name](self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
         self._seen = sum(sizes) - (sizes[-1] if self.groups[-1] == "critic" else 0)
-        self.size = 6 + (config.n_robots - 1) * sum(sizes)
+        self._numbers = 6 + config.n_others * sum(sizes)  # where the numbers of the others begin, if there are any
+        self.size = self._numbers + (config.n_others if config.is_limited else 0)
         self._blank = 0 if critics else sum(sizes) - self._seen
 
     def _pair(self, swarm: Swarm) -> PairView:
@@ -282,9 +303,10 @@ class PairObservation:
 
     @property
     def layout(self) -> dict[str, Any]:
-        blocks = np.arange(6, self.size).reshape(self.config.n_robots - 1, -1)
+        blocks = np.arange(6, self._numbers).reshape(self.config.n_others, -1)
         seen, hidden = blocks[:, : self._seen], blocks[:, self._seen :]
-        layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True, "complete": True}
+        layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True}
+        layout |= _numbered(self._numbers, self.size) if self.config.is_limited else {"complete": True}
         if "mask" in self.groups:
             layout["action_mask"] = seen[:, -1].tolist()  # the last group that robots see
         return layout | ({"critic": hidden.tolist()} if hidden.size else {})
@@ -294,13 +316,16 @@ class PairObservation:
         teams = pair.view.pos.shape[:2]
         observed = np.zeros((*teams, self.size), dtype=np.float32)
         observed[..., :6] = _own(pair.view)
-        blocks = observed[..., 6:].reshape(*teams, self.config.n_robots - 1, -1)  # a view
+        blocks = observed[..., 6 : self._numbers].reshape(*teams, self.config.n_others, -1)  # a view
         column = 0
         for name in self.groups:
             if name != "critic" or not self._blank:
                 features = GROUPS[name](pair)
                 blocks[..., column : column + features.shape[-1]] = features
                 column += features.shape[-1]
+        if pair.view.present is not None:
+            blocks[~pair.view.present] = 0.0
+            observed[..., self._numbers :] = swarm.neighbours.numbers() + 1
         return observed
 
 
@@ -316,7 +341,7 @@ def make_observation(
     :raises ValueError: unknown name, or scaling of what is scaled
     """
     if observation == "paper":
-        return PaperObservation(config.n_robots, scale_observation)
+        return PaperObservation(config, scale_observation)
     pairs = PairObservation(config, observation.split("+"), critics)
     if scale_observation:
         raise ValueError(

@@ -1,4 +1,8 @@
-"""What a robot knows when it decides whom to ask, for rules and for observations."""
+"""What a robot knows when it decides whom to ask, for rules and for observations.
+
+Axes of the n - 1 others of a robot have fewer places where its neighbourhood is limited, see `world.neighbours`. Nobody
+is in an empty place: it shows a robot that is far away and flies along.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import numpy as np
 from quad_swarm.geometry import length
 from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.world.beliefs import PlanApproach, Prediction
+from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
 from quad_swarm.world.swarm import Swarm
 
 
@@ -111,13 +115,32 @@ class View:
         :param stages: which of the next N steps, from 0 on
         """
         presumed = self._swarm.presume()
-        fields = (presumed.believed(stages), presumed.remembers, presumed.age, presumed.error)
-        return Presumed(*map(self.of_the_other, fields))
+        # Who does not perceive this robot has no plan of it
+        times = self._swarm.config.planner.dt * (np.array(stages) + 1)
+        steady = self.own_pos[:, :, None] + times[:, None] * self.own_vel[:, :, None]
+        return Presumed(
+            self.of_the_other(presumed.believed(stages), steady[:, :, None]),
+            self.of_the_other(presumed.remembers),
+            self.of_the_other(presumed.age, self.horizon),
+            self.of_the_other(presumed.error),
+        )
 
-    def of_the_other(self, field: np.ndarray) -> np.ndarray:
+    def of_the_other(self, field: np.ndarray, otherwise: np.ndarray | float = 0) -> np.ndarray:
         """What each of the others has about this robot, of something that robots have about others, (E, n, n - 1,
-        ...)."""
-        return field[:, self._swarm.beliefs.others, self._swarm.beliefs.reverse]
+        ...).
+
+        :param otherwise: what counts for those that do not perceive this robot: it knows who does
+        """
+        return self._swarm.neighbours.of_the_other(field, otherwise)
+
+    def of_others(self, field: np.ndarray) -> np.ndarray:
+        """What each of its others has, of something that robots have, (E, n, n - 1, ...)."""
+        return of_others(field, self._swarm.neighbours.others)
+
+    @property
+    def present(self) -> np.ndarray | None:
+        """Which of its places for others are taken, (E, n, n - 1) bool; None: all."""
+        return self._swarm.neighbours.present
 
     @property
     def age(self) -> np.ndarray:

@@ -17,6 +17,7 @@ from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.validation import Length, PositiveLength, checked, replaced
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
+from quad_swarm.world.neighbours import Neighbourhood
 from quad_swarm.world.scenarios import ScenarioSpace
 
 PRESET_VERSION = 1
@@ -43,6 +44,7 @@ class SwarmConfig:
     :param noise: disturbances of the flight
     :param sensing: errors of the estimated states
     :param radio: how plans travel
+    :param neighbourhood: whom robots perceive and may ask, see `quad_swarm.world.neighbours`
     :param plant: what is flown: "model" is the planner's model (with the disturbances), "crazyflow:cf21B_500" a vehicle
         of that simulator, see `quad_swarm.plants`
     :param mismatch: by up to this share each vehicle's parameters differ from the planner's model, drawn evenly for
@@ -68,6 +70,7 @@ class SwarmConfig:
     noise: ProcessNoise = field(default_factory=ProcessNoise)
     sensing: SensingError = field(default_factory=SensingError)
     radio: Radio = field(default_factory=Radio)
+    neighbourhood: Neighbourhood = field(default_factory=Neighbourhood)
     plant: str = MODEL
     mismatch: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
@@ -101,10 +104,26 @@ class SwarmConfig:
                 f"mismatch={self.mismatch}: the fastest vehicles take sub-steps of up to {fastest:.2g} s, not "
                 f"planner.dt / substeps = {planner.dt / self.substeps:.2g} s: raise substeps"
             )
+        reach = self.neighbourhood.range
+        if reach is not None and reach < planner.separation:
+            raise ValueError(
+                f"neighbourhood.range={reach}: robots must perceive each other at least as far as they keep apart, "
+                f"planner.separation={planner.separation}"
+            )
         if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
             raise ValueError(
                 f"clock_skew={self.clock_skew} is less than one of the substeps={self.substeps} of a step: raise either"
             )
+
+    @property
+    def n_others(self) -> int:
+        """Of how many others a robot perceives something at most."""
+        return self.neighbourhood.places(self.n_robots)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether robots may miss others."""
+        return self.neighbourhood.limits(self.n_robots)
 
     @property
     def is_random(self) -> bool:

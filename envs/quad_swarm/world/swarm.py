@@ -1,4 +1,7 @@
-"""E swarms of n robots: who asks whom -> beliefs -> plans -> dynamics. No reward, no episode: that is `task`."""
+"""E swarms of n robots: who asks whom -> beliefs -> plans -> dynamics. No reward, no episode: that is `task`.
+
+Axes of the n - 1 others of a robot have fewer places where its neighbourhood is limited, see `neighbours`.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown
-from quad_swarm.native.pairs import advance, resample
+from quad_swarm.native.pairs import advance, resample, separations
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.states import like
-from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, other_indices, resampled
+from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, of_others, other_indices, resampled
+from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
 
+# So many separations away an empty place shows a robot: nothing that anybody plans comes near it
+_NOBODY = 30.0
 _FARTHEST = 1e4  # m, of starts and goals; far beyond any room, and well before squares lose their meaning
 
 
@@ -29,11 +35,14 @@ class StepReport(NamedTuple):
     :param min_separation: smallest distance between two robots after the step, (E,) (m)
     :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line between
         two sub-steps, (E,) (m)
+    :param others: who the others are, -1: an empty place, (E, n, n - 1), or (n, n - 1) where all swarms have the same
     :param separation: distance of each robot to each of the others after the step, (E, n, n - 1) (m)
     :param colliding: which of the others each robot collides with after the step, (E, n, n - 1) bool
     :param colliding_continuous: the same at any time during the step
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
     :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
+    :param changed: places that somebody else has after the step, or nobody, (E, n, n - 1) bool; None where that never
+        happens
     :param moved: distance that each robot flew, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
@@ -45,11 +54,13 @@ class StepReport(NamedTuple):
 
     min_separation: np.ndarray
     min_separation_continuous: np.ndarray
+    others: np.ndarray
     separation: np.ndarray
     colliding: np.ndarray
     colliding_continuous: np.ndarray
     collision: np.ndarray
     collision_continuous: np.ndarray
+    changed: np.ndarray | None
     moved: np.ndarray
     at_goal: np.ndarray
     belief_source: np.ndarray
@@ -64,6 +75,7 @@ class Swarm:
 
     :ivar state: true states, (E, n, 9)
     :ivar goal: goals, (E, n, 3), world frame (m)
+    :ivar neighbours: whom each robot perceives
     :ivar chance: errors, gusts and losses that are met
     :ivar beliefs: what each robot believes of the others
     :ivar presumed_beliefs: what each robot's others take it to believe of them: all that they answered has arrived
@@ -75,13 +87,14 @@ class Swarm:
 
     def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
         self.config = config
-        self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_robots, solver)
+        self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_others + 1, solver)
         n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
         self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
         self.state = np.zeros((n_swarms, n, 9))
         self.goal = np.zeros((n_swarms, n, 3))
+        self.neighbours = Neighbours(n_swarms, n, config.neighbourhood)
         self.chance = Realisation(config, n_swarms)
-        beliefs = (n_swarms, n, horizon, dt, config.memory)
+        beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others)
         self.beliefs = Beliefs(*beliefs)
         differ = config.radio.is_random or config.sensing.others
         self.presumed_beliefs = Beliefs(*beliefs) if differ else self.beliefs
@@ -90,11 +103,12 @@ class Swarm:
         late = config.radio.delay + config.radio.jitter
         self._earlier = [self.plans[..., POSITION].copy() for _ in range(late)]
         self._u = np.zeros((n_swarms, n, 4))  # inputs that act
-        self._pairs = np.triu_indices(n, k=1)
-        number = np.zeros((n, n), dtype=int)
-        number[self._pairs] = np.arange(len(self._pairs[0]))
-        # Which pair each robot is with each of the others
-        self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
+        if not self.neighbours.limited:
+            self._pairs = np.triu_indices(n, k=1)
+            number = np.zeros((n, n), dtype=int)
+            number[self._pairs] = np.arange(len(self._pairs[0]))
+            # Which pair each robot is with each of the others
+            self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
 
     @property
     def n_swarms(self) -> int:
@@ -122,8 +136,12 @@ class Swarm:
 
     def _seen_by_all(self) -> tuple[np.ndarray, np.ndarray]:
         """The same without what each observer gets wrong in its own way."""
-        estimate = self.estimate()[:, self.beliefs.others]
-        return estimate[..., POSITION], estimate[..., VELOCITY]
+        estimate, neighbours = self.estimate(), self.neighbours
+        seen = of_others(estimate, neighbours.others)
+        pos, vel = seen[..., POSITION], seen[..., VELOCITY]
+        if neighbours.present is not None:
+            pos[..., 0] += np.where(neighbours.present, 0.0, _NOBODY * self.config.planner.separation)
+        return pos, vel
 
     def presume(self) -> Prediction:
         """What the others of each robot take it to predict of them as long as it does not ask."""
@@ -141,11 +159,17 @@ class Swarm:
         start = self.chance.start
         return plans if start is None else resampled(plans, -start / self.config.substeps)
 
-    def planned_separation(self, steps: int) -> np.ndarray:
+    def planned_separation(self, steps: int, others: np.ndarray) -> np.ndarray:
         """How far each robot is from each of the others by their plans in each of the ``steps`` after the present
-        one, (E, n, n - 1, steps) (m)."""
-        i, j = self._pairs
+        one, (E, n, n - 1, steps) (m); infinity for an empty place.
+
+        :param others: who they are, see `StepReport`
+        """
         plans = self.planned_positions()[..., 2 : 2 + steps, :]
+        if self.neighbours.limited:
+            between = of_others(plans, np.maximum(others, 0)) - plans[:, :, None]
+            return np.where(others[..., None] >= 0, np.sqrt(_dot(between, between)), np.inf)
+        i, j = self._pairs
         between = plans[:, i] - plans[:, j]
         return np.sqrt(_dot(between, between))[:, self._pair_of]
 
@@ -160,6 +184,7 @@ class Swarm:
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
+        self.neighbours.reset(swarm, starts)
         for beliefs in {self.beliefs, self.presumed_beliefs}:
             beliefs.forget(np.array([swarm]))
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
@@ -175,6 +200,7 @@ class Swarm:
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
         self.state, self.goal, self._u = self.state[swarms], self.goal[swarms], self._u[swarms]
+        self.neighbours.keep(swarms)
         self.chance.keep(swarms)
         self._plant.keep(swarms)
         for beliefs in {self.beliefs, self.presumed_beliefs}:
@@ -187,7 +213,7 @@ class Swarm:
         part = copy(self)
         part.beliefs = copy(self.beliefs)
         part.presumed_beliefs = part.beliefs if self.presumed_beliefs is self.beliefs else copy(self.presumed_beliefs)
-        part.chance = copy(self.chance)
+        part.neighbours, part.chance = copy(self.neighbours), copy(self.chance)
         part._plant = self._plant.fork()
         part.keep(swarms)
         return part
@@ -215,6 +241,7 @@ class Swarm:
             "beliefs": self.beliefs.state_dict(),
             "presumed_beliefs": presumed,
             "chance": self.chance.state_dict(),
+            "neighbours": self.neighbours.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -238,21 +265,38 @@ class Swarm:
         if self.presumed_beliefs is not self.beliefs:
             self.presumed_beliefs.load_state_dict(state["presumed_beliefs"])
         self.chance.load_state_dict(state["chance"])
+        if self.neighbours.limited:
+            self.neighbours.load_state_dict(state["neighbours"])
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let every robot ask, plan and fly for one step.
 
-        :param requests: whom each robot asks, (E, n, n - 1) bool, the others of a robot in ascending order
+        :param requests: whom each robot asks, (E, n, n - 1) bool, the others of a robot in ascending order or as in
+            `neighbours`, which has no empty place asked
         """
         believed, source = self._believe(requests)
         started = time.perf_counter()
         self._plans = self.planner.plan(self._problems(believed, source), self._plans)
         solve_seconds = time.perf_counter() - started
-        return self._report(self._fly(), source, solve_seconds)
+        report = self._report(self._fly(), source, solve_seconds)
+        return report if self.neighbours.present is None else report._replace(changed=self._look_around())
+
+    def _look_around(self) -> np.ndarray:
+        """Forget those who are out of reach now, and begin with those who have come: what a robot knew of one that it
+        loses sight of is of no use when they meet again.
+
+        :return: places that somebody else has now, or nobody, (E, n, m) bool
+        """
+        changed = self.neighbours.update(self.pos, self.vel)
+        if changed.any():
+            for beliefs in {self.beliefs, self.presumed_beliefs}:
+                beliefs.forget_others(changed)
+            self.chance.meet(self.neighbours.perceived(changed))
+        return changed
 
     def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What robots believe once answers have arrived, see `Beliefs.update`."""
-        radio, others = self.config.radio, self.beliefs.others
+        radio, others = self.config.radio, self.neighbours.others
         trajectories = advance(self.planned_positions())
         if self._earlier:
             self._earlier = [*map(advance, self._earlier), trajectories]  # each as of now
@@ -300,8 +344,35 @@ class Swarm:
         return positions
 
     def _report(self, positions: list[np.ndarray], source: np.ndarray, solve_seconds: float) -> StepReport:
-        i, j = self._pairs
         before, pos = positions[0], positions[-1]
+        least, least_continuous, separation, separation_continuous = self._separations(positions)
+        limit = 2 * self.config.radius - self.config.collision_tolerance
+        shape = self.state.shape[:2]
+        return StepReport(
+            min_separation=least,
+            min_separation_continuous=least_continuous,
+            others=self.neighbours.numbers(),
+            separation=separation,
+            colliding=separation < limit,
+            colliding_continuous=separation_continuous < limit,
+            collision=least < limit,
+            collision_continuous=least_continuous < limit,
+            changed=None,
+            moved=np.sqrt(_dot(pos - before, pos - before)),
+            at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
+            belief_source=source,
+            plan_age=self.beliefs.age.copy(),  # a later reset writes into it
+            plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
+            iterations=self._plans.iterations.reshape(shape).copy(),
+            solve_seconds=solve_seconds,
+        )
+
+    def _separations(self, positions: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """See `quad_swarm.native.pairs.separations`: of all pairs, whether they perceive each other or not."""
+        if self.neighbours.limited:
+            return separations(np.stack(positions), self.neighbours.others)
+        # The same in another order of operations, to which the figures of the presets hold to the last bit
+        i, j = self._pairs
         apart = [each[:, i] - each[:, j] for each in positions]
         if len(apart) == 2:
             start, end = apart[0][None], apart[1][None]
@@ -312,23 +383,11 @@ class Swarm:
         along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
         closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
         separation, separation_continuous = np.sqrt(_dot(end[-1], end[-1])), np.sqrt(_dot(closest, closest).min(axis=0))
-        limit = 2 * self.config.radius - self.config.collision_tolerance
-        shape = self.state.shape[:2]
-        return StepReport(
-            min_separation=separation.min(axis=-1),
-            min_separation_continuous=separation_continuous.min(axis=-1),
-            separation=separation[:, self._pair_of],
-            colliding=(separation < limit)[:, self._pair_of],
-            colliding_continuous=(separation_continuous < limit)[:, self._pair_of],
-            collision=(separation < limit).any(axis=-1),
-            collision_continuous=(separation_continuous < limit).any(axis=-1),
-            moved=np.sqrt(_dot(pos - before, pos - before)),
-            at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
-            belief_source=source,
-            plan_age=self.beliefs.age.copy(),  # a later reset writes into it
-            plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
-            iterations=self._plans.iterations.reshape(shape).copy(),
-            solve_seconds=solve_seconds,
+        return (
+            separation.min(axis=-1),
+            separation_continuous.min(axis=-1),
+            separation[:, self._pair_of],
+            separation_continuous[:, self._pair_of],
         )
 
 

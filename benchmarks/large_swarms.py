@@ -1,0 +1,160 @@
+"""Steps per second and memory of large swarms, with and without a limited neighbourhood.
+
+``python benchmarks/large_swarms.py [--json F]`` flies the preset `flight` with 4 to 128 robots, as many to a square
+metre as there, observed as for the recipe of `flight`, with random bits. ``all``: everybody perceives everybody.
+``planned``: plans consider the nearest few only. ``limited``: robots perceive the nearest few within a range, and plan
+as in ``planned``. A critic's pass is that of `PairPolicy`, forwards and backwards, over a batch of the recipe's size.
+
+Each cell has a process of its own, one after the other, pinned to a core where the system allows. Memory is the growth
+of the process's peak. JSON: one row a cell with the keys perceived, n_robots, n_others, n_envs, steps_per_s, memory_mb
+(of the environments), critic_ms, critic_mb, and the ratios steps_ratio and critic_ratio to ``all`` with as many robots.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import os
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from quad_swarm.task.request_task import RequestTask, make_task
+from sb3_maddpg.relational import PairPolicy
+
+SIZES = (4, 8, 16, 32, 64, 128)
+PERCEIVED = ("all", "planned", "limited")
+NEIGHBOURHOOD = {"max_others": 16, "range": 8.0, "look_ahead": 1.0}
+PLANNED = 8
+BATCH = 96
+OBSERVATION = "state+approach+side+memory+plan+told+mask+critic"
+_WARM_UP = 3  # steps
+
+
+def world(n_robots: int, perceived: str) -> dict[str, Any]:
+    """Fields of the world and its space: as many robots to a square metre as in `flight`."""
+    half_width = 3.0 * math.sqrt(n_robots / 8)
+    reach = half_width + 2.0
+    planner: dict[str, Any] = {"workspace_low": (-reach, -reach, 0.48), "workspace_high": (reach, reach, 2.4)}
+    fields: dict[str, Any] = {"planner": planner, "space": {"half_width": half_width}}
+    if perceived != "all":
+        planner["max_neighbours"] = PLANNED
+    if perceived == "limited":
+        fields["neighbourhood"] = NEIGHBOURHOOD
+    return fields
+
+
+def measure(n_robots: int, perceived: str, n_envs: int, seconds: float, core: int) -> dict[str, Any]:
+    """The row of a cell, but for its ratios."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {core % (os.cpu_count() or 1)})
+    th.set_num_threads(1)
+    before = _peak_mb()
+    task = make_task(
+        n_envs,
+        "flight",
+        "random_swap",
+        n_robots=n_robots,
+        observation=OBSERVATION,
+        announcements=True,
+        world=world(n_robots, perceived),
+    )
+    steps_per_s = _fly(task, seconds)
+    flown = _peak_mb()
+    critic_ms = _think(task, seconds)
+    return {
+        "perceived": perceived,
+        "n_robots": n_robots,
+        "n_others": task.swarm.config.n_others,
+        "n_envs": n_envs,
+        "steps_per_s": steps_per_s,
+        "memory_mb": flown - before,
+        "critic_ms": critic_ms,
+        "critic_mb": _peak_mb() - flown,
+    }
+
+
+def _fly(task: RequestTask, seconds: float) -> float:
+    """Steps per second of all environments together."""
+    n_envs, config, rng = task.swarm.n_swarms, task.swarm.config, np.random.default_rng(0)
+    for k in range(n_envs):
+        task.reset(k, np.random.default_rng(k))
+    # About as many requests and announcements as a trained policy sends, whatever the size of the swarm
+    share = 0.15 / config.n_others
+    bits = [rng.random((n_envs, config.n_robots, config.n_others, 2)) < share for _ in range(8)]
+    count, started = -_WARM_UP, time.perf_counter()
+    while count < 1 or time.perf_counter() - started < seconds:
+        if count == 0:
+            started = time.perf_counter()
+        task.act(bits[count % len(bits)])
+        task.observe()
+        count += 1
+    return count * n_envs / (time.perf_counter() - started)
+
+
+def _think(task: RequestTask, seconds: float) -> float:
+    """Milliseconds of a critic's pass, the least of several."""
+    n, m = task.swarm.config.n_robots, task.swarm.config.n_others
+    seen = task.observe()
+    policy = PairPolicy(
+        spaces.Box(-np.inf, np.inf, seen.shape[1:], np.float32),
+        spaces.MultiBinary(n * m * 2),
+        lambda _: 1e-3,
+        net_arch=[64, 64],
+        observation_layout=task.observation_layout,  # type: ignore[arg-type]
+        pair_credit=True,
+    )
+    observations = th.as_tensor(np.resize(seen, (BATCH, *seen.shape[1:])))
+    actions = policy.actor.act(observations).detach()
+    times: list[float] = []
+    while not times or sum(times) < seconds:
+        started = time.perf_counter()
+        policy.critic(observations, actions).square().mean().backward()
+        times.append(time.perf_counter() - started)
+    return 1e3 * min(times)
+
+
+def _peak_mb() -> float:
+    """Most memory that the process has had (MB)."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write one JSON object a cell")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots (default 4 to 128)")
+    parser.add_argument("--envs", type=int, default=16, help="swarms in a process (default 16)")
+    parser.add_argument("--seconds", type=float, default=4.0, help="time of each measurement (default 4)")
+    parser.add_argument("--core", type=int, default=0, help="which core to use (default 0)")
+    args = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    print(f"{'robots':>6} {'perceived':>9} {'others':>6} {'steps/s':>9} {'MB':>7} {'critic ms':>9} {'MB':>7}   ratios")
+    for n_robots in args.sizes:
+        for perceived in PERCEIVED:
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                row = pool.apply(measure, (n_robots, perceived, args.envs, args.seconds, args.core))
+            rival = next((r for r in rows if r["n_robots"] == n_robots), row)
+            row["steps_ratio"] = row["steps_per_s"] / rival["steps_per_s"]
+            row["critic_ratio"] = rival["critic_ms"] / row["critic_ms"]
+            rows.append(row)
+            print(
+                f"{n_robots:6} {perceived:>9} {row['n_others']:6} {row['steps_per_s']:9.0f} {row['memory_mb']:7.0f} "
+                f"{row['critic_ms']:9.1f} {row['critic_mb']:7.0f}   {row['steps_ratio']:.1f} {row['critic_ratio']:.1f}",
+                flush=True,
+            )
+    if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+if __name__ == "__main__":
+    main()
