@@ -31,6 +31,8 @@ class TeamReplayBufferSamples(NamedTuple):
     :param next_active: 1 if the agent is still active at the end of the window, (batch, n_agents); ``None`` if every
         agent always has been active
     :param pair_rewards: discounted sums of pair rewards, (batch, n_agents, n_pairs); ``None`` if they are not stored
+    :param pair_goes_on: 1 if the next observation is about the same pair, (batch, n_agents, n_pairs); ``None`` if pairs
+        never end before their agents
     :param indices: indices of the samples for ``update_priorities``, (batch,); ``None`` without priorities
     :param weights: importance-sampling weights, at most 1, (batch,); ``None`` without priorities
     """
@@ -44,6 +46,7 @@ class TeamReplayBufferSamples(NamedTuple):
     active: th.Tensor | None = None
     next_active: th.Tensor | None = None
     pair_rewards: th.Tensor | None = None
+    pair_goes_on: th.Tensor | None = None
     indices: np.ndarray | None = None
     weights: th.Tensor | None = None
 
@@ -60,6 +63,7 @@ class _Columns(NamedTuple):
     cuts: np.ndarray
     """1 if the next transition does not continue this one although the episode did not end, as after a new learn()"""
     pair_rewards: np.ndarray
+    pair_terminated: np.ndarray
 
 
 # Attributes that are not pickled, because they are views of the records or derived from them
@@ -101,6 +105,7 @@ class TeamReplayBuffer(ReplayBuffer):
     :param n_steps: number of rewards in the n-step return
     :param gamma: discount factor
     :param n_pairs: number of neighbours in ``pair_rewards``, 0 without pair rewards
+    :param pairs_end: whether neighbours change, so that ``info["pair_terminated"]``, (n_agents, n_pairs), is required
     :raises ValueError: if the spaces do not describe a team, or an argument is out of range
     """
 
@@ -114,6 +119,7 @@ class TeamReplayBuffer(ReplayBuffer):
         "n_steps",
         "gamma",
         "n_pairs",
+        "pairs_end",
     )
     _COUNTERS: ClassVar[tuple[str, ...]] = ("pos", "full", "all_active", "n_added")
 
@@ -129,6 +135,7 @@ class TeamReplayBuffer(ReplayBuffer):
         n_steps: int = 1,
         gamma: float = 0.99,
         n_pairs: int = 0,
+        pairs_end: bool = False,
     ):
         self.team = Team.from_spaces(observation_space, action_space)
         arguments = validated(
@@ -140,11 +147,13 @@ class TeamReplayBuffer(ReplayBuffer):
             n_steps=n_steps,
             gamma=gamma,
             n_pairs=n_pairs,
+            pairs_end=pairs_end,
         )
         self.n_agents = self.team.n_agents
         self.n_steps = arguments.pop("n_steps")
         self.gamma = arguments.pop("gamma")
         self.n_pairs = arguments.pop("n_pairs")
+        self.pairs_end = arguments.pop("pairs_end")
         if self.n_steps > 1 and arguments["optimize_memory_usage"]:
             raise ValueError(
                 f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not "
@@ -168,7 +177,8 @@ class TeamReplayBuffer(ReplayBuffer):
             names.append("next_observations")
         fields: list[Any] = [(name, getattr(self, name).dtype, getattr(self, name).shape[2:]) for name in names]
         # All other numbers are one field, so that one index reads n steps of them
-        fields.append(("numbers", np.float32, (self.n_agents * (3 + self.n_pairs) + 4,)))
+        n_columns = 3 + self.n_pairs * (2 if self.pairs_end else 1)
+        fields.append(("numbers", np.float32, (self.n_agents * n_columns + 4,)))
         self._use(np.zeros((self.buffer_size, self.n_envs), np.dtype(fields, align=True)))
 
     def _use(self, records: np.ndarray) -> None:
@@ -187,6 +197,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self.timeouts = columns.timeouts
         self.cuts = columns.cuts
         self.pair_rewards = columns.pair_rewards
+        self.pair_terminated = columns.pair_terminated
         # The numbers of the transition being added, which are stored only if they are finite
         self._new = np.zeros(self.numbers.shape[1:], np.float32)
         self._new_columns = self._columns(self._new)
@@ -196,7 +207,8 @@ class TeamReplayBuffer(ReplayBuffer):
         :param numbers: the numbers stored besides observations and actions, in the last axis
         :return: views of them
         """
-        n = self.n_agents
+        n, end = self.n_agents, 3 * self.n_agents + 4 + self.n_agents * self.n_pairs
+        pairs = (*numbers.shape[:-1], n, self.n_pairs)
         return _Columns(
             agent_rewards=numbers[..., :n],
             agent_terminated=numbers[..., n : 2 * n],
@@ -205,7 +217,8 @@ class TeamReplayBuffer(ReplayBuffer):
             dones=numbers[..., 3 * n + 1],
             timeouts=numbers[..., 3 * n + 2],
             cuts=numbers[..., 3 * n + 3],
-            pair_rewards=numbers[..., 3 * n + 4 :].reshape(*numbers.shape[:-1], n, self.n_pairs),
+            pair_rewards=numbers[..., 3 * n + 4 : end].reshape(pairs),
+            pair_terminated=numbers[..., end:].reshape(pairs if self.pairs_end else (*pairs[:-1], 0)),
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -303,6 +316,8 @@ class TeamReplayBuffer(ReplayBuffer):
         some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
         if self.n_pairs:
             self._read_infos("pair_rewards", new.pair_rewards, infos, None)
+        if self.pairs_end:
+            self._read_infos("pair_terminated", new.pair_terminated, infos, None)
         if not all_finite(self._new):
             self._refuse_numbers(infos)
 
@@ -397,15 +412,16 @@ class TeamReplayBuffer(ReplayBuffer):
     def _check_shapes(self, key: InfoKey, values: Sequence[Any], needed: tuple[int, ...]) -> None:
         for value in values:
             if np.shape(value) != needed:
-                pairs = f" and n_pairs={self.n_pairs}" if key == "pair_rewards" else ""
-                remedy = "" if key == "pair_rewards" else ", or leave the key out"
+                of_pairs = key in ("pair_rewards", "pair_terminated")
+                pairs = f" and n_pairs={self.n_pairs}" if of_pairs else ""
+                remedy = "" if of_pairs else ", or leave the key out"
                 raise ValueError(
                     f"info['{key}'] has shape {np.shape(value)}, but there are {self.n_agents} agents{pairs}: "
                     f"the environment must return shape {needed}{remedy}."
                 )
 
     def _refuse_numbers(self, infos: Sequence[dict[str, Any]]) -> None:
-        keys = ("agent_rewards", "pair_rewards", "agent_terminated", "agent_active", "rewards")
+        keys = ("agent_rewards", "pair_rewards", "pair_terminated", "agent_terminated", "agent_active", "rewards")
         for key in keys:
             array = getattr(self._new_columns, key)
             for index in np.argwhere(~np.isfinite(array)):
@@ -487,6 +503,7 @@ class TeamReplayBuffer(ReplayBuffer):
             "discounts": self.gamma,
             "next_active": None if self.all_active else columns.agent_active * (1 - terminated),
             "pair_rewards": self._normalize_reward(columns.pair_rewards, env) if self.n_pairs else None,
+            "pair_goes_on": 1 - columns.pair_terminated if self.pairs_end else None,
         }
 
     def _windows(
@@ -514,12 +531,16 @@ class TeamReplayBuffer(ReplayBuffer):
         # Which agents' sums and which windows continue after the steps so far
         alive, goes_on = active[0] & ~terminated[0], np.ones(len(batch_inds), bool)
         gone = terminated[0].copy(order="K")
+        same_pair = columns.pair_terminated[0] == 0
         for step in range(1, self.n_steps):
             goes_on &= (newer >= step) & ~ends[step - 1] & (active[step] | ~alive).all(axis=1)
             counts = alive & goes_on[:, None]
             total += self.gamma**step * rewards[step] * counts
             if self.n_pairs:
-                pair_total += self.gamma**step * pairs[step] * counts[..., None]
+                pair_counts = counts[..., None] & same_pair if self.pairs_end else counts[..., None]
+                pair_total += self.gamma**step * pairs[step] * pair_counts
+            if self.pairs_end:
+                same_pair &= ~goes_on[:, None, None] | (columns.pair_terminated[step] == 0)
             np.copyto(discounts, self.gamma ** (step + 1), where=counts)
             last += goes_on
             gone |= counts & terminated[step]
@@ -532,6 +553,7 @@ class TeamReplayBuffer(ReplayBuffer):
             "discounts": discounts,
             "next_active": None if self.all_active else (active & ~terminated)[at_end].astype(np.float32),
             "pair_rewards": pair_total if self.n_pairs else None,
+            "pair_goes_on": same_pair.astype(np.float32) if self.pairs_end else None,
         }
 
 

@@ -15,7 +15,7 @@ from sb3_maddpg.relational import NeighbourViews
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
 
-_FLAGS = ("agent_terminated", "agent_active")
+_FLAGS = ("agent_terminated", "agent_active", "pair_terminated")
 
 
 def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed: int = 0) -> Team:
@@ -78,6 +78,7 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         where = f"in step {step}"
         if (index := not_finite_at(np.asarray(obs))) is not None:
             raise ValueError(f"The observation of agent {team.names[index[0]]} {where} holds NaN or infinity.")
+        _check_numbers_of_neighbours(env, np.asarray(obs), team, where)
         if not math.isfinite(reward):
             raise ValueError(f"The team's reward {where} is {reward}: it must be finite.")
         _check_info(info, team, where)
@@ -94,6 +95,17 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
             return
 
 
+def _check_numbers_of_neighbours(env: gymnasium.Env, obs: np.ndarray, team: Team, where: str) -> None:
+    layout = env.get_wrapper_attr("observation_layout") if env.has_wrapper_attr("observation_layout") else {}
+    for agent, row in enumerate(obs[:, layout.get("who_columns", [])]):
+        named = row[row != 0]
+        if not set(named) <= set(range(1, team.n_agents + 1)) - {agent + 1} or len(set(named)) < len(named):
+            raise ValueError(
+                f"The neighbours of agent {team.names[agent]} {where}, in `who_columns` of its observation, are "
+                f"{shown(row.tolist())}: each must be another agent's index plus 1, named once, or 0 for no neighbour."
+            )
+
+
 def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
     known = set(TeamInfo.__annotations__)
     for name in info.keys() - known:
@@ -101,11 +113,12 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
             raise ValueError(f"info {where}: {suggest('entry', name, known)}")
     for name in known & info.keys() - {"is_success", "metrics"}:
         value = np.asarray(info[name])
-        shape = value.shape[:1] if name == "pair_rewards" and value.ndim == 2 else value.shape
+        of_pairs = name in ("pair_rewards", "pair_terminated")
+        shape = value.shape[:1] if of_pairs and value.ndim == 2 else value.shape
         if shape != (team.n_agents,) or value.dtype.kind not in "biuf":
             raise ValueError(
                 f"info['{name}'] {where} is {shown(info[name])}: it must hold a number for each of the {team.n_agents} "
-                f"agents{' and each of its neighbours' if name == 'pair_rewards' else ''}."
+                f"agents{' and each of its neighbours' if of_pairs else ''}."
             )
         if (index := not_finite_at(value)) is not None:
             raise ValueError(f"info['{name}'] of agent {team.names[index[0]]} {where} is not finite.")

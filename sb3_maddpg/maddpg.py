@@ -316,6 +316,8 @@ class MADDPG(OffPolicyAlgorithm):
         if self.policy_kwargs.get("pair_credit") and "observation_layout" in self.policy_kwargs:
             n_pairs = len(self.policy_kwargs["observation_layout"]["neighbours"])
             self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_pairs": n_pairs}
+            if "who_columns" in self.policy_kwargs["observation_layout"]:
+                self.replay_buffer_kwargs["pairs_end"] = True
 
     def _check_normalization(self, env: GymEnv) -> None:
         layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
@@ -543,7 +545,9 @@ class MADDPG(OffPolicyAlgorithm):
         """:return: the loss of each value head, (n_values,), and each agent's mean Q-value, (n_agents,)"""
         critic, action_cost = self.critic, self._scaled_action_cost()
         rewards = critic.rewards(replay_data.rewards)
-        if len(critic.agent_of_value) > critic.n_agents and replay_data.pair_rewards is not None:
+        pair_goes_on = replay_data.pair_goes_on
+        by_pair = len(critic.agent_of_value) > critic.n_agents or pair_goes_on is not None
+        if by_pair and replay_data.pair_rewards is not None:
             rewards = replay_data.pair_rewards.flatten(1)
         with th.no_grad():
             # Select actions with the target actors
@@ -557,6 +561,8 @@ class MADDPG(OffPolicyAlgorithm):
                 next_q_values = next_q_values - critic.known_cost(next_actions, action_cost)
                 rewards = rewards + critic.known_cost(actions, action_cost)
             discounts = critic.per_value((1 - replay_data.dones) * replay_data.discounts)
+            if pair_goes_on is not None:
+                discounts = discounts * pair_goes_on.flatten(1)
             target_q_values = rewards + discounts * next_q_values
 
         # Get the current Q-value estimates of each critic network
@@ -691,7 +697,7 @@ class MADDPG(OffPolicyAlgorithm):
         }
         own = {key: value for key, value in self.policy_kwargs.items() if key not in PairPolicy.env_attributes}
         if "replay_buffer_class" not in kwargs:
-            of_team = (*OWN_BUFFER_KWARGS, "n_pairs")
+            of_team = (*OWN_BUFFER_KWARGS, "n_pairs", "pairs_end")
             buffer = {key: value for key, value in self.replay_buffer_kwargs.items() if key not in of_team}
             arguments["replay_buffer_kwargs"] = buffer
         arguments |= {"policy_kwargs": own, "device": self.device, **kwargs}

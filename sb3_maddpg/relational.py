@@ -27,6 +27,9 @@ class ObservationLayout(TypedDict, total=False):
     - ``own``: columns about the agent itself;
     - ``neighbours``: the columns about each neighbour, of the same number and order for all neighbours;
     - ``who``: the indices of each agent's neighbours, by default all other agents in ascending order;
+    - ``who_columns``: instead of ``who`` if neighbours change: one column per neighbour, which contains its index plus
+      1, or 0 without a neighbour, and which only critics read. A neighbour keeps its position as long as it remains
+      one; ``info["pair_terminated"]`` marks the positions that change;
     - ``acts_on_neighbours``: whether the action consists of equal parts, one for each neighbour;
     - ``critic``: additional columns about each neighbour that only critics read, because agents do not know them
       when they act;
@@ -40,6 +43,7 @@ class ObservationLayout(TypedDict, total=False):
     own: Sequence[int]
     neighbours: Sequence[Sequence[int]]
     who: Sequence[Sequence[int]]
+    who_columns: Sequence[int]
     acts_on_neighbours: bool
     critic: Sequence[Sequence[int]]
     action_mask: Sequence[int]
@@ -50,21 +54,22 @@ def _others(n_agents: int) -> list[list[int]]:
     return [[other for other in range(n_agents) if other != agent] for agent in range(n_agents)]
 
 
-def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[int]]:
-    """:return: the indices of each agent's neighbours"""
+def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[int]] | None:
+    """:return: the indices of each agent's neighbours, None if they change"""
     if not {"own", "neighbours"} <= set(layout) <= set(ObservationLayout.__annotations__):
         raise ValueError(
             f"observation_layout has entries {sorted(layout)}, but needs `own` and `neighbours`, and may only add "
-            "`who`, `acts_on_neighbours`, `critic`, `action_mask` and `complete`."
+            "`who`, `who_columns`, `acts_on_neighbours`, `critic`, `action_mask` and `complete`."
         )
     neighbours = layout["neighbours"]
     hidden = layout.get("critic", [[]] * len(neighbours))
     mask = layout.get("action_mask", [0] * len(neighbours))
-    used = [*layout["own"], *chain(*neighbours, *hidden), *mask]
+    numbers = layout.get("who_columns", [0] * len(neighbours))
+    used = [*layout["own"], *chain(*neighbours, *hidden), *mask, *numbers]
     alike = len({len(columns) for columns in neighbours}) == len({len(columns) for columns in hidden}) == 1
     if (
         not alike
-        or not len(hidden) == len(mask) == len(neighbours)
+        or not len(hidden) == len(mask) == len(numbers) == len(neighbours)
         or not all(0 <= column < team.obs_dim for column in used)
     ):
         raise ValueError(
@@ -77,11 +82,18 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
             "observation_layout: `action_mask` is for MultiBinary actions on neighbours, but the actions are "
             f"{team.action_spaces[0]} and acts_on_neighbours={layout.get('acts_on_neighbours', False)}."
         )
+    if "who_columns" in layout:
+        if "who" in layout or layout.get("complete"):
+            raise ValueError(
+                "observation_layout: `who_columns` is for neighbours that change, so it cannot be combined with `who` "
+                "or complete=True."
+            )
+        return None
     who = layout.get("who") or _others(team.n_agents)
     if {len(row) for row in who} != {len(neighbours)} or len(who) != team.n_agents:
         raise ValueError(
             f"observation_layout has columns for {len(neighbours)} neighbours, but the {team.n_agents} agents have "
-            f"{[len(row) for row in who]}: add `who` or the missing columns."
+            f"{[len(row) for row in who]}: add `who`, `who_columns` or the missing columns."
         )
     if not all(set(row) <= set(others) for row, others in zip(who, _others(team.n_agents), strict=True)):
         raise ValueError(
@@ -93,6 +105,8 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
 class NeighbourViews(nn.Module):
     """
     Splits an observation into the agent's own part and its views of its neighbours.
+
+    :ivar changing: whether the neighbours change, so that they are read from the observation
 
     :param layout: see ``ObservationLayout``
     :param team: a team of homogeneous agents
@@ -124,6 +138,11 @@ class NeighbourViews(nn.Module):
         self.own = _Columns([list(layout["own"])])
         self.neighbours = _Columns(neighbours)
         self.mask = _Columns([[column] for column in layout["action_mask"]]) if "action_mask" in layout else None
+        self.n_agents = team.n_agents
+        self.changing = who is None
+        if who is None:
+            self.numbers = _Columns([[column] for column in layout["who_columns"]])
+            return
         back = [[who[j].index(i) if i in who[j] else -1 for j in row] for i, row in enumerate(who)]
         for name, table in (("neighbour_indices", who), ("reverse_indices", back)):
             self.register_buffer(name, th.tensor(table, dtype=th.long), persistent=False)
@@ -137,6 +156,46 @@ class NeighbourViews(nn.Module):
         neighbours = self.neighbours(obs)
         present = None if self.complete else (neighbours != 0).any(dim=-1, keepdim=True).to(obs.dtype)
         return self.own(obs).squeeze(-2), neighbours, present
+
+    def of_neighbours(self, obs: th.Tensor, what: th.Tensor) -> th.Tensor:
+        """
+        Return the values of each agent's neighbours.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param what: values of all agents, (batch, n_agents, ...)
+        :return: values of the neighbours, (batch, n_agents, n_neighbours, ...), arbitrary for absent neighbours
+        """
+        if not self.changing:
+            return what[:, self.neighbour_indices]
+        return what[_batch(what), self._who(obs).clamp(min=0)]
+
+    def towards_agent(self, obs: th.Tensor, what: th.Tensor) -> th.Tensor:
+        """
+        Swap the roles in values that agents have for their neighbours.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param what: values that agents have for each neighbour, (batch, n_agents, n_neighbours, width)
+        :return: values that each neighbour has for the agent, of the same shape, 0 if the agent is not one of its
+            neighbours
+        """
+        if not self.changing:
+            return what[:, self.neighbour_indices, self.reverse_indices.clamp(min=0)] * (
+                self.reverse_indices >= 0
+            ).unsqueeze(-1)
+        who = self._who(obs)
+        theirs = who[_batch(who), who.clamp(min=0)]  # the neighbours of neighbours
+        is_agent = theirs == th.arange(self.n_agents, device=obs.device)[:, None, None]
+        back, mutual = is_agent.long().argmax(dim=-1), is_agent.any(dim=-1) & (who >= 0)
+        return what[_batch(what), who.clamp(min=0), back] * mutual.unsqueeze(-1)
+
+    def _who(self, obs: th.Tensor) -> th.Tensor:
+        """:return: indices of the neighbours, -1 without a neighbour, (batch, n_agents, n_neighbours)"""
+        return self.numbers(obs).squeeze(-1).round().long() - 1
+
+
+def _batch(what: th.Tensor) -> th.Tensor:
+    """:return: indices along the first axis, (batch, 1, 1)"""
+    return th.arange(len(what), device=what.device)[:, None, None]
 
 
 class _Columns(nn.Module):
@@ -337,7 +396,7 @@ class PairCritic(Critic):
         pair_credit: bool = False,
         n_critics: int = 1,
     ):
-        super().__init__(factors, len(views.neighbour_indices), views.n_neighbours if pair_credit else 1, n_critics)
+        super().__init__(factors, views.n_agents, views.n_neighbours if pair_credit else 1, n_critics)
         self.pair_credit = pair_credit
         self.views = views
         self.on_neighbours = on_neighbours
@@ -346,25 +405,24 @@ class PairCritic(Critic):
         # Saved models contain this name
         self.modules_of_nets = cast("Sequence[PairNet]", nn.ModuleList(nets))
 
-    def _pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _pairs(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
+        :param obs: observations, (batch, n_agents, obs_dim or more)
         :param actions: encoded actions, (batch, n_agents, width)
         :return: i's action on j and j's action on i, both (batch, n_agents, n_neighbours, the factors' width)
         """
-        who = self.views.neighbour_indices
         if not self.on_neighbours:
-            return actions.unsqueeze(2).expand(-1, -1, self.views.n_neighbours, -1), actions[:, who]
+            mine = actions.unsqueeze(2).expand(-1, -1, self.views.n_neighbours, -1)
+            return mine, self.views.of_neighbours(obs, actions)
         parts = actions.unflatten(-1, (self.views.n_neighbours, -1))
         # If i is not a neighbour of j, j does not act on i
-        return parts, parts[:, who, self.views.reverse_indices.clamp(min=0)] * (
-            self.views.reverse_indices >= 0
-        ).unsqueeze(-1)
+        return parts, self.views.towards_agent(obs, parts)
 
     def _hidden(self, net: PairNet, obs: th.Tensor, theirs: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
         """:return: the second network's first layer without i's own action, and which neighbours are present"""
         own, neighbours, present = self.views(obs)
         each = own.unsqueeze(-2).expand(*neighbours.shape[:-1], -1)
-        hidden, _ = net.encode(th.cat([each, neighbours, own[:, self.views.neighbour_indices]], dim=-1), present)
+        hidden, _ = net.encode(th.cat([each, neighbours, self.views.of_neighbours(obs, own)], dim=-1), present)
         return hidden.add_(net.extra(1, theirs)), 1.0 if present is None else present
 
     def of_pairs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -375,7 +433,7 @@ class PairCritic(Critic):
         :param actions: encoded actions, (batch, n_agents, width)
         :return: Q_ij, (n_critics, batch, n_agents * n_neighbours)
         """
-        mine, theirs = self._pairs(actions)
+        mine, theirs = self._pairs(obs, actions)
         q_values = []
         for net in self.modules_of_nets:
             hidden, present = self._hidden(net, obs, theirs)
@@ -391,7 +449,7 @@ class PairCritic(Critic):
     ) -> th.Tensor:
         assert factors is None, "homogeneous agents have one kind of action"
         net = self.modules_of_nets[0]
-        hidden, present = self._hidden(net, obs, self._pairs(actions)[1])
+        hidden, present = self._hidden(net, obs, self._pairs(obs, actions)[1])
         own = own.unflatten(1, hidden.shape[1:3]) if self.on_neighbours else own.unsqueeze(2)
         mine = net.extra(0, own)
         values = net.head(hidden.unsqueeze(3) + mine).squeeze(-1) * present

@@ -34,13 +34,16 @@ class TeamInfo(TypedDict, total=False):
     pair_rewards: np.ndarray
     """The part of each agent's reward that belongs to each of its neighbours, (n_agents, n_neighbours). Required for
     ``pair_credit``."""
+    pair_terminated: np.ndarray
+    """Whether another neighbour, or none, takes the place of each neighbour after this step, (n_agents, n_neighbours)
+    bool. Required for ``pair_credit`` if neighbours change."""
     is_success: bool
     """Whether the episode succeeded, in its last step. Used by ``rollout/success_rate`` and ``CurriculumCallback``."""
     metrics: dict[str, float]
     """Numbers whose means are logged under their keys."""
 
 
-InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards"]
+InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards", "pair_terminated"]
 
 
 class TeamEnvironment(Protocol):

@@ -167,6 +167,7 @@ class ReplayBufferArguments(Arguments):
     n_steps: Natural = Field(description="an integer of at least 1")
     gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
     n_pairs: NaturalOrZero = Field(description="an integer of at least 0")
+    pairs_end: bool = Field(description="True or False")
 
 
 class PriorityArguments(Arguments):

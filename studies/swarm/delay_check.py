@@ -70,7 +70,7 @@ class DelayCheckedSwarm(Swarm):
         self._x[swarm] = self.state[swarm][:, None, None]
         self._inputs[swarm] = 0.0
         self._pending[swarm] = 0
-        self._known[swarm] = self.pos[swarm][self.beliefs.others][:, :, None, None]
+        self._known[swarm] = self.pos[swarm][self.neighbours.others][:, :, None, None]
         self._sent = [self._announced() for _ in range(self.wait)]
 
     def _announced(self) -> np.ndarray:
@@ -86,8 +86,8 @@ class DelayCheckedSwarm(Swarm):
             (E, n, n - 1, 2, stages + 1, 3)
         """
         self._sent = [advance(sent) for sent in self._sent]
-        arriving, _ = self.chance.arrivals(requests, self.beliefs.others)
-        newest = self._sent[0][:, self.beliefs.others]
+        arriving, _ = self.chance.arrivals(requests, self.neighbours.others)
+        newest = self._sent[0][:, self.neighbours.others]
         self._known = np.where(arriving[..., None, None, None], newest, advance(self._known))
         start = self.chance.start
         if start is None:

@@ -177,7 +177,7 @@ def test_plans_that_passed_the_delay_check_never_come_near_each_other(delay):
         swarm.step(np.ones((2, 6, 5), dtype=bool))
         pos = swarm.plans[..., POSITION]
         committed += bool((length(pos[:, :, -1] - pos[:, :, 0]) > 0.5).any())
-        apart = length(pos[:, swarm.beliefs.others] - pos[:, :, None])
+        apart = length(pos[:, swarm.neighbours.others] - pos[:, :, None])
         assert apart.min() > 0.65 - 1e-9
     assert committed > 30
     assert length(swarm.pos - swarm.goal).max() < 1.0

@@ -41,7 +41,7 @@ def test_plans_depend_on_those_that_were_asked_alone(solver, n_seeds):
             for other in range(4):
                 if other == robot:
                     continue
-                place = plain.beliefs.others[other].tolist().index(robot)
+                place = plain.neighbours.others[other].tolist().index(robot)
                 same = all(
                     np.array_equal(getattr(plain._plans, name)[other], getattr(changed._plans, name)[other])
                     for name in ("x", "u", "status", "iterations")

@@ -249,6 +249,24 @@ def test_rewards_are_normalised_before_they_are_summed():
     assert np.allclose(sample.pair_rewards, 0 + 0.5 * 2 + 0.25 * 2)
 
 
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rewards_of_a_pair_end_with_it(n_steps):
+    memory = buffer(n_steps=n_steps, gamma=0.5, n_pairs=2, pairs_end=True)
+    ended = np.zeros((3, N, 2), dtype=bool)
+    ended[1, 0, 0] = ended[0, 1, 1] = True  # ends of pairs by step
+    infos = [{"pair_rewards": np.full((N, 2), 1.0), "pair_terminated": each} for each in ended]
+    episodes(memory, *infos)
+    sample = memory.samples_at(np.array([0]), np.array([0]))
+    rewards, goes_on = np.full((N, 2), 1.0 if n_steps == 1 else 1.75), np.ones((N, 2))
+    rewards[1, 1], goes_on[1, 1] = 1.0, 0.0
+    if n_steps == 3:
+        rewards[0, 0], goes_on[0, 0] = 1.5, 0.0
+    assert np.allclose(sample.pair_rewards[0], rewards)
+    assert np.allclose(sample.pair_goes_on[0], goes_on)
+    again, _ = through_file(memory)
+    assert np.array_equal(again.pair_terminated, memory.pair_terminated)
+
+
 def through_pickle(memory: TeamReplayBuffer) -> tuple[TeamReplayBuffer, int]:
     data = pickle.dumps(memory)
     return pickle.loads(data), len(data)

@@ -72,6 +72,8 @@ class Wrong(team_tasks.OwnBit):
             "agent_0 is active in step 2, although it",
         ),
         (Wrong(pair_rewards=np.zeros(3)[None]), "each of its neighbours"),
+        (Wrong(pair_terminated=np.zeros(3, bool)[None]), "each of its neighbours"),
+        (Wrong(pair_terminated=np.full((3, 2), 0.5)), "must hold True or False"),
         (Wrong(metrics={"x": {"y": 1}}), "flat dict of numbers"),
         (Wrong({"agent_names": ["a", "b"]}), "2 names, a, b, for 3 agents"),
         (Wrong({"action_cost": np.nan}), "action_cost=nan must be a finite number"),
@@ -79,6 +81,10 @@ class Wrong(team_tasks.OwnBit):
         (Wrong({"n_curriculum_levels": 0, "set_curriculum_level": print}), "n_curriculum_levels=0"),
         (Wrong({"n_curriculum_levels": 2, "set_curriculum_level": print}), "is_success"),
         (Wrong({"observation_layout": {"own": [0]}}), "needs `own` and `neighbours`"),
+        (
+            Wrong({"observation_layout": {"own": [0], "neighbours": [[0]], "who_columns": [1]}}),
+            "neighbours of agent agent_0 in step 1, .* another agent's index plus 1",
+        ),
         (Wrong({"action_space": spaces.MultiBinary(10)}), "10 numbers cannot be divided evenly"),
         (
             Wrong({"draw": unseeded}),

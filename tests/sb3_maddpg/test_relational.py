@@ -126,6 +126,71 @@ def test_what_a_neighbour_does_counts_only_where_it_sees_the_agent():
     assert (gradient.abs().sum(dim=0) > 0).tolist() == [[True, True], [True, False]] + [[False, False]] * 3
 
 
+CHANGING = {**LAYOUT, "who_columns": [10 + j for j in range(M)]}
+
+
+@each_action
+@pytest.mark.parametrize("layout", [CHANGING, {**CHANGING, "acts_on_neighbours": False}], ids=["on", "by itself"])
+def test_neighbours_that_are_named_in_columns_may_stand_anywhere(layout, space):
+    fixed = policy(space, {key: value for key, value in layout.items() if key != "who_columns"})
+    named = policy(space, layout, columns=10 + M)
+    named.load_state_dict(fixed.state_dict())
+    obs, actions = batch(fixed)
+    who = th.tensor([others(agent) for agent in range(N)]).expand(B, -1, -1)
+    order = th.rand(B, N, M).argsort(dim=-1)
+    place = th.tensor(LAYOUT["neighbours"])
+    moved = th.cat([obs, who.gather(2, order) + 1.0], dim=-1)
+    for column in range(2):
+        moved[..., place[:, column]] = obs[..., place[:, column]].gather(2, order)
+    moved_actions = actions
+    if layout["acts_on_neighbours"]:
+        parts = actions.unflatten(-1, (M, -1))
+        moved_actions = parts.gather(2, order.unsqueeze(-1).expand_as(parts)).flatten(2)
+    expected = fixed.critic.of_pairs(obs, actions)[0].unflatten(-1, (N, M)).gather(2, order)
+    got = named.critic.of_pairs(moved, moved_actions)[0].unflatten(-1, (N, M))
+    assert th.allclose(got, expected, atol=1e-6)
+    # The value of an absent neighbour is zero for all actions
+    moved[:, 0, [*place[1], 10 + 1]] = 0.0
+    assert not named.critic.of_pairs(moved, moved_actions)[0].unflatten(-1, (N, M))[:, 0, 1].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"complete": True}, "cannot be combined with .* complete=True"),
+        ({"who": [others(agent) for agent in range(N)]}, "cannot be combined with `who`"),
+        ({"who_columns": [10, 11]}, "every neighbour needs the same number of columns"),
+        ({"who_columns": [10, 11, 12, 99]}, "each from 0 to 13"),
+    ],
+)
+def test_refuses_columns_of_numbers_that_do_not_fit(change, message):
+    with pytest.raises(ValueError, match=message):
+        policy(layout={**CHANGING, **change}, columns=10 + M)
+
+
+def test_numbers_of_neighbours_reach_critics_alone():
+    built = policy(layout=CHANGING, columns=10 + M)
+    obs, _ = batch(built, 10 + M)
+    other = obs.clone()
+    other[..., 10:] = 0.0
+    assert th.equal(built.actor(obs), built.actor(other))
+
+
+def test_what_a_neighbour_does_counts_only_while_it_sees_the_agent():
+    built = policy(layout=CHANGING, columns=10 + M)
+    obs, actions = batch(built, 10 + M)
+    actions.requires_grad_()
+    obs[..., 10:] = 0.0
+    obs[:, 0, 10:12] = th.tensor([3.0, 2.0])  # agent 0 perceives 2 and 1; it is the last neighbour of 1
+    obs[:, 1, 10 + M - 1] = 1.0
+    obs[:, 0, [4, 5, 8, 9]] = 0.0  # its other positions are empty
+    (gradient,) = th.autograd.grad(built.critic.of_pairs(obs, actions)[0, :, :M].sum(), actions)
+    acting = (gradient.abs().sum(dim=0) > 0).unflatten(-1, (M, -1)).any(dim=-1)
+    assert acting[0].tolist() == [True, True, False, False]
+    assert acting[1].tolist() == [False] * (M - 1) + [True]
+    assert not acting[2:].any()
+
+
 @each_action
 @each_mode
 def test_alternatives_equal_substituted_actions_and_pairs_sum_to_the_agents_value(layout, space):

@@ -10,7 +10,7 @@ from mpe2 import simple_spread_v3
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from reference import assert_close, drawn
-from sb3_maddpg import MADDPG
+from sb3_maddpg import MADDPG, check_team_env
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.parallel import TeamEnv
 from toys import SMALL, Neighbours
@@ -116,3 +116,35 @@ def test_what_holds_for_every_neighbour_is_learned_from_all_of_them(n_choices, p
     obs, asking = env.draw(np.random.default_rng(1), 200), np.ones((200, 12))
     values = model.critic(th.as_tensor(obs), model.policy.actions.encode(th.as_tensor(asking))).detach().numpy()
     assert np.corrcoef(values.ravel(), env.pair_rewards(obs, asking).ravel())[0, 1] > 0.9
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_the_value_of_a_pair_ends_with_it(n_steps):
+    """If neighbours change, the target of a pair does not depend on a later neighbour in the same position."""
+    world = {"neighbourhood": {"max_others": 2, "range": 2.0}}
+    kwargs = {"n_robots": 6, "preset": "dense", "scenario": "random_swap", "reward": {"near_miss": 1.0}}
+    env = gymnasium.make("QuadSwarm-v0", observation="state+critic", world=world, **kwargs)
+    policy_kwargs = {"net_arch": [8, 8], "optimizer_class": th.optim.SGD, "pair_credit": True}
+    numbers = {"learning_rate": 0.02, "max_grad_norm": None, "policy_regularization": 0.0, "gamma": 0.9}
+    model = MADDPG("PairPolicy", env, **{**SMALL, **numbers, "n_steps": n_steps, "policy_kwargs": policy_kwargs})
+    model.learn(80)
+    old, data = copy.deepcopy(model.policy), drawn(model, 32)
+    assert 0 < data.pair_goes_on.mean() < 1
+    model.train(1, batch_size=32)
+    bits = old.actions.encode(data.actions)
+    rest = old.critic_target.of_pairs(data.next_observations, old.actor_target.act(data.next_observations))[0]
+    discounts = data.discounts if n_steps == 1 else data.discounts.repeat_interleave(2, dim=1)
+    dones = data.dones.repeat_interleave(2, dim=1)
+    targets = data.pair_rewards.flatten(1) + discounts * (1 - dones) * data.pair_goes_on.flatten(1) * rest
+    errors = old.critic.of_pairs(data.observations, bits)[0] - targets.detach()
+    critic = copy.deepcopy(old.critic)
+    gradients = th.autograd.grad(errors.square().mean(dim=0).sum(), list(old.critic.parameters()))
+    for parameter, gradient in zip(critic.parameters(), gradients, strict=True):
+        parameter.data -= 0.02 * gradient
+    assert_close(model.critic, critic, atol=1e-5)
+
+
+def test_a_team_whose_neighbours_change_keeps_the_convention():
+    world = {"neighbourhood": {"max_others": 2, "range": 2.5}}
+    for observation in ("paper", "state+mask", "state+told+critic"):
+        check_team_env(gymnasium.make("QuadSwarm-v0", observation=observation, world=world, announcements=True))

@@ -281,7 +281,7 @@ def add_worker_arguments(parser: argparse.ArgumentParser, jobs: int) -> None:
 
 
 def workers(args: argparse.Namespace) -> Executor:
-    """Make the executor that the options of ``add_worker_arguments`` choose, see ``make_pool``."""
+    """Create the executor that the options of ``add_worker_arguments`` choose, see ``make_pool``."""
     return make_pool(args.jobs, args.engine, args.address, args.mixed)
 
 

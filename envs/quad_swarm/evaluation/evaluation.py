@@ -52,8 +52,8 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
     collisions = int(figures["collided"].sum())
     low, high = wilson_interval(collisions, len(rows))
     requests = int(figures["requests"].sum())
-    possible = int(figures["steps_counted"].sum()) * n * (n - 1)
-    share = requests / possible
+    possible = int(figures["possible_requests"].sum())
+    share = requests / max(possible, 1)
     deeper = {
         f"collisions{suffix}_{name}": int((figures[f"min_separation{suffix}"] < 2 * config.radius - depth).sum())
         for suffix in ("", "_continuous")

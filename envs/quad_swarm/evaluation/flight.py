@@ -16,6 +16,7 @@ from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, req
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.neighbours import spread
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -97,7 +98,8 @@ class Step(NamedTuple):
     """One step of a batch of episodes.
 
     :param episodes: indices of the running episodes, (E,)
-    :param requests: whose plan each robot got, (E, n, n - 1) bool
+    :param requests: whose plan each robot got, (E, n, n - 1) bool, with all others in ascending order even if the
+        neighbourhood is limited
     :param announced: which of these plans were announced without a request, (E, n, n - 1) bool
     :param outcome: outcome of the step
     :param over: which episodes end with this step, (E,) bool
@@ -124,14 +126,16 @@ def fly_steps(
     since_arrival = np.zeros(episodes.size, dtype=int)
     rngs = list(rngs)
     while episodes.size:
-        bits = policy(task, rngs)
-        requests = requests_of(bits)
-        outcome = task.step(requests)
+        bits = task.sent(policy(task, rngs))
+        requests = requests_of(bits, task.swarm.neighbours)
+        announced = requests & ~bits[..., 0]
+        outcome = task.act(bits)
         since_arrival += task.statistics.reached
         over = outcome.terminated | outcome.truncated
         if linger is not None:
             over |= since_arrival > linger
-        yield Step(episodes, requests, requests & ~bits[..., 0], outcome, over)
+        others = outcome.report.others
+        yield Step(episodes, spread(requests, others), spread(announced, others), outcome, over)
         if over.any():
             task.keep(~over)
             episodes, since_arrival = episodes[~over], since_arrival[~over]
@@ -160,7 +164,8 @@ class Flight:
     :param state: states, (T + 1, n, 9)
     :param plans: planned states at stages 0..N, (T + 1, n, N + 1, 9)
     :param goal: goals, (n, 3), world frame (m)
-    :param requests: whose plan each robot got in each step, (T, n, n - 1) bool
+    :param requests: whose plan each robot got in each step, (T, n, n - 1) bool, with all others in ascending order even
+        if the neighbourhood is limited
     :param announced: which of these plans were announced without a request, (T, n, n - 1) bool
     :param other_requests: requests of a second rule in each step, which were not executed, (T, n, n - 1) bool
     :param min_separation: smallest distance between two robots at the start and in each step, (T + 1,) (m): at any time
@@ -246,7 +251,9 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     other_requests: list[np.ndarray] = []
 
     def recorded(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
-        other_requests.append(rule(View(task.swarm, other_rngs))[0])
+        neighbours = task.swarm.neighbours
+        asked = neighbours.perceived(rule(View(task.swarm, other_rngs)))
+        other_requests.append(spread(asked, neighbours.numbers())[0])
         return policy(task, rngs)
 
     closest: list[float] = []

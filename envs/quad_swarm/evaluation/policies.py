@@ -129,7 +129,7 @@ def make_policy(policy: str, config: SwarmConfig, algo: str) -> tuple[RequestPol
         if policy.startswith(("pretrained:", "latest:")):
             hint += "; only `sb3-maddpg evaluate` also accepts latest:LOGDIR and pretrained:NAME"
         raise ValueError(f"{error} {hint}.") from None
-    return (lambda task, rngs: rule(View(task.swarm, rngs))[..., None]), PaperObservation(config.n_robots)
+    return (lambda task, rngs: rule(View(task.swarm, rngs))[..., None]), PaperObservation(config)
 
 
 def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:
@@ -141,13 +141,14 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
     :raises ValueError: if the model was trained for another number of robots or another space
     """
     arguments = {k: v for k, v in trained_in(model).items() if k in OBSERVATION_ARGUMENTS}
-    n = config.n_robots
+    n, m = config.n_robots, config.n_others
     observation = make_observation(config, **arguments, critics=False)
     expected, trained = (n, observation.size), tuple(model.observation_space.shape)
     n_bits = 2 if trained_in(model).get("announcements") else 1
     predictor = model
-    if trained != expected:
-        if not hasattr(model, "policy_for") or not hasattr(model.policy, "observation_layout"):
+    fits_any_number = hasattr(model, "policy_for") and hasattr(model.policy, "observation_layout")
+    if trained != expected or (config.is_limited and fits_any_number):
+        if not fits_any_number:
             robots = f"{trained[0]} robots" if len(trained) == 2 else "another environment"
             raise ValueError(
                 f"{name} was trained for {robots} (observation {trained}), but "
@@ -157,13 +158,13 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
         # Relational policies fit any number of robots
         predictor = model.policy_for(
             spaces.Box(-np.inf, np.inf, expected, np.float32),
-            spaces.MultiBinary(n * (n - 1) * n_bits),
+            spaces.MultiBinary(n * m * n_bits),
             observation.layout,
         )
 
     def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
         bits, _ = predictor.predict(task.observe(), deterministic=True)
-        return np.asarray(bits).reshape(-1, n, n - 1, n_bits) > 0.5
+        return np.asarray(bits).reshape(-1, n, m, n_bits) > 0.5
 
     return request, observation
 

@@ -64,38 +64,39 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
     """
     config = make_config(**({"preset": "paper"} | {k: v for k, v in env_kwargs.items() if k in _OF_THE_WORLD}))
     conditions = [Condition("model", name, config, linger=5) for name in SCENARIOS]
-    asked, steps, collisions = requests_by_pair(conditions[-1], model)
-    n = config.n_robots
+    asked, possible, steps, collisions = requests_by_pair(conditions[-1], model)
     pictures: dict[str, Figure | float] = {
         f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5) for one in conditions
     }
     return pictures | {
         "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), conditions[-1].scenario),
-        "symmetric_swap/request_share": float(asked.sum() / max(steps * n * (n - 1), 1)),
+        "symmetric_swap/request_share": float(asked.sum() / max(possible, 1)),
         "symmetric_swap/collision_rate": collisions / EPISODES,
     }
 
 
-def requests_by_pair(condition: Condition, model: Any) -> tuple[np.ndarray, int, int]:
+def requests_by_pair(condition: Condition, model: Any) -> tuple[np.ndarray, int, int, int]:
     """Count requests until a collision or the arrival of all robots.
 
     :param condition: scenario and world
     :param model: the model that flies
-    :return: number of requests of robot i to robot j, (n, n), number of steps, and number of episodes with a collision
+    :return: number of requests of robot i to robot j, (n, n), number of possible requests, number of steps, and number
+        of episodes with a collision
     """
     policy, task, rngs = begin(condition, [first_episode(SET) + k for k in range(EPISODES)], model)
     n = condition.config.n_robots
     rows, others = np.arange(n)[:, None], other_indices(n)
-    asked, steps = np.zeros((n, n)), 0
+    asked, possible, steps = np.zeros((n, n)), 0, 0
     collided = np.zeros(EPISODES, dtype=bool)
     done = np.zeros(EPISODES, dtype=bool)
     for step in fly_steps(policy, task, rngs, linger=0):
         counted = ~done[step.episodes]
         asked[rows, others] += step.requests[counted].sum(axis=0)
+        possible += int((counted * (step.outcome.report.others >= 0).sum(axis=(-2, -1))).sum())
         steps += int(counted.sum())
         collided[step.episodes] |= task.statistics.collided & counted
         done[step.episodes] |= task.statistics.collided | task.statistics.reached
-    return asked, steps, int(collided.sum())
+    return asked, possible, steps, int(collided.sum())
 
 
 def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:

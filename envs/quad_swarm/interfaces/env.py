@@ -15,6 +15,7 @@ from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_o
 from quad_swarm.states import generator_of, generator_state, like
 from quad_swarm.task.request_task import make_task, requests_of
 from quad_swarm.validation import checked_arguments
+from quad_swarm.world.neighbours import spread
 
 
 class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
@@ -28,7 +29,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     ## Action Space
     `MultiBinary(n * (n - 1))`: robot 0's bits for robots 1..n-1, robot 1's bits for robots 0, 2..n-1, and so on. 1
     requests the robot's plan. With `announcements`, there are two consecutive bits for each of the others: to request
-    its plan, and to send it the robot's own plan.
+    its plan, and to send it the robot's own plan. With `world={"neighbourhood": {"max_others": m}}`, there are bits for
+    only m of the others, which change during an episode, see `world.neighbours`.
 
     ## Observation Space
     `Box(n, 6n)`, one row per robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the
@@ -51,7 +53,9 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     `reward_terms`, `pair_rewards` (n, n - 1; the part of a robot's reward that belongs to one of the others),
     `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
     `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and `metrics`. In the last
-    step of an episode also `is_success` and further `metrics`.
+    step of an episode also `is_success` and further `metrics`. With a limited neighbourhood also `neighbours` (n, m),
+    the index of the robot in each slot of the action and of the entries about others, -1 for an empty slot, and
+    `pair_terminated` (n, m), whether another robot, or none, is in the slot after the step.
 
     ## Arguments
     :param preset: a name of `presets.PRESETS`, such as "paper" or "dense"
@@ -128,7 +132,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         )
         n = self.n_agents
         self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
-        self.action_space = spaces.MultiBinary(n * (n - 1) * self.task.n_bits)
+        self._n_bits = n * self.config.n_others * self.task.n_bits
+        self.action_space = spaces.MultiBinary(self._n_bits)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
@@ -170,10 +175,10 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         """
         if not self._is_reset:
             raise need_reset()
-        shape = (self._requests.size * self.task.n_bits,)
-        bits = checked_bits(action, shape, self.n_agents, self.task.n_bits)
-        self._requests = requests_of(bits)
-        outcome = self.task.act(bits[None])
+        bits = checked_bits(action, (self._n_bits,), self.config.n_others, self.task.n_bits)[None]
+        neighbours = self.task.swarm.neighbours
+        self._requests = spread(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
+        outcome = self.task.act(bits)
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = info_of(self.task.info(outcome), 0)
         if terminated or truncated:

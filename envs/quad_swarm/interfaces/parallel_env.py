@@ -35,7 +35,8 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         self.possible_agents = list(self.team.agent_names)
         self.agents: list[str] = []
         self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, (size,), np.float32) for a in self.possible_agents}
-        self.action_spaces = {a: spaces.MultiBinary((n - 1) * self.task.n_bits) for a in self.possible_agents}
+        n_bits = self.config.n_others * self.task.n_bits
+        self.action_spaces = {a: spaces.MultiBinary(n_bits) for a in self.possible_agents}
         self.state_space = spaces.Box(-np.inf, np.inf, (n * size,), np.float32)
         self._is_reset = False
 
@@ -81,10 +82,9 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
             raise ValueError(f"actions={shown(actions)}: step() takes a mapping from agent names to actions.")
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise ValueError(f"No action for {', '.join(missing)}; every robot must act in every step.")
-        n, n_bits = self.n_agents, self.task.n_bits
+        m, n_bits = self.config.n_others, self.task.n_bits
         bits = [
-            checked_bits(actions[agent], ((n - 1) * n_bits,), n, n_bits, f"The action of {agent}")
-            for agent in self.agents
+            checked_bits(actions[agent], (m * n_bits,), m, n_bits, f"The action of {agent}") for agent in self.agents
         ]
         observation, reward, terminated, truncated, info = self.team.step(np.concatenate(bits).ravel())
         agents = self.agents

@@ -99,23 +99,23 @@ def need_reset() -> gym.error.ResetNeeded:
 
 
 def checked_bits(
-    actions: Any, shape: tuple[int, ...], n_robots: int, n_bits: int = 1, whose: str = "The action"
+    actions: Any, shape: tuple[int, ...], n_others: int, n_bits: int = 1, whose: str = "The action"
 ) -> np.ndarray:
     """Check actions and reshape them to bits of each acting robot for each of the others.
 
     :param actions: bits
     :param shape: shape of the action space, whose last axis holds the bits of one or more robots
-    :param n_robots: number of robots n
+    :param n_others: number of others per robot
     :param n_bits: number of bits of each robot for each of the others
     :param whose: whose action it is, for error messages
-    :return: the bits, (..., robots, n - 1, n_bits) bool
+    :return: the bits, (..., robots, n_others, n_bits) bool
     :raises ValueError: if the shape differs, or there are other entries than 0 and 1
     """
     bits = np.asarray(actions)
     if bits.shape != shape:
         raise ValueError(
             f"{whose} has shape {bits.shape}; the action space has {shape}: "
-            f"{n_bits * (n_robots - 1)} bits per robot, {n_bits} for each of the others."
+            f"{n_bits * n_others} bits per robot, {n_bits} for each of the others."
         )
     asked = bits == 1
     if not (asked | (bits == 0)).all():
@@ -123,4 +123,4 @@ def checked_bits(
         raise ValueError(
             f"{whose} contains {shown(wrong)}; every entry must be 0 or 1. Threshold scores before acting."
         )
-    return asked.reshape(*shape[:-1], -1, n_robots - 1, n_bits)
+    return asked.reshape(*shape[:-1], -1, n_others, n_bits)

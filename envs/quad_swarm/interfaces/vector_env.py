@@ -42,7 +42,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         self.task = make_task(num_envs, **kwargs)
         n = self.n_agents
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
-        self._n_bits = n * (n - 1) * self.task.n_bits
+        self._n_bits = n * self.config.n_others * self.task.n_bits
         self.single_action_space = spaces.MultiBinary(self._n_bits)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -83,7 +83,8 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """
         if not self._rngs:
             raise need_reset()
-        outcome = self.task.act(checked_bits(actions, (self.num_envs, self._n_bits), self.n_agents, self.task.n_bits))
+        bits = checked_bits(actions, (self.num_envs, self._n_bits), self.config.n_others, self.task.n_bits)
+        outcome = self.task.act(bits)
         info = self.task.info(outcome)
         infos = self._with_masks(info)
         done = outcome.terminated | outcome.truncated

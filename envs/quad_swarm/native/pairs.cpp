@@ -1,12 +1,14 @@
-// What is computed for every pair of robots in every step. pairs.py says what, and does the same in NumPy to the last
-// bit: no operation here may change its order.
+// Computations for every pair of robots in every step. pairs.py documents them. Its NumPy versions give bit-identical
+// results, so the order of operations must not change.
 //
-// All arrays are contiguous. A trajectory is a row of 3 N numbers, stage by stage; pairs are ordered by the robot, then
+// All arrays are contiguous. A trajectory is a row of 3 N numbers, stage by stage. Pairs are ordered by the robot, then
 // by the other.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
+#include <utility>
 #include <vector>
 
 namespace {
@@ -23,7 +25,32 @@ inline double distance(const double* a, const double* b) {
 
 inline double clipped(double value) { return std::min(std::max(value, 0.0), 1.0); }
 
-// A constant velocity at some times, each of which stands three times.
+inline double squared_distance(const double* a, const double* b) {
+  const double difference[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+  return dot(difference, difference);
+}
+
+// Return the smallest squared distance of two robots that move in straight lines between consecutive positions, which
+// are `stride` numbers apart.
+double closest(const double* a, const double* b, Integer n_parts, Integer stride) {
+  double least = std::numeric_limits<double>::infinity();
+  double start[3], end[3];
+  for (int i = 0; i < 3; i++) start[i] = a[i] - b[i];
+  for (Integer part = 1; part <= n_parts; part++) {
+    double change[3], point[3];
+    for (int i = 0; i < 3; i++) {
+      end[i] = a[part * stride + i] - b[part * stride + i];
+      change[i] = end[i] - start[i];
+    }
+    const double along = clipped(-dot(start, change) / std::max(dot(change, change), 1e-12));
+    for (int i = 0; i < 3; i++) point[i] = start[i] + along * change[i];
+    least = std::min(least, dot(point, point));
+    std::copy(end, end + 3, start);
+  }
+  return least;
+}
+
+// Positions at constant velocity. Each time is repeated three times.
 inline void steady(const double* pos, const double* vel, const std::vector<double>& times, double* to) {
   for (std::size_t k = 0; k < times.size(); k += 3)
     for (int i = 0; i < 3; i++) to[k + i] = vel[i] * times[k + i] + pos[i];
@@ -129,5 +156,86 @@ EXPORT void quad_swarm_keep_right(Integer n_robots, Integer n_others, Integer n_
       row[3 * k + 1] += shift[1];
       clearance[n_stages * pair + k] += grown;
     }
+  }
+}
+
+EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_places, double limit, double look_ahead,
+                                  const double* pos, const double* vel, Integer* others, Flag* present,
+                                  Integer* reverse) {
+  std::vector<std::pair<double, Integer>> near;
+  std::vector<Flag> comes(n_robots);
+  for (Integer swarm = 0; swarm < n_swarms; swarm++) {
+    const double *swarm_pos = pos + 3 * n_robots * swarm, *swarm_vel = vel + 3 * n_robots * swarm;
+    const Integer first = n_places * n_robots * swarm;
+    for (Integer robot = 0; robot < n_robots; robot++) {
+      near.clear();
+      for (Integer other = 0; other < n_robots; other++) {
+        double apart[3], along[3];
+        for (int i = 0; i < 3; i++) {
+          apart[i] = swarm_pos[3 * robot + i] - swarm_pos[3 * other + i];
+          along[i] = swarm_vel[3 * robot + i] - swarm_vel[3 * other + i];
+        }
+        if (other == robot || dot(apart, apart) > limit * limit) continue;
+        const double time =
+            std::min(std::max(-dot(apart, along) / std::max(dot(along, along), 1e-12), 0.0), look_ahead);
+        for (int i = 0; i < 3; i++) apart[i] += time * along[i];
+        near.emplace_back(dot(apart, apart), other);
+      }
+      if (static_cast<Integer>(near.size()) > n_places) {
+        std::nth_element(near.begin(), near.begin() + n_places, near.end());
+        near.resize(n_places);
+      }
+      std::fill(comes.begin(), comes.end(), 0);
+      for (const auto& one : near) comes[one.second] = 1;
+      Integer* who = others + first + n_places * robot;
+      Flag* taken = present + first + n_places * robot;
+      for (Integer place = 0; place < n_places; place++) {
+        taken[place] = taken[place] && comes[who[place]];
+        if (taken[place])
+          comes[who[place]] = 0;
+        else
+          who[place] = robot;
+      }
+      Integer place = 0;
+      for (Integer other = 0; other < n_robots; other++) {
+        if (!comes[other]) continue;
+        while (taken[place]) place++;
+        who[place] = other;
+        taken[place] = 1;
+      }
+    }
+    for (Integer robot = 0; robot < n_robots; robot++) {
+      for (Integer k = first + n_places * robot; k < first + n_places * (robot + 1); k++) {
+        const Integer* theirs = others + first + n_places * others[k];
+        const Integer* found = std::find(theirs, theirs + n_places, robot);
+        reverse[k] = present[k] && found != theirs + n_places ? found - theirs : -1;
+      }
+    }
+  }
+}
+
+EXPORT void quad_swarm_separations(Integer n_parts, Integer n_swarms, Integer n_robots, Integer n_places,
+                                   const double* positions, const Integer* others, double* least, double* least_during,
+                                   double* apart, double* apart_during) {
+  const double infinity = std::numeric_limits<double>::infinity();
+  const Integer stride = 3 * n_robots * n_swarms, last = stride * n_parts;
+  for (Integer swarm = 0; swarm < n_swarms; swarm++) {
+    const double* pos = positions + 3 * n_robots * swarm;
+    double after = infinity, during = infinity;
+    for (Integer robot = 0; robot < n_robots; robot++) {
+      for (Integer other = robot + 1; other < n_robots; other++) {
+        after = std::min(after, squared_distance(pos + last + 3 * robot, pos + last + 3 * other));
+        during = std::min(during, closest(pos + 3 * robot, pos + 3 * other, n_parts, stride));
+      }
+      for (Integer place = 0; place < n_places; place++) {
+        const Integer k = n_places * (n_robots * swarm + robot) + place, other = others[k];
+        apart[k] = other == robot ? infinity
+                                  : std::sqrt(squared_distance(pos + last + 3 * robot, pos + last + 3 * other));
+        apart_during[k] =
+            other == robot ? infinity : std::sqrt(closest(pos + 3 * robot, pos + 3 * other, n_parts, stride));
+      }
+    }
+    least[swarm] = std::sqrt(after);
+    least_during[swarm] = std::sqrt(during);
   }
 }

@@ -24,6 +24,8 @@ _FUNCTIONS = {
     "quad_swarm_approach": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 9],
     "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
     "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
+    "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 5],
+    "quad_swarm_separations": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, *[_ARRAY] * 6],
 }
 
 
@@ -175,6 +177,93 @@ def keep_right(
     grown = width * known * np.clip(time / fade, 0.0, 1.0) * np.clip(speed / slow, 0.0, 1.0)
     left = np.stack([vel[..., 1], -vel[..., 0], np.zeros_like(speed)], axis=-1) / np.maximum(speed, 1e-9)[..., None]
     return others + (grown[..., None] * left)[:, :, None], np.repeat(grown[..., None], others.shape[2], axis=2)
+
+
+def neighbours(
+    pos: np.ndarray, vel: np.ndarray, others: np.ndarray, present: np.ndarray, limit: float, look_ahead: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Update the neighbours of each robot. A robot that remains a neighbour keeps its slot, see
+    `quad_swarm.world.neighbours`.
+
+    :param pos: positions, (E, n, 3) (m)
+    :param vel: velocities, (E, n, 3) (m/s)
+    :param others: index of the robot that was in each slot, the robot's own index in empty slots, (E, n, m) int64
+    :param present: whether each slot was taken, (E, n, m) bool
+    :param limit: maximum distance of a neighbour (m), infinity for any distance
+    :param look_ahead: time over which the smallest distance at constant velocities decides which robots are nearest
+        (s); 0 for the current distance
+    :return: the new ``others`` and ``present``, and the slot of the robot at each of its neighbours, -1 without one,
+        (E, n, m)
+    """
+    if (library := compiled()) is not None:
+        others, present = np.array(others, order="C"), np.array(present, order="C")
+        pos, vel, reverse = np.ascontiguousarray(pos), np.ascontiguousarray(vel), np.empty_like(others)
+        library.quad_swarm_neighbours(*others.shape, limit, look_ahead, *_addresses(pos, vel, others, present, reverse))
+        return others, present, reverse
+    n_swarms, n, m = others.shape
+    numbers = np.arange(n)
+    apart, along = (each[:, :, None] - each[:, None] for each in (pos, vel))
+    within = _dot(apart, apart) <= limit * limit
+    within[:, numbers, numbers] = False
+    time = np.minimum(np.maximum(-_dot(apart, along) / np.maximum(_dot(along, along), 1e-12), 0.0), look_ahead)
+    apart = apart + time[..., None] * along
+    nearest = np.argsort(np.where(within, _dot(apart, apart), np.inf), axis=-1, kind="stable")[..., :m]
+    near = np.zeros(within.shape, dtype=bool)
+    np.put_along_axis(near, nearest, np.take_along_axis(within, nearest, axis=-1), axis=-1)
+
+    stays = present & np.take_along_axis(near, others, axis=-1)
+    swarms, robots, places = np.nonzero(stays)
+    near[swarms, robots, others[swarms, robots, places]] = False  # the remaining ones are new
+    others = np.where(stays, others, numbers[:, None])
+    free = np.argsort(stays, axis=-1, kind="stable")  # free slots first
+    swarms, robots, come = np.nonzero(near)
+    places = free[swarms, robots, (near.cumsum(axis=-1) - 1)[swarms, robots, come]]
+    others[swarms, robots, places] = come
+    present = stays.copy()
+    present[swarms, robots, places] = True
+
+    seen = others[np.arange(n_swarms)[:, None, None], others] == numbers[:, None, None]
+    seen &= present[np.arange(n_swarms)[:, None, None], others]
+    reverse = np.where(present & seen.any(axis=-1), seen.argmax(axis=-1), -1)
+    return others, present, reverse
+
+
+def separations(positions: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the distances between robots after a step and the smallest distances during it, with straight motion
+    between sub-steps.
+
+    :param positions: positions before the step and after each of the S sub-steps, (S + 1, E, n, 3) (m)
+    :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m)
+    :return: smallest distance of all pairs after and during the step, (E,) each (m), and distance of each robot to each
+        of its ``others`` after and during the step, (E, n, m) each (m), infinity for none
+    """
+    if (library := compiled()) is not None:
+        positions, others = np.ascontiguousarray(positions), np.ascontiguousarray(others)
+        least, least_during = np.empty(len(others)), np.empty(len(others))
+        apart, apart_during = np.empty(others.shape), np.empty(others.shape)
+        library.quad_swarm_separations(
+            len(positions) - 1,
+            *others.shape,
+            *_addresses(positions, others, least, least_during, apart, apart_during),
+        )
+        return least, least_during, apart, apart_during
+    between = positions[:, :, :, None] - positions[:, :, None]
+    start, change = between[:-1], np.diff(between, axis=0)
+    along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
+    closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
+    after, during = np.sqrt(_dot(between[-1], between[-1])), np.sqrt(_dot(closest, closest).min(axis=0))
+    own = np.arange(positions.shape[2])
+    after[:, own, own] = during[:, own, own] = np.inf
+    return (
+        after.min(axis=(1, 2)),
+        during.min(axis=(1, 2)),
+        np.take_along_axis(after, others, axis=2),
+        np.take_along_axis(during, others, axis=2),
+    )
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def advance(trajectory: np.ndarray) -> np.ndarray:

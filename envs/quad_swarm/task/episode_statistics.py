@@ -34,6 +34,8 @@ class EpisodeStatistics:
     :ivar steps: number of steps flown
     :ivar steps_counted: number of steps that count for requests and path length
     :ivar requests: number of requests in the steps counted
+    :ivar possible_requests: number of possible requests in the steps counted: one of each robot to each perceived robot
+        per step
     :ivar peak_requests: maximum number of requests in a step counted
     :ivar plans_used: number of other robots' plans believed, summed over the steps counted
     :ivar plan_ages: sum of the ages of these plans (steps)
@@ -54,6 +56,7 @@ class EpisodeStatistics:
         "steps": 0,
         "steps_counted": 0,
         "requests": 0,
+        "possible_requests": 0,
         "peak_requests": 0,
         "plans_used": 0,
         "plan_ages": 0,
@@ -73,6 +76,7 @@ class EpisodeStatistics:
     steps: np.ndarray
     steps_counted: np.ndarray
     requests: np.ndarray
+    possible_requests: np.ndarray
     peak_requests: np.ndarray
     plans_used: np.ndarray
     plan_ages: np.ndarray
@@ -123,6 +127,8 @@ class EpisodeStatistics:
         self.steps += 1
         self.steps_counted += counted
         self.requests += counted * n_requests
+        # `others` has no leading axis of swarms unless the neighbourhood is limited
+        self.possible_requests += counted * (report.others >= 0).sum(axis=(-2, -1))
         self.peak_requests = np.maximum(self.peak_requests, counted * n_requests)
         used = report.belief_source.reshape(len(counted), -1) != _NO_PLAN
         self.plans_used += counted * used.sum(axis=1)
@@ -153,12 +159,11 @@ class EpisodeStatistics:
         """Return metrics of the episodes so far by the names under which they are logged, each (E,)."""
         n, dt = self.config.n_robots, self.config.planner.dt
         plans = self.steps * n
-        possible = self.steps_counted * n * (n - 1)
         return {
             "swarm/collision_rate": self.collided.astype(float),
             "swarm/arrival_rate": self.success.astype(float),
             "swarm/min_separation": self.min_separation.copy(),
-            "comm/request_share": self.requests / possible,
+            "comm/request_share": self.requests / np.maximum(self.possible_requests, 1),
             "comm/peak_requests": self.peak_requests.astype(float),
             "comm/bytes_per_second": exchange_bytes(self.config) * self.requests / (self.steps_counted * n * dt),
             "comm/plan_age": dt * self.plan_ages / np.maximum(self.plans_used, 1),

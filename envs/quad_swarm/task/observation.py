@@ -44,29 +44,46 @@ class PaperObservation:
     """The paper's observation z_i = [v_i, p_ig, {p_ij}, {v_ij}] (Sec. IV-B): own velocity, goal relative to the robot,
     relative positions of all others, and relative velocities of all others, in ascending order; length 6n.
 
-    :param n_robots: number of robots n
+    If the neighbourhood is limited to m others, there are m positions and velocities, zero in an empty slot, and the
+    numbers of the others follow as in `PairObservation`; length 7m + 6.
+
+    :param config: the world
     :param scaled: whether to divide distances by 4 m and velocities by 4 m/s
     """
 
-    def __init__(self, n_robots: int, scaled: bool = False):
-        self.n_robots, self.size = n_robots, 6 * n_robots
+    def __init__(self, config: SwarmConfig, scaled: bool = False):
+        self.config = config
+        self._numbers = 6 * (config.n_others + 1)  # first column of the others' numbers, if there are any
+        self.size = self._numbers + (config.n_others if config.is_limited else 0)
         distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
-        others = 3 * (n_robots - 1)
+        others = 3 * config.n_others
         self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, others, others])
 
     @property
     def layout(self) -> dict[str, Any]:
-        m = self.n_robots - 1
+        m = self.config.n_others
         others = [[6 + 3 * k + axis + part for part in (0, 3 * m) for axis in range(3)] for k in range(m)]
-        return {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+        layout = {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
+        return layout | (_numbered(self._numbers, self.size) if self.config.is_limited else {})
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
         estimate, (others_pos, others_vel) = swarm.estimate(), swarm.observe()
         pos, vel = estimate[..., POSITION], estimate[..., VELOCITY]
         flat = (*pos.shape[:2], -1)
         relative_pos, relative_vel = others_pos - pos[:, :, None], others_vel - vel[:, :, None]
+        present = swarm.neighbours.present
+        if present is not None:
+            relative_pos[~present], relative_vel[~present] = 0.0, 0.0
         parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
-        return (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        observed = (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        if present is None:
+            return observed
+        return np.concatenate([observed, swarm.neighbours.numbers() + 1], axis=-1, dtype=np.float32)
+
+
+def _numbered(first: int, end: int) -> dict[str, Any]:
+    """Return the layout entries of the columns with the others' numbers, which also mask actions on empty slots."""
+    return {"who_columns": list(range(first, end)), "action_mask": list(range(first, end))}
 
 
 class PairView:
@@ -226,18 +243,17 @@ def _mask(pair: PairView) -> np.ndarray:
 def _critic(pair: PairView) -> np.ndarray:
     """Return features that no robot knows: the prediction errors of both robots, and the distance of their plans."""
     view, stages = pair.view, _stages(pair.horizon)
-    prediction, others = view.prediction, pair.swarm.beliefs.others
-    certain = replace(prediction, remembered=view.absolute_plans[:, others], remembers=np.ones(view.age.shape, bool))
+    prediction, plans = view.prediction, view.of_others(view.absolute_plans)
+    certain = replace(prediction, remembered=plans, remembers=np.ones(view.age.shape, bool))
     surprise = certain.believed(stages) - view.own_pos[:, :, None, None] - view.expected(stages)
-    reverse = pair.swarm.beliefs.reverse  # swaps the two robots of a pair
     size = length(surprise)
     parts = (
         np.clip(2 * _flat(pair.turn(surprise), 3), -2, 2),
         np.tanh(size / 0.1),
-        np.tanh(size[:, others, reverse] / 0.1),
+        np.tanh(view.of_the_other(size) / 0.1),  # swaps the two robots of a pair
         pair.closeness(certain.approach(view.own_pos, view.plan).least),
         pair.closeness(view.plan_approach.least),
-        prediction.remembers[:, others, reverse, None],
+        view.of_the_other(prediction.remembers)[..., None],
     )
     return np.concatenate(parts, axis=-1)
 
@@ -258,6 +274,10 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
 class PairObservation:
     """Pair observation: six numbers about the robot itself, then groups of features about each of the others.
 
+    If the neighbourhood is limited, the features of an empty slot are zero, and the last columns are the numbers of the
+    others, counted from 1, with 0 for an empty slot. Critics use these numbers to look up the others' own columns. For
+    robots, they are only the action mask.
+
     :param config: the world
     :param groups: names of `GROUPS`; only critics may read the group "critic"
     :param critics: whether to fill the critic's columns, which are zeros otherwise
@@ -272,7 +292,8 @@ class PairObservation:
         self.groups = [name for name in GROUPS if name in groups]
         sizes = [GROUPS[name](self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
         self._seen = sum(sizes) - (sizes[-1] if self.groups[-1] == "critic" else 0)
-        self.size = 6 + (config.n_robots - 1) * sum(sizes)
+        self._numbers = 6 + config.n_others * sum(sizes)  # first column of the others' numbers, if there are any
+        self.size = self._numbers + (config.n_others if config.is_limited else 0)
         self._blank = 0 if critics else sum(sizes) - self._seen
 
     def _pair(self, swarm: Swarm) -> PairView:
@@ -280,9 +301,10 @@ class PairObservation:
 
     @property
     def layout(self) -> dict[str, Any]:
-        blocks = np.arange(6, self.size).reshape(self.config.n_robots - 1, -1)
+        blocks = np.arange(6, self._numbers).reshape(self.config.n_others, -1)
         seen, hidden = blocks[:, : self._seen], blocks[:, self._seen :]
-        layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True, "complete": True}
+        layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True}
+        layout |= _numbered(self._numbers, self.size) if self.config.is_limited else {"complete": True}
         if "mask" in self.groups:
             layout["action_mask"] = seen[:, -1].tolist()  # the mask is the last group that robots see
         return layout | ({"critic": hidden.tolist()} if hidden.size else {})
@@ -292,13 +314,16 @@ class PairObservation:
         teams = pair.view.pos.shape[:2]
         observed = np.zeros((*teams, self.size), dtype=np.float32)
         observed[..., :6] = _own(pair.view)
-        blocks = observed[..., 6:].reshape(*teams, self.config.n_robots - 1, -1)  # a view
+        blocks = observed[..., 6 : self._numbers].reshape(*teams, self.config.n_others, -1)  # a view
         column = 0
         for name in self.groups:
             if name != "critic" or not self._blank:
                 features = GROUPS[name](pair)
                 blocks[..., column : column + features.shape[-1]] = features
                 column += features.shape[-1]
+        if pair.view.present is not None:
+            blocks[~pair.view.present] = 0.0
+            observed[..., self._numbers :] = swarm.neighbours.numbers() + 1
         return observed
 
 
@@ -314,7 +339,7 @@ def make_observation(
     :raises ValueError: if a name is unknown, or the pair observation should be scaled
     """
     if observation == "paper":
-        return PaperObservation(config.n_robots, scale_observation)
+        return PaperObservation(config, scale_observation)
     pairs = PairObservation(config, observation.split("+"), critics)
     if scale_observation:
         raise ValueError(

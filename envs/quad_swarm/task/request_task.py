@@ -14,6 +14,7 @@ from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.validation import checked, checked_arguments, replaced
 from quad_swarm.world.beliefs import other_indices, reverse_indices
+from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm
@@ -73,15 +74,19 @@ class Outcome(NamedTuple):
     report: StepReport
 
 
-def requests_of(bits: np.ndarray) -> np.ndarray:
+def requests_of(bits: np.ndarray, neighbours: Neighbours | None = None) -> np.ndarray:
     """Convert actions to requests. Announcements become requests of their receivers.
 
     :param bits: bits of each robot for each of the others, (..., n, n - 1, 1 or 2) bool: whether it requests the
         other's plan and, with announcements, whether it sends its own plan
+    :param neighbours: whom the robots perceive, which requires exactly one leading axis, that of the swarms; by default
+        all others
     :return: whose plan each robot gets, (..., n, n - 1) bool
     """
     if bits.shape[-1] == 1:
         return bits[..., 0]
+    if neighbours is not None:
+        return bits[..., 0] | neighbours.of_the_other(bits[..., 1])
     n = bits.shape[-3]
     return bits[..., 0] | bits[..., other_indices(n), reverse_indices(n), 1]
 
@@ -134,10 +139,9 @@ class RequestTask:
         self.end_at_arrival = end_at_arrival
         self.end_at_collision = end_at_collision
         self.n_bits = 2 if announcements else 1
-        n = swarm.config.n_robots
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, swarm.config)
-        self.observation = observation or PaperObservation(n, scaled=False)
+        self.observation = observation or PaperObservation(swarm.config, scaled=False)
 
     @property
     def agent_names(self) -> tuple[str, ...]:
@@ -208,25 +212,41 @@ class RequestTask:
         return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))
 
     def act(self, bits: np.ndarray) -> Outcome:
-        """Take one step in every swarm. An announcement arrives like an answer and counts as a request.
+        """Take one step in every swarm. An announcement arrives like an answer and counts as a request. An announcement
+        to a robot that does not perceive the sender is lost, but still counts.
 
         :param bits: actions, (E, n, n - 1, n_bits) bool, see `requests_of`
         """
-        return self.step(requests_of(bits), bits.sum(axis=-1))
+        bits, neighbours = self.sent(bits), self.swarm.neighbours
+        requests = requests_of(bits, neighbours)
+        unheard = bits[..., 1:] & (neighbours.reverse < 0)[..., None]
+        return self.step(requests, bits.sum(axis=-1), requests.sum(axis=(1, 2)) + unheard.sum(axis=(1, 2, 3)))
 
-    def step(self, requests: np.ndarray, messages: np.ndarray | None = None) -> Outcome:
+    def sent(self, bits: np.ndarray) -> np.ndarray:
+        """Return the actions without the bits for empty slots.
+
+        :param bits: actions, (E, n, n - 1, 1 or 2) bool, see `requests_of`
+        """
+        present = self.swarm.neighbours.present
+        return bits if present is None else bits & present[..., None]
+
+    def step(
+        self, requests: np.ndarray, messages: np.ndarray | None = None, n_requests: np.ndarray | None = None
+    ) -> Outcome:
         """Take one step in every swarm.
 
         :param requests: whose plan each robot gets, as in `Swarm.step`
         :param messages: number of bits that each robot sets for each of the others, which the reward penalises,
             (E, n, n - 1); by default the requests
+        :param n_requests: number of requests to report, (E,); by default that of ``requests``
         """
         if messages is None:
             messages = requests
         report = self.swarm.step(requests)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
-        n_requests = requests.sum(axis=(1, 2))
+        if n_requests is None:
+            n_requests = requests.sum(axis=(1, 2))
         self.statistics.add(report, n_requests, collided)
         terms = {
             "goal": self.reward.goal * report.at_goal.all(axis=1),
@@ -235,16 +255,17 @@ class RequestTask:
         }
         near_misses = np.zeros_like(report.separation)
         if self.reward.near_miss:
-            near_misses = self.reward.near_miss * self._near_misses(report.separation)
+            near_misses = self.reward.near_miss * self._near_misses(report)
             terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
         terminated = collided if self.end_at_collision else np.zeros_like(collided)
         if self.end_at_arrival:
             terminated = terminated | self.statistics.arrived
-        share = terms["goal"] / max(requests.shape[2], 1)
+        present = np.broadcast_to(report.others >= 0, requests.shape)
+        share = present * (terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1))[..., None]
         return Outcome(
             reward=sum(terms.values(), start=np.zeros(len(n_requests))),
             pair_rewards=(
-                share[:, None, None] - self.reward.collision * colliding - self.reward.request * messages - near_misses
+                share - self.reward.collision * colliding - self.reward.request * messages - near_misses
             ).astype(np.float32),
             reward_terms=terms,
             terminated=terminated,
@@ -253,21 +274,22 @@ class RequestTask:
             report=report,
         )
 
-    def _near_misses(self, separation: np.ndarray) -> np.ndarray:
+    def _near_misses(self, report: StepReport) -> np.ndarray:
         """Return the severity of each near miss, 0 to 1, (E, n, n - 1)."""
         reward, ahead, distance = self.reward, self.reward.near_miss_ahead, self.reward.near_miss_distance
         assert distance is not None  # set in __init__
-        shortfall = distance - separation
+        shortfall = distance - report.separation
         if ahead:
             limits = distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
-            planned = (limits - self.swarm.planned_separation(ahead)).max(axis=-1)
+            planned = (limits - self.swarm.planned_separation(ahead, report.others)).max(axis=-1)
             shortfall = np.maximum(shortfall, planned)
         return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0) ** reward.near_miss_exponent
 
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """Return the `info` of a step: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
         report = outcome.report
-        return {
+        who = {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
+        return who | {
             "scenario": np.array(self.scenario),
             "pair_rewards": outcome.pair_rewards,
             "reward_terms": outcome.reward_terms,

@@ -1,4 +1,8 @@
-"""The knowledge of robots when they decide on requests, for rules and observations."""
+"""The knowledge of robots when they decide on requests, for rules and observations.
+
+If the neighbourhood is limited, axes of length n - 1 have fewer entries, one per slot, see `world.neighbours`. An empty
+slot shows a robot that is far away and has the same velocity.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import numpy as np
 from quad_swarm.geometry import length
 from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.world.beliefs import PlanApproach, Prediction
+from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
 from quad_swarm.world.swarm import Swarm
 
 
@@ -112,13 +116,36 @@ class View:
         :param stages: indices among the next N steps, counting from 0
         """
         presumed = self._swarm.presume()
-        fields = (presumed.believed(stages), presumed.remembers, presumed.age, presumed.error)
-        return Presumed(*map(self.of_the_other, fields))
+        # Others that do not perceive this robot have no plan of it: they predict a constant velocity
+        times = self._swarm.config.planner.dt * (np.array(stages) + 1)
+        steady = self.own_pos[:, :, None] + times[:, None] * self.own_vel[:, :, None]
+        return Presumed(
+            self.of_the_other(presumed.believed(stages), steady[:, :, None]),
+            self.of_the_other(presumed.remembers),
+            self.of_the_other(presumed.age, self.horizon),
+            self.of_the_other(presumed.error),
+        )
 
-    def of_the_other(self, field: np.ndarray) -> np.ndarray:
+    def of_the_other(self, field: np.ndarray, otherwise: np.ndarray | float = 0) -> np.ndarray:
         """Swap the roles in values that robots have about others: return the values that the others have about this
-        robot, (E, n, n - 1, ...)."""
-        return field[:, self._swarm.beliefs.others, self._swarm.beliefs.reverse]
+        robot, (E, n, n - 1, ...).
+
+        :param field: values that robots have about others, (E, n, n - 1, ...)
+        :param otherwise: value for others that do not perceive this robot, which knows who does
+        """
+        return self._swarm.neighbours.of_the_other(field, otherwise)
+
+    def of_others(self, field: np.ndarray) -> np.ndarray:
+        """Return the values of each robot's others, (E, n, n - 1, ...).
+
+        :param field: values of all robots, (E, n, ...)
+        """
+        return of_others(field, self._swarm.neighbours.others)
+
+    @property
+    def present(self) -> np.ndarray | None:
+        """Whether each slot is taken, (E, n, n - 1) bool; None if all slots always are."""
+        return self._swarm.neighbours.present
 
     @property
     def age(self) -> np.ndarray:

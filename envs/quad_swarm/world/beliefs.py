@@ -31,7 +31,8 @@ class BeliefSource(IntEnum):
 @cache
 def other_indices(n_robots: int) -> np.ndarray:
     """Return the indices of each robot's others in ascending order, (n, n - 1), read-only."""
-    others = np.array([[j for j in range(n_robots) if j != i] for i in range(n_robots)], dtype=np.int64)
+    below = np.arange(n_robots - 1, dtype=np.int64)
+    others = below + (below >= np.arange(n_robots)[:, None])
     others.setflags(write=False)
     return others
 
@@ -39,11 +40,19 @@ def other_indices(n_robots: int) -> np.ndarray:
 @cache
 def reverse_indices(n_robots: int) -> np.ndarray:
     """Return the position of each robot in the rows of its others in `other_indices`, (n, n - 1), read-only."""
-    others = other_indices(n_robots)
-    places = [[row.tolist().index(i) for row in others[others[i]]] for i in range(n_robots)]
-    reverse = np.array(places, dtype=np.int64)
+    numbers = np.arange(n_robots, dtype=np.int64)[:, None]
+    reverse = numbers - (numbers > other_indices(n_robots))
     reverse.setflags(write=False)
     return reverse
+
+
+def of_others(field: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the values of each robot's others, (E, n, n - 1, ...).
+
+    :param field: values of all robots, (E, n, ...)
+    :param others: see `other_indices` or `Neighbours.others`
+    """
+    return field[:, others] if others.ndim == 2 else field[np.arange(len(others))[:, None, None], others]
 
 
 def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:
@@ -67,11 +76,12 @@ def answered(arriving: np.ndarray, trajectories: np.ndarray, others: np.ndarray)
 
     :param arriving: whose trajectory each robot receives, (E, n, n - 1) bool
     :param trajectories: trajectories of all robots, (E, n, K, 3)
-    :param others: see `other_indices`
+    :param others: see `other_indices` or `Neighbours.others`
     :return: received trajectories in the order of the true entries of ``arriving``, (number of answers, K, 3)
     """
     swarms, robots, places = np.nonzero(arriving)
-    return trajectories[swarms, others[robots, places]]
+    senders = others[robots, places] if others.ndim == 2 else others[swarms, robots, places]
+    return trajectories[swarms, senders]
 
 
 class PlanApproach(NamedTuple):
@@ -133,17 +143,19 @@ class Beliefs:
     :param dt: length of a stage (s)
     :param memory: an earlier plan is believed as long as it predicts the observed position to within this distance (m)
         and is younger than N steps; 0 disables the memory
+    :param n_others: number of others that a robot has beliefs about, by default all n - 1
     :raises ValueError: if ``memory`` is negative or NaN
     """
 
-    def __init__(self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float):
+    def __init__(
+        self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float, n_others: int | None = None
+    ):
         if not memory >= 0:
             raise ValueError(f"memory={memory}: it must be a distance in metres, or 0 to disable the memory.")
-        self.others, self.reverse = other_indices(n_robots), reverse_indices(n_robots)
         self.horizon = horizon
         self.dt = dt
         self.memory = memory
-        shape = (n_swarms, n_robots, n_robots - 1)
+        shape = (n_swarms, n_robots, n_robots - 1 if n_others is None else n_others)
         # Remembered positions now and at the next N steps, and steps since they were planned, N or more without a plan
         self._remembered = np.zeros((*shape, horizon + 1, 3))
         self._age = np.full(shape, horizon, dtype=np.int64)
@@ -158,6 +170,12 @@ class Beliefs:
     def forget(self, swarms: np.ndarray) -> None:
         """Forget every received plan in the given swarms (indices or mask)."""
         self._age[swarms] = self.horizon
+        self._known = None
+
+    def forget_others(self, places: np.ndarray) -> None:
+        """Forget the plans received from some of the others, (E, n, n - 1) bool."""
+        self._age[places] = self.horizon
+        self._remembered[places] = 0.0
         self._known = None
 
     def keep(self, swarms: np.ndarray) -> None:

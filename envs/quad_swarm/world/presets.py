@@ -17,6 +17,7 @@ from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.validation import Length, PositiveLength, checked, replaced
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
+from quad_swarm.world.neighbours import Neighbourhood
 from quad_swarm.world.scenarios import ScenarioSpace
 
 PRESET_VERSION = 1
@@ -43,6 +44,7 @@ class SwarmConfig:
     :param noise: disturbances of the flight
     :param sensing: errors of the estimated states
     :param radio: transmission of plans
+    :param neighbourhood: which others robots perceive and may request plans from, see `quad_swarm.world.neighbours`
     :param plant: simulated vehicle: "model" for the planner's model (with the disturbances), or for example
         "crazyflow:cf21B_500" for a vehicle of that simulator, see `quad_swarm.plants`
     :param mismatch: maximum relative deviation of each vehicle's parameters from the planner's model, drawn uniformly
@@ -68,6 +70,7 @@ class SwarmConfig:
     noise: ProcessNoise = field(default_factory=ProcessNoise)
     sensing: SensingError = field(default_factory=SensingError)
     radio: Radio = field(default_factory=Radio)
+    neighbourhood: Neighbourhood = field(default_factory=Neighbourhood)
     plant: str = MODEL
     mismatch: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
@@ -101,11 +104,27 @@ class SwarmConfig:
                 f"mismatch={self.mismatch}: the fastest vehicles need sub-steps of at most {fastest:.2g} s, but "
                 f"planner.dt / substeps = {planner.dt / self.substeps:.2g} s: raise substeps"
             )
+        reach = self.neighbourhood.range
+        if reach is not None and reach < planner.separation:
+            raise ValueError(
+                f"neighbourhood.range={reach}: robots must perceive others at least up to the distance that they keep, "
+                f"planner.separation={planner.separation}"
+            )
         if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
             raise ValueError(
                 f"clock_skew={self.clock_skew} is shorter than one of the substeps={self.substeps} of a step: raise "
                 "either of them"
             )
+
+    @property
+    def n_others(self) -> int:
+        """Maximum number of others that a robot perceives."""
+        return self.neighbourhood.places(self.n_robots)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether there may be others that a robot does not perceive."""
+        return self.neighbourhood.limits(self.n_robots)
 
     @property
     def is_random(self) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from quad_swarm.quadrotor import N_STATES, VEHICLE_PARAMETERS
 from quad_swarm.states import generator_of, generator_state, like
+from quad_swarm.world.beliefs import of_others
 from quad_swarm.world.presets import SwarmConfig
 
 OUTAGE_WITHIN = 5.0  # time from the start of an episode within which robots stop answering (s)
@@ -37,10 +38,10 @@ class Realisation:
         self._wind = np.zeros((n_swarms, n, 2))
         self._gust = np.zeros((n_swarms, n, 2))
         self._own = np.zeros((n_swarms, n, N_STATES))
-        self._observer = np.zeros((n_swarms, n, n - 1, 6))
+        self._observer = np.zeros((n_swarms, n, config.n_others, 6))
         self._factors = np.ones((n_swarms, n, len(VEHICLE_PARAMETERS)))
         self._start = np.zeros((n_swarms, n), dtype=np.int64)
-        self._down = np.zeros((n_swarms, n, n - 1), dtype=bool)
+        self._down = np.zeros((n_swarms, n, config.n_others), dtype=bool)
         self._silent_from = np.full((n_swarms, n), _NEVER)
         self._step = np.zeros(n_swarms, dtype=np.int64)
 
@@ -89,6 +90,19 @@ class Realisation:
         if config.sensing.others:
             self._observer[swarm] = self._observer_scale * rng.normal(size=self._observer.shape[1:])
 
+    def meet(self, places: np.ndarray) -> None:
+        """Draw new observation errors and link states for slots with new robots.
+
+        :param places: whether the slot has a new robot, (E, n, n - 1) bool
+        """
+        for swarm in np.flatnonzero(places.any(axis=(1, 2))):
+            where, rng = places[swarm], self._rngs[swarm]
+            count = int(where.sum())
+            if self.config.radio.bursts:
+                self._down[swarm, where] = rng.random(count) < self.config.radio.bursts
+            if self.config.sensing.others:
+                self._observer[swarm, where] = self._observer_scale * rng.normal(size=(count, 6))
+
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
         for name in self._ARRAYS:
@@ -131,7 +145,7 @@ class Realisation:
         """Draw which answers of this step arrive.
 
         :param requests: whose plans each robot requests, (E, n, n - 1) bool
-        :param others: see `other_indices`
+        :param others: see `other_indices` or `Neighbours.others`
         :return: which requests are answered, (E, n, n - 1) bool, and the answers' additional delays beyond the radio's
             delay (steps), (E, n, n - 1), None without jitter
         """
@@ -147,7 +161,7 @@ class Realisation:
             requests = requests & ~self._down
         if radio.outage:
             silent = self._silent_from <= self._step[:, None]
-            requests = requests & ~silent[:, others]
+            requests = requests & ~of_others(silent, others)
         if radio.jitter:
             lateness = np.stack([rng.integers(0, radio.jitter + 1, shape) for rng in self._rngs])
         return requests, lateness

@@ -1,4 +1,7 @@
-"""Simulation of E swarms of n robots: requests -> beliefs -> plans -> dynamics. Rewards and episodes are in `task`."""
+"""Simulation of E swarms of n robots: requests -> beliefs -> plans -> dynamics. Rewards and episodes are in `task`.
+
+If the neighbourhood is limited, axes of length n - 1 have fewer entries, one per slot, see `neighbours`.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown
-from quad_swarm.native.pairs import advance, resample
+from quad_swarm.native.pairs import advance, resample, separations
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.states import like
-from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, other_indices, resampled
+from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, of_others, other_indices, resampled
+from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
 
+# Distance (in separations) at which an empty slot shows a robot, far beyond all plans
+_NOBODY = 30.0
 _FARTHEST = 1e4  # limit of starts and goals (m), far beyond any room and small enough for precise squares
 
 
@@ -29,12 +35,16 @@ class StepReport(NamedTuple):
     :param min_separation: smallest distance between two robots after the step, (E,) (m)
     :param min_separation_continuous: smallest distance between two robots during the step, with straight motion between
         sub-steps, (E,) (m)
+    :param others: indices of the others, -1 for an empty slot, (E, n, n - 1), or (n, n - 1) if they are the same in all
+        swarms
     :param separation: distance of each robot to each of the others after the step, (E, n, n - 1) (m)
     :param colliding: which of the others each robot collides with after the step, (E, n, n - 1) bool
     :param colliding_continuous: which of the others each robot collides with at any time during the step,
         (E, n, n - 1) bool
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
     :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
+    :param changed: whether another robot, or none, is in the slot after the step, (E, n, n - 1) bool; None if slots
+        never change
     :param moved: distance that each robot flew, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
@@ -46,11 +56,13 @@ class StepReport(NamedTuple):
 
     min_separation: np.ndarray
     min_separation_continuous: np.ndarray
+    others: np.ndarray
     separation: np.ndarray
     colliding: np.ndarray
     colliding_continuous: np.ndarray
     collision: np.ndarray
     collision_continuous: np.ndarray
+    changed: np.ndarray | None
     moved: np.ndarray
     at_goal: np.ndarray
     belief_source: np.ndarray
@@ -65,6 +77,7 @@ class Swarm:
 
     :ivar state: true states, (E, n, 9)
     :ivar goal: goals, (E, n, 3), world frame (m)
+    :ivar neighbours: which others each robot perceives
     :ivar chance: realisation of the disturbances
     :ivar beliefs: beliefs of each robot about the others
     :ivar presumed_beliefs: beliefs of each robot as the others presume them, assuming that all their answers arrived
@@ -76,13 +89,14 @@ class Swarm:
 
     def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
         self.config = config
-        self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_robots, solver)
+        self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_others + 1, solver)
         n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
         self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
         self.state = np.zeros((n_swarms, n, 9))
         self.goal = np.zeros((n_swarms, n, 3))
+        self.neighbours = Neighbours(n_swarms, n, config.neighbourhood)
         self.chance = Realisation(config, n_swarms)
-        beliefs = (n_swarms, n, horizon, dt, config.memory)
+        beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others)
         self.beliefs = Beliefs(*beliefs)
         differ = config.radio.is_random or config.sensing.others
         self.presumed_beliefs = Beliefs(*beliefs) if differ else self.beliefs
@@ -91,11 +105,12 @@ class Swarm:
         late = config.radio.delay + config.radio.jitter
         self._earlier = [self.plans[..., POSITION].copy() for _ in range(late)]
         self._u = np.zeros((n_swarms, n, 4))  # current inputs
-        self._pairs = np.triu_indices(n, k=1)
-        number = np.zeros((n, n), dtype=int)
-        number[self._pairs] = np.arange(len(self._pairs[0]))
-        # Index of the pair of each robot and each of its others
-        self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
+        if not self.neighbours.limited:
+            self._pairs = np.triu_indices(n, k=1)
+            number = np.zeros((n, n), dtype=int)
+            number[self._pairs] = np.arange(len(self._pairs[0]))
+            # Index of the pair of each robot and each of its others
+            self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
 
     @property
     def n_swarms(self) -> int:
@@ -123,8 +138,12 @@ class Swarm:
 
     def _seen_by_all(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the same as `observe`, but without the additional errors of the observers."""
-        estimate = self.estimate()[:, self.beliefs.others]
-        return estimate[..., POSITION], estimate[..., VELOCITY]
+        estimate, neighbours = self.estimate(), self.neighbours
+        seen = of_others(estimate, neighbours.others)
+        pos, vel = seen[..., POSITION], seen[..., VELOCITY]
+        if neighbours.present is not None:
+            pos[..., 0] += np.where(neighbours.present, 0.0, _NOBODY * self.config.planner.separation)
+        return pos, vel
 
     def presume(self) -> Prediction:
         """Return each robot's predictions without requests, as the others presume them."""
@@ -142,11 +161,18 @@ class Swarm:
         start = self.chance.start
         return plans if start is None else resampled(plans, -start / self.config.substeps)
 
-    def planned_separation(self, steps: int) -> np.ndarray:
+    def planned_separation(self, steps: int, others: np.ndarray) -> np.ndarray:
         """Return the planned distances of each robot to each of the others in the ``steps`` after the current one,
-        (E, n, n - 1, steps) (m)."""
-        i, j = self._pairs
+        (E, n, n - 1, steps) (m), infinity for an empty slot.
+
+        :param steps: number of steps
+        :param others: indices of the others, see `StepReport`
+        """
         plans = self.planned_positions()[..., 2 : 2 + steps, :]
+        if self.neighbours.limited:
+            between = of_others(plans, np.maximum(others, 0)) - plans[:, :, None]
+            return np.where(others[..., None] >= 0, np.sqrt(_dot(between, between)), np.inf)
+        i, j = self._pairs
         between = plans[:, i] - plans[:, j]
         return np.sqrt(_dot(between, between))[:, self._pair_of]
 
@@ -164,6 +190,7 @@ class Swarm:
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
+        self.neighbours.reset(swarm, starts)
         for beliefs in {self.beliefs, self.presumed_beliefs}:
             beliefs.forget(np.array([swarm]))
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
@@ -179,6 +206,7 @@ class Swarm:
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
         self.state, self.goal, self._u = self.state[swarms], self.goal[swarms], self._u[swarms]
+        self.neighbours.keep(swarms)
         self.chance.keep(swarms)
         self._plant.keep(swarms)
         for beliefs in {self.beliefs, self.presumed_beliefs}:
@@ -191,7 +219,7 @@ class Swarm:
         part = copy(self)
         part.beliefs = copy(self.beliefs)
         part.presumed_beliefs = part.beliefs if self.presumed_beliefs is self.beliefs else copy(self.presumed_beliefs)
-        part.chance = copy(self.chance)
+        part.neighbours, part.chance = copy(self.neighbours), copy(self.chance)
         part._plant = self._plant.fork()
         part.keep(swarms)
         return part
@@ -219,6 +247,7 @@ class Swarm:
             "beliefs": self.beliefs.state_dict(),
             "presumed_beliefs": presumed,
             "chance": self.chance.state_dict(),
+            "neighbours": self.neighbours.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -244,21 +273,38 @@ class Swarm:
         if self.presumed_beliefs is not self.beliefs:
             self.presumed_beliefs.load_state_dict(state["presumed_beliefs"])
         self.chance.load_state_dict(state["chance"])
+        if self.neighbours.limited:
+            self.neighbours.load_state_dict(state["neighbours"])
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let all robots make requests, plan and fly for one step.
 
-        :param requests: whose plans each robot requests, (E, n, n - 1) bool, with the others in ascending order
+        :param requests: whose plans each robot requests, (E, n, n - 1) bool, with the others in ascending order or as
+            in `neighbours`, and False for empty slots
         """
         believed, source = self._believe(requests)
         started = time.perf_counter()
         self._plans = self.planner.plan(self._problems(believed, source), self._plans)
         solve_seconds = time.perf_counter() - started
-        return self._report(self._fly(), source, solve_seconds)
+        report = self._report(self._fly(), source, solve_seconds)
+        return report if self.neighbours.present is None else report._replace(changed=self._look_around())
+
+    def _look_around(self) -> np.ndarray:
+        """Update the neighbours, forget those that left, and draw the disturbances of those that came. Knowledge about
+        a robot that left is not kept for its return.
+
+        :return: whether another robot, or none, is in the slot now, (E, n, m) bool
+        """
+        changed = self.neighbours.update(self.pos, self.vel)
+        if changed.any():
+            for beliefs in {self.beliefs, self.presumed_beliefs}:
+                beliefs.forget_others(changed)
+            self.chance.meet(self.neighbours.perceived(changed))
+        return changed
 
     def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the beliefs after the answers have arrived, see `Beliefs.update`."""
-        radio, others = self.config.radio, self.beliefs.others
+        radio, others = self.config.radio, self.neighbours.others
         trajectories = advance(self.planned_positions())
         if self._earlier:
             self._earlier = [*map(advance, self._earlier), trajectories]  # advanced to the current step
@@ -306,8 +352,36 @@ class Swarm:
         return positions
 
     def _report(self, positions: list[np.ndarray], source: np.ndarray, solve_seconds: float) -> StepReport:
-        i, j = self._pairs
         before, pos = positions[0], positions[-1]
+        least, least_continuous, separation, separation_continuous = self._separations(positions)
+        limit = 2 * self.config.radius - self.config.collision_tolerance
+        shape = self.state.shape[:2]
+        return StepReport(
+            min_separation=least,
+            min_separation_continuous=least_continuous,
+            others=self.neighbours.numbers(),
+            separation=separation,
+            colliding=separation < limit,
+            colliding_continuous=separation_continuous < limit,
+            collision=least < limit,
+            collision_continuous=least_continuous < limit,
+            changed=None,
+            moved=np.sqrt(_dot(pos - before, pos - before)),
+            at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
+            belief_source=source,
+            plan_age=self.beliefs.age.copy(),  # a later reset writes into it
+            plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
+            iterations=self._plans.iterations.reshape(shape).copy(),
+            solve_seconds=solve_seconds,
+        )
+
+    def _separations(self, positions: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the separations of all pairs, including those that do not perceive each other, see
+        `quad_swarm.native.pairs.separations`."""
+        if self.neighbours.limited:
+            return separations(np.stack(positions), self.neighbours.others)
+        # Another order of operations, which keeps the results of the presets bit-identical
+        i, j = self._pairs
         apart = [each[:, i] - each[:, j] for each in positions]
         if len(apart) == 2:
             start, end = apart[0][None], apart[1][None]
@@ -318,23 +392,11 @@ class Swarm:
         along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
         closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
         separation, separation_continuous = np.sqrt(_dot(end[-1], end[-1])), np.sqrt(_dot(closest, closest).min(axis=0))
-        limit = 2 * self.config.radius - self.config.collision_tolerance
-        shape = self.state.shape[:2]
-        return StepReport(
-            min_separation=separation.min(axis=-1),
-            min_separation_continuous=separation_continuous.min(axis=-1),
-            separation=separation[:, self._pair_of],
-            colliding=(separation < limit)[:, self._pair_of],
-            colliding_continuous=(separation_continuous < limit)[:, self._pair_of],
-            collision=(separation < limit).any(axis=-1),
-            collision_continuous=(separation_continuous < limit).any(axis=-1),
-            moved=np.sqrt(_dot(pos - before, pos - before)),
-            at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
-            belief_source=source,
-            plan_age=self.beliefs.age.copy(),  # a later reset writes into it
-            plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
-            iterations=self._plans.iterations.reshape(shape).copy(),
-            solve_seconds=solve_seconds,
+        return (
+            separation.min(axis=-1),
+            separation_continuous.min(axis=-1),
+            separation[:, self._pair_of],
+            separation_continuous[:, self._pair_of],
         )
 
 

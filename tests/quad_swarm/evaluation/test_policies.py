@@ -69,6 +69,46 @@ def test_a_model_tells_its_world(model):
     assert trained_in(object()) == {}
 
 
+@pytest.fixture(scope="module")
+def relational(tmp_path_factory) -> str:
+    """Return the path of a relational model that announces."""
+    kwargs = {"preset": "flight", "n_robots": 3, "observation": "state+approach+told+mask", "announcements": True}
+    path = str(tmp_path_factory.mktemp("relational") / "model.zip")
+    MADDPG("PairPolicy", gym.make("QuadSwarm-v0", **kwargs), buffer_size=2000, seed=0).save(path)
+    return path
+
+
+def test_a_model_decides_alike_where_everybody_happens_to_be_near(relational):
+    flights = [
+        fly(Condition(relational, "random_swap", make_config("flight", n_robots=8, world={"neighbourhood": limit})), 1)
+        for limit in ({}, {"range": 100.0})
+    ]
+    assert np.array_equal(flights[0].state, flights[1].state)
+    assert np.array_equal(flights[0].requests, flights[1].requests)
+    assert np.array_equal(flights[0].announced, flights[1].announced)
+    assert flights[0].announced.any()
+
+
+def test_a_model_flies_more_robots_than_it_was_trained_with_and_asks_its_neighbours_alone(relational):
+    world = {
+        "neighbourhood": {"max_others": 5, "range": 4.0},
+        "planner": {"workspace_low": (-8, -8, 0.5), "workspace_high": (8, 8, 2.4)},
+        "space": {"half_width": 6.0},
+    }
+    one = Condition(relational, "random_swap", make_config("flight", n_robots=32, world=world), max_steps=40)
+    flight = fly(one, seed=1, other_rule="full")
+    assert flight.requests.shape == (40, 32, 31)
+    assert 0 < flight.requests.sum() < flight.other_requests.sum()
+    perceived = flight.other_requests
+    assert perceived.sum(axis=2).mean() > 3
+    assert perceived.sum(axis=2).max() == 5
+    assert flight.separation[:-1][perceived].max() <= 4.0
+    assert (flight.requests <= perceived).all()
+    [row] = run_episodes(one, [first_episode(1)])
+    assert 0 < row["requests"] < row["possible_requests"] == perceived.sum()
+    assert len(replay_page([one], seed=1)) > 1e5
+
+
 def test_a_model_that_announces_flies_as_in_its_environment(tmp_path):
     kwargs = {"preset": "flight", "n_robots": 3, "observation": "state+approach+mask", "announcements": True}
     env = gym.make("QuadSwarm-v0", scenario="symmetric_swap", **kwargs)

@@ -51,11 +51,12 @@ def test_pairs_are_counted_as_episodes_are():
     path = str(pretrained_folder("quad-swarm-paper") / "model.zip")
     model = pretrained("quad-swarm-paper", device="cpu")
     condition = Condition(path, "symmetric_swap", make_config("paper"), linger=5)
-    asked, steps, collisions = dashboard.requests_by_pair(condition, model)
+    asked, possible, steps, collisions = dashboard.requests_by_pair(condition, model)
     first = dashboard.first_episode(dashboard.SET)
     rows = run_episodes(condition, range(first, first + dashboard.EPISODES))
     assert asked.sum() == sum(row["requests"] for row in rows) > 0
     assert steps == sum(row["steps_counted"] for row in rows)
+    assert possible == sum(row["possible_requests"] for row in rows)
     assert collisions == sum(row["collided"] for row in rows)
     assert not np.diag(asked).any()
 

@@ -45,7 +45,15 @@ def assert_same(a, b):
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"preset": "dense"}, {"n_robots": 2, "scenario": "random"}])
+LIMITED = {
+    "preset": "flight-hard",
+    "observation": "state+told+mask+critic",
+    "announcements": True,
+    "world": {"neighbourhood": {"max_others": 2, "range": 3.0}},
+}
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"preset": "dense"}, {"n_robots": 2, "scenario": "random"}, LIMITED])
 def test_upstream_checkers(kwargs):
     env = gymnasium.make("QuadSwarm-v0", render_mode="rgb_array", **kwargs)
     with warnings.catch_warnings():
@@ -56,7 +64,7 @@ def test_upstream_checkers(kwargs):
         sb3_check_env(env.unwrapped)
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"noise": {"vel": 0.05, "wind": 1.0}, "memory": 0.3, "n_robots": 3}])
+@pytest.mark.parametrize("kwargs", [{}, {"noise": {"vel": 0.05, "wind": 1.0}, "memory": 0.3, "n_robots": 3}, LIMITED])
 def test_a_hundred_steps_repeat_exactly(kwargs):
     first = without_times(run(gymnasium.make("QuadSwarm-v0", **kwargs), 7, 100))
     second = without_times(run(gymnasium.make("QuadSwarm-v0", **kwargs), 7, 100))

@@ -13,10 +13,11 @@ import quad_swarm
 from quad_swarm.interfaces.env import QuadSwarmEnv
 
 
-def test_parallel_api():
+@pytest.mark.parametrize("world", [{}, {"neighbourhood": {"max_others": 2, "range": 2.5}}])
+def test_parallel_api(world):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        parallel_api_test(quad_swarm.parallel_env(max_steps=20), num_cycles=60)
+        parallel_api_test(quad_swarm.parallel_env(max_steps=20, world=world), num_cycles=60)
 
 
 @pytest.mark.parametrize("announcements", [False, True])

@@ -51,14 +51,14 @@ def test_a_step_before_the_reset_is_refused(env):
 
 def test_actions_become_bits_of_each_robot_for_each_of_the_others():
     bits = [[1, 0, 0, 1, 0, 1], [0, 0, 1, 1, 1, 1]]
-    asked = checked_bits(bits, (2, 6), 3)
+    asked = checked_bits(bits, (2, 6), 2)
     assert asked.dtype == bool
     assert asked[..., 0].astype(int).tolist() == [[[1, 0], [0, 1], [0, 1]], [[0, 0], [1, 1], [1, 1]]]
-    both = checked_bits(bits[0] + bits[1], (12,), 3, 2)
+    both = checked_bits(bits[0] + bits[1], (12,), 2, 2)
     assert both.astype(int).tolist() == [[[1, 0], [0, 1]], [[0, 1], [0, 0]], [[1, 1], [1, 1]]]
-    assert np.array_equal(checked_bits(np.array(bits, np.float32), (2, 6), 3), asked)
-    assert np.array_equal(checked_bits(np.array(bits, bool), (2, 6), 3), asked)
-    assert checked_bits([1, 0], (2,), 3).tolist() == [[[True], [False]]], "one robot's own"
+    assert np.array_equal(checked_bits(np.array(bits, np.float32), (2, 6), 2), asked)
+    assert np.array_equal(checked_bits(np.array(bits, bool), (2, 6), 2), asked)
+    assert checked_bits([1, 0], (2,), 2).tolist() == [[[True], [False]]], "one robot's own"
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_actions_become_bits_of_each_robot_for_each_of_the_others():
 )
 def test_what_is_no_action_is_named(actions, message):
     with pytest.raises(ValueError, match=message):
-        checked_bits(actions, (6,), 3, whose="Whose")
+        checked_bits(actions, (6,), 2, whose="Whose")
 
 
 def test_what_learners_read_is_the_team_s():

@@ -34,6 +34,7 @@ EVERYTHING = {"preset": "dense", "observation": "state+approach+memory+plan+told
         {"max_steps": 9, "n_robots": 3, "noise": {"vel": 0.05}},
         {"max_steps": 7, "n_robots": 3, **EVERYTHING},
         {"max_steps": 7, "n_robots": 3, "announcements": True},
+        {"max_steps": 7, "n_robots": 5, "world": {"neighbourhood": {"max_others": 2, "range": 3.0}}, **EVERYTHING},
     ],
 )
 def test_flies_what_single_environments_fly(kwargs):

@@ -36,7 +36,21 @@ def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace
         own=rng.normal(size=(n_swarms, n, 3)),
         plan=rng.normal(size=(n_swarms, n, horizon, 3)).cumsum(axis=-2),
         later=rng.random((n_swarms, n)),
+        vels=rng.normal(size=(n_swarms, n, 3)),
+        path=rng.normal(size=(1, n_swarms, n, 3)) + 0.2 * rng.normal(size=(4, n_swarms, n, 3)).cumsum(axis=0),
     )
+
+
+def neighbourhoods(s: SimpleNamespace) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return the neighbours along the paths of a scene."""
+    _, n_swarms, n, _ = s.path.shape
+    m = max((n - 1) // 2, 1)
+    others = np.broadcast_to(np.arange(n)[:, None], (n_swarms, n, m)).astype(np.int64)
+    present, steps = np.zeros(others.shape, dtype=bool), []
+    for pos, limit in zip(s.path, (np.inf, 1.0, 2.0, 1.5), strict=True):
+        others, present, reverse = pairs.neighbours(pos, s.vels, others, present, limit, 0.5 * (limit < 2))
+        steps.append((others, present, reverse))
+    return steps
 
 
 def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
@@ -45,11 +59,14 @@ def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
     resampled = pairs.believe(*belief, DT)
     others = resampled.reshape(s.x.shape[0], *resampled.shape[2:]).copy()
     pairs.resample(resampled, s.later)
+    near = neighbourhoods(s)
     return {
         "remember": list(pairs.remember(s.remembered, s.age, s.pos, 0.03)),
         "believe": [pairs.believe(*belief, DT), pairs.believe(*belief, DT, [2, 0])],
         "approach": list(pairs.approach(s.own, s.plan, *belief, DT)),
         "resample": [resampled],
+        "neighbours": [array for step in near for array in step],
+        "separations": list(pairs.separations(s.path, near[-1][0])),
         "keep_right": list(pairs.keep_right(s.x, others, s.remembers.reshape(others.shape[:2]), 0.3, DT, 1.0, 0.5)),
     }
 

@@ -50,7 +50,8 @@ def test_texts_are_read_as_what_they_stand_for():
 
 def test_near_misses_may_look_ahead_to_the_end_of_the_plans():
     task = make_task(reward={"near_miss": 1.0, "near_miss_ahead": 9})
-    assert task.swarm.planned_separation(task.reward.near_miss_ahead).shape == (1, 4, 3, 9)
+    others = task.swarm.neighbours.numbers()
+    assert task.swarm.planned_separation(task.reward.near_miss_ahead, others).shape == (1, 4, 3, 9)
 
 
 def test_a_world_reaches_every_field():

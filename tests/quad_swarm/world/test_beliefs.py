@@ -29,8 +29,9 @@ def update(
     beliefs: Beliefs, asked: np.ndarray, pos: np.ndarray, vel: np.ndarray, plans: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """`Beliefs.update` with what everybody sees and planned."""
-    received = answered(asked, advance(plans), beliefs.others)
-    return beliefs.update(asked, pos[:, beliefs.others], vel[:, beliefs.others], received)
+    others = other_indices(pos.shape[1])
+    received = answered(asked, advance(plans), others)
+    return beliefs.update(asked, pos[:, others], vel[:, others], received)
 
 
 def test_other_indices():

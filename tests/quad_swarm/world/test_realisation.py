@@ -36,7 +36,7 @@ def make_swarm(n_swarms: int, **world) -> Swarm:
 
 
 def fly(swarm: Swarm, steps: int, seed: int = 0) -> np.ndarray:
-    requests = np.random.default_rng(seed).random((steps, 1, *swarm.beliefs.others.shape)) < 0.5
+    requests = np.random.default_rng(seed).random((steps, 1, *swarm.neighbours.others.shape)) < 0.5
     path = []
     for k in range(steps):
         swarm.step(np.broadcast_to(requests[k], (swarm.n_swarms, *requests.shape[2:])))
@@ -144,7 +144,7 @@ def test_a_late_answer_holds_the_plan_of_its_time():
     assert (source == BeliefSource.REQUESTED).all()
     late = 0
     for i, m in np.ndindex(4, 3):
-        j = swarm.beliefs.others[i, m]
+        j = swarm.neighbours.others[i, m]
         is_new = np.allclose(believed[0, i, m, :-1], newest[j])
         assert is_new or np.allclose(believed[0, i, m, :-2], older[j][1:])
         late += not is_new
@@ -179,7 +179,7 @@ def test_substeps_find_what_passes_between_steps():
 def test_robots_see_estimates_and_not_the_truth():
     swarm = make_swarm(2, sensing={"pos": 0.05, "others_pos": 0.05})
     fly(swarm, 3)
-    others = swarm.beliefs.others
+    others = swarm.neighbours.others
     estimate, (seen, _) = swarm.estimate(), swarm.observe()
     assert np.abs(estimate[..., :3] - swarm.pos).max() > 0.02
     assert np.abs(seen - swarm.pos[:, others]).max() > 0.02

@@ -50,7 +50,7 @@ def test_first_plan_asked_for_is_to_stay():
     swarm = make_swarm(1)
     believed, source = swarm._believe(all_ask(swarm))
     assert (source == BeliefSource.REQUESTED).all()
-    assert np.array_equal(believed, np.broadcast_to(swarm.pos[:, swarm.beliefs.others, None], believed.shape))
+    assert np.array_equal(believed, np.broadcast_to(swarm.pos[:, swarm.neighbours.others, None], believed.shape))
 
 
 def test_robots_that_ask_believe_the_plan_of_one_step_ago_shifted_by_one(monkeypatch):
@@ -61,7 +61,7 @@ def test_robots_that_ask_believe_the_plan_of_one_step_ago_shifted_by_one(monkeyp
     monkeypatch.setattr(swarm.planner, "plan", lambda problems, last: asked.append(problems) or plan(problems, last))
     fly(swarm, 1)
     for i in range(4):
-        for k, j in enumerate(swarm.beliefs.others[i]):
+        for k, j in enumerate(swarm.neighbours.others[i]):
             assert np.array_equal(asked[0].others[i, k, :-1], plans[j, 2:])
 
 
@@ -152,8 +152,8 @@ def test_a_robot_knows_what_the_others_believe_of_it():
     believed = (prediction.believed(), prediction.remembers, prediction.age, prediction.error)
     assert 0 < presumed.remembers.mean() < 1
     for i, m in np.ndindex(4, 3):
-        j = swarm.beliefs.others[i, m]
-        mine = swarm.beliefs.others[j].tolist().index(i)
+        j = swarm.neighbours.others[i, m]
+        mine = swarm.neighbours.others[j].tolist().index(i)
         for field, of_other in zip(presumed, believed, strict=True):
             assert np.array_equal(field[:, i, m], of_other[:, j, mine])
 
@@ -180,7 +180,7 @@ def test_late_answers_are_older_plans():
     for _ in range(3):
         expected = advance(expected)
     remembered = late.beliefs._remembered
-    np.testing.assert_allclose(remembered, expected[:, late.beliefs.others])
+    np.testing.assert_allclose(remembered, expected[:, late.neighbours.others])
     assert (late.beliefs._age == 3).all()
     assert not np.allclose(fly(swarm, 20)[-1], fly(late, 14)[-1])
 
@@ -190,4 +190,4 @@ def test_planned_separation_is_the_distance_between_plans():
     fly(swarm, 8)
     plans = swarm.plans[0, :, 2:5, :3]
     between = np.linalg.norm(plans[0] - plans[2], axis=-1)
-    assert swarm.planned_separation(3)[0, 0, 1] == pytest.approx(between)
+    assert swarm.planned_separation(3, swarm.neighbours.numbers())[0, 0, 1] == pytest.approx(between)
