@@ -1,8 +1,8 @@
-"""What checkpoints cost a training: ``python benchmarks/checkpoints.py [--seconds 120] [--json F]``.
+"""Measure the cost of checkpoints during training: ``python benchmarks/checkpoints.py [--seconds 120] [--json F]``.
 
-Trains with `RunCheckpoint`, by time as ``sb3-maddpg train`` does, and with a checkpoint each 10,000 steps, and counts
-the seconds that go into checkpoints, synced to disk. JSON: one row for each training with recipe, every, steps,
-seconds, checkpoints, share of the time, and megabytes on disk at the end.
+Trains with `RunCheckpoint`, by time as in ``sb3-maddpg train`` and with a checkpoint every 10,000 steps, and measures
+the time of writing checkpoints, synced to disk. JSON: one row per training with recipe, every, steps, seconds,
+checkpoints, share of the time, and megabytes on disk at the end.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sb3_maddpg import MADDPG
 from sb3_maddpg.checkpoints import RunCheckpoint
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
-# Environments, transitions in the replay buffer, arguments of the algorithm: those of recipes that fill their buffers
+# Arguments of the environments and of the algorithm, as in recipes that fill their replay buffers
 RECIPES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "four robots, flat observations": (
         {"num_envs": 8, "preset": "paper"},
@@ -46,7 +46,7 @@ RECIPES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 class Stopwatch(RunCheckpoint):
-    """Counts the seconds that its checkpoints take."""
+    """Checkpoint callback that measures the time of its checkpoints."""
 
     taken = 0.0
     count = 0
@@ -61,7 +61,7 @@ class Stopwatch(RunCheckpoint):
 
 
 class EndAfter(BaseCallback):
-    """Ends a training after some seconds."""
+    """Callback that ends training after a number of seconds."""
 
     def __init__(self, seconds: float):
         super().__init__()
@@ -75,7 +75,7 @@ class EndAfter(BaseCallback):
 
 
 def measure(recipe: str, every: int | None, seconds: float) -> dict[str, Any]:
-    """The row of a training."""
+    """Train and return the row of the training."""
     env_kwargs, arguments = RECIPES[recipe]
     env = VecMonitor(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", **env_kwargs)))
     model = MADDPG(env=env, learning_starts=1000, seed=0, **{"train_freq": 1, **arguments})
@@ -96,9 +96,9 @@ def measure(recipe: str, every: int | None, seconds: float) -> dict[str, Any]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=120.0, help="of each training (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=120.0, help="seconds per training (default %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     rows = []

@@ -1,17 +1,17 @@
-"""Whose agents win: the agents that learning.py has trained, of all libraries, against each other.
+"""Cross-play: let the agents of all libraries that learning.py trained play against each other.
 
-``python -m benchmarks.crossplay [--json F]`` after ``python -m benchmarks.learning --peers``. In tag and adversary one
-side gains what the other loses, and both learn, so a library's return against its own agents does not say how good
-they are. Here the side of every training meets the other side of every training, of its own library and the others,
-in the same episodes without exploration. For each side and library:
+``python -m benchmarks.crossplay [--json F]`` after ``python -m benchmarks.learning --peers``. In tag and adversary, one
+side gains what the other loses, and both learn, so a library's return against its own agents does not show how good
+they are. Here, each side of each training plays against the other side of all trainings, of its own library and the
+others, in the same episodes without exploration. For each side and library:
 
-- ``score``: mean return of an agent of that side. A training's score is its mean over the libraries of its opponents,
-  each of which counts as much, however many trainings it has. Mean over the trainings with a 95 % t-interval;
+- ``score``: mean return of an agent of that side. A training's score is the mean over the libraries of its opponents,
+  which have equal weights, regardless of their numbers of trainings. Mean over trainings with a 95 % t-interval;
 - ``others``: the same against other libraries only;
-- ``ours_minus``: how much better ours does than this library against the same opponents, with a 95 % interval of
-  Welch over the trainings of both.
+- ``ours_minus``: score of ours minus score of this library against the same opponents, with Welch's 95 % interval over
+  the trainings of both.
 
-Worlds are stepped by the thousand, as mpe2 steps one; the first episodes are played in mpe2 too, and compared.
+Thousands of worlds are stepped at a time, as mpe2 steps a single one. The first episodes are compared with mpe2.
 """
 
 import argparse
@@ -36,11 +36,11 @@ Training = tuple[str, int, int]  # driver, seed and steps
 
 class Worlds:
     """
-    Many worlds of one task of mpe2, with the starts of its seeded episodes.
+    Batch of worlds of a task of mpe2, with the initial states of its seeded episodes.
 
-    :param name: of the task
-    :param seeds: of the episodes
-    :param copies: how often to have each episode, one set of episodes after the other
+    :param name: name of the task
+    :param seeds: seeds of the episodes
+    :param copies: number of copies of the set of episodes
     """
 
     def __init__(self, name: str, seeds: Sequence[int], copies: int = 1):
@@ -67,7 +67,7 @@ class Worlds:
         self.goal = self.position[np.arange(len(self.position)), self.n_agents + np.tile(goals, copies)]
 
     def observe(self) -> dict[str, np.ndarray]:
-        """What each agent sees, (worlds, obs_dim)."""
+        """:return: each agent's observations, (worlds, obs_dim)"""
         n, landmarks = self.n_agents, range(self.n_agents, self.position.shape[1])
         observations = {}
         for i, agent in enumerate(self.agents):
@@ -84,8 +84,8 @@ class Worlds:
 
     def step(self, actions: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
-        :param actions: (worlds, 5) of each agent
-        :return: rewards, (worlds,) of each agent
+        :param actions: each agent's actions, (worlds, 5)
+        :return: each agent's rewards, (worlds,)
         """
         n, world = self.n_agents, self.world
         joint = np.stack([actions[agent] for agent in self.agents], axis=1).astype(np.float64)
@@ -110,7 +110,7 @@ class Worlds:
         return self.rewards()
 
     def rewards(self) -> dict[str, np.ndarray]:
-        """Of each agent, (worlds,)."""
+        """:return: each agent's rewards, (worlds,)"""
         hunters = [i for i, agent in enumerate(self.agents) if agent.startswith("adversary")]
         good = [i for i in range(self.n_agents) if i not in hunters]
         if self.tag:
@@ -130,9 +130,9 @@ class Worlds:
 
 def check(name: str, seeds: Sequence[int]) -> None:
     """
-    Play in mpe2 and in ``Worlds``, at random or, in tag, so that agents meet.
+    Compare ``Worlds`` with mpe2 for random actions or, in tag, actions that make agents meet.
 
-    :raises AssertionError: observations or rewards differ
+    :raises AssertionError: if observations or rewards differ
     """
     worlds, rng = Worlds(name, seeds), np.random.default_rng(0)
     envs = [common.parallel_env(name) for _ in seeds]
@@ -142,7 +142,7 @@ def check(name: str, seeds: Sequence[int]) -> None:
         for agent in worlds.agents:
             np.testing.assert_allclose(observations[agent], [each[agent] for each in observed], atol=1e-4)
         actions = {agent: rng.random((len(seeds), 5), np.float32) for agent in worlds.agents}
-        if worlds.tag:  # all towards the prey and the prey stays, for contacts
+        if worlds.tag:  # all move towards the prey, which stays, to cause contacts
             for i, agent in enumerate(worlds.agents):
                 x, y = (worlds.position[:, worlds.n_agents - 1] - worlds.position[:, i]).T
                 actions[agent] = np.stack([0 * x, -x, x, -y, y], axis=1).clip(0, 1).astype(np.float32)
@@ -155,9 +155,10 @@ def check(name: str, seeds: Sequence[int]) -> None:
 
 def play(name: str, trainings: Sequence[Training], folder: Path, seeds: Sequence[int]) -> dict[str, np.ndarray]:
     """
-    All against all.
+    Let all trainings play against each other.
 
-    :return: mean return of an agent of each side: ``adversary`` and ``good``, (adversaries of, good agents of)
+    :return: mean return of an agent of each side, ``adversary`` and ``good``, (training of the adversaries, training of
+        the good agents)
     """
     count, episodes = len(trainings), len(seeds)
     worlds = Worlds(name, seeds, count * count)
@@ -173,7 +174,7 @@ def play(name: str, trainings: Sequence[Training], folder: Path, seeds: Sequence
         actions = {}
         for agent, observations in worlds.observe().items():
             axis = 0 if agent.startswith("adversary") else 1
-            # (adversaries of, good agents of, episode, number)
+            # (training of the adversaries, training of the good agents, episode, column)
             table = th.from_numpy(observations).view(count, count, episodes, -1)
             with th.no_grad():
                 parts = [
@@ -190,7 +191,7 @@ def play(name: str, trainings: Sequence[Training], folder: Path, seeds: Sequence
 
 
 def summarise(name: str, trainings: Sequence[Training], scores: dict[str, np.ndarray]) -> list[Row]:
-    """One row a side and library."""
+    """:return: one row per side and library"""
     drivers = sorted({driver for driver, *_ in trainings}, key=EVERYTHING.index)
     members = {driver: [i for i, (other, *_) in enumerate(trainings) if other == driver] for driver in drivers}
     rows = []
@@ -222,7 +223,7 @@ def summarise(name: str, trainings: Sequence[Training], scores: dict[str, np.nda
 
 
 def report(rows: Sequence[Row]) -> None:
-    """Print the scores, and who does how well against whom."""
+    """Print the scores in total and against each library."""
     for row in rows:
         if row["driver"] == rows[0]["driver"]:
             opponents = "".join(f"{name:>10}" for name in row["against"])
@@ -236,12 +237,12 @@ def report(rows: Sequence[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a row")
-    parser.add_argument("--only", nargs="+", choices=EVERYTHING, default=EVERYTHING, help="these libraries")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
+    parser.add_argument("--only", nargs="+", choices=EVERYTHING, default=EVERYTHING, help="only these libraries")
     parser.add_argument("--tasks", nargs="+", choices=COMPETITIVE, default=COMPETITIVE)
-    parser.add_argument("--seeds", type=int, help="no more trainings of a library than these")
-    parser.add_argument("--steps", type=int, default=50_000, help="of the trainings")
-    parser.add_argument("--folder", type=Path, default=FOLDER, help="of the trainings (default logs/learning)")
+    parser.add_argument("--seeds", type=int, help="maximum number of trainings per library")
+    parser.add_argument("--steps", type=int, default=50_000, help="steps of the trainings")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="folder of the trainings (default logs/learning)")
     args = parser.parse_args()
 
     th.set_num_threads(1)

@@ -1,9 +1,10 @@
-"""Environment steps per second, and where the time goes.
+"""Measure environment steps per second, and where the time goes.
 
-``python benchmarks/env.py [--json F]`` steps the swarm through Gymnasium (one swarm) and through the Stable-Baselines3
-VecEnv (many), rewards, infos and auto-reset included, with random requests; the face "render" draws a picture of 640 x
-480 in each step. Each cell is one process per core, pinned to it where the system allows; rates of two cores are sums.
-JSON: one row a cell with the keys face, preset, n_robots, n_envs, cores, steps_per_s, and the share of each part.
+``python benchmarks/env.py [--json F]`` steps the swarm through Gymnasium (one swarm) and through Stable-Baselines3's
+VecEnv (many swarms) with random requests, including rewards, infos and automatic resets. The face "render" also renders
+an image of 640 x 480 in each step. Each cell runs one process per core, pinned to it if possible; rates of two cores
+are sums. JSON: one row per cell with the keys face, preset, n_robots, n_envs, cores, steps_per_s, and the share of each
+part.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ CELLS = [(face, preset, 1) for face in ("gym", "render") for preset in ("paper",
 
 
 def measure(face: str, preset: str, n_envs: int, core: int, seconds: float, solver: str) -> dict[str, Any]:
-    """Steps per second of one process, and the share of the time that each part takes."""
+    """Measure the steps per second of one process, and the share of each part."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {core % (os.cpu_count() or 1)})
     kwargs: dict[str, Any] = {"preset": preset, "scenario": "mixed", "solver": solver}
@@ -70,7 +71,7 @@ def measure(face: str, preset: str, n_envs: int, core: int, seconds: float, solv
 
 
 def attach_timers(task: RequestTask) -> dict[str, list[float]]:
-    """Let the parts of a step count their own time."""
+    """Measure the time of each part of a step."""
     timers: dict[str, list[float]] = {}
     for name, owner, method in [
         ("solve", task.swarm.planner, "plan"),
@@ -87,8 +88,8 @@ def attach_timers(task: RequestTask) -> dict[str, list[float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write one JSON object a cell")
-    parser.add_argument("--seconds", type=float, default=4.0, help="time of each cell (default 4)")
+    parser.add_argument("--json", type=Path, help="write one JSON object per cell")
+    parser.add_argument("--seconds", type=float, default=4.0, help="seconds per cell (default 4)")
     parser.add_argument("--solver", default="auto", help="planner's solver (default auto)")
     args = parser.parse_args()
     rows = []

@@ -1,5 +1,5 @@
 """
-How well each estimator of the gradient through bits and categories learns the small team tasks.
+Compare how well the gradient estimators for bits and categories learn the small team tasks.
 
 ``python benchmarks/estimators.py [--seeds 5] [--json FILE]``
 """
@@ -18,7 +18,7 @@ from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.team_tasks import BINARY_TASKS, OwnCategory, TeamTask
 from sb3_maddpg.utils import atomic_write
 
-# Same for every estimator; the steps after which the deterministic policy is measured.
+# Arguments for all estimators, and the steps after which the deterministic policy is evaluated
 RECIPE: dict[str, Any] = {
     "learning_rate": 3e-3,
     "learning_starts": 200,
@@ -33,10 +33,10 @@ T_95 = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 7: 2.36, 8: 2.31,
 
 def learning_curve(task: type[TeamTask], estimator: str, seed: int) -> list[float]:
     """
-    :param task: to learn
+    :param task: task to learn
     :param estimator: name of the estimator
-    :param seed: of environment, networks and exploration
-    :return: at each checkpoint the return, 0 for random actions, 1 for the best policy
+    :param seed: seed of environment, networks and exploration
+    :return: the return at each checkpoint, scaled to 0 for random actions and 1 for the best policy
     """
     model = MADDPG("MlpPolicy", task(), estimator=estimator, seed=seed, buffer_size=CHECKPOINTS[-1], **RECIPE)
     curve = []
@@ -48,8 +48,8 @@ def learning_curve(task: type[TeamTask], estimator: str, seed: int) -> list[floa
 
 def cell(returns: Sequence[float]) -> str:
     """
-    :param returns: of the seeds
-    :return: mean and half the width of the 95 % interval
+    :param returns: returns of the seeds
+    :return: text with the mean and the half-width of the 95 % interval
     """
     half = T_95[len(returns) - 1] * np.std(returns, ddof=1) / len(returns) ** 0.5
     return f"{np.mean(returns):5.2f} ± {half:.2f}"
@@ -57,13 +57,15 @@ def cell(returns: Sequence[float]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=5, choices=range(2, 11), help="runs of each (default 5)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every return")
+    parser.add_argument(
+        "--seeds", type=int, default=5, choices=range(2, 11), help="runs per estimator and task (default 5)"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all returns")
     arguments = parser.parse_args()
     th.set_num_threads(1)
 
     print(
-        "Return of the deterministic policy after so many steps: 0 random actions, 1 optimum; mean and 95 % interval."
+        "Return of the deterministic policy by steps: 0 for random actions, 1 for the optimum; mean and 95 % interval."
     )
     print(f"{'task':12} {'estimator':24}" + "".join(f"{steps:>15}" for steps in CHECKPOINTS))
     rows = []

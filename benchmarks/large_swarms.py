@@ -1,13 +1,18 @@
-"""Steps per second and memory of large swarms, with and without a limited neighbourhood.
+"""Measure the steps per second and the memory of large swarms, with and without a limited neighbourhood.
 
-``python benchmarks/large_swarms.py [--json F]`` flies the preset `flight` with 4 to 128 robots, as many to a square
-metre as there, observed as for the recipe of `flight`, with random bits. ``all``: everybody perceives everybody.
-``planned``: plans consider the nearest few only. ``limited``: robots perceive the nearest few within a range, and plan
-as in ``planned``. A critic's pass is that of `PairPolicy`, forwards and backwards, over a batch of the recipe's size.
+``python benchmarks/large_swarms.py [--json F]`` flies the preset `flight` with 4 to 128 robots, the preset's number of
+robots per area, the observation of its recipe, and random actions:
 
-Each cell has a process of its own, one after the other, pinned to a core where the system allows. Memory is the growth
-of the process's peak. JSON: one row a cell with the keys perceived, n_robots, n_others, n_envs, steps_per_s, memory_mb
-(of the environments), critic_ms, critic_mb, and the ratios steps_ratio and critic_ratio to ``all`` with as many robots.
+- ``all``: robots perceive all others,
+- ``planned``: the planner considers only the nearest others,
+- ``limited``: robots also perceive only the nearest others within a range.
+
+The critic's time is that of a forward and a backward pass of `PairPolicy` with the recipe's batch size.
+
+Each cell runs in its own process, one after the other, pinned to a core if the system supports this. Memory is the
+increase of the process's peak. JSON: one row per cell with the keys perceived, n_robots, n_others, n_envs, steps_per_s,
+memory_mb (of the environments), critic_ms, critic_mb, and the ratios to ``all`` with the same number of robots,
+steps_ratio and critic_ratio.
 """
 
 from __future__ import annotations
@@ -37,11 +42,15 @@ NEIGHBOURHOOD = {"max_others": 16, "range": 8.0, "look_ahead": 1.0}
 PLANNED = 8
 BATCH = 96
 OBSERVATION = "state+approach+side+memory+plan+told+mask+critic"
-_WARM_UP = 3  # steps
+_WARM_UP = 3  # number of steps that are not measured
 
 
 def world(n_robots: int, perceived: str) -> dict[str, Any]:
-    """Fields of the world and its space: as many robots to a square metre as in `flight`."""
+    """Return the arguments of a world with the number of robots per area of `flight`.
+
+    :param n_robots: number of robots
+    :param perceived: one of `PERCEIVED`
+    """
     half_width = 3.0 * math.sqrt(n_robots / 8)
     reach = half_width + 2.0
     planner: dict[str, Any] = {"workspace_low": (-reach, -reach, 0.48), "workspace_high": (reach, reach, 2.4)}
@@ -54,7 +63,15 @@ def world(n_robots: int, perceived: str) -> dict[str, Any]:
 
 
 def measure(n_robots: int, perceived: str, n_envs: int, seconds: float, core: int) -> dict[str, Any]:
-    """The row of a cell, but for its ratios."""
+    """Measure a cell.
+
+    :param n_robots: number of robots
+    :param perceived: one of `PERCEIVED`
+    :param n_envs: number of swarms
+    :param seconds: duration of each measurement (s)
+    :param core: core to use
+    :return: row of the cell without its ratios
+    """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {core % (os.cpu_count() or 1)})
     th.set_num_threads(1)
@@ -84,11 +101,11 @@ def measure(n_robots: int, perceived: str, n_envs: int, seconds: float, core: in
 
 
 def _fly(task: RequestTask, seconds: float) -> float:
-    """Steps per second of all environments together."""
+    """Return the steps per second, summed over all environments."""
     n_envs, config, rng = task.swarm.n_swarms, task.swarm.config, np.random.default_rng(0)
     for k in range(n_envs):
         task.reset(k, np.random.default_rng(k))
-    # About as many requests and announcements as a trained policy sends, whatever the size of the swarm
+    # About as many requests and announcements per robot as a trained policy makes, for any number of robots
     share = 0.15 / config.n_others
     bits = [rng.random((n_envs, config.n_robots, config.n_others, 2)) < share for _ in range(8)]
     count, started = -_WARM_UP, time.perf_counter()
@@ -102,7 +119,7 @@ def _fly(task: RequestTask, seconds: float) -> float:
 
 
 def _think(task: RequestTask, seconds: float) -> float:
-    """Milliseconds of a critic's pass, the least of several."""
+    """Return the shortest of several times of a critic's passes (ms)."""
     n, m = task.swarm.config.n_robots, task.swarm.config.n_others
     seen = task.observe()
     policy = PairPolicy(
@@ -124,17 +141,19 @@ def _think(task: RequestTask, seconds: float) -> float:
 
 
 def _peak_mb() -> float:
-    """Most memory that the process has had (MB)."""
+    """Return the peak memory of the process (MB)."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write one JSON object a cell")
+    parser.add_argument("--json", type=Path, help="write one JSON object per cell")
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots (default 4 to 128)")
-    parser.add_argument("--envs", type=int, default=16, help="swarms in a process (default 16)")
-    parser.add_argument("--seconds", type=float, default=4.0, help="time of each measurement (default 4)")
-    parser.add_argument("--core", type=int, default=0, help="which core to use (default 0)")
+    parser.add_argument("--envs", type=int, default=16, help="number of swarms per process (default 16)")
+    parser.add_argument(
+        "--seconds", type=float, default=4.0, help="duration of each measurement in seconds (default 4)"
+    )
+    parser.add_argument("--core", type=int, default=0, help="core to use (default 0)")
     args = parser.parse_args()
     rows: list[dict[str, Any]] = []
     print(f"{'robots':>6} {'perceived':>9} {'others':>6} {'steps/s':>9} {'MB':>7} {'critic ms':>9} {'MB':>7}   ratios")

@@ -1,17 +1,17 @@
-"""How well MADDPG learns here and in other libraries, on the tasks of Lowe et al. (mpe2, continuous actions).
+"""Compare how well MADDPG learns here and in other libraries, on the tasks of Lowe et al. (mpe2, continuous actions).
 
-``python -m benchmarks.learning [--json F]`` trains ours and the plain loop; with ``--peers`` all libraries, which
-``make bench-peers`` installs. Every training has the settings of benchmarks/peers/common.py, one core and one thread.
-Each that has ended is a line of runs.jsonl in ``--folder``, beside its policies: the script trains only what is not
-there yet, so it can be stopped and called again. Rows, for each task, side and library:
+``python -m benchmarks.learning [--json F]`` trains our MADDPG and the plain loop, with ``--peers`` also all libraries
+that ``make bench-peers`` installs. All trainings use the settings of benchmarks/peers/common.py, one core and one
+thread. Each finished training is a line of runs.jsonl in ``--folder``, beside its policies. The script skips finished
+trainings, so it can be stopped and restarted. Rows, for each task, side and library:
 
-- ``return``: mean return of an agent over 100 episodes without exploration, the mean over the seeds of the training,
-  with a 95 % t-interval. On tag and adversary, where one side gains what the other loses, it is each side's return
-  against those it trained with, which says little: see crossplay.py.
-- ``ours_minus``: how much better ours does than this library, with a 95 % interval of Welch;
-- ``cpu_s``: processor time of a training, median.
+- ``return``: mean return of an agent over 100 episodes without exploration, averaged over seeds, with a 95 %
+  t-interval. In tag and adversary, where one side gains what the other loses, this is each side's return against its
+  training partners, which is not informative: see crossplay.py.
+- ``ours_minus``: return of ours minus return of this library, with Welch's 95 % interval;
+- ``cpu_s``: median processor time of a training.
 
-``--no-train`` only prints what is there.
+``--no-train`` only prints existing results.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from benchmarks.training import OURS, REFERENCE, ROOT, machine, missing, python_
 TASKS = ("simple_speaker_listener_v4", "simple_tag_v3", "simple_adversary_v3", "simple_spread_v3")
 TWIN = "matd3"
 EVERYTHING = (OURS, REFERENCE, "xuance", "agilerl", "benchmarl", TWIN)
-# Seeds of each training; the slow ones have fewer
+# Number of seeds per library, fewer for slow ones
 SEEDS = {OURS: 5, REFERENCE: 5, "xuance": 5, "agilerl": 3, "benchmarl": 1, TWIN: 3}
 FOLDER = ROOT / "logs" / "learning"
 
@@ -40,7 +40,7 @@ Row = dict[str, Any]
 
 
 def sides(agents: Iterable[str]) -> dict[str, list[str]]:
-    """The agents of each side: one for all, unless some are adversaries."""
+    """:return: the agents of each side; there is only one side unless some agents are adversaries"""
     teams: dict[str, list[str]] = {}
     names = list(agents)
     against = any(name.startswith("adversary") for name in names)
@@ -52,8 +52,8 @@ def sides(agents: Iterable[str]) -> dict[str, list[str]]:
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
     """
-    :param values: independent, such as one a seed
-    :return: mean, and half the width of its 95 % t-interval; NaN for one value
+    :param values: independent values, such as one per seed
+    :return: the mean and the half-width of its 95 % t-interval, NaN for a single value
     """
     if len(values) < 2:
         return float(np.mean(values)), float("nan")
@@ -63,7 +63,7 @@ def interval(values: Sequence[float]) -> tuple[float, float]:
 
 def welch(first: Sequence[float], second: Sequence[float]) -> tuple[float, float]:
     """
-    :return: difference of the means, and half the width of its 95 % interval; NaN where one has a single value
+    :return: the difference of the means and the half-width of its 95 % interval, NaN if either has a single value
     """
     difference = float(np.mean(first) - np.mean(second))
     if min(len(first), len(second)) < 2:
@@ -74,20 +74,20 @@ def welch(first: Sequence[float], second: Sequence[float]) -> tuple[float, float
 
 
 def read(folder: Path) -> list[Row]:
-    """The trainings that have ended."""
+    """:return: the finished trainings"""
     path = folder / "runs.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def write(path: Path, rows: Iterable[Row]) -> None:
-    """One JSON object a row, null where there is no interval."""
+    """Write one JSON object per row, with null for missing intervals."""
     path.parent.mkdir(parents=True, exist_ok=True)
     clean = ({key: None if value != value else value for key, value in row.items()} for row in rows)
     path.write_text("".join(json.dumps(row) + "\n" for row in clean))
 
 
 def actors_of(folder: Path, name: str, env: str, seed: int, steps: int) -> Path:
-    """Where a training leaves its policies."""
+    """:return: folder of a training's policies"""
     return folder / env / f"{name}_{seed}_{steps}"
 
 
@@ -95,7 +95,7 @@ def train(name: str, env: str, seed: int, steps: int, folder: Path, core: int | 
     """
     Run a driver once.
 
-    :raises RuntimeError: it failed
+    :raises RuntimeError: if the driver failed
     """
     command = [str(python_of(name)), "-m", f"benchmarks.peers.{name}_bench", "learn", "--env", env]
     command += ["--steps", str(steps), "--seed", str(seed), "--export", str(actors_of(folder, name, env, seed, steps))]
@@ -108,7 +108,7 @@ def train(name: str, env: str, seed: int, steps: int, folder: Path, core: int | 
 
 
 def summarise(runs: Iterable[Row]) -> list[Row]:
-    """One row a task, side and library: the mean over the seeds."""
+    """:return: one row per task, side and library, averaged over seeds"""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for run in runs:
         for side in sides(run["returns"]):
@@ -151,25 +151,25 @@ def report(rows: Iterable[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a row")
-    parser.add_argument("--peers", action="store_true", help="the other libraries too, and MATD3")
-    parser.add_argument("--only", nargs="+", choices=EVERYTHING, help="these libraries")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
+    parser.add_argument("--peers", action="store_true", help="also the other libraries, and MATD3")
+    parser.add_argument("--only", nargs="+", choices=EVERYTHING, help="only these libraries")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS[:3])
-    parser.add_argument("--seeds", type=int, help="as many for each library (default: more for the fast ones)")
-    parser.add_argument("--steps", type=int, default=50_000, help="of the environment, of each training")
-    parser.add_argument("--folder", type=Path, default=FOLDER, help="where the trainings are (default logs/learning)")
-    parser.add_argument("--no-train", action="store_true", help="print what is there")
-    parser.add_argument("--core", type=int, help="pin to this core (default: the last one that is allowed)")
+    parser.add_argument("--seeds", type=int, help="seeds per library (default: more for fast ones)")
+    parser.add_argument("--steps", type=int, default=50_000, help="environment steps per training")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="folder of the trainings (default logs/learning)")
+    parser.add_argument("--no-train", action="store_true", help="only print existing results")
+    parser.add_argument("--core", type=int, help="core to pin to (default: the last allowed one)")
     args = parser.parse_args()
 
     names = args.only or (EVERYTHING if args.peers else (OURS, REFERENCE))
     for name in names:
         if not args.no_train and (command := missing(name)):
-            print(f"{name} is left out, it is not installed: {command}", file=sys.stderr, flush=True)
+            print(f"{name} is skipped, since it is not installed: {command}", file=sys.stderr, flush=True)
     available = [name for name in names if not missing(name)]
     wanted = {name: args.seeds or SEEDS[name] for name in available}
     failures = 0
-    # Seed by seed, so that whatever is there at any time compares the same seeds
+    # Seed by seed, so that intermediate results compare the same seeds
     for seed in range(0 if args.no_train else max(wanted.values(), default=0)):
         for name, env in [(name, env) for name in available for env in args.tasks if seed < wanted[name]]:
             key = (name, env, seed, args.steps)

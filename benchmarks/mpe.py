@@ -1,14 +1,14 @@
-"""It learns what others learn: the particle worlds of Lowe et al. (2017), by the packaged recipes.
+"""Train with the packaged recipes in the particle worlds of Lowe et al. (2017).
 
 ``python benchmarks/mpe.py [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
-runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes
-without noise every 10,000 steps, and writes all learning curves to benchmarks/results/mpe2.json, beside those that are
-there of other runs. Finished runs in ``--log-folder`` that were trained by the present recipe are not trained again.
-Actions are continuous, except where the environment is followed by ``:discrete``. ``ppo`` is PPO with one policy for
-all agents; its recipes have discrete actions.
+runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes without noise
+every 10,000 steps. It adds the learning curves to benchmarks/results/mpe2.json. Finished runs in ``--log-folder`` that
+used the current recipe are not repeated. Actions are continuous, except for environments followed by ``:discrete``.
+``ppo`` is PPO with one policy for all agents; its recipes have discrete actions.
 
-Returns are means over the agents, as the zoo evaluates them: of teams with opponents (tag, adversary) the mean tells
-little, since all learn. Hence each run also says what the agents get by the last policy, ``agents``.
+Returns are means over the agents, as in the zoo's evaluation. With opponents (tag, adversary), the mean is not
+informative, since all agents learn. Therefore each run also has the returns of the individual agents with the last
+policy, ``agents``.
 """
 
 import argparse
@@ -48,11 +48,11 @@ ENVS = (*MODULES, "simple_spread:discrete")
 ALGOS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
 SHOWN = (50_000, 100_000)
-# What a new implementation should reach, mean of the seeds: a little worse than XuanCe and a plain PyTorch loop
+# Mean returns that an implementation should reach, slightly worse than those of XuanCe and a plain PyTorch loop
 BARS = {("simple_spread", 50_000): -21.0, ("simple_spread", 100_000): -19.5}
 PACKAGES = ("sb3-maddpg", "stable-baselines3", "rl_zoo3", "torch", "numpy", "gymnasium", "pettingzoo", "mpe2")
 
-KEYS = ("env", "actions", "algo", "seed")  # of a run
+KEYS = ("env", "actions", "algo", "seed")  # identify a run
 Row = dict[str, Any]
 
 
@@ -68,7 +68,7 @@ class Run(NamedTuple):
 
     @property
     def folder(self) -> Path:
-        """Its own log folder."""
+        """Log folder of this training."""
         return self.log_folder / f"{self.env}-{self.actions}-{self.algo}-seed{self.seed}"
 
     @property
@@ -78,12 +78,12 @@ class Run(NamedTuple):
 
     @property
     def counted(self) -> int:
-        """How often an environment step is counted: PPO counts it for each agent."""
+        """Number of timesteps counted per environment step: PPO counts one per agent."""
         return len(_team(self).agent_names) if self.algo == "ppo" else 1
 
     @property
     def command(self) -> list[str]:
-        """The command line behind ``python``, but for the log folder."""
+        """Command line after ``python``, without the log folder."""
         command = ["-m", "sb3_maddpg", "train", "--algo", self.algo, "--env", MODULES[self.env]]
         command += ["--seed", str(self.seed), "-n", str(self.counted * self.steps)]
         command += ["--eval-freq", str(self.counted * EVAL_FREQ)]
@@ -91,7 +91,7 @@ class Run(NamedTuple):
         return command if self.continuous else [*command, "--env-kwargs", "continuous_actions:False"]
 
     def finished(self) -> Path | None:
-        """Where it was trained to the end by the present recipe, if it was."""
+        """:return: folder of the finished training with the current recipe, None if there is none"""
         name = MODULES[self.env].replace("/", "-")
         recipe = _recipe(self.algo, MODULES[self.env])
         recipe["env_kwargs"] = {**recipe["env_kwargs"], "continuous_actions": self.continuous}
@@ -100,7 +100,8 @@ class Run(NamedTuple):
             model, curve, config = (folder / part for part in (f"{name}.zip", "evaluations.npz", f"{name}/config.yml"))
             if not (model.exists() and curve.exists() and config.exists()):
                 continue
-            trained_by = yaml.load(config.read_text(), yaml.UnsafeLoader)  # our own; rl_zoo3 writes an OrderedDict
+            # rl_zoo3 writes an OrderedDict. The file is our own, so the unsafe loader is safe here.
+            trained_by = yaml.load(config.read_text(), yaml.UnsafeLoader)
             if any(trained_by.get(key) != recipe.get(key) for key in (trained_by.keys() | recipe.keys()) - beside):
                 continue
             results = np.load(curve)["results"]
@@ -110,12 +111,12 @@ class Run(NamedTuple):
 
     def train(self) -> None:
         """
-        Train, unless that is done.
+        Train, unless the training is finished.
 
-        :raises RuntimeError: it failed
+        :raises RuntimeError: if the training failed
         """
         if self.finished():
-            print(f"{self.label}: done before", flush=True)
+            print(f"{self.label}: already finished", flush=True)
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "commit").write_text(_commit())
@@ -131,17 +132,17 @@ class Run(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What to call it."""
+        """Name of the training in messages."""
         return f"{self.env} {self.actions} {self.algo} seed {self.seed}"
 
     def row(self) -> Row | None:
-        """What is reported of it, once it is finished."""
+        """:return: the row of the training, None if it is not finished"""
         folder = self.finished()
         if folder is None:
             return None
         evaluations = np.load(folder / "evaluations.npz")
         agents = folder / "agents.json"
-        if self.algo == "ppo":  # one policy, which acts for one agent at a time
+        if self.algo == "ppo":  # a single-agent policy, which returns_by_agent cannot run
             agents.write_text("{}")
         if not agents.exists():
             returns = returns_by_agent(next(folder.glob("mpe2-*.zip")), self)
@@ -174,8 +175,8 @@ def _commit() -> str:
 
 def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
     """
-    :param model: a trained model
-    :param run: how it was trained
+    :param model: path of a trained model
+    :param run: its training
     :return: each agent's mean return over ``EVAL_EPISODES`` episodes without noise
     """
     team = _team(run)
@@ -194,14 +195,14 @@ def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """:return: half of the 95 % interval of the mean, by Student's t"""
+    """:return: the half-width of the 95 % t-interval of the mean"""
     from scipy.stats import t
 
     return float(t.ppf(0.975, len(values) - 1)) * stdev(values) / len(values) ** 0.5 if len(values) > 1 else np.nan
 
 
 def grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
-    """:return: the seeds of each environment, kind of actions and algorithm"""
+    """:return: rows of all seeds by environment, kind of actions and algorithm"""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["env"], row["actions"], row["algo"]), []).append(row)
@@ -227,10 +228,10 @@ def report(rows: Sequence[Row]) -> None:
 
 
 def random_return(env: str, actions: str) -> float:
-    """Return of random actions, mean over agents and 500 episodes.
-
-    :param env: as in rows, such as mpe2/simple_spread_v3
+    """
+    :param env: environment as in rows, such as mpe2/simple_spread_v3
     :param actions: continuous or discrete
+    :return: mean return of random actions over agents and 500 episodes
     """
     module = importlib.import_module(env.replace("/", "."))
     team_env = TeamEnv(module.parallel_env(continuous_actions=actions == "continuous"))
@@ -246,7 +247,7 @@ def random_return(env: str, actions: str) -> float:
 
 
 def plot(rows: Sequence[Row], file: Path) -> None:
-    """Draw the learning curves, a panel an environment, with 95 % t-intervals and the return of random actions."""
+    """Draw the learning curves with 95 % t-intervals and the return of random actions, with a panel per environment."""
     groups = grouped(rows)
     envs = list(dict.fromkeys(env for env, _, _ in groups))
     labels = list(dict.fromkeys((algo, actions) for _, actions, algo in groups))
@@ -279,7 +280,7 @@ def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> Non
 
 
 def write(rows: Sequence[Row], file: Path) -> None:
-    """Write the results, and with what they were obtained."""
+    """Write the results with the versions and recipes that produced them."""
     about = {
         "command": " ".join(["python", *sys.argv]),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
@@ -302,11 +303,11 @@ def main() -> None:
     parser.add_argument("--algos", nargs="+", default=["maddpg"], choices=[*ALGOS, "ppo"])
     parser.add_argument("--seeds", nargs="+", type=int, default=range(5))
     parser.add_argument("--steps", type=int, default=100_000, help="length of each training (default 100,000)")
-    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, each with one thread")
-    parser.add_argument("--log-folder", type=Path, default=Path("logs/mpe2"), help="where the trainings are")
+    parser.add_argument("--jobs", type=int, default=1, help="parallel trainings, each with one thread")
+    parser.add_argument("--log-folder", type=Path, default=Path("logs/mpe2"), help="folder of the trainings")
     parser.add_argument("--json", type=Path, default=ROOT / "benchmarks/results/mpe2.json", metavar="FILE")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the learning curves")
-    parser.add_argument("--report", action="store_true", help="train nothing, report what is finished")
+    parser.add_argument("--report", action="store_true", help="only report finished trainings")
     args = parser.parse_args()
 
     folder = args.log_folder.resolve()
@@ -321,7 +322,7 @@ def main() -> None:
     failures = []
     if not args.report:
         with ThreadPoolExecutor(args.jobs) as pool:
-            # Seed by seed, so that an early end leaves as many seeds of each
+            # Seed by seed, so that an early end leaves equal numbers of seeds
             for future in [pool.submit(run.train) for run in sorted(runs, key=lambda run: run.seed)]:
                 try:
                     future.result()

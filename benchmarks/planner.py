@@ -1,21 +1,20 @@
-"""How long the solvers of the planner take on problems recorded in closed loop, on one core.
+"""Measure the time of the planner's solvers for problems recorded in closed loop, on one core.
 
 python benchmarks/planner.py [--json FILE] [--full]
 
-Every solver gets the same problems and the same guess, the last plan shifted. `ipopt`, `fatrop` and `hpipm` solve one
-problem after the other, so their time a solve holds for any number of environments. Times are processor time of this
-thread, which other processes on the machine do not count into, but which their use of the caches still disturbs:
-trust the ratios.
+All solvers get the same problems and the same initial guess, which is the shifted last plan. `ipopt`, `fatrop` and
+`hpipm` solve one problem after the other, so their time per solve holds for any number of environments. Times are
+processor times of this thread. They do not include other processes, which still affect the caches: rely on the ratios.
 
 - ipopt: the nonlinear program interpreted by CasADi, warm-started, tolerance 1e-6; ipopt_compiled: with C code
 - fatrop: the reference solver of `quad_swarm`, tolerance 1e-4
 - hpipm: a real-time iteration in C on the HPIPM in CasADi's wheel, the method of acados
 - rti: the batched real-time iteration of `quad_swarm`
 
-iterations: quadratic programs a problem for hpipm and rti, the solver's own iterations (mean) for the others.
+iterations: quadratic programs per problem for hpipm and rti, mean number of the solver's iterations for the others.
 
-With --agreement it compares plans instead of times: rti after 1, 2 and 3 quadratic programs against the converged
-optimum of fatrop (tolerance 1e-6), in both presets.
+--agreement compares plans instead of times: rti after 1, 2 and 3 quadratic programs with the converged optimum of
+fatrop (tolerance 1e-6), in both presets.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ from quad_swarm.world.swarm import Swarm
 HORIZONS = (10, 20)
 ROBOTS = (4, 8, 16)
 ENVIRONMENTS = (1, 4, 16, 64)
-STEPS = 40  # of each recorded flight: until most robots have passed each other
+STEPS = 40  # steps per recorded flight, until most robots have passed each other
 KEYS = (
     "solver", "horizon", "n_robots", "n_envs", "preset", "precision", "iterations", "success_rate", "us_median",
     "us_p99", "times_ipopt", "times_fatrop", "times_hpipm",
@@ -54,14 +53,14 @@ KEYS = (
 
 
 class Call(NamedTuple):
-    """What a planner gives its solver in one step of some environments."""
+    """Arguments of a solver in one step of some environments."""
 
     problems: Problems
     x_guess: np.ndarray
     u_guess: np.ndarray
 
     def part(self, index: Any) -> Call:
-        """Some of its problems."""
+        """Return some of the problems."""
         return Call(self.problems.part(index), self.x_guess[index], self.u_guess[index])
 
 
@@ -69,7 +68,7 @@ Solve = Callable[[Call], Solution]
 
 
 def world(n_robots: int, horizon: int) -> tuple[str, SwarmConfig]:
-    """The preset for a number of robots; its room is widened for more than eight, which would not fit."""
+    """Return the preset for a number of robots, with a larger room for more than eight robots."""
     preset = "paper" if n_robots <= 4 else "dense"
     config = make_config(preset, n_robots=n_robots)
     space, planner = config.space, replace(config.planner, horizon=horizon)
@@ -91,7 +90,7 @@ def world(n_robots: int, horizon: int) -> tuple[str, SwarmConfig]:
 
 
 def record(config: SwarmConfig, n_envs: int, seed: int = 0) -> list[Call]:
-    """Fly environments of all scenarios, half of them asking everybody and half nobody; one call a step."""
+    """Fly environments of all scenarios, half of them with full communication, half without, and record the calls."""
     swarm = Swarm(config, n_envs, "rti")
     names = list(SCENARIOS)
     for k in range(n_envs):
@@ -110,11 +109,11 @@ def record(config: SwarmConfig, n_envs: int, seed: int = 0) -> list[Call]:
     requests[: n_envs // 2] = True
     for _ in range(STEPS):
         swarm.step(requests)
-    return [call for call in calls if len(call.x_guess) == n_envs * n]  # without the ladder's retries
+    return [call for call in calls if len(call.x_guess) == n_envs * n]  # without retries of the fallback chain
 
 
 def split(calls: Sequence[Call], n_envs: int, n_robots: int, limit: int) -> list[Call]:
-    """At most ``limit`` calls of ``n_envs`` environments each, spread over the recorded flights."""
+    """Return at most ``limit`` calls of ``n_envs`` environments each, spread over the recorded flights."""
     size = n_envs * n_robots
     parts = [
         call.part(slice(start, start + size))
@@ -125,7 +124,7 @@ def split(calls: Sequence[Call], n_envs: int, n_robots: int, limit: int) -> list
 
 
 def measure(solve: Solve, calls: Sequence[Call], repeats: int) -> dict[str, Any]:
-    """Time a solve in every call (the fastest of some repeats) and what came of it."""
+    """Measure the time of each call (the minimum over repeats) and the success of its solves."""
     solve(calls[0])
     times, success, iterations = [], [], []
     for call in calls:
@@ -146,7 +145,7 @@ def measure(solve: Solve, calls: Sequence[Call], repeats: int) -> dict[str, Any]
 
 
 def ipopt(problem: OptimalControlProblem, compiled: bool) -> Solve:
-    """Ipopt as a user of CasADi writes it."""
+    """Return a solver that uses Ipopt as CasADi's users do."""
     program = transcribe(problem)
     options: dict[str, Any] = {
         "print_time": False,
@@ -179,7 +178,7 @@ def ipopt(problem: OptimalControlProblem, compiled: bool) -> Solve:
 
 
 def hpipm(problem: OptimalControlProblem, sqp_iterations: int, folder: Path) -> Solve:
-    """The real-time iteration in `hpipm_rti.c`, compiled for the problem."""
+    """Return the real-time iteration in `hpipm_rti.c`, compiled for the problem."""
     library = ctypes.CDLL(str(_compile_hpipm(problem, folder)))
     config, nu = problem.config, problem.nu
     u = ca.SX.sym("u", nu)
@@ -248,7 +247,7 @@ def _compile_hpipm(problem: OptimalControlProblem, folder: Path) -> Path:
 
 
 def compare(n_robots: int, horizon: int, n_envs: Sequence[int], full: bool, folder: Path) -> list[dict[str, Any]]:
-    """All solvers on the problems of one world."""
+    """Measure all solvers on the problems of one world."""
     preset, config = world(n_robots, horizon)
     calls = record(config, max(16, *n_envs))
     robots = np.random.default_rng(0).integers(n_robots, size=100)
@@ -283,7 +282,7 @@ def compare(n_robots: int, horizon: int, n_envs: Sequence[int], full: bool, fold
 
 
 def plan_cost(problem: OptimalControlProblem, call: Call, u: np.ndarray) -> np.ndarray:
-    """The cost (eq. 2) of the inputs (B, N, 4) of each problem and the states that follow from them."""
+    """Return the cost (eq. 2) of the inputs (B, N, 4) of each problem and the resulting states."""
     c, n_others = problem.config, problem.n_others
     x0, goal, others = ca.SX.sym("x0", problem.nx), ca.SX.sym("goal", 3), ca.SX.sym("others", 3, c.horizon * n_others)
     inputs = ca.SX.sym("u", problem.nu, c.horizon)
@@ -310,7 +309,7 @@ def plan_cost(problem: OptimalControlProblem, call: Call, u: np.ndarray) -> np.n
 
 
 def agreement() -> None:
-    """Print how far the plans of rti are from the converged optimum."""
+    """Print the deviations of rti's plans from the converged optimum."""
     print("preset  programs  precision  success   cost gap            first input         position (m)")
     print("                                      (median, p99, max of each)")
     for n_robots in (4, 8):
@@ -340,7 +339,7 @@ def agreement() -> None:
 
 
 def _with_ratios(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with how many times faster each is than three rivals; of hpipm the single iteration counts."""
+    """Add the speedups over three rivals to the rows; for hpipm, those over a single iteration."""
     rivals: dict[str, float] = {}
     for row in rows:
         rivals.setdefault(row["solver"], row["us_median"])
@@ -363,9 +362,9 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a row")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
     parser.add_argument("--full", action="store_true", help="more problems and variants (half an hour)")
     parser.add_argument("--agreement", action="store_true", help="compare plans with the converged optimum instead")
     parser.add_argument("--horizon", type=int, nargs="+", default=HORIZONS, help="default 10 20")

@@ -1,9 +1,9 @@
-"""What environments in other processes gain: ``python benchmarks/ray_env.py [--workers 2] [--json F]``.
+"""Measure the speedup of environments in other processes: ``python benchmarks/ray_env.py [--workers 2] [--json F]``.
 
-Steps an environment that takes so many milliseconds a step, in this process and as shards of a `RayVecEnv`, a worker
-each, and the swarm. An environment that waits takes no processor time, so more workers than cores tell what a larger
-machine would. JSON: one row a case with case, workers, local and remote steps/s, and efficiency: the remote rate
-over the local one and the workers.
+Steps environments with given milliseconds per step, and the swarm, in this process and as shards of a `RayVecEnv` with
+one worker each. Waiting takes no processor time, so more workers than cores simulate a larger machine. JSON: one row
+per case with case, workers, local and remote steps/s, and efficiency: the remote rate divided by the local one and the
+number of workers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 
 class Slow(OwnBit):
-    """Takes its time."""
+    """Environment that waits in each step."""
 
     def __init__(self, milliseconds: float):
         super().__init__()
@@ -41,19 +41,19 @@ class Slow(OwnBit):
 
 
 def slow(milliseconds: float) -> VecEnv:
-    """A shard of one environment."""
+    """Create a shard of one environment."""
     return DummyVecEnv([partial(Slow, milliseconds)])
 
 
 def swarms() -> VecEnv:
-    """A shard of 32 swarms."""
+    """Create a shard of 32 swarms."""
     import quad_swarm  # noqa: F401 - registers the environment in the worker
 
     return GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", num_envs=32))
 
 
 def rate(env: VecEnv, seconds: float) -> float:
-    """Steps per second of all its environments."""
+    """Measure the steps per second of all environments."""
     env.reset()
     actions = np.array([env.action_space.sample() for _ in range(env.num_envs)])
     for _ in range(3):
@@ -66,7 +66,7 @@ def rate(env: VecEnv, seconds: float) -> float:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, nargs="+", default=[2, 4])
     parser.add_argument("--seconds", type=float, default=5.0)

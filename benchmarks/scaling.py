@@ -1,8 +1,8 @@
-"""Gradient updates per second for larger batches and larger teams, on any device.
+"""Measure gradient updates per second for larger batches and larger teams, on any device.
 
-``python benchmarks/scaling.py [--device cuda] [--json F]``: separate networks of 2x64, observations of 18 numbers, five
-continuous actions an agent, transitions drawn at random. An update is that of ``benchmarks/training.py``. Rates are per
-second of wall time, the best of the rounds; the ratio is to the smallest batch, in transitions per second.
+``python benchmarks/scaling.py [--device cuda] [--json F]``: networks of 2x64, observations of 18 numbers, five
+continuous actions per agent, random transitions. Updates are those of ``benchmarks/training.py``. Rates are per second
+of wall time, the best of all rounds. The ratio compares transitions per second with those of the smallest batch.
 """
 
 import argparse
@@ -26,9 +26,9 @@ TRANSITIONS = 100_000
 
 class Noise(gym.Env):
     """
-    A team whose observations and rewards are noise.
+    Team environment whose observations and rewards are noise.
 
-    :param n_agents: its size
+    :param n_agents: number of agents
     """
 
     def __init__(self, n_agents: int) -> None:
@@ -38,10 +38,10 @@ class Noise(gym.Env):
 
 def filled_model(n_agents: int, device: str, networks: str) -> MADDPG:
     """
-    :param n_agents: size of the team
-    :param device: where to train
+    :param n_agents: number of agents
+    :param device: device to train on
     :param networks: "separate" or "shared"
-    :return: a model whose memory is full of noise
+    :return: a model whose replay buffer is full of noise
     """
     rng = np.random.default_rng(0)
     shared = networks == "shared"
@@ -64,9 +64,10 @@ def filled_model(n_agents: int, device: str, networks: str) -> MADDPG:
 
 def updates_per_second(model: MADDPG, batch_size: int, seconds: float) -> float:
     """
-    :param model: with a full memory
+    :param model: a model with a full replay buffer
     :param batch_size: transitions per update
-    :param seconds: how long to measure, about
+    :param seconds: approximate duration of the measurement
+    :return: updates per second
     """
 
     def run(updates: int) -> float:
@@ -84,15 +85,15 @@ def updates_per_second(model: MADDPG, batch_size: int, seconds: float) -> float:
 
 
 def main() -> None:
-    """Measure every combination, print the table, write JSON."""
+    """Measure all combinations, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--device", default="cuda" if th.cuda.is_available() else "cpu")
-    parser.add_argument("--agents", type=int, nargs="+", help="sizes of the team (default 3 8 16, on a GPU to 64)")
-    parser.add_argument("--batch-sizes", type=int, nargs="+", help="default 1024 4096, on a GPU to 65536")
+    parser.add_argument("--agents", type=int, nargs="+", help="numbers of agents (default 3 8 16, on a GPU up to 64)")
+    parser.add_argument("--batch-sizes", type=int, nargs="+", help="default 1024 4096, on a GPU up to 65536")
     parser.add_argument("--networks", choices=("separate", "shared"), default="separate")
-    parser.add_argument("--seconds", type=float, default=2.0, help="for each measurement (default 2)")
+    parser.add_argument("--seconds", type=float, default=2.0, help="seconds per measurement (default 2)")
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--threads", type=int, default=1, help="of the processor (default 1)")
+    parser.add_argument("--threads", type=int, default=1, help="processor threads (default 1)")
     parser.add_argument("--json", help="write the rows to this file")
     arguments = parser.parse_args()
     th.set_num_threads(arguments.threads)

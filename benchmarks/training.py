@@ -1,16 +1,17 @@
-"""How fast MADDPG trains here and in other libraries.
+"""Compare how fast MADDPG trains here and in other libraries.
 
-``python benchmarks/training.py [--json F]``; ``make bench-peers`` installs the other libraries first. One core, one
-thread, three agents of simple_spread (mpe2, continuous actions), networks of two hidden layers of 64, batches of 1024:
+``python benchmarks/training.py [--json F]`` after ``make bench-peers``, which installs the other libraries. All use one
+core, one thread, three agents of simple_spread (mpe2, continuous actions), networks with two hidden layers of 64, and
+batches of 1024:
 
-- ``updates_per_s``: one step of all critics and all actors and of the target networks, with the sample for it,
+- ``updates_per_s``: updates of all critics, all actors and the target networks, including sampling,
 - ``steps_per_s_100``, ``steps_per_s_1``: environment steps of the library's own training loop, with an update every
-  100 steps (as Lowe et al. have it) and every step.
+  100 steps (as in Lowe et al.) and every step.
 
-Rates are per second of processor time, and with ``_wall`` of wall time. Each is the median of several rounds, in which
-the libraries take turns, each in a process of its own. Ratios are medians of those within a round. What a library does
-differently is said in its driver in benchmarks/peers. JSON: one row a library and
-kind of networks.
+Rates are per second of processor time, with ``_wall`` per second of wall time. They are medians over several rounds, in
+which the libraries take turns in separate processes. Ratios are medians of the ratios within rounds. The drivers in
+benchmarks/peers describe what their libraries do differently, especially with shared networks. JSON: one row per
+library and kind of networks.
 """
 
 import argparse
@@ -42,12 +43,12 @@ Rounds = Mapping[tuple[str, str], Sequence[Row]]
 
 
 def python_of(name: str) -> Path:
-    """The interpreter that has the library of a driver."""
+    """:return: the Python interpreter with the library of a driver"""
     return ROOT / ".bench" / name / "bin" / "python" if name in PEERS else Path(sys.executable)
 
 
 def missing(name: str) -> str | None:
-    """How to install what a driver needs, if that is not there."""
+    """:return: the command that installs the dependencies of a driver, None if they are installed"""
     if name in PEERS:
         return None if (ROOT / ".bench" / name / ".installed").exists() else f"make .bench/{name}/.installed"
     return None if importlib.util.find_spec("mpe2") else f"{sys.executable} -m pip install -c constraints.txt mpe2"
@@ -57,7 +58,7 @@ def measure(name: str, networks: str, amounts: Mapping[str, int], core: int | No
     """
     Run a driver once.
 
-    :raises RuntimeError: it failed
+    :raises RuntimeError: if the driver failed
     """
     command = [str(python_of(name)), "-m", f"benchmarks.peers.{name}_bench", "speed", "--networks", networks]
     for option, value in [*amounts.items(), *([] if core is None else [("core", core)])]:
@@ -70,14 +71,14 @@ def measure(name: str, networks: str, amounts: Mapping[str, int], core: int | No
 
 
 def machine() -> str:
-    """The processor, by name."""
+    """:return: name of the processor"""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
 
 
 def summarise(rounds: Rounds) -> list[Row]:
-    """One row a library and kind of networks: medians, and under ``rounds`` what they are medians of."""
+    """:return: one row per library and kind of networks with medians, and all values under ``rounds``"""
     rows = []
     for runs in rounds.values():
         rates = {key: [run[key] for run in runs] for key in runs[0] if key.startswith(RATES)}
@@ -88,7 +89,7 @@ def summarise(rounds: Rounds) -> list[Row]:
 
 
 def ratios(rounds: Rounds, networks: str, rate: str) -> dict[str, float]:
-    """How many times as fast as each other library we are, medians over the rounds."""
+    """:return: our speedup over each other library, as the median over rounds"""
     ours = rounds.get((OURS, networks), ())
     return {
         name: median(our[rate] / other[rate] for our, other in zip(ours, runs, strict=True))
@@ -98,7 +99,11 @@ def ratios(rounds: Rounds, networks: str, rate: str) -> dict[str, float]:
 
 
 def report(rounds: Rounds) -> list[Row]:
-    """Print the table and the ratios, and return the rows."""
+    """
+    Print the table and the ratios.
+
+    :return: the rows
+    """
     rows = summarise(rounds)
     print(f"\nPer second of one core of {machine()}; medians of {max(map(len, rounds.values()))} rounds.")
     print(f"{'library':14} {'version':12} {'networks':9}" + "".join(f"{rate:>17}" for rate in RATES))
@@ -118,18 +123,18 @@ def report(rounds: Rounds) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     everything = (OURS, REFERENCE, *PEERS)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a row")
-    parser.add_argument("--only", nargs="+", choices=everything, default=everything, help="these libraries")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
+    parser.add_argument("--only", nargs="+", choices=everything, default=everything, help="only these libraries")
     parser.add_argument("--networks", nargs="+", choices=HAVE, default=list(HAVE))
-    parser.add_argument("--rounds", type=int, default=3, help="measurements of each (default 3)")
-    parser.add_argument("--quick", action="store_true", help="a fifth of the work, to see that all runs")
-    parser.add_argument("--core", type=int, help="pin to this core (default: the last one that is allowed)")
+    parser.add_argument("--rounds", type=int, default=3, help="number of rounds (default 3)")
+    parser.add_argument("--quick", action="store_true", help="a fifth of the work, as a test")
+    parser.add_argument("--core", type=int, help="core to pin to (default: the last allowed one)")
     args = parser.parse_args()
 
     names = []
     for name in args.only:
         if command := missing(name):
-            print(f"{name} is left out, it is not installed: {command}", flush=True)
+            print(f"{name} is skipped, since it is not installed: {command}", flush=True)
         else:
             names.append(name)
     rounds: dict[tuple[str, str], list[Row]] = {

@@ -1,6 +1,6 @@
-"""One agent's actor by itself: ``python examples/deploy_actor.py [--quick]``.
+"""Deploy the actor of a single agent: ``python examples/deploy_actor.py [--quick]``.
 
-On a robot neither the critics nor the other actors are needed, nor this package: TorchScript runs in Python and in C++.
+A robot needs neither the critics nor the other actors, nor this package: TorchScript runs in Python and in C++.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from mpe2 import simple_speaker_listener_v4
 from sb3_maddpg import MADDPG
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--quick", action="store_true", help="a few steps, to see that it runs")
+parser.add_argument("--quick", action="store_true", help="only a few steps, as a test")
 quick = parser.parse_args().quick
 
 env = simple_speaker_listener_v4.parallel_env(continuous_actions=True)
@@ -22,7 +22,7 @@ model.learn(500 if quick else 100_000)
 listener = model.agent_policy("listener_0")
 listener.export("listener.pt")
 
-# From here on as on the robot: PyTorch alone
+# From here on, only PyTorch is used, as on the robot
 actor = torch.jit.load("listener.pt")
 observations, _ = env.reset(seed=1)
 seen = observations["listener_0"]

@@ -1,4 +1,4 @@
-"""Fly a pretrained model, and draw it: ``python examples/fly_pretrained.py [--quick]``."""
+"""Fly a pretrained model and render it: ``python examples/fly_pretrained.py [--quick]``."""
 
 import argparse
 
@@ -8,11 +8,11 @@ from PIL import Image
 from sb3_maddpg import pretrained
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--quick", action="store_true", help="a few steps, to see that it runs")
+parser.add_argument("--quick", action="store_true", help="only a few steps, as a test")
 quick = parser.parse_args().quick
 
 model = pretrained("quad-swarm-paper")
-kwargs = model.env_spec["kwargs"] | {"scenario": "symmetric_swap"}  # the world in which it was trained
+kwargs = model.env_spec["kwargs"] | {"scenario": "symmetric_swap"}  # the world of its training
 for n_robots in (4, 6):
     env = gymnasium.make("quad_swarm:QuadSwarm-v0", render_mode="rgb_array", **kwargs | {"n_robots": n_robots})
     # One network for all pairs of robots fits a team of any size

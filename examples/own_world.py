@@ -1,4 +1,4 @@
-"""A scenario and a rule of your own, in wind and with lost plans: ``python examples/own_world.py [--quick]``."""
+"""A custom scenario and a custom rule, in wind and with lost plans: ``python examples/own_world.py [--quick]``."""
 
 import argparse
 
@@ -11,21 +11,21 @@ from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--quick", action="store_true", help="a few episodes, to see that it runs")
+parser.add_argument("--quick", action="store_true", help="only a few episodes, as a test")
 quick = parser.parse_args().quick
 
 
 def gate(n_robots, space, rng):
-    """All robots want to pass between the same two points, half of them from either side."""
+    """All robots pass through the same gap, half of them from each side."""
     side = np.where(np.arange(n_robots) % 2, 1.0, -1.0)
     row = (np.arange(n_robots) // 2 - (n_robots // 2 - 1) / 2) * 1.2
     starts = np.column_stack([3.0 * side, row, np.full(n_robots, 1.4)])
-    goals = np.column_stack([-3.0 * side, -row, np.full(n_robots, 1.4)])  # their ways cross at the origin
+    goals = np.column_stack([-3.0 * side, -row, np.full(n_robots, 1.4)])  # their paths cross at the origin
     return tuple(points + rng.uniform(-0.15, 0.15, points.shape) for points in (starts, goals))
 
 
 def crowded(radius, count):
-    """Asks everybody closer than ``radius`` (m), but only where at least ``count`` are."""
+    """Request plans from all robots closer than ``radius`` (m), if there are at least ``count`` of them."""
 
     def rule(view):
         near = np.linalg.norm(view.pos, axis=-1) < radius

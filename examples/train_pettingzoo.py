@@ -1,4 +1,4 @@
-"""Train a team of a PettingZoo environment: ``python examples/train_pettingzoo.py [--quick]``."""
+"""Train a team in a PettingZoo environment: ``python examples/train_pettingzoo.py [--quick]``."""
 
 import argparse
 
@@ -11,12 +11,12 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_maddpg import MADDPG, DashboardCallback, TeamEnv
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--quick", action="store_true", help="a few steps, to see that it runs")
+parser.add_argument("--quick", action="store_true", help="only a few steps, as a test")
 quick = parser.parse_args().quick
 
-torch.set_num_threads(1)  # small networks are fastest so
+torch.set_num_threads(1)  # small networks are fastest with one thread
 env = simple_spread_v3.parallel_env(continuous_actions=True)
-# For evaluation as one environment of the whole team, which is what Stable-Baselines3's tools know
+# Stable-Baselines3's tools need a single environment for the whole team
 eval_env = Monitor(TeamEnv(simple_spread_v3.parallel_env(continuous_actions=True)))
 
 model = MADDPG(
@@ -24,7 +24,7 @@ model = MADDPG(
     env,
     gamma=0.95,
     learning_starts=200 if quick else 5000,
-    exploration_noise=(0.6, 0.1),  # falls from 0.6 to 0.1 in the course of the training
+    exploration_noise=(0.6, 0.1),  # annealed from 0.6 to 0.1 over training
     tensorboard_log="logs/tensorboard",
     seed=0,
 )

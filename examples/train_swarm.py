@@ -1,4 +1,4 @@
-"""Train the swarm in Python: ``python examples/train_swarm.py [--quick]`` (seven minutes of a core without it)."""
+"""Train the swarm in Python: ``python examples/train_swarm.py [--quick]`` (seven minutes on one core)."""
 
 import argparse
 
@@ -13,7 +13,7 @@ from sb3_maddpg import MADDPG
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--quick", action="store_true", help="a few steps, to see that it runs")
+parser.add_argument("--quick", action="store_true", help="only a few steps, as a test")
 quick = parser.parse_args().quick
 
 torch.set_num_threads(1)

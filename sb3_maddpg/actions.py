@@ -1,17 +1,18 @@
 """
-The joint action of a team inside the networks: binary, continuous and categorical actions side by side.
+The joint action of a team in the networks, which may mix binary, continuous and categorical actions.
 
-An action has four forms, which all code here calls by these names:
+An action has four forms, which this package names as follows:
 
-- *environment actions*, (batch, length): as the environment takes them, flat, agent after agent; continuous ones in its
-  units, a category as its index from 0;
-- *buffer actions*, (batch, length): the same with continuous ones scaled to [-1, 1], as the replay buffer keeps them;
-- *encoded actions*, (batch, n_agents, width): as critics read them and actors give them; binary ones 0 or 1, continuous
-  ones in [-1, 1], categories one-hot, padded with zeros to the widest agent;
+- *environment actions*, (batch, length): flat, agent after agent, as the environment takes them; continuous actions in
+  the environment's units, categories as indices from 0;
+- *buffer actions*, (batch, length): like environment actions, but with continuous actions scaled to [-1, 1], as the
+  replay buffer stores them;
+- *encoded actions*, (batch, n_agents, width): inputs of critics and outputs of actors; binary actions are 0 or 1,
+  continuous ones in [-1, 1], categories one-hot, padded with zeros to the widest agent;
 - *logits*, (batch, n_agents, width): outputs of actors before they are squashed to probabilities or continuous actions.
 
-``TeamActions`` goes between them: ``act`` from logits to encoded actions, ``decode`` and ``encode`` from these to
-buffer actions and back, ``unscale`` and ``scale`` from these to environment actions and back.
+``TeamActions`` converts between them: ``act`` from logits to encoded actions, ``decode`` and ``encode`` between encoded
+and buffer actions, ``unscale`` and ``scale`` between buffer and environment actions.
 """
 
 from __future__ import annotations
@@ -32,12 +33,11 @@ QOfAlternatives = Callable[[th.Tensor, th.Tensor | None], th.Tensor]
 
 class ActionKind(nn.Module):
     """
-    Those agents of a team that act in the same way.
+    The agents of a team with one kind of action. Their encoded actions have length ``width``, see the module's
+    docstring.
 
-    Their encoded actions are ``width`` numbers wide, see the module's docstring.
-
-    :param agents: their numbers
-    :param action_spaces: their action spaces, all of one kind
+    :param agents: indices of the agents
+    :param action_spaces: their action spaces, all of the same kind
     """
 
     real: th.Tensor
@@ -57,57 +57,65 @@ class ActionKind(nn.Module):
         self.register_buffer("n_columns", real.sum(dim=1), persistent=False)
 
     def _real_columns(self) -> th.Tensor:
-        """Which columns are no padding, (n_agents, width) bool."""
+        """:return: which columns are not padding, (n_agents, width) bool"""
         longest = max(map(len, self.sizes))
         return th.tensor([[column < len(sizes) for column in range(longest)] for sizes in self.sizes])
 
     def squash(self, logits: th.Tensor) -> th.Tensor:
         """
         :param logits: the networks' outputs, (batch, n_agents, width)
-        :return: probabilities of binary and categorical actions, continuous actions in [-1, 1]; the same shape
+        :return: probabilities of binary and categorical actions, continuous actions in [-1, 1]; of the same shape
         """
         raise NotImplementedError
 
     def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
         """
-        :param logits: (batch, n_agents, width)
-        :param deterministic: the best action, otherwise one to explore with
+        Choose actions.
+
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :param deterministic: whether to act without exploration
         :return: encoded actions, (batch, n_agents, width)
         """
         raise NotImplementedError
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
         """
-        :param estimator: of the gradient
-        :param logits: (batch, n_agents, width)
-        :param q: values of alternatives for the own action, (batch, n_agents, M, width) -> (batch, n_agents, M)
-        :param temperature: of relaxations
-        :return: what the actors ascend, (batch, n_agents)
+        Compute the objective of the actors, which they maximise.
+
+        :param estimator: gradient estimator for binary and categorical actions
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :param q: returns the values of M alternatives for each agent's own action,
+            (batch, n_agents, M, width) -> (batch, n_agents, M)
+        :param temperature: temperature of relaxations
+        :return: the objective, (batch, n_agents)
         """
         raise NotImplementedError
 
     def mask(self, logits: th.Tensor, allowed: th.Tensor) -> th.Tensor:
         """
-        :param logits: (batch, n_agents, width)
-        :param allowed: what each agent may choose, the same shape, bool
-        :return: the logits, minus infinity where an agent may not choose
+        Apply action masks.
+
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :param allowed: whether each choice is legal, of the same shape, bool
+        :return: the logits, minus infinity for illegal choices
         """
         return logits.masked_fill(~allowed, -th.inf)
 
     def regularization(self, logits: th.Tensor) -> th.Tensor:
         """
-        :param logits: (batch, n_agents, width)
-        :return: mean square of each agent's outputs without padding and what is masked, (batch, n_agents)
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :return: mean square of each agent's outputs, excluding padding and masked choices, (batch, n_agents)
         """
         squares = (logits.masked_fill(logits.isneginf(), 0.0) if self.has_masks else logits).square()
         return (squares * self.real).sum(dim=-1) / self.n_columns if self.padded else squares.mean(dim=-1)
 
 
 class Continuous(ActionKind):
-    """Continuous actions (``Box``), scaled to [-1, 1]. Exploration noise is the algorithm's."""
+    """Continuous actions (``Box``), scaled to [-1, 1]. The algorithm adds exploration noise."""
 
     def squash(self, logits: th.Tensor) -> th.Tensor:
-        # The same slope for an action's whole range as the sigmoid of a bit; steeper, simple_spread learns worse
+        # The same slope relative to the action's range as the sigmoid of a bit. With a steeper one, simple_spread
+        # learns worse
         actions = th.tanh(0.5 * logits)
         return actions * self.real if self.padded else actions
 
@@ -115,18 +123,18 @@ class Continuous(ActionKind):
         return self.squash(logits)
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: Callable, temperature: float) -> th.Tensor:
-        # The deterministic policy gradient (Silver et al. 2014), whatever the estimator
+        # The deterministic policy gradient (Silver et al. 2014), for every estimator
         return q(self.squash(logits).unsqueeze(2)).squeeze(2)
 
 
 class Binary(ActionKind):
     """
-    Binary actions (``MultiBinary``) by a threshold, 1[f > delta] of probabilities f. To explore, delta' ~ U(0, 1) is
-    drawn per agent and shared by its bits (Serra-Gomez et al., IROS 2020, Sec. IV-C).
+    Binary actions (``MultiBinary``), which compare probabilities f with a threshold: 1[f > delta]. For exploration,
+    each agent draws delta' ~ U(0, 1), shared by its bits (Serra-Gomez et al., IROS 2020, Sec. IV-C).
 
     :param threshold: delta
-    :param n_thresholds: how many delta' an agent draws, each for an equal part of its bits
-    :param random_thresholds: share of these that are drawn; the others are delta
+    :param n_thresholds: number of thresholds delta' per agent, each for an equal part of its bits
+    :param random_thresholds: fraction of the thresholds that are drawn at random, the others are delta
     """
 
     def __init__(
@@ -163,8 +171,8 @@ class Binary(ActionKind):
 
 class Categorical(ActionKind):
     """
-    ``Discrete`` and ``MultiDiscrete``: H sub-actions of K categories each, one-hot, padded to the largest. To explore,
-    categories are drawn with their probabilities.
+    Categorical actions (``Discrete`` and ``MultiDiscrete``): H sub-actions of K categories each, one-hot, padded to the
+    largest. For exploration, categories are sampled from their probabilities.
     """
 
     allowed: th.Tensor
@@ -178,7 +186,7 @@ class Categorical(ActionKind):
         for agent, sizes in enumerate(self.sizes):
             for head, size in enumerate(sizes):
                 real[agent, head, :size] = True
-        # A padded sub-action has one category, which its own columns do not show
+        # A padded sub-action has one category, so that its softmax is defined, but no real column
         allowed = real.clone()
         allowed[..., 0] = True
         self.register_buffer("allowed", allowed, persistent=False)
@@ -199,7 +207,7 @@ class Categorical(ActionKind):
 
     def mask(self, logits: th.Tensor, allowed: th.Tensor) -> th.Tensor:
         heads = allowed.unflatten(-1, self.shape) & self.real.unflatten(-1, self.shape)
-        # An agent that may choose nothing takes no part, and what it chooses is not read
+        # An agent without any legal choice is inactive, and its choice is not read
         return super().mask(logits, (heads | ~heads.any(dim=-1, keepdim=True)).flatten(-2))
 
     def squash(self, logits: th.Tensor) -> th.Tensor:
@@ -207,14 +215,15 @@ class Categorical(ActionKind):
 
     def act(self, logits: th.Tensor, deterministic: bool) -> th.Tensor:
         heads = self._heads(logits)
-        if not deterministic:  # Gumbel's trick: the largest is distributed as the softmax
+        if not deterministic:  # the Gumbel-max trick samples from the softmax
             heads = heads - th.empty_like(heads).exponential_().clamp_min(th.finfo(heads.dtype).tiny).log()
         return self._columns(nn.functional.one_hot(heads.argmax(dim=-1), self.shape[1]).to(logits.dtype))
 
     def chosen(self, actions: th.Tensor) -> th.Tensor:
         """
-        :param actions: one-hot, (batch, n_agents, width)
-        :return: the categories, sub-action after sub-action without padding, (batch, number of all sub-actions)
+        :param actions: one-hot actions, (batch, n_agents, width)
+        :return: the chosen categories, sub-action after sub-action without padding, (batch, total number of
+            sub-actions)
         """
         return actions.unflatten(-1, self.shape).argmax(dim=-1).flatten(1)[:, self.real_heads]
 
@@ -226,12 +235,13 @@ def make_kinds(
     action_spaces: Sequence[AgentActionSpace], threshold: float, n_thresholds: int = 1, random_thresholds: float = 1.0
 ) -> list[ActionKind]:
     """
-    Group the agents of a team by how they act.
+    Group the agents of a team by the kind of their actions.
 
-    :param action_spaces: of all agents
-    :param threshold: for binary actions, see ``Binary``
-    :param n_thresholds: for binary actions, see ``Binary``
-    :param random_thresholds: for binary actions, see ``Binary``
+    :param action_spaces: each agent's action space
+    :param threshold: see ``Binary``
+    :param n_thresholds: see ``Binary``
+    :param random_thresholds: see ``Binary``
+    :return: the kinds
     """
     groups: dict[str, list[int]] = {}
     for agent, space in enumerate(action_spaces):
@@ -251,13 +261,13 @@ def make_kinds(
 
 class TeamActions(nn.Module):
     """
-    How a team acts: from each form of the joint action to the next, see the module's docstring.
+    The actions of a team: converts the joint action from one form to another, see the module's docstring.
 
     :param action_spaces: each agent's action space, categories counting from 0
-    :param threshold: for binary actions, see ``Binary``
-    :param n_thresholds: for binary actions, see ``Binary``
-    :param random_thresholds: for binary actions, see ``Binary``
-    :param masks: columns of the agents' action masks in their observations, see ``Team``; empty without any
+    :param threshold: see ``Binary``
+    :param n_thresholds: see ``Binary``
+    :param random_thresholds: see ``Binary``
+    :param masks: columns of each agent's action mask in its observation, see ``Team``; empty if no agent has one
     """
 
     mask_columns: th.Tensor
@@ -282,7 +292,6 @@ class TeamActions(nn.Module):
         super().__init__()
         self.action_spaces = tuple(action_spaces)
         self.n_agents = len(action_spaces)
-        # A ModuleList alone is so slow to index that acting shows it
         kinds = make_kinds(action_spaces, threshold, n_thresholds, random_thresholds)
         self.kinds = cast("Sequence[ActionKind]", nn.ModuleList(kinds))
         self.width = max(kind.width for kind in self.kinds)
@@ -301,7 +310,7 @@ class TeamActions(nn.Module):
         self.has_continuous = bool(self.is_continuous.any())
 
     def _make_tables(self) -> None:
-        """Where each number of the encoded action stands in the buffer action, and the other way round."""
+        """Tabulate which number of the encoded action is which number of the buffer action, and vice versa."""
         starts = np.cumsum([0, *(len(heads_of(space)) for space in self.action_spaces)])
         source = np.zeros((self.n_agents, self.width), int)
         value = np.full((self.n_agents, self.width), -1)  # the category of a one-hot column, -1 for a plain number
@@ -338,7 +347,7 @@ class TeamActions(nn.Module):
             self.register_buffer(name, th.as_tensor(table), persistent=False)
 
     def _place_masks(self, masks: Sequence[Sequence[int]]) -> None:
-        """Which column of an agent's observation says whether it may choose a number of its encoded action."""
+        """Tabulate which column of an agent's observation masks which number of its encoded action."""
         columns = np.zeros((self.n_agents, self.width), int)
         masked = np.zeros((self.n_agents, self.width), bool)
         for kind in self.kinds:
@@ -351,7 +360,7 @@ class TeamActions(nn.Module):
         self.register_buffer("masked", th.as_tensor(masked), persistent=False)
 
     def _of_mask(self, kind: ActionKind, row: int) -> np.ndarray:
-        """Which columns of the encoded action a mask speaks of, in its order, (width,) bool."""
+        """:return: which columns of the encoded action the mask covers, in its order, (width,) bool"""
         columns = np.zeros(self.width, bool)
         if isinstance(kind, Categorical):
             for head, size in enumerate(kind.sizes[row]):
@@ -362,17 +371,19 @@ class TeamActions(nn.Module):
 
     def allowed(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :return: what the agents may choose by their action masks, (batch, n_agents, width) bool
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :return: whether the action masks allow each choice, (batch, n_agents, width) bool
         """
         return (obs.gather(2, self.mask_columns.expand(len(obs), -1, -1)) > 0) | ~self.masked
 
     def mask(self, logits: th.Tensor, obs: th.Tensor) -> th.Tensor:
         """
-        :param logits: (batch, n_agents, width)
-        :param obs: (batch, n_agents, obs_dim or more)
-        :return: the logits, minus infinity where the action masks in the observations are not positive. An agent whose
-            mask allows none of its categories takes no part, and keeps all of them
+        Apply the action masks in the observations.
+
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :return: the logits, minus infinity where the action mask is not positive. An agent whose mask allows none of
+            its categories is inactive and keeps all of them
         """
         if not self.has_masks:
             return logits
@@ -387,9 +398,11 @@ class TeamActions(nn.Module):
 
     def legal(self, flat: th.Tensor, obs: th.Tensor) -> th.Tensor:
         """
+        Replace illegal actions: an illegal category is resampled, an illegal bit is set to 0.
+
         :param flat: buffer actions, (batch, length)
-        :param obs: (batch, n_agents, obs_dim or more)
-        :return: the same where they are allowed: a forbidden category is drawn anew, a forbidden bit is 0
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :return: legal buffer actions, (batch, length)
         """
         encoded = self.encode(flat)
         logits = self.mask(th.zeros_like(encoded), obs)
@@ -409,7 +422,9 @@ class TeamActions(nn.Module):
 
     def set_threshold(self, threshold: float) -> None:
         """
-        :param threshold: delta, of all binary actions
+        Set the threshold of all binary actions.
+
+        :param threshold: delta
         """
         for kind in self.kinds:
             if isinstance(kind, Binary):
@@ -422,8 +437,8 @@ class TeamActions(nn.Module):
 
     def columns_of(self, agent: int) -> list[int]:
         """
-        :param agent: its number
-        :return: those of its columns that are left where it is by itself: padding to other agents' sizes is not
+        :param agent: index of the agent
+        :return: the columns of its encoded action that remain without padding to the sizes of other agents
         """
         sizes = heads_of(self.action_spaces[agent])
         (kind,) = (kind for kind in self.kinds if agent in kind.agents)
@@ -443,7 +458,7 @@ class TeamActions(nn.Module):
 
     def decode(self, actions: th.Tensor) -> th.Tensor:
         """
-        :param actions: encoded, (batch, n_agents, width)
+        :param actions: encoded actions, (batch, n_agents, width)
         :return: buffer actions, (batch, length) float
         """
         if self.plain:
@@ -456,7 +471,7 @@ class TeamActions(nn.Module):
         return flat
 
     def _by_kind(self, tensor: th.Tensor, function: Callable[[ActionKind, th.Tensor], th.Tensor]) -> th.Tensor:
-        """Apply to each kind's agents, (batch, n_agents, width), and put the results side by side."""
+        """Apply a function to the agents of each kind and join the results, (batch, n_agents, width)."""
         if len(self.kinds) == 1:
             return function(self.kinds[0], tensor)
         result = th.zeros_like(tensor)
@@ -467,26 +482,30 @@ class TeamActions(nn.Module):
     def squash(self, logits: th.Tensor) -> th.Tensor:
         """
         :param logits: the networks' outputs, (batch, n_agents, width)
-        :return: probabilities or continuous actions, the same shape
+        :return: probabilities or continuous actions, of the same shape
         """
         return self._by_kind(logits, lambda kind, part: kind.squash(part))
 
     def act(self, logits: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
-        :param logits: (batch, n_agents, width)
-        :param deterministic: without exploration
+        Choose actions.
+
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :param deterministic: whether to act without exploration
         :return: encoded actions, (batch, n_agents, width)
         """
         return self._by_kind(logits, lambda kind, part: kind.act(part, deterministic))
 
     def objective(self, estimator: Estimator, logits: th.Tensor, q: QOfAlternatives, temperature: float) -> th.Tensor:
         """
-        :param estimator: of the gradient through binary and categorical actions
-        :param logits: (batch, n_agents, width)
-        :param q: ``q(own, agents)``: values of alternatives for the own action, (batch, len(agents), M, width) ->
-            (batch, len(agents), M); ``agents`` is None for all
-        :param temperature: of relaxations
-        :return: what the actors ascend, (batch, n_agents)
+        Compute the objective of the actors, which they maximise.
+
+        :param estimator: gradient estimator for binary and categorical actions
+        :param logits: the networks' outputs, (batch, n_agents, width)
+        :param q: ``q(own, agents)`` returns the values of M alternatives for each agent's own action,
+            (batch, len(agents), M, width) -> (batch, len(agents), M); ``agents`` is None for all agents
+        :param temperature: temperature of relaxations
+        :return: the objective, (batch, n_agents)
         """
         if len(self.kinds) == 1:
             return self.kinds[0].objective(estimator, logits, lambda own: q(own, None), temperature)
@@ -503,7 +522,7 @@ class TeamActions(nn.Module):
 
     def regularization(self, logits: th.Tensor) -> th.Tensor:
         """
-        :param logits: (batch, n_agents, width)
+        :param logits: the networks' outputs, (batch, n_agents, width)
         :return: mean square of each agent's outputs, (batch, n_agents)
         """
         if len(self.kinds) == 1:
@@ -518,7 +537,7 @@ class TeamActions(nn.Module):
         :param actions: environment actions, (batch, length)
         :return: buffer actions, (batch, length)
         """
-        # A bound that is both the lowest and the highest value has no range to divide by
+        # Avoid a division by zero where both bounds are equal
         span = np.where(self.high > self.low, self.high - self.low, 1.0)
         scaled = 2.0 * (actions - self.low) / span - 1.0
         return np.where(self.is_continuous, scaled, actions)

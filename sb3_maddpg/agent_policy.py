@@ -1,4 +1,4 @@
-"""One agent's policy by itself: what a robot has to carry."""
+"""The policy of a single agent, as a robot runs it."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 class AgentPolicy(nn.Module):
     """
-    Maps one agent's observation to its action: no critic, no team, no exploration. Get one from
-    ``model.agent_policy("robot_2")``.
+    Policy of a single agent, which maps its observation to its action without critics, team or exploration. Create it
+    with ``model.agent_policy("robot_2")``.
 
-    :param name: of the agent
-    :param network: maps observations, (batch, obs_dim), to outputs, (batch, width or more)
-    :param columns: which of the outputs are the agent's, see ``TeamActions.columns_of``
-    :param action_space: the agent's
-    :param obs_dim: length of its observation
-    :param threshold: for binary actions, see ``Binary``
-    :param mask: columns of its action mask in its observation, see ``TeamObservation``; empty without one
+    :param name: name of the agent
+    :param network: network that maps observations, (batch, obs_dim), to outputs, (batch, width or more)
+    :param columns: columns of the agent's outputs, see ``TeamActions.columns_of``
+    :param action_space: the agent's action space
+    :param obs_dim: length of the agent's observation
+    :param threshold: threshold of binary actions, see ``Binary``
+    :param mask: columns of the observation that hold the action mask, see ``TeamObservation``; empty without one
     """
 
     columns: th.Tensor
@@ -61,7 +61,7 @@ class AgentPolicy(nn.Module):
         self.register_buffer("columns", th.tensor(columns))
         self.has_mask = bool(mask)
         if self.has_mask:
-            # Where encoded actions are padded, any column will do
+            # Where encoded actions are padded, any column serves
             full = np.zeros(self.kind.width, int)
             full[self.kind.real[0].numpy()] = mask
             self.register_buffer("mask", th.tensor(full))
@@ -75,9 +75,12 @@ class AgentPolicy(nn.Module):
     @classmethod
     def of(cls, policy: MADDPGPolicy, agent: str | int) -> AgentPolicy:
         """
-        :param policy: of the team
-        :param agent: name or number
-        :raises ValueError: no such agent, or parameters that are not finite
+        Extract an agent's policy from the team's.
+
+        :param policy: policy of the team
+        :param agent: name or index of the agent
+        :return: the agent's policy
+        :raises ValueError: if there is no such agent, or parameters are not finite
         """
         if problem := policy.not_finite(policy.state_dict()):
             raise ValueError(f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file.")
@@ -89,9 +92,9 @@ class AgentPolicy(nn.Module):
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, obs_dim)
-        :return: actions in the environment's units, (batch, length of the action): binary ones as int8, continuous ones
-            as float32, categorical ones as int64
+        :param obs: observations, (batch, obs_dim)
+        :return: actions in the environment's units, (batch, length of the action), as int8 if binary, float32 if
+            continuous and int64 if categorical
         """
         logits = self.network(obs)[:, self.columns].unsqueeze(1)
         if self.has_mask:
@@ -105,16 +108,20 @@ class AgentPolicy(nn.Module):
 
     def predict(self, observation: np.ndarray) -> np.ndarray:
         """
-        :param observation: flat, (obs_dim,), or several of them, (batch, obs_dim)
-        :return: an action of the agent's own space, or (batch, length of the action)
-        :raises ValueError: another length, NaN or infinity
+        Choose the action for an observation.
+
+        :param observation: a flat observation, (obs_dim,), or a batch of them, (batch, obs_dim)
+        :return: an action of the agent's action space, or a batch of flat ones, (batch, length of the action)
+        :raises ValueError: if the observation has another length or holds NaN or infinity
         """
         try:
             obs = th.as_tensor(as_numbers(observation))
         except ValueError:
-            raise ValueError(f"The observation of {self.name} is no array of numbers: {shown(observation)}") from None
+            raise ValueError(
+                f"The observation of {self.name} is not an array of numbers: {shown(observation)}"
+            ) from None
         if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
-            raise ValueError(f"An observation of {self.name} has length {self.obs_dim}, not shape {tuple(obs.shape)}.")
+            raise ValueError(f"An observation of {self.name} has shape ({self.obs_dim},), not {tuple(obs.shape)}.")
         if not obs.isfinite().all():
             raise ValueError(f"The observation of {self.name} holds NaN or infinity: clip or replace such values.")
         with th.no_grad():
@@ -127,16 +134,18 @@ class AgentPolicy(nn.Module):
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """
-        Write the policy as a program that needs nothing of this package: a function from observations, (batch, obs_dim)
-        float32, to actions as ``forward`` gives them. A name that ends with ``.onnx`` writes ONNX, for ONNX Runtime and
-        the compilers of embedded processors (input ``observation``, output ``action``; needs the extra ``onnx``), any
-        other TorchScript, for ``torch.jit.load`` and libtorch (C++).
+        Export the policy as a program that runs without this package. The program maps float32 observations of shape
+        (batch, obs_dim) to the actions that ``forward`` returns.
 
-        :param path: of the file
-        :raises ValueError: a parameter is not finite, or ONNX is not installed
+        The suffix ``.onnx`` selects ONNX, for ONNX Runtime and compilers for embedded processors (input
+        ``observation``, output ``action``; needs the extra ``onnx``). Any other suffix selects TorchScript, for
+        ``torch.jit.load`` and libtorch (C++).
+
+        :param path: path of the file
+        :raises ValueError: if a parameter is not finite, or ONNX is needed and not installed
         """
         if not isinstance(path, (str, os.PathLike)):
-            raise ValueError(f"{shown(path)} is no path of a file.")
+            raise ValueError(f"{shown(path)} is not the path of a file.")
         for name, parameter in self.named_parameters():
             if not parameter.isfinite().all():
                 raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
@@ -147,7 +156,7 @@ class AgentPolicy(nn.Module):
             return
         example, other = th.zeros(2, self.obs_dim), th.linspace(-2.0, 2.0, 5 * self.obs_dim).view(5, -1)
         with warnings.catch_warnings():
-            # What torch offers instead, torch.export, needs a compiler to run without Python
+            # Torch recommends torch.export instead, but its programs need a compiler to run without Python
             warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
             script = th.jit.trace(self, example, check_inputs=[(other,)])
             with atomic_write(path, suffix="pt") as file:
@@ -156,10 +165,10 @@ class AgentPolicy(nn.Module):
     def _to_onnx(self) -> bytes:
         logger = logging.getLogger("torch.onnx._internal.exporter._registration")
         level = logger.level
-        logger.setLevel(logging.ERROR)  # it misses torchvision, which is not needed
+        logger.setLevel(logging.ERROR)  # it warns that torchvision is missing, which is not needed
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # about the exporter's own insides
+                warnings.simplefilter("ignore")  # they concern the exporter's internals
                 program = th.onnx.export(
                     self,
                     (th.zeros(2, self.obs_dim),),

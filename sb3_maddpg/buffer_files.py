@@ -1,4 +1,4 @@
-"""Replay buffers in files: JSON and arrays, which run no code when they are read."""
+"""Files of replay buffers: JSON and arrays, which run no code when they are loaded."""
 
 from __future__ import annotations
 
@@ -24,9 +24,11 @@ _MOST_JSON = 2**24  # bytes
 
 def write_buffer(buffer: TeamReplayBuffer, file: io.BufferedIOBase) -> None:
     """
+    Write a replay buffer to a file.
+
     :param buffer: a team's replay buffer
-    :param file: to write to
-    :raises ValueError: its class may not be named in files, see ``allow_in_files``
+    :param file: binary file to write to
+    :raises ValueError: if files may not name the buffer's class, see ``allow_in_files``
     """
     arguments, counters, arrays = buffer.contents()
     state = {"format": _FORMAT, "class": type(buffer), "arguments": arguments, "counters": counters}
@@ -39,8 +41,8 @@ def write_buffer(buffer: TeamReplayBuffer, file: io.BufferedIOBase) -> None:
 
 def is_buffer_file(path: Any) -> bool:
     """
-    :param path: of a file, or a file
-    :return: whether ``write_buffer`` may have written it, rather than pickle
+    :param path: path of a file, or an open file
+    :return: whether ``write_buffer`` may have written the file, rather than pickle
     """
     found = zipfile.is_zipfile(path)
     if not isinstance(path, (str, os.PathLike)):
@@ -50,10 +52,12 @@ def is_buffer_file(path: Any) -> bool:
 
 def read_buffer(path: str | pathlib.Path | io.BufferedIOBase, device: th.device | str) -> TeamReplayBuffer:
     """
-    :param path: of a file that ``write_buffer`` wrote, or that file
-    :param device: where samples go
+    Read a replay buffer from a file of ``write_buffer``.
+
+    :param path: path of the file, or the open file
+    :param device: device of the samples
     :return: the buffer
-    :raises ValueError: another content
+    :raises ValueError: if the file holds no valid replay buffer
     """
     with zipfile.ZipFile(cast(Any, path)) as archive:
         members = {member.filename: member for member in archive.infolist()}
@@ -66,7 +70,7 @@ def read_buffer(path: str | pathlib.Path | io.BufferedIOBase, device: th.device 
             decode(state.get(key), f"{path}: {key}") for key in ("class", "arguments", "counters")
         )
         if not (isinstance(cls, type) and issubclass(cls, TeamReplayBuffer)):
-            raise ValueError(f"{path} holds a {shown(cls)}, which knows no agents; the model needs a TeamReplayBuffer.")
+            raise ValueError(f"{path} holds a {shown(cls)}, but the model needs a TeamReplayBuffer.")
         if not isinstance(arguments, dict) or not isinstance(counters, dict):
             raise ValueError(f"{path} is damaged: its arguments or counters have no names.")
         buffer = cls(**arguments, device=device)
@@ -76,7 +80,7 @@ def read_buffer(path: str | pathlib.Path | io.BufferedIOBase, device: th.device 
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """An array that is as large as its header says, which is looked at first."""
+    """Read an array after checking that its header fits the file's size."""
     with archive.open(member) as file:
         version = np.lib.format.read_magic(file)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -17,23 +17,24 @@ from sb3_maddpg.validation import PriorityArguments, ReplayBufferArguments, vali
 
 class TeamReplayBufferSamples(NamedTuple):
     """
-    SB3's ``ReplayBufferSamples`` with an entry per agent. The window of a sample is the ``n_steps`` transitions from
-    the sampled one on, or fewer where it has to stop early, see ``TeamReplayBuffer``.
+    SB3's ``ReplayBufferSamples`` with an entry per agent. The window of a sample consists of ``n_steps`` transitions
+    starting with the sampled one, or fewer if it has to stop early, see ``TeamReplayBuffer``.
 
-    :param observations: (batch, n_agents, columns)
-    :param actions: (batch, length of the joint action), as they were stored
-    :param next_observations: (batch, n_agents, columns), at the end of the window
-    :param dones: (batch, n_agents), 1 where nothing is to be added to the rewards
-    :param rewards: (batch, n_agents), discounted sum over the window
-    :param discounts: what the value of the next observation is to be multiplied with: the number gamma with single
-        steps, else (batch, n_agents), gamma to the number of rewards summed
-    :param active: (batch, n_agents), 1 where the agent acted; ``None`` if every agent always has
-    :param next_active: (batch, n_agents), 1 where the agent is still there at the end of the window; ``None`` as above
-    :param pair_rewards: (batch, n_agents, n_pairs), discounted sums, ``None`` if they are not kept
-    :param pair_goes_on: (batch, n_agents, n_pairs), 1 where the next observation is about the same pair; ``None`` if
-        pairs do not end before their agents
-    :param indices: (batch,), where the samples lie, for ``update_priorities``; ``None`` without priorities
-    :param weights: (batch,), what the losses of the samples count, at most 1; ``None`` without priorities
+    :param observations: observations, (batch, n_agents, columns)
+    :param actions: stored joint actions, (batch, length)
+    :param next_observations: observations at the end of the window, (batch, n_agents, columns)
+    :param dones: 1 if the target must not bootstrap, (batch, n_agents)
+    :param rewards: discounted sums of rewards over the window, (batch, n_agents)
+    :param discounts: factors of the next value: the number gamma with single steps, else gamma to the power of the
+        number of rewards summed, (batch, n_agents)
+    :param active: 1 if the agent acted, (batch, n_agents); ``None`` if every agent always has
+    :param next_active: 1 if the agent is still active at the end of the window, (batch, n_agents); ``None`` if every
+        agent always has been active
+    :param pair_rewards: discounted sums of pair rewards, (batch, n_agents, n_pairs); ``None`` if they are not stored
+    :param pair_goes_on: 1 if the next observation is about the same pair, (batch, n_agents, n_pairs); ``None`` if pairs
+        never end before their agents
+    :param indices: indices of the samples for ``update_priorities``, (batch,); ``None`` without priorities
+    :param weights: importance-sampling weights, at most 1, (batch,); ``None`` without priorities
     """
 
     observations: th.Tensor
@@ -51,7 +52,7 @@ class TeamReplayBufferSamples(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """Views of what is kept of transitions besides observations and actions, each (..., its own shape)."""
+    """Views of the numbers stored besides observations and actions, each (..., its own shape)."""
 
     agent_rewards: np.ndarray
     agent_terminated: np.ndarray
@@ -60,55 +61,52 @@ class _Columns(NamedTuple):
     dones: np.ndarray
     timeouts: np.ndarray
     cuts: np.ndarray
-    """Where the environment went on elsewhere without an end, as when learn() is called again"""
+    """1 if the next transition does not continue this one although the episode did not end, as after a new learn()"""
     pair_rewards: np.ndarray
     pair_terminated: np.ndarray
 
 
-# Attributes that are not pickled, because they lie in the records or are made of them
+# Attributes that are not pickled, because they are views of the records or derived from them
 _VIEWS = {"observations", "next_observations", "actions", "numbers", *_Columns._fields, "_new", "_new_columns"}
-_REMEDY = (
-    "Look there for a division by zero or a simulation that diverged, end the episode before it does, or bound it."
-)
-_REMEDY_ACTION = "Look for networks that diverged (lower learning_rate) or a Box whose bounds are equal or too large."
+_REMEDY = "Look there for a division by zero or a diverging simulation; end the episode earlier, or clip the value."
+_REMEDY_ACTION = "Look for diverged networks (lower learning_rate) or a Box whose bounds are equal or too large."
 
 
 class TeamReplayBuffer(ReplayBuffer):
     """
-    SB3's replay buffer with rewards and ends of each agent, which come from ``infos``:
+    SB3's replay buffer with rewards and terminations of each agent. It reads these entries of ``infos``:
 
-    - ``agent_rewards`` (n_agents,): where it is left out, every agent gets the team's reward;
-    - ``agent_terminated`` (n_agents,): where it is left out, no agent ends before the team;
-    - ``agent_active`` (n_agents,), whether the agent acted: where it is left out, all did;
-    - ``pair_rewards`` (n_agents, n_pairs), needed if ``n_pairs`` is set: the part of an agent's reward that belongs to
-      each of its neighbours.
+    - ``agent_rewards``, (n_agents,): the agents' rewards, by default the team's reward for every agent;
+    - ``agent_terminated``, (n_agents,): whether each agent terminated, by default none terminates before the team;
+    - ``agent_active``, (n_agents,): whether each agent acted, by default all did;
+    - ``pair_rewards``, (n_agents, n_pairs), required if ``n_pairs`` is set: the part of an agent's reward that belongs
+      to each of its neighbours.
 
-    Time limits are treated as truncation: targets still bootstrap from the next observation. With ``n_steps`` > 1
-    rewards are summed over a window of that many transitions. It stops early at the end of the episode, at the newest
-    transition and where an agent is truncated (inactive without having terminated), for all agents, since they share
-    the next observation; the sum of an agent that terminates stops there while those of the others go on.
+    Time limits are treated as truncation: targets still bootstrap from the next observation. With ``n_steps`` > 1,
+    rewards are summed over a window of that many transitions. The window stops early at the end of the episode, at the
+    newest transition, and when an agent is truncated (inactive without having terminated). It stops for all agents,
+    because they share the next observation. When an agent terminates, only its own sum stops.
 
     ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running standard deviation of the team's
     return.
 
-    Nothing that is NaN or infinite is stored: ``add`` refuses it, and the buffer stays as it was.
+    ``add`` refuses NaN and infinity and leaves the buffer unchanged.
 
-    All arrays are views into ``records``, (buffer_size, n_envs), so that one transition lies in one place.
+    All arrays are views of ``records``, (buffer_size, n_envs), so that a transition is contiguous in memory.
 
-    :param buffer_size: max number of transitions
+    :param buffer_size: maximum number of transitions
     :param observation_space: ``Box(n_agents, columns)``
     :param action_space: flat joint action space
     :param device: PyTorch device
     :param n_envs: number of parallel environments
-    :param optimize_memory_usage: see SB3's ``ReplayBuffer``, only with ``n_steps=1`` and
+    :param optimize_memory_usage: see SB3's ``ReplayBuffer``; needs ``n_steps=1`` and
         ``handle_timeout_termination=False``
     :param handle_timeout_termination: see SB3's ``ReplayBuffer``
-    :param n_steps: how many rewards to sum before the value of the next observation is used
+    :param n_steps: number of rewards in the n-step return
     :param gamma: discount factor
-    :param n_pairs: number of neighbours of an agent with a reward of their own, 0 if there are no such rewards
-    :param pairs_end: neighbours change: ``info["pair_terminated"]``, (n_agents, n_pairs), says whose place is another
-        one's, or nobody's, after the step
-    :raises ValueError: spaces that describe no team, or an argument out of its range
+    :param n_pairs: number of neighbours in ``pair_rewards``, 0 without pair rewards
+    :param pairs_end: whether neighbours change, so that ``info["pair_terminated"]``, (n_agents, n_pairs), is required
+    :raises ValueError: if the spaces do not describe a team, or an argument is out of range
     """
 
     _ARGUMENTS: ClassVar[tuple[str, ...]] = (
@@ -159,13 +157,12 @@ class TeamReplayBuffer(ReplayBuffer):
         if self.n_steps > 1 and arguments["optimize_memory_usage"]:
             raise ValueError(
                 f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not "
-                "keep where an episode ends. Set n_steps=1 or optimize_memory_usage=False."
+                "store at the end of an episode. Set n_steps=1 or optimize_memory_usage=False."
             )
         if arguments["optimize_memory_usage"] and arguments["handle_timeout_termination"]:
             raise ValueError(
-                "optimize_memory_usage=True forgets the last observation of an episode that a time limit ends. Set it "
-                "to False, or give handle_timeout_termination=False (in replay_buffer_kwargs) to learn as if such ends "
-                "were real."
+                "optimize_memory_usage=True drops the last observation of a truncated episode. Set it to False, or "
+                "set handle_timeout_termination=False (in replay_buffer_kwargs) to treat truncation as termination."
             )
         super().__init__(
             observation_space=observation_space,
@@ -179,7 +176,7 @@ class TeamReplayBuffer(ReplayBuffer):
         if not self.optimize_memory_usage:
             names.append("next_observations")
         fields: list[Any] = [(name, getattr(self, name).dtype, getattr(self, name).shape[2:]) for name in names]
-        # Side by side and of one type, so that n steps of them are read with one index
+        # All other numbers are one field, so that one index reads n steps of them
         n_columns = 3 + self.n_pairs * (2 if self.pairs_end else 1)
         fields.append(("numbers", np.float32, (self.n_agents * n_columns + 4,)))
         self._use(np.zeros((self.buffer_size, self.n_envs), np.dtype(fields, align=True)))
@@ -201,14 +198,14 @@ class TeamReplayBuffer(ReplayBuffer):
         self.cuts = columns.cuts
         self.pair_rewards = columns.pair_rewards
         self.pair_terminated = columns.pair_terminated
-        # The numbers of a transition that is being added, stored once they are known to be finite
+        # The numbers of the transition being added, which are stored only if they are finite
         self._new = np.zeros(self.numbers.shape[1:], np.float32)
         self._new_columns = self._columns(self._new)
 
     def _columns(self, numbers: np.ndarray) -> _Columns:
         """
-        :param numbers: what is kept of transitions besides observations and actions, in the last axis
-        :return: views of it
+        :param numbers: the numbers stored besides observations and actions, in the last axis
+        :return: views of them
         """
         n, end = self.n_agents, 3 * self.n_agents + 4 + self.n_agents * self.n_pairs
         pairs = (*numbers.shape[:-1], n, self.n_pairs)
@@ -226,7 +223,7 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def __getstate__(self) -> dict[str, Any]:
         state = {name: value for name, value in self.__dict__.items() if name not in _VIEWS}
-        # The part in use. Without next_observations the last of them stands one further
+        # Only the rows in use. Without next_observations, the row after them holds the last next observation
         state["records"] = self.records[: self.size() + int(self.optimize_memory_usage)]
         return state
 
@@ -240,22 +237,24 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def contents(self) -> tuple[dict[str, Any], dict[str, Any], dict[str, np.ndarray]]:
         """
-        What makes the same buffer again: ``cls(**arguments)``, then ``restore(counters, arrays)``.
+        Return what recreates the buffer with ``cls(**arguments)`` and ``restore(counters, arrays)``.
 
-        :return: arguments but for the device, counters, and arrays, of which as much as is in use
+        :return: arguments except the device, counters, and the used part of the arrays
         """
-        # Without next_observations the last of them stands one further
+        # Without next_observations, the row after the last one holds the last next observation
         used = self.records[: self.size() + int(self.optimize_memory_usage)]
         arguments = {name: getattr(self, name) for name in self._ARGUMENTS}
-        arguments["buffer_size"] *= self.n_envs  # SB3 keeps the rows
+        arguments["buffer_size"] *= self.n_envs  # SB3 stores the number of rows
         counters = {name: getattr(self, name) for name in self._COUNTERS}
         return arguments, counters, {name: used[name] for name in self.records.dtype.names or ()}
 
     def restore(self, counters: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         """
+        Restore the contents of another buffer with the same arguments.
+
         :param counters: see ``contents``
         :param arrays: see ``contents``
-        :raises ValueError: not those of a buffer with these arguments, or numbers that are not finite
+        :raises ValueError: if they do not fit this buffer's arguments, or hold numbers that are not finite
         """
         if set(counters) != set(self._COUNTERS):
             raise ValueError(f"A {type(self).__name__} has the counters {self._COUNTERS}, not {tuple(counters)}.")
@@ -292,15 +291,16 @@ class TeamReplayBuffer(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """
-        Add a transition of every environment.
+        Add one transition per environment.
 
-        :param obs: (n_envs, n_agents, columns)
-        :param next_obs: (n_envs, n_agents, columns), of an ended episode its last
-        :param action: (n_envs, length of the joint action)
-        :param reward: (n_envs,), the team's
-        :param done: (n_envs,), whether the episode ended or was cut off
-        :param infos: of each environment
-        :raises ValueError: a shape that does not fit, a missing entry of ``infos``, or NaN or infinity anywhere
+        :param obs: observations, (n_envs, n_agents, columns)
+        :param next_obs: next observations, (n_envs, n_agents, columns), the final ones if the episode ended
+        :param action: joint actions, (n_envs, length)
+        :param reward: team rewards, (n_envs,)
+        :param done: whether the episode was terminated or truncated, (n_envs,)
+        :param infos: infos of the environments
+        :raises ValueError: if a shape does not fit, a required entry of ``infos`` is missing, or a number is NaN or
+            infinite
         """
         team = (self.n_envs, *self.obs_shape)
         self._check("observation", obs, team)
@@ -341,17 +341,17 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def _check(self, what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
         """
-        :param what: name of the values, for the error's message
-        :param values: of all environments, with an entry per agent, or the joint actions
-        :param shape: that they must have; actions may come in another one of the same size
-        :raises ValueError: another shape, or NaN or infinity
+        :param what: name of the values, for error messages
+        :param values: observations or joint actions of all environments
+        :param shape: the required shape; actions may have another shape of the same size
+        :raises ValueError: if the shape differs, or a value is NaN or infinite
         """
         fits = values.shape == shape or (what == "action" and values.size == math.prod(shape))
         if not fits or len(values) != self.n_envs:
             raise ValueError(
                 f"The {what} has shape {values.shape}, but this replay buffer is for {self.n_envs} environment(s) of "
                 f"{self.n_agents} agents: it must be {shape}. A buffer fits only the team and the number of "
-                "environments that it was made for."
+                "environments that it was created for."
             )
         values = values.reshape(shape)
         if (index := not_finite_at(values)) is None:
@@ -364,34 +364,36 @@ class TeamReplayBuffer(ReplayBuffer):
         )
 
     def _place_of_action(self, column: int) -> tuple[int, int]:
-        """:return: the agent, and the column in its own action, of a column of the joint action"""
+        """:return: the agent that a column of the joint action belongs to, and the column in its own action"""
         ends = np.cumsum([len(heads_of(space)) for space in self.team.action_spaces])
         agent = int(np.searchsorted(ends, column, side="right"))
         return agent, column - (int(ends[agent - 1]) if agent else 0)
 
     def _where(self, env: int) -> str:
-        return f"in environment {env} at step {self.n_added + 1} (counted since the replay buffer was made)"
+        return f"in environment {env} at step {self.n_added + 1} (counted since the replay buffer was created)"
 
     def _read_infos(
         self, key: InfoKey, array: np.ndarray, infos: Sequence[dict[str, Any]], default: np.ndarray | float | None
     ) -> bool:
         """
-        :param key: of infos
-        :param array: to write to, (n_envs, ...)
-        :param infos: of each environment
-        :param default: for environments that leave the key out, None if they must not
+        Read one entry of all infos into an array.
+
+        :param key: key of the entry
+        :param array: array to write to, (n_envs, ...)
+        :param infos: infos of the environments
+        :param default: value for environments without the key, None if the key is required
         :return: whether any environment has the key
         """
         if len(infos) == 1 and getattr(infos[0].get(key), "shape", None) == array.shape[1:]:
-            array[0] = infos[0][key]  # the common case, in a fraction of the time
+            array[0] = infos[0][key]  # fast path for the common case
             return True
         values = [info[key] for info in infos if key in info]
         where: slice | list[int] = slice(None)
         if len(values) < len(infos):
             if default is None:
                 raise ValueError(
-                    f"info['{key}'] is missing, but the buffer was made with n_pairs={self.n_pairs}: the environment "
-                    f"must give shape {array.shape[1:]} in every step, or leave n_pairs at 0."
+                    f"info['{key}'] is missing, but the buffer was created with n_pairs={self.n_pairs}: return it with "
+                    f"shape {array.shape[1:]} in every step of the environment, or leave n_pairs at 0."
                 )
             array[:] = default
             if not values:
@@ -415,7 +417,7 @@ class TeamReplayBuffer(ReplayBuffer):
                 remedy = "" if of_pairs else ", or leave the key out"
                 raise ValueError(
                     f"info['{key}'] has shape {np.shape(value)}, but there are {self.n_agents} agents{pairs}: "
-                    f"the environment must give shape {needed}{remedy}."
+                    f"the environment must return shape {needed}{remedy}."
                 )
 
     def _refuse_numbers(self, infos: Sequence[dict[str, Any]]) -> None:
@@ -433,10 +435,10 @@ class TeamReplayBuffer(ReplayBuffer):
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
     ) -> TeamReplayBufferSamples:
         """
-        :param batch_inds: which steps
-        :param env: to normalise observations and rewards
+        :param batch_inds: rows of the transitions, (batch,)
+        :param env: normalises observations and rewards
         """
-        # The global generator, as in SB3: set_random_seed() then makes sampling repeat
+        # NumPy's global generator, as in SB3, so that set_random_seed() makes sampling reproducible
         env_inds = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
         return self.samples_at(batch_inds, env_inds, env)
 
@@ -444,13 +446,14 @@ class TeamReplayBuffer(ReplayBuffer):
         self, batch_inds: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None = None
     ) -> TeamReplayBufferSamples:
         """
-        The samples that start at given transitions.
+        Return the samples that start at given transitions.
 
-        :param batch_inds: (batch,), their rows in the buffer
-        :param env_inds: (batch,), their environments
-        :param env: to normalise observations and rewards
+        :param batch_inds: rows of the transitions in the buffer, (batch,)
+        :param env_inds: indices of their environments, (batch,)
+        :param env: normalises observations and rewards
+        :return: the samples
         """
-        # take() is several times faster than an index, and one read per transition than one per array
+        # take() is several times faster than an index, and so is one read per transition instead of one per array
         batch = self.records.reshape(-1).take(batch_inds * self.n_envs + env_inds)
         if self.n_steps > 1:
             last, data = self._windows(batch_inds, env_inds, env)
@@ -474,9 +477,11 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def _read(self, name: str, index: np.ndarray) -> np.ndarray:
         """
-        :param name: of an array
-        :param index: (batch,), which transitions, counted through all environments
-        :return: (batch, ...), its part there; take() would copy the whole array first
+        Read an array at given transitions. NumPy's ``take`` would copy the whole array first.
+
+        :param name: name of the array
+        :param index: indices of the transitions, with rows and environments flattened, (batch,)
+        :return: the values, (batch, ...)
         """
         array = getattr(self, name)
         flat = th.from_numpy(array.reshape(-1, *array.shape[2:]))
@@ -484,12 +489,12 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def _single_steps(self, numbers: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         """
-        :param numbers: (batch, columns) of the sampled transitions
-        :param env: to normalise rewards
-        :return: rewards and what else differs from ``_windows``
+        :param numbers: numbers of the sampled transitions, (batch, columns)
+        :param env: normalises rewards
+        :return: fields of the samples: dones, rewards, discounts, ...
         """
         columns = self._columns(numbers)
-        # timeouts stays zero if they are not handled
+        # timeouts stay zero unless handle_timeout_termination is set
         team_done = columns.dones * (1 - columns.timeouts)
         terminated = columns.agent_terminated
         return {
@@ -505,14 +510,14 @@ class TeamReplayBuffer(ReplayBuffer):
         self, batch_inds: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        :param batch_inds: (batch,), first rows of the windows
-        :param env_inds: (batch,), their environments
-        :param env: to normalise rewards, each before they are summed
-        :return: last rows of the windows, and rewards and what else is summed over them
+        :param batch_inds: first rows of the windows, (batch,)
+        :param env_inds: indices of their environments, (batch,)
+        :param env: normalises rewards before they are summed
+        :return: last rows of the windows, and fields of the samples as in ``_single_steps``
         """
         rows = (batch_inds + np.arange(self.n_steps)[:, None]) % self.buffer_size
         numbers = self._read("numbers", (rows * self.n_envs + env_inds).ravel())
-        # One column after the other in memory: what follows then works along the batch, not along a few agents
+        # Move the batch to the contiguous axis in memory, which is longer than that of the agents
         columns = self._columns(np.moveaxis(numbers.T.copy().reshape(-1, *rows.shape), 0, -1))
         rewards = self._normalize_reward(columns.agent_rewards, env)
         pairs = self._normalize_reward(columns.pair_rewards, env)
@@ -523,7 +528,7 @@ class TeamReplayBuffer(ReplayBuffer):
         total, pair_total = rewards[0].copy(order="K"), pairs[0].copy(order="K")
         discounts = np.full_like(total, self.gamma)
         last = np.zeros(len(batch_inds), np.intp)
-        # Whose return goes on after the steps so far, and which windows do
+        # Which agents' sums and which windows continue after the steps so far
         alive, goes_on = active[0] & ~terminated[0], np.ones(len(batch_inds), bool)
         gone = terminated[0].copy(order="K")
         same_pair = columns.pair_terminated[0] == 0
@@ -554,15 +559,16 @@ class TeamReplayBuffer(ReplayBuffer):
 
 class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     """
-    A team's replay buffer with proportional prioritised experience replay (Schaul et al. 2016, arXiv:1511.05952,
-    Algorithm 1). A transition's priority is its TD error when it was last sampled, plus ``epsilon``; new ones get the
-    largest priority so far. It is sampled in proportion to its priority to the power of ``alpha``, and its losses have
-    the importance-sampling weight ``(size * probability) ** -beta``, divided by the largest such weight in the batch.
-    Sampling is stratified: the total of the priorities falls into as many equal shares as a batch has samples.
+    Team replay buffer with proportional prioritised experience replay (Schaul et al. 2016, arXiv:1511.05952,
+    Algorithm 1). The priority of a transition is its absolute TD error when it was last sampled, plus ``epsilon``; new
+    transitions get the largest priority so far. Transitions are sampled in proportion to their priority to the power of
+    ``alpha``. Their losses are weighted by the importance-sampling weights ``(size * probability) ** -beta``, divided
+    by the largest weight in the batch. Sampling is stratified: each sample of a batch comes from an equal share of the
+    total priority.
 
     :param alpha: exponent of the priorities, 0 for uniform replay
-    :param beta: exponent of the importance-sampling weights, 1 to correct all of the bias of prioritised replay
-    :param epsilon: keeps every transition's sampling probability positive
+    :param beta: exponent of the importance-sampling weights, 1 to correct the whole bias of prioritised replay
+    :param epsilon: number added to each TD error, so that every transition has a positive probability
     :param args: see ``TeamReplayBuffer``
     :param kwargs: see ``TeamReplayBuffer``
     """
@@ -590,7 +596,9 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         super().restore(counters, arrays)
         given = arrays.get("priorities")
         if given is None or (given.shape, given.dtype) != ((self.size() * self.n_envs,), np.dtype(float)):
-            raise ValueError(f"The replay buffer has no priorities of {self.size() * self.n_envs} transitions.")
+            raise ValueError(
+                f"The replay buffer does not hold priorities of its {self.size() * self.n_envs} transitions."
+            )
         if not (np.isfinite(given).all() and (given >= 0).all()):
             raise ValueError("The replay buffer has priorities that are negative, NaN or infinite.")
         self.priorities.set(np.arange(len(given)), given)
@@ -600,25 +608,28 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         self.new_rows = min(self.new_rows + 1, self.buffer_size)
 
     def _prioritize_new(self) -> None:
-        """Set the priorities of all that were added since the last call at once, much faster than one by one."""
+        """Set the priorities of all transitions added since the last call at once, which is faster than one by one."""
         if not self.new_rows:
             return
         rows = (self.pos - 1 - np.arange(self.new_rows)) % self.buffer_size
         self.priorities.set(self._indices(rows), self.largest_priority)
         self.new_rows = 0
         if self.optimize_memory_usage and self.full:
-            # Its observation was overwritten by the next one of its predecessor
+            # The newest next observation has overwritten this row's observation
             self.priorities.set(self._indices(np.array([self.pos])), 0.0)
 
     def _indices(self, rows: np.ndarray) -> np.ndarray:
-        """:return: of all transitions in some rows"""
+        """:return: the indices of all transitions in these rows"""
         return (rows[:, None] * self.n_envs + np.arange(self.n_envs)).ravel()
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> TeamReplayBufferSamples:  # type: ignore[override]
         """
+        Sample transitions by priority.
+
         :param batch_size: number of transitions
-        :param env: to normalise observations and rewards
-        :raises ValueError: there is nothing to sample
+        :param env: normalises observations and rewards
+        :return: the samples
+        :raises ValueError: if the buffer is empty
         """
         if not self.size():
             raise ValueError("The replay buffer is empty: add transitions first, see learning_starts.")
@@ -633,17 +644,17 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         """
         Set priorities from TD errors.
 
-        :param indices: (batch,), of the samples
-        :param errors: (batch,), absolute TD errors
-        :raises ValueError: NaN or infinity
+        :param indices: indices of the samples, (batch,)
+        :param errors: absolute TD errors, (batch,)
+        :raises ValueError: if an error is NaN or infinite
         """
         self._prioritize_new()
         priorities = (errors.astype(np.float64) + self.epsilon) ** self.alpha
         largest = priorities.max()
         if not math.isfinite(largest):
             raise ValueError(
-                f"The critics' error is {errors[~np.isfinite(errors)][0]}: the critics diverged. Choose a lower "
-                "learning_rate, or smaller rewards."
+                f"The critics' error is {errors[~np.isfinite(errors)][0]}: the critics diverged. Lower the "
+                "learning_rate or scale the rewards down."
             )
         self.largest_priority = max(self.largest_priority, float(largest))
         self.priorities.set(indices, priorities)
@@ -651,9 +662,9 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
 
 class SumTree:
     """
-    Sum tree for sampling indices in proportion to priority in O(log n).
+    Sum tree, which samples indices in proportion to their priorities in O(log n).
 
-    :param size: number n of priorities, all 0 at first
+    :param size: number n of priorities, initially 0
     """
 
     def __init__(self, size: int):
@@ -662,13 +673,15 @@ class SumTree:
 
     @property
     def values(self) -> np.ndarray:
-        """All priorities, and zeros behind them."""
+        """All priorities, padded with zeros."""
         return self.sums[1 << self.depth :]
 
     def set(self, indices: np.ndarray, values: np.ndarray | float) -> None:
         """
-        :param indices: (n,), of priorities
-        :param values: (n,), at least 0, or one for all
+        Set priorities.
+
+        :param indices: indices of the priorities, (n,)
+        :param values: the non-negative priorities, (n,), or one for all
         """
         nodes = indices + (1 << self.depth)
         self.sums[nodes] = values
@@ -678,15 +691,17 @@ class SumTree:
 
     def find(self, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        :param shares: (n,), of the total of all priorities, from 0 to below 1
-        :return: (n,), indices whose intervals of the cumulative sum contain these points, and (n,), their probabilities
+        Find the indices whose intervals of the cumulative sum of priorities contain given points.
+
+        :param shares: the points, as fractions of the total in [0, 1), (n,)
+        :return: the indices and their probabilities, each (n,)
         """
         nodes = np.ones(len(shares), np.intp)
         rest = shares * self.sums[1]
         for _ in range(self.depth):
             nodes = 2 * nodes
             left, right = self.sums[nodes], self.sums[nodes + 1]
-            goes_right = (rest >= left) & (right > 0)  # rounding must not lead to where there is nothing
+            goes_right = (rest >= left) & (right > 0)  # rounding must not lead to an empty subtree
             rest -= left * goes_right
             nodes += goes_right
         return nodes - (1 << self.depth), self.sums[nodes] / self.sums[1]

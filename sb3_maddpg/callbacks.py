@@ -11,17 +11,17 @@ from stable_baselines3.common.logger import Figure, HParam, Logger, TensorBoardO
 from sb3_maddpg.utils import arguments_of, shown
 from sb3_maddpg.validation import CurriculumArguments, validated
 
-# What a text log cannot show
+# Outputs that cannot show figures and hyperparameters
 TENSORBOARD_ONLY = ("stdout", "log", "json", "csv")
 
 
 def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
     """
-    Log the numbers an environment puts into ``info["metrics"]``, as means over the steps until the next log dump.
+    Log the numbers in ``info["metrics"]``, as means over the steps until the next dump of the log.
 
-    :param logger: of the algorithm
-    :param infos: of one step, one per environment, see ``TeamInfo``
-    :raises ValueError: a metric that is no number
+    :param logger: the algorithm's logger
+    :param infos: infos of one step, one per environment, see ``TeamInfo``
+    :raises ValueError: if a metric is not a number
     """
     for info in infos:
         for name, value in info.get("metrics", {}).items():
@@ -42,14 +42,14 @@ class MetricsCallback(BaseCallback):
 
 class CurriculumCallback(BaseCallback):
     """
-    Makes the training environment harder once the team succeeds. The environment has a number ``n_curriculum_levels``,
-    a method ``set_curriculum_level(level)`` with levels from 0, and says ``info["is_success"]`` at the end of an
-    episode. The level is kept in ``model.curriculum_level``, hence in the saved model, and logged as
-    ``curriculum/level``. Evaluation environments neither count nor change.
+    Callback that makes the training environment harder once the team succeeds. The environment must have an attribute
+    ``n_curriculum_levels`` and a method ``set_curriculum_level(level)`` with levels from 0, and must set
+    ``info["is_success"]`` at the end of each episode. The level is stored in ``model.curriculum_level``, and thus in
+    the saved model, and logged as ``curriculum/level``. Evaluation environments neither count nor change.
 
-    :param success_threshold: share of successes that raises the level
-    :param window: number of latest episodes at the current level over which it is taken
-    :param verbose: 1 says when the level is raised
+    :param success_threshold: success rate that raises the level
+    :param window: number of most recent episodes at the current level that determine the success rate
+    :param verbose: 1 to print when the level is raised
     """
 
     def __init__(self, success_threshold: float = 0.9, window: int = 100, verbose: int = 0):
@@ -74,7 +74,7 @@ class CurriculumCallback(BaseCallback):
             if not self.training_env.has_attr(name):
                 raise ValueError(
                     f"CurriculumCallback needs an environment with `{name}`, which this one lacks. Choose an "
-                    "environment (or a scenario of it) with a curriculum, or drop the callback."
+                    "environment or scenario with a curriculum, or remove the callback."
                 )
         self.n_levels = int(self.training_env.get_attr("n_curriculum_levels", indices=0)[0])
         self._set_level(min(self.level, self.n_levels - 1))
@@ -100,12 +100,12 @@ class CurriculumCallback(BaseCallback):
 
 class DashboardCallback(BaseCallback):
     """
-    Fills TensorBoard beside the curves: at the start the hyperparameters with the figures that they are judged by, and
-    a layout for its page "Custom scalars"; each time it is called pictures and numbers of the model as it is. Give it
-    to SB3's ``EvalCallback`` as ``callback_after_eval``: it is called after each evaluation. Without TensorBoard it
-    does nothing.
+    Callback that adds to TensorBoard's curves. At the start of training, it logs the hyperparameters with the metrics
+    that judge them, and a layout for the tab "Custom scalars". At each call, it logs figures and numbers of the current
+    model. Pass it to SB3's ``EvalCallback`` as ``callback_after_eval`` to call it after each evaluation. Without
+    TensorBoard it does nothing.
 
-    :param draw: from the model to pictures (Matplotlib) and numbers by their tags; None: no pictures
+    :param draw: function that returns Matplotlib figures and numbers of a model by tag, None for no figures
     :param layout: title -> chart -> kind and tags, see ``SummaryWriter.add_custom_scalars``
     """
 
@@ -140,7 +140,7 @@ class DashboardCallback(BaseCallback):
         return [one for one in self.logger.output_formats if isinstance(one, TensorBoardOutputFormat)]
 
 
-# For environments that say nothing about theirs. One tag a chart: TensorBoard gives all tags of a run one colour
+# Default layout. Each chart has one tag, because TensorBoard draws all tags of a run in the same colour
 LAYOUT: dict[str, dict[str, list[Any]]] = {
     "Learning": {
         "training: return": ["Multiline", ["rollout/ep_rew_mean"]],
@@ -156,8 +156,8 @@ LAYOUT: dict[str, dict[str, list[Any]]] = {
 
 def hyperparameters(model: BaseAlgorithm) -> dict[str, bool | str | float]:
     """
-    :param model: any algorithm
-    :return: the arguments it was made with, as far as they are numbers or words; collections as words
+    :param model: a model of any algorithm
+    :return: the numbers and strings among the arguments it was created with, and collections as strings
     """
     known: dict[str, bool | str | float] = {"algo": type(model).__name__, "policy": type(model.policy).__name__}
     for name in sorted(arguments_of(type(model)) - {"env", "policy", "verbose", "tensorboard_log"}):

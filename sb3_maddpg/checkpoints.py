@@ -1,9 +1,9 @@
-"""Checkpoints of a run: all that a training goes on from, bit for bit, and committed whole or not at all.
+"""Checkpoints of a run, from which training resumes bit for bit, written atomically.
 
 A checkpoint is a folder ``checkpoint-STEPS`` with the model, the state of everything around it, and the names of the
-segments that hold the replay buffer. Segments lie beside the checkpoints and are written once: a checkpoint adds the
-transitions since the one before. A folder is written under another name, every file of it is synced, a manifest with
-their checksums comes last, and renaming the folder commits it.
+segments that hold the replay buffer. Segments are files beside the checkpoints that are written once: each checkpoint
+adds a segment with the transitions since the previous one. The folder is first written under a temporary name. All
+files are synced to disk, then a manifest with their checksums is written, and renaming the folder commits it.
 """
 
 from __future__ import annotations
@@ -51,26 +51,28 @@ from sb3_maddpg.utils import shown, sync_folder
 _FORMAT = 1
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
 _SEGMENTS = "segments"
-# Called with the name of each moment at which a kill might hurt; tests put something here that kills
+# Called with the name of each step of writing; tests replace it by a function that kills the process
 fault: Callable[[str], None] = lambda point: None  # noqa: E731
-_ROWS = 64  # of a replay buffer, that are written at once
-_SECONDS, _SHARE = 30.0, 100.0  # between checkpoints by time: at least, and as a multiple of what one takes
+_ROWS = 64  # rows of a replay buffer to write at once
+# Minimum time between checkpoints: in seconds, and as a multiple of the time that one takes
+_SECONDS, _SHARE = 30.0, 100.0
 _LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 _LOGGED = ("name_to_value", "name_to_count", "name_to_excluded")
 
 
 class RunCheckpoint(BaseCallback):
     """
-    Writes checkpoints while a model learns, between rollouts. ``resume`` goes on from the newest.
+    Callback that writes checkpoints between rollouts during training. ``resume`` continues from the newest one.
 
-    At SIGTERM and SIGHUP, with which clusters and closed terminals end a process, it writes one more and ends the
-    process by that signal; a second one ends it at once.
+    On SIGTERM and SIGHUP, which clusters and closed terminals send to end a process, the callback writes another
+    checkpoint and then ends the process with that signal. A second signal ends the process at once.
 
-    :param folder: for the checkpoints, of this run alone
-    :param every: steps from one to the next; None: by time, each half minute, or more seldom where that takes more than
-        a hundredth of the time
-    :param keep: how many of the newest stay
-    :param verbose: 1 says what is written
+    :param folder: folder for the checkpoints of this run only
+    :param every: number of steps between checkpoints; None to write one every half minute, or less often if
+        checkpoints would take more than a hundredth of the time
+    :param keep: number of most recent checkpoints to keep
+    :param verbose: 1 to print what is written
+    :raises ValueError: if ``every`` or ``keep`` is less than 1
     """
 
     def __init__(self, folder: str | os.PathLike[str], every: int | None = None, keep: int = 2, verbose: int = 0):
@@ -83,7 +85,7 @@ class RunCheckpoint(BaseCallback):
         self._signal: int | None = None
         self._handlers: dict[int, Any] = {}
         self.inexact: str | None = None
-        self.logger_folder: str | None = None  # of the run that is gone on with
+        self.logger_folder: str | None = None  # of the run that is resumed
         self._pending: dict[str, Any] | None = None
         self._segments: list[dict[str, Any]] = []
 
@@ -96,7 +98,7 @@ class RunCheckpoint(BaseCallback):
                 _restore(cast(MADDPG, self.model), _callbacks(self._root()), self._pending)
             except (KeyError, TypeError, AttributeError, IndexError) as error:
                 raise ValueError(
-                    f"A checkpoint in {self.folder} is damaged, or of another environment or other callbacks "
+                    f"A checkpoint in {self.folder} is damaged, or belongs to another environment or other callbacks "
                     f"({type(error).__name__}: {error})."
                 ) from error
             self._pending = None
@@ -131,9 +133,9 @@ class RunCheckpoint(BaseCallback):
 
     def save(self) -> Path | None:
         """
-        Write a checkpoint now; only between rollouts is all of one moment.
+        Write a checkpoint now. Call this between rollouts only, when all parts of the state are consistent.
 
-        :return: its folder, None where the disk is full: then the one before stays
+        :return: folder of the checkpoint, None if the disk is full; the previous checkpoint stays then
         """
         model = cast(MADDPG, self.model)
         steps = model.num_timesteps
@@ -147,7 +149,9 @@ class RunCheckpoint(BaseCallback):
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            warnings.warn(f"No space for a checkpoint at step {steps}: the last one stays ({error}).", stacklevel=2)
+            warnings.warn(
+                f"No space left for a checkpoint at step {steps}: the previous one stays ({error}).", stacklevel=2
+            )
             for path in self.folder.glob(f"*{_UNFINISHED}"):
                 shutil.rmtree(path, ignore_errors=True)
             return None
@@ -164,13 +168,14 @@ class RunCheckpoint(BaseCallback):
         root: BaseCallback = self
         while root.parent is not None:
             root = root.parent
-        # A CallbackList is no parent of its callbacks, but learn() knows it
+        # A CallbackList is not the parent of its callbacks, but it is a local variable of learn()
         return self.locals.get("callback", root)
 
     def _write_segments(self, model: MADDPG) -> list[dict[str, Any]]:
-        """Write the transitions since the last checkpoint, and the one before, whose end may have changed.
+        """
+        Write the transitions since the last checkpoint, and the one before them, whose end may have changed.
 
-        :return: the segments that hold the buffer, the oldest first
+        :return: the segments that hold the buffer, oldest first
         """
         buffer = model.replay_buffer
         assert isinstance(buffer, TeamReplayBuffer)
@@ -194,7 +199,7 @@ class RunCheckpoint(BaseCallback):
         return [*kept, {"name": name, "first": first, "end": end, "sha256": found.hexdigest()}]
 
     def _tidy(self) -> None:
-        """Remove what no checkpoint that stays needs."""
+        """Remove old checkpoints, and segments that no remaining checkpoint needs."""
         folders = _finished(self.folder)
         for path in folders[: -self.keep]:
             shutil.rmtree(path, ignore_errors=True)
@@ -216,17 +221,17 @@ def resume(
     device: th.device | str = "auto",
 ) -> tuple[MADDPG, RunCheckpoint] | None:
     """
-    A model and the callback with which it goes on: ``model.learn(total_timesteps - model.num_timesteps, [callback,
-    ...], reset_num_timesteps=False)``, with an environment and callbacks made as they were for the run.
+    Load the newest checkpoint of a run. Continue training with ``model.learn(total_timesteps - model.num_timesteps,
+    [callback, ...], reset_num_timesteps=False)``, with the same environment and callbacks as in the run.
 
-    :param folder: of the checkpoints
-    :param env: made as for the run
-    :param algorithm: of the run
-    :param every: steps from one checkpoint to the next; as before unless given
+    :param folder: folder of the checkpoints
+    :param env: environment, created as for the run
+    :param algorithm: algorithm of the run
+    :param every: number of steps between checkpoints, by default as before
     :param keep: see ``RunCheckpoint``
     :param device: see ``MADDPG.load``
-    :return: None where there is no whole checkpoint
-    :raises ValueError: another environment than the run's
+    :return: the model and the callback that continues its checkpoints, None if there is no complete checkpoint
+    :raises ValueError: if the environment differs from the run's
     """
     path = newest(folder)
     if path is None:
@@ -250,12 +255,14 @@ def resume(
 
 def newest(folder: str | os.PathLike[str]) -> Path | None:
     """
-    :param folder: of checkpoints
-    :return: the newest that is whole, with all its segments; one that is not is passed over with a warning
+    Find the newest complete checkpoint. Damaged checkpoints are skipped with a warning.
+
+    :param folder: folder of the checkpoints
+    :return: path of the checkpoint, None if there is none
     """
     for path in reversed(_finished(Path(folder))):
         if problem := _damage(path):
-            warnings.warn(f"{path} is passed over: {problem}.", stacklevel=2)
+            warnings.warn(f"{path} is skipped: {problem}.", stacklevel=2)
         else:
             return path
     return None
@@ -264,16 +271,17 @@ def newest(folder: str | os.PathLike[str]) -> Path | None:
 @contextmanager
 def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
     """
-    Keep a folder of checkpoints for this process; the lock ends with it, however it ends. Not on Windows.
+    Lock a folder of checkpoints for this process. The lock ends with the process, however that ends. On Windows, this
+    does nothing.
 
-    :param folder: of the checkpoints
-    :raises ValueError: another process has it
+    :param folder: folder of the checkpoints
+    :raises ValueError: if another process holds the lock
     """
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     try:
         import fcntl
-    except ImportError:  # Windows has none
+    except ImportError:  # on Windows
         yield
         return
     with (path / "lock").open("a+") as file:
@@ -291,7 +299,7 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
 def digest(model: MADDPG) -> str:
     """
     :param model: a model with its replay buffer
-    :return: SHA-256 of parameters, optimizers, replay buffer, counters and random generators
+    :return: SHA-256 of parameters, optimizers, replay buffer, counters and random number generators
     """
     found = hashlib.sha256()
     for leaf in th.utils._pytree.tree_leaves(model.get_parameters()):
@@ -307,11 +315,11 @@ def digest(model: MADDPG) -> str:
 
 
 def _state_of(model: MADDPG, callbacks: list[BaseCallback]) -> dict[str, Any]:
-    """All that is not in the model's file."""
+    """:return: the state of everything that is not in the model's file"""
     buffer = model.replay_buffer
     assert isinstance(buffer, TeamReplayBuffer)
     _, counters, arrays = buffer.contents()
-    for name in buffer.records.dtype.names or ():  # in the segments
+    for name in buffer.records.dtype.names or ():  # those are in the segments
         del arrays[name]
     inexact, env = _env_state_or_reason(cast(VecEnv, model.env))
     states = []
@@ -350,11 +358,11 @@ def _env_state_or_reason(env: VecEnv) -> tuple[str | None, dict[str, Any] | None
 
 
 def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]) -> None:
-    """Everything but the networks and the replay buffer, when learn() has begun."""
+    """Restore everything but the networks and the replay buffer, after learn() has begun."""
     env = cast(VecEnv, model.env)
     if state["env"] is None:
         warnings.warn(
-            f"{state['inexact']} The run goes on with new episodes, and not exactly as it would have.", stacklevel=2
+            f"{state['inexact']} The run continues with new episodes and will not be bit-identical.", stacklevel=2
         )
         model._last_obs = env.reset()  # type: ignore[assignment]
         model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
@@ -366,7 +374,7 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
     names = [type(one).__name__ for one in callbacks]
     if names != [one["class"] for one in state["callbacks"]]:
         written = [one["class"] for one in state["callbacks"]]
-        raise ValueError(f"The run had the callbacks {written}, these are {names}: resume with the same.")
+        raise ValueError(f"The run had the callbacks {written}, but now they are {names}: resume with the same ones.")
     for one, saved in zip(callbacks, state["callbacks"], strict=True):
         set_plain_values(one, saved["values"])
         if saved["eval_env"] is not None:
@@ -378,7 +386,7 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
 
 
 def _end_by(number: int) -> None:
-    """End this process as the signal would have."""
+    """End this process with a signal's default action."""
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)
 
@@ -404,7 +412,7 @@ def _set_random_state(state: dict[str, Any]) -> None:
 
 
 def _callbacks(root: BaseCallback) -> list[BaseCallback]:
-    """A callback and all that it calls."""
+    """:return: a callback and all callbacks inside it"""
     inner: list[BaseCallback | None] = []
     if isinstance(root, CallbackList):
         inner = [*root.callbacks]
@@ -415,7 +423,7 @@ def _callbacks(root: BaseCallback) -> list[BaseCallback]:
 
 def fingerprint() -> dict[str, str]:
     """
-    :return: what the bits of a training depend on beside its settings
+    :return: the hardware and software versions that the exact results of training depend on
     """
     return {
         "processor": f"{platform.machine()} {platform.processor()} {th.backends.cpu.get_cpu_capability()}",
@@ -431,10 +439,10 @@ def fingerprint() -> dict[str, str]:
 def _compare_fingerprints(written: dict[str, str]) -> None:
     here = fingerprint()
     differ = [
-        f"{name}: {written.get(name)} then, {value} now" for name, value in here.items() if written.get(name) != value
+        f"{name}: {written.get(name)} before, {value} now" for name, value in here.items() if written.get(name) != value
     ]
     if differ:
-        warnings.warn(f"The run goes on, but not bit for bit as it would have: {'; '.join(differ)}.", stacklevel=3)
+        warnings.warn(f"The run continues, but will not be bit-identical: {'; '.join(differ)}.", stacklevel=3)
 
 
 def _columns(buffer: TeamReplayBuffer) -> dict[str, np.ndarray]:
@@ -470,13 +478,13 @@ def _write(path: Path, model: MADDPG, state: dict[str, Any], segments: list[dict
 def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     state = json.loads((path / "state.json").read_text())
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
-        raise ValueError(f"{path} has format {shown(state.get('format'))}, this version reads {_FORMAT}.")
+        raise ValueError(f"{path} has format {shown(state.get('format'))}, but this version reads {_FORMAT}.")
     with np.load(path / "arrays.npz", allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}, state
 
 
 def _commit(target: Path, write: Callable[[Path], None]) -> Path:
-    """Write a folder that appears whole or not at all."""
+    """Write a folder atomically."""
     unfinished = target.with_name(target.name + _UNFINISHED)
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
@@ -501,7 +509,7 @@ def _commit(target: Path, write: Callable[[Path], None]) -> Path:
 
 
 def _damage(path: Path) -> str | None:
-    """What is wrong with a checkpoint."""
+    """:return: what is wrong with a checkpoint, None if it is complete"""
     try:
         for name, expected in json.loads((path / _MANIFEST).read_text()).items():
             if _sha256(path / name) != expected:

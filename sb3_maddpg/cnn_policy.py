@@ -1,4 +1,4 @@
-"""Policies of teams whose agents see images."""
+"""Policy for teams whose agents observe images."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from sb3_maddpg.utils import shown
 
 class ImageFeatures(nn.Module):
     """
-    Images in rows of a team observation, to rows of features. All agents share the extractor.
+    Features extractor of a team, which replaces each agent's image by its features. All agents share it.
 
-    :param space: of each agent's image, channels first or last
-    :param extractor_class: as in Stable-Baselines3, reads images with channels first
-    :param extractor_kwargs: its further arguments
-    :param normalize: divide by 255
+    :param space: space of an agent's image, channels first or last
+    :param extractor_class: features extractor of Stable-Baselines3, which reads images with channels first
+    :param extractor_kwargs: keyword arguments to pass to the features extractor
+    :param normalize: whether to divide images by 255
     """
 
     def __init__(
@@ -45,8 +45,8 @@ class ImageFeatures(nn.Module):
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (..., obs_dim or more); what comes after an agent's image is kept
-        :return: (..., features_dim or more)
+        :param obs: observations, (..., obs_dim or more); numbers after an agent's image are kept
+        :return: features, (..., features_dim or more)
         """
         images = obs[..., : self.obs_dim].reshape(-1, *self.shape) * self.scale
         if self.channels_last:
@@ -57,9 +57,9 @@ class ImageFeatures(nn.Module):
 
 class CnnActor(Actor):
     """
-    Features of the agents' images, then one multi-layer perceptron per agent.
+    Actors that read the features of their agents' images.
 
-    :param features: of images
+    :param features: the features extractor
     :param head: actors that read features
     """
 
@@ -81,9 +81,9 @@ class CnnActor(Actor):
 
 class CnnCritic(Critic):
     """
-    Features of all agents' images, then centralised critics that read them and all actions.
+    Centralised critics that read the features of all agents' images, and all actions.
 
-    :param features: of images
+    :param features: the features extractor
     :param head: critics that read features
     """
 
@@ -107,16 +107,16 @@ class CnnCritic(Critic):
 
 class CnnPolicy(MADDPGPolicy):
     """
-    Policy for teams of homogeneous agents that see images: a convolutional network for all agents' images, one for
-    actors and one for critics, and behind it what ``MADDPGPolicy`` has.
+    Policy for teams of homogeneous agents that observe images. All agents share one convolutional features extractor
+    for the actors and another for the critics; the networks of ``MADDPGPolicy`` read the features.
 
     :param args: see ``MADDPGPolicy``
-    :param image_space: ``Box`` of each agent's image, (height, width, channels) or (channels, height, width); MADDPG
-        takes it from the environment unless given
-    :param features_extractor_class: as in Stable-Baselines3
-    :param features_extractor_kwargs: its further arguments, such as ``features_dim``
-    :param kwargs: see ``MADDPGPolicy``; ``normalize_images``: divide images by 255
-    :raises ValueError: agents that see different things, or no images
+    :param image_space: ``Box`` of an agent's image, (height, width, channels) or (channels, height, width); by default
+        MADDPG reads it from the environment
+    :param features_extractor_class: features extractor, see Stable-Baselines3
+    :param features_extractor_kwargs: keyword arguments to pass to the features extractor, such as ``features_dim``
+    :param kwargs: see ``MADDPGPolicy``; ``normalize_images`` says whether to divide images by 255
+    :raises ValueError: if the agents do not each observe one image of the same size
     """
 
     env_attributes: ClassVar[tuple[str, ...]] = ("agent_names", "image_space")
@@ -131,14 +131,14 @@ class CnnPolicy(MADDPGPolicy):
     ):
         if image_space is None:
             raise ValueError(
-                "CnnPolicy needs agents that see images of one size, or policy_kwargs with an `image_space`; use "
-                "MlpPolicy for other observations."
+                "CnnPolicy needs agents that observe images of the same size, or an `image_space` in policy_kwargs. "
+                "Use MlpPolicy for other observations."
             )
         if not isinstance(features_extractor_class, type) or not issubclass(
             features_extractor_class, BaseFeaturesExtractor
         ):
             raise ValueError(
-                f"features_extractor_class={shown(features_extractor_class)}: give a subclass of Stable-Baselines3's "
+                f"features_extractor_class={shown(features_extractor_class)}: pass a subclass of Stable-Baselines3's "
                 "BaseFeaturesExtractor, such as NatureCNN."
             )
         self.image_space = image_space
@@ -150,10 +150,11 @@ class CnnPolicy(MADDPGPolicy):
         size = int(th.Size(self.image_space.shape).numel())
         if set(self.team.obs_dims) != {size} or self.team.masks:
             raise ValueError(
-                f"image_space={self.image_space} has {size} numbers, the agents observe {self.team.obs_dims}"
-                f"{' with action masks' if self.team.masks else ''}: CnnPolicy is for teams that see one image each."
+                f"image_space={self.image_space} has {size} numbers, but the agents observe {self.team.obs_dims}"
+                f"{' with action masks' if self.team.masks else ''}: CnnPolicy is for agents that observe one image "
+                "each."
             )
-        # Networks behind the extractors know the team by its features
+        # The networks after the extractors see a team that observes features
         of_actor, of_critic = self._make_features(), self._make_features()
         team, width = self.team, of_actor.features_dim
         self.team = replace(team, obs_dims=(width,) * team.n_agents, obs_dim=width)
@@ -167,16 +168,17 @@ class CnnPolicy(MADDPGPolicy):
         if self._extractor_class is NatureCNN:
             if not is_image_space(self.image_space, normalized_image=not self.normalize_images):
                 raise ValueError(
-                    f"image_space={self.image_space} is no image for NatureCNN: give uint8 from 0 to 255 and three "
-                    "axes, or normalize_images=False for images of floats, or a features_extractor_class of your own."
+                    f"image_space={self.image_space} is not an image for NatureCNN, which needs three axes and uint8 "
+                    "from 0 to 255. For images of floats, set normalize_images=False or write your own "
+                    "features_extractor_class."
                 )
             self._extractor_kwargs.setdefault("normalized_image", not self.normalize_images)
         try:
             return ImageFeatures(self.image_space, self._extractor_class, self._extractor_kwargs, self.normalize_images)
         except (AssertionError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(
-                f"features_extractor_class={self._extractor_class.__name__} cannot be made for {self.image_space} with "
-                f"features_extractor_kwargs={self._extractor_kwargs}: {error}"
+                f"features_extractor_class={self._extractor_class.__name__} cannot be created for {self.image_space} "
+                f"with features_extractor_kwargs={self._extractor_kwargs}: {error}"
             ) from error
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

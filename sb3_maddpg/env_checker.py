@@ -1,4 +1,4 @@
-"""Whether an environment of one's own is a team environment, found out by an episode of random actions."""
+"""Environment checker for custom team environments."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _FLAGS = ("agent_terminated", "agent_active", "pair_terminated")
 
 def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed: int = 0) -> Team:
     """
-    Check an environment against the team convention, see ``TeamEnvironment``, ``TeamAttributes`` and ``TeamInfo``:
-    Stable-Baselines3's ``check_env``, then the spaces, the attributes and an episode of random actions.
+    Check that an environment follows the team convention, see ``TeamEnvironment``, ``TeamAttributes`` and ``TeamInfo``.
+    Runs Stable-Baselines3's ``check_env``, then checks the spaces, the attributes and an episode of random actions.
 
-    :param env: team environment, or PettingZoo parallel environment
-    :param max_steps: after which the episode is given up, if it has not ended by itself
-    :param seed: of the episode and of the actions
+    :param env: team environment or PettingZoo environment
+    :param max_steps: maximum number of steps of the episode
+    :param seed: seed of the episode and the actions
     :return: the team as MADDPG will see it
-    :raises ValueError: what is wrong first, with the remedy
+    :raises ValueError: if a check fails; the message describes the first problem and its remedy
     """
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
@@ -48,7 +48,9 @@ def _check_attributes(env: gymnasium.Env, team: Team) -> None:
     if env.has_wrapper_attr("action_cost"):
         cost = np.asarray(env.get_wrapper_attr("action_cost"))
         if cost.dtype.kind not in "biuf" or not all_finite(cost) or (cost.ndim and cost.shape[0] != team.n_agents):
-            raise ValueError(f"action_cost={cost.tolist()} must be a finite number, or (n_agents, width) of them.")
+            raise ValueError(
+                f"action_cost={cost.tolist()} must be a finite number, or an array of them of shape (n_agents, width)."
+            )
     curriculum = [env.has_wrapper_attr(name) for name in ("n_curriculum_levels", "set_curriculum_level")]
     if any(curriculum) and not all(curriculum):
         raise ValueError("A curriculum needs both `n_curriculum_levels` and `set_curriculum_level(level)`.")
@@ -66,7 +68,9 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
     first, _ = env.reset(seed=seed)
     again, _ = env.reset(seed=seed)
     if not np.array_equal(first, again):
-        raise ValueError(f"Two calls of reset(seed={seed}) gave different observations: draw from self.np_random only.")
+        raise ValueError(
+            f"Two calls of reset(seed={seed}) returned different observations: draw all numbers from self.np_random."
+        )
     env.action_space.seed(seed)
     gone = np.zeros(team.n_agents, bool)
     for step in range(1, max_steps + 1):
@@ -82,7 +86,7 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         if (acts & gone).any():
             name = team.names[np.flatnonzero(acts & gone)[0]]
             raise ValueError(
-                f"Agent {name} acts {where}, although it has terminated: set agent_active to False for it."
+                f"Agent {name} is active {where}, although it has terminated: set its agent_active to False."
             )
         gone |= np.asarray(info.get("agent_terminated", np.zeros(team.n_agents)), bool)
         if terminated or truncated:
@@ -98,7 +102,7 @@ def _check_numbers_of_neighbours(env: gymnasium.Env, obs: np.ndarray, team: Team
         if not set(named) <= set(range(1, team.n_agents + 1)) - {agent + 1} or len(set(named)) < len(named):
             raise ValueError(
                 f"The neighbours of agent {team.names[agent]} {where}, in `who_columns` of its observation, are "
-                f"{shown(row.tolist())}: each must be another agent's number, counted from 1, or 0 for nobody."
+                f"{shown(row.tolist())}: each must be another agent's index plus 1, named once, or 0 for no neighbour."
             )
 
 

@@ -1,8 +1,9 @@
-"""States of environments as plain values, so that a training goes on from where it was.
+"""States of environments as plain values, so that training can resume in the middle of an episode.
 
-An environment tells its state by ``state_dict()``, plain values and arrays, and takes it back by ``load_state_dict()``.
-Those of Gymnasium that do not, but always do the same after the same seed and actions, do when they are wrapped in
-``Replayable``. What wrappers keep, Gymnasium's and Stable-Baselines3's, is read and written here.
+An environment returns its state, plain values and arrays, from ``state_dict()`` and restores it with
+``load_state_dict()``. The wrapper ``Replayable`` adds both methods to Gymnasium environments that are deterministic
+given the seed and the actions. This module also saves and restores the state of Gymnasium's and Stable-Baselines3's
+wrappers.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ _BEFORE = ".before"
 
 
 class NoStateError(ValueError):
-    """An environment does not tell its state."""
+    """Raised if an environment does not provide its state."""
 
 
 class Replayable(gymnasium.Wrapper):
     """
-    An environment that is brought back into a state by the seed and the actions of its episode. It has to do the same
-    after the same seed and actions, and each episode gets a seed of its own.
+    Wrapper that restores a state by replaying the seed and the actions of the episode. The environment must be
+    deterministic given both. Each episode gets its own seed.
 
     :param env: the environment
     """
@@ -55,7 +56,7 @@ class Replayable(gymnasium.Wrapper):
         return self.env.step(action)
 
     def state_dict(self) -> dict[str, Any]:
-        """:return: generator, seed and actions of the episode"""
+        """:return: the random number generator's state, and seed, options and actions of the episode"""
         return {
             "generator": self._rng.bit_generator.state,
             "seed": self._seed,
@@ -78,8 +79,8 @@ class Replayable(gymnasium.Wrapper):
 def vec_env_state(env: VecEnv) -> dict[str, Any]:
     """
     :param env: a vectorised environment, with its wrappers
-    :return: its state, see ``load_vec_env_state``
-    :raises NoStateError: part of it does not tell its state
+    :return: the environment's state, see ``load_vec_env_state``
+    :raises NoStateError: if a part of the environment does not provide its state
     """
     own = {"class": type(env).__name__, "values": plain_values(env), **_written(env)}
     if isinstance(env, VecEnvWrapper):
@@ -88,14 +89,18 @@ def vec_env_state(env: VecEnv) -> dict[str, Any]:
         return {**own, "inner": _told(env.envs.unwrapped)}
     if isinstance(env, DummyVecEnv):
         return {**own, "inner": [_env_state(one) for one in env.envs]}
-    raise NoStateError(f"{type(env).__name__} keeps its environments in other processes, which tell no state.")
+    raise NoStateError(
+        f"{type(env).__name__} runs its environments in other processes, which do not provide their state."
+    )
 
 
 def load_vec_env_state(env: VecEnv, state: dict[str, Any]) -> None:
     """
-    :param env: an environment made as the one that told its state
+    Restore the state of a vectorised environment.
+
+    :param env: an environment created like the one whose state was saved
     :param state: see ``vec_env_state``
-    :raises ValueError: the state of another environment
+    :raises ValueError: if the state belongs to another environment
     """
     _take(env, state)
     if isinstance(env, VecEnvWrapper):
@@ -116,7 +121,7 @@ def _told(env: Any) -> Any:
 
 def _env_state(env: gymnasium.Env) -> dict[str, Any]:
     own = {"class": type(env).__name__}
-    if isinstance(env, Replayable):  # what it replays goes through the wrappers inside, but not what they keep
+    if isinstance(env, Replayable):  # replaying does not restore all attributes of inner wrappers
         return {**own, "told": env.state_dict(), "layers": [_layer(one) for one in _layers(env.env)]}
     if "state_dict" in dir(type(env)):
         return {**own, "told": _told(env)}
@@ -140,7 +145,7 @@ def _load_env_state(env: gymnasium.Env, state: dict[str, Any]) -> None:
 
 
 def _layers(env: gymnasium.Env) -> list[gymnasium.Env]:
-    """The wrappers around an environment, the outermost first."""
+    """:return: the wrappers around an environment, outermost first"""
     return [env, *_layers(env.env)] if isinstance(env, gymnasium.Wrapper) else []
 
 
@@ -150,14 +155,14 @@ def _layer(env: gymnasium.Env) -> dict[str, Any]:
 
 def _take(owner: Any, state: dict[str, Any]) -> None:
     if state["class"] != type(owner).__name__:
-        raise ValueError(f"The state is of a {state['class']}, this is a {type(owner).__name__}.")
+        raise ValueError(f"The state belongs to a {state['class']}, but this is a {type(owner).__name__}.")
     set_plain_values(owner, state.get("values", {}))
     if "written" in state and (writer := getattr(owner, "results_writer", None)) is not None:
         _write_again(Path(writer.file_handler.name), writer.file_handler, state["written"])
 
 
 def _written(monitor: Any) -> dict[str, int]:
-    """How far a monitor's file has come."""
+    """:return: the size of a monitor's file, if there is one"""
     writer = getattr(monitor, "results_writer", None)
     if writer is None:
         return {}
@@ -166,7 +171,7 @@ def _written(monitor: Any) -> dict[str, int]:
 
 
 def _write_again(path: Path, file: Any, size: int) -> None:
-    """The rows that a monitor had written, which a new one has begun to overwrite, see ``put_aside``."""
+    """Restore the rows of a monitor's file, which a new monitor has begun to overwrite, see ``put_aside``."""
     before = Path(f"{path}{_BEFORE}")
     if before.is_file():
         file.seek(0)
@@ -178,24 +183,25 @@ def _write_again(path: Path, file: Any, size: int) -> None:
 
 def put_aside(folder: Path) -> None:
     """
-    Keep the monitors' files of an earlier part of a run from being overwritten, until its state is loaded.
+    Rename the monitor files of an interrupted run, so that new monitors do not overwrite them before its state is
+    loaded.
 
-    :param folder: of the run
+    :param folder: folder of the run
     """
     for path in folder.glob("*monitor.csv"):
-        if not (before := Path(f"{path}{_BEFORE}")).exists():  # else this part was killed too before it went on
+        if not (before := Path(f"{path}{_BEFORE}")).exists():  # otherwise a previous attempt to resume was killed
             path.rename(before)
 
 
-# What is no state, or is told elsewhere
+# Attributes that are not state, or are saved elsewhere
 _NOT_STATE = {"metadata", "render_mode", "spec", "class_attributes", "t_start", "num_envs", "n_envs"}
 _NOT_STATE |= {"model", "parent", "locals", "globals", "logger", "training_env", "eval_env", "callback", "callbacks"}
 
 
 def plain_values(owner: Any) -> dict[str, Any]:
     """
-    :param owner: a wrapper, a callback
-    :return: those of its attributes that are plain values, arrays or lists of them, by name
+    :param owner: a wrapper or a callback
+    :return: the attributes that are plain values, arrays, or lists of them, by name
     """
     kinds = (spaces.Space, type)
     return plain_entries(
@@ -205,8 +211,8 @@ def plain_values(owner: Any) -> dict[str, Any]:
 
 def plain_entries(values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    :param values: by name
-    :return: those that can be written to a file
+    :param values: values by name
+    :return: the values that can be written to a file
     """
     found = {}
     for name, value in values.items():
@@ -220,7 +226,9 @@ def plain_entries(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
     """
-    :param owner: of the same class as the one that had them
+    Set attributes.
+
+    :param owner: a wrapper or a callback of the same class as the one that was saved
     :param values: see ``plain_values``
     """
     for name, value in values.items():
@@ -230,7 +238,7 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
 def tells_state(env: gymnasium.Env) -> bool:
     """
     :param env: an environment, with its wrappers
-    :return: whether it tells its state
+    :return: whether it provides its state
     """
     inner: Any = env.unwrapped
     inner = inner.parallel_env.unwrapped if isinstance(inner, TeamEnv) else inner
@@ -240,14 +248,16 @@ def tells_state(env: gymnasium.Env) -> bool:
 def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
     """
     :param space: a space
-    :return: the states of its random generators and its parts', None for one that was not used yet
+    :return: states of the random number generators of the space and its parts, None for unused generators
     """
     return [None if one._np_random is None else dict(one._np_random.bit_generator.state) for one in _parts(space)]
 
 
 def set_space_generators(space: spaces.Space, states: list[dict[str, Any] | None]) -> None:
     """
-    :param space: a space like the one that had them
+    Restore random number generators.
+
+    :param space: a space like the one that was saved
     :param states: see ``space_generators``
     """
     for one, state in zip(_parts(space), states, strict=True):

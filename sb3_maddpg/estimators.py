@@ -1,28 +1,29 @@
 r"""
-The gradient through discrete actions.
+Gradient estimators for discrete actions.
 
 **Binary actions.** Agent :math:`i` has probabilities :math:`f_1..f_k \in [0, 1]` and acts with the bits :math:`c_j =
 1[f_j > \delta']`. One threshold :math:`\delta' \sim U(0, 1)` is drawn per agent and step and shared by its bits
 (Serra-Gomez et al., IROS 2020, Sec. IV-C).
 
 **Categorical actions.** Agent :math:`i` has logits :math:`l_{h1}..l_{hK}` for each of its H heads (one for
-``Discrete``, one per sub-action of ``MultiDiscrete``) and draws from every head one category with the probabilities
-softmax(l_h), independently.
+``Discrete``, one per sub-action of ``MultiDiscrete``). It samples one category per head with the probabilities
+softmax(l_h), independently of the other heads.
 
-Neither has a useful derivative: the slope of the expected value :math:`E[Q_i]` needs an estimator. Each has a function
-for both kinds, ``objective = estimator(probabilities or logits, q, temperature)``:
+Neither kind of action has a useful derivative, so the gradient of the expected value :math:`E[Q_i]` needs an estimator.
+Each estimator has one function per kind, ``objective = estimator(probabilities or logits, q, temperature)``:
 
-- ``probabilities``, with gradient, (batch, n_agents, k). A padded bit, of an agent with fewer than the others, has
-  probability 0. It is never set; its gradient is finite, and ends where the caller made the probability 0.
-- ``logits``, with gradient, (batch, n_agents, H, K). A padded category has logit -inf; a padded head has a finite logit
-  for category 0 only. Padding is never drawn and gets no gradient.
-- ``q``: the critic with all agents' actions but the own ones fixed. It maps M alternatives for the own action,
-  (batch, n_agents, M, k) or (batch, n_agents, M, H, K), to their values, (batch, n_agents, M).
-- ``temperature``: of the relaxation, > 0. The lower, the nearer to the discrete action and the higher the variance.
-  Estimators without a relaxation do not read it.
-- ``objective``: what the actors ascend, (batch, n_agents).
+- ``probabilities``: of bits, with gradient, (batch, n_agents, k). Padded bits, of agents with fewer bits than others,
+  have probability 0. They are never set. Their gradients are finite and end where the caller set the probability to 0.
+- ``logits``: of categories, with gradient, (batch, n_agents, H, K). A padded category has logit -inf; a padded head has
+  a finite logit for category 0 only. Padding is never sampled and gets no gradient.
+- ``q``: the critic as a function of each agent's own action, with the other agents' actions fixed. It maps M
+  alternatives, (batch, n_agents, M, k) or (batch, n_agents, M, H, K), to their values, (batch, n_agents, M).
+- ``temperature``: of the relaxation, > 0. A lower temperature brings the relaxation closer to the discrete action but
+  increases the variance. Estimators without a relaxation ignore it.
+- ``objective``: what the actors maximise, (batch, n_agents).
 
-Random numbers come from torch's global generator. To add one, write the two functions and name them in ``ESTIMATORS``.
+Random numbers come from torch's global generator. To add an estimator, write both functions and add them to
+``ESTIMATORS``.
 """
 
 from collections.abc import Callable
@@ -38,10 +39,10 @@ EstimatorOfOneKind = Callable[[th.Tensor, CriticOfOwnAction, float], th.Tensor]
 @dataclass(frozen=True)
 class Estimator:
     """
-    One estimator for both kinds of actions, see the module's docstring.
+    Gradient estimator for both kinds of discrete actions, see the module's docstring.
 
-    :param binary: from probabilities, (batch, n_agents, k)
-    :param categorical: from logits, (batch, n_agents, H, K)
+    :param binary: function of probabilities, (batch, n_agents, k)
+    :param categorical: function of logits, (batch, n_agents, H, K)
     """
 
     binary: EstimatorOfOneKind
@@ -50,10 +51,11 @@ class Estimator:
 
 def nested_sets(order: th.Tensor) -> th.Tensor:
     """
-    All joint bits that one shared threshold can produce: the bits of the m highest probabilities, for m = 0..k.
+    Return all settings of an agent's bits that one shared threshold can produce: the m bits with the highest
+    probabilities are set, for m = 0..k.
 
-    :param order: the numbers of the bits, highest probability first, (..., k)
-    :return: bits, (..., k + 1, k) bool
+    :param order: indices of the bits, highest probability first, (..., k)
+    :return: the bits, (..., k + 1, k) bool
     """
     sizes = th.arange(order.shape[-1] + 1, device=order.device)
     rank = th.empty_like(order).scatter_(-1, order, sizes[:-1].expand_as(order))
@@ -64,17 +66,17 @@ def _value_of(q: CriticOfOwnAction, action: th.Tensor, dim: int) -> th.Tensor:
     """
     :param q: see the module's docstring
     :param action: one alternative, without the axis M
-    :param dim: where that axis belongs
-    :return: its value, (batch, n_agents)
+    :param dim: position of that axis
+    :return: the action's value, (batch, n_agents)
     """
     return q(action.unsqueeze(dim)).squeeze(-1)
 
 
 def _with_gradient_of(value: th.Tensor, source: th.Tensor) -> th.Tensor:
     """
-    :param value: what comes out, to the last bit
-    :param source: what the gradient flows to; nothing flows where it is -inf
-    :return: (shape of both, broadcast)
+    :param value: the exact value of the result
+    :param source: receives the gradient, except where it is -inf
+    :return: the value with the gradient of the source, in their broadcast shape
     """
     source = source.masked_fill(source.isneginf(), 0.0)  # -inf - -inf would be NaN
     return value.detach() + (source - source.detach())
@@ -86,7 +88,7 @@ def _gumbel(logits: th.Tensor) -> th.Tensor:
 
 
 def _one_hot_of_largest(logits: th.Tensor) -> th.Tensor:
-    """:return: 1 at the largest of each head, (..., K)"""
+    """:return: 1 for the largest logit of each head, else 0, (..., K)"""
     return F.one_hot(logits.argmax(dim=-1), logits.shape[-1]).to(logits.dtype)
 
 
@@ -97,26 +99,26 @@ def _sampled_categorical(logits: th.Tensor) -> th.Tensor:
 
 
 def _sampled_binary(probabilities: th.Tensor) -> th.Tensor:
-    """:return: bits at one sampled threshold per agent, (..., k)"""
+    """:return: bits for one sampled threshold per agent, (..., k)"""
     return (probabilities > th.rand_like(probabilities[..., :1])).to(probabilities.dtype)
 
 
 def _inside(x: th.Tensor) -> th.Tensor:
-    """:return: x at least one machine epsilon away from 0 and from 1; no gradient where that moves it"""
+    """:return: x, clamped to be at least one machine epsilon away from 0 and 1; clamped values get no gradient"""
     eps = th.finfo(x.dtype).eps
     return x.clamp(eps, 1 - eps)
 
 
 def expected_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     r"""
-    The exact expectation. With the probabilities sorted, :math:`f_{(1)} \ge ... \ge f_{(k)}`, and :math:`f_{(0)} = 1`,
-    :math:`f_{(k+1)} = 0`, the threshold falls between two neighbours with a probability that is their difference:
+    Exact expectation. With the probabilities sorted, :math:`f_{(1)} \ge ... \ge f_{(k)}`, and :math:`f_{(0)} = 1`,
+    :math:`f_{(k+1)} = 0`, the probability that the threshold falls between two consecutive ones is their difference:
 
     .. math:: E_{\delta'}[Q(c)] = \sum_{m=0}^{k} Q(c_{(m)}) (f_{(m)} - f_{(m+1)}),
 
-    where :math:`c_{(m)}` are the bits of the m highest probabilities. The sum is piecewise linear in f, continuous also
-    where probabilities tie, and needs no derivative of Q, which is only evaluated at bits as they occur in the replay
-    buffer.
+    where :math:`c_{(m)}` sets the m bits with the highest probabilities. The sum is piecewise linear in f and
+    continuous, even where probabilities tie. It needs no derivative of Q and evaluates Q only at bits as they occur in
+    the replay buffer.
 
     :param probabilities: (batch, n_agents, k)
     :param q: see the module's docstring, M = k + 1
@@ -134,17 +136,18 @@ def expected_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temperature:
 
 def expected_categorical(logits: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     r"""
-    The expectation over one head at a time. For a single head it is exact,
+    Expectation over one head at a time. For a single head it is exact,
 
     .. math:: E[Q(a)] = \sum_{a=1}^{K} \pi(a) Q(a).
 
-    With several, joint actions are too many to sum over. Each head's own categories are, while the other heads keep one
-    sample :math:`a_{-h}` of the policy. Since heads are drawn independently, the gradient
+    With several heads, there are too many joint actions to sum over. The sum then runs over each head's own categories,
+    while the other heads keep one sample :math:`a_{-h}` of the policy. Since heads are sampled independently, the
+    gradient
 
     .. math:: \sum_h \sum_a \nabla \pi_h(a) Q(a, a_{-h})
 
     is then an unbiased sample of :math:`\nabla E[Q]`; the value is the mean of the heads' expectations, an unbiased
-    sample of :math:`E[Q]`. No derivative of Q is needed, which is only evaluated at one-hot actions.
+    sample of :math:`E[Q]`. It needs no derivative of Q and evaluates Q only at one-hot actions.
 
     :param logits: (batch, n_agents, H, K)
     :param q: see the module's docstring, M = H * K
@@ -165,8 +168,9 @@ def expected_categorical(logits: th.Tensor, q: CriticOfOwnAction, temperature: f
 
 def straight_through_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     """
-    One sampled threshold per agent; the step function counts as the identity in the backward pass (Bengio et al. 2013,
-    arXiv:1308.3432). Its value is an unbiased sample of the expectation; its gradient is biased unless Q is linear.
+    Straight-through estimator: samples one threshold per agent and treats the step function as the identity in the
+    backward pass (Bengio et al. 2013, arXiv:1308.3432). The value is an unbiased sample of the expectation; the
+    gradient is biased unless Q is linear.
 
     :param probabilities: (batch, n_agents, k)
     :param q: see the module's docstring, M = 1
@@ -178,8 +182,9 @@ def straight_through_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temp
 
 def straight_through_categorical(logits: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     """
-    Straight-through Gumbel-softmax (Jang et al. 2017, arXiv:1611.01144): a category is sampled as the largest of logits
-    plus Gumbel noise; in the backward pass it counts as the softmax of the same sum. Biased, also for a linear Q.
+    Straight-through Gumbel-softmax (Jang et al. 2017, arXiv:1611.01144): samples the category with the largest sum of
+    logit and Gumbel noise, and treats it as the softmax of these sums in the backward pass. The gradient is biased,
+    even for a linear Q.
 
     :param logits: (batch, n_agents, H, K)
     :param q: see the module's docstring, M = 1
@@ -193,9 +198,9 @@ def straight_through_categorical(logits: th.Tensor, q: CriticOfOwnAction, temper
 
 def score_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     """
-    The probabilities stand in for the bits. The critic is evaluated between the bits it was trained on. What the
-    deterministic policy gradient (Lillicrap et al. 2016, arXiv:1509.02971) is for continuous actions; exact where Q is
-    linear.
+    Passes the probabilities to the critic in place of the bits, like the deterministic policy gradient for continuous
+    actions (Lillicrap et al. 2016, arXiv:1509.02971). It is exact if Q is linear, but evaluates the critic between the
+    bits it was trained on.
 
     :param probabilities: (batch, n_agents, k)
     :param q: see the module's docstring, M = 1
@@ -207,8 +212,8 @@ def score_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temperature: fl
 
 def score_categorical(logits: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     """
-    The probabilities stand in for the one-hot action. The critic is evaluated between the actions it was trained on.
-    Exact where Q is linear in each head.
+    Passes the probabilities to the critic in place of the one-hot action. It is exact if Q is linear in each head, but
+    evaluates the critic between the actions it was trained on.
 
     :param logits: (batch, n_agents, H, K)
     :param q: see the module's docstring, M = 1
@@ -220,10 +225,10 @@ def score_categorical(logits: th.Tensor, q: CriticOfOwnAction, temperature: floa
 
 def gumbel_softmax_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     r"""
-    A relaxed sample, the binary concrete distribution (Maddison et al. 2017, arXiv:1611.00712):
+    Relaxed sample of the binary concrete distribution (Maddison et al. 2017, arXiv:1611.00712):
     :math:`\sigma((\mathrm{logit} f_j + z) / T)` with logistic noise :math:`z = -\mathrm{logit} \delta'`. It exceeds 1/2
-    just where :math:`f_j > \delta'`. An agent's bits share z like the threshold, so that for T to 0 the sample becomes
-    the bits that the agent acts with.
+    if and only if :math:`f_j > \delta'`. An agent's bits share z as they share the threshold, so that the sample tends
+    to the agent's bits as T tends to 0.
 
     :param probabilities: (batch, n_agents, k)
     :param q: see the module's docstring, M = 1
@@ -237,9 +242,9 @@ def gumbel_softmax_binary(probabilities: th.Tensor, q: CriticOfOwnAction, temper
 
 def gumbel_softmax_categorical(logits: th.Tensor, q: CriticOfOwnAction, temperature: float) -> th.Tensor:
     """
-    A relaxed sample, softmax((l + Gumbel noise) / T) (Jang et al. 2017, arXiv:1611.01144; Maddison et al. 2017,
-    arXiv:1611.00712), as in the original MADDPG with T = 1 (Lowe et al. 2017, arXiv:1706.02275). The critic is
-    evaluated between the actions it was trained on.
+    Relaxed sample, softmax((l + Gumbel noise) / T) (Jang et al. 2017, arXiv:1611.01144; Maddison et al. 2017,
+    arXiv:1611.00712), as in the original MADDPG with T = 1 (Lowe et al. 2017, arXiv:1706.02275). It evaluates the
+    critic between the actions it was trained on.
 
     :param logits: (batch, n_agents, H, K)
     :param q: see the module's docstring, M = 1
@@ -254,13 +259,13 @@ def gapped_straight_through_binary(
 ) -> th.Tensor:
     r"""
     ``gapped_straight_through_categorical`` for two classes: "set", with logit :math:`l = \mathrm{logit} f_j`, and "not
-    set", with logit 0. After the moves their difference is max(l, gap) where the bit is set, else min(l, -gap). The
-    bits come from one sampled threshold per agent.
+    set", with logit 0. After the shifts, their difference is max(l, gap) if the bit is set, else min(l, -gap). The bits
+    come from one sampled threshold per agent.
 
     :param probabilities: (batch, n_agents, k)
     :param q: see the module's docstring, M = 1
     :param temperature: of the sigmoid in the backward pass
-    :param gap: least distance between the two classes in the backward pass
+    :param gap: minimum distance between the two logits in the backward pass
     :return: (batch, n_agents)
     """
     bits, logits = _sampled_binary(probabilities), _inside(probabilities).logit()
@@ -273,15 +278,16 @@ def gapped_straight_through_categorical(
     logits: th.Tensor, q: CriticOfOwnAction, temperature: float, gap: float = 1.0
 ) -> th.Tensor:
     r"""
-    Gapped straight-through (Fan et al. 2022, arXiv:2206.07235; for MADDPG Tilbury et al. 2023, arXiv:2302.11793): a
-    category D is sampled; in the backward pass it counts as a softmax whose logits are moved, without noise, until D is
-    the largest by a gap: D is raised to the maximum by :math:`m_1 = \max l - l_D`, each other category is lowered by
-    :math:`m_2 = \max(0, l_a + gap - \max l)`. The moves count as constants. Less variance than with noise; biased.
+    Gapped straight-through estimator (Fan et al. 2022, arXiv:2206.07235; for MADDPG Tilbury et al. 2023,
+    arXiv:2302.11793): samples a category D and treats it as a softmax of shifted logits in the backward pass. The
+    shifts make D the largest by a gap: they raise D to the maximum by :math:`m_1 = \max l - l_D` and lower each other
+    category by :math:`m_2 = \max(0, l_a + gap - \max l)`. They count as constants. The gradient is biased, but has less
+    variance than with Gumbel noise.
 
     :param logits: (batch, n_agents, H, K)
     :param q: see the module's docstring, M = 1
     :param temperature: of the softmax in the backward pass
-    :param gap: least distance of the sampled category to the others in the backward pass
+    :param gap: minimum distance between the sampled category's logit and the others in the backward pass
     :return: (batch, n_agents)
     """
     sample = _sampled_categorical(logits)
@@ -295,19 +301,18 @@ def rao_blackwell_binary(
     probabilities: th.Tensor, q: CriticOfOwnAction, temperature: float, n_samples: int = 10
 ) -> th.Tensor:
     r"""
-    ``rao_blackwell_categorical`` for bits, which come from one sampled threshold per agent. A bit c of probability p
-    has been sampled because its threshold fell into an interval of length p; for :math:`u \sim U(0, 1)` the perturbed
-    logit
+    ``rao_blackwell_categorical`` for bits, which come from one sampled threshold per agent. A bit of probability p is
+    sampled if its threshold falls into an interval of length p. For :math:`u \sim U(0, 1)`, the perturbed logit
     :math:`\mathrm{logit} f_j - \mathrm{logit} \delta_j`, given the bit, is
 
-    .. math:: \pm \log(1 + (1/u - 1) / (1 - p)), \quad \text{positive where the bit is set.}
+    .. math:: \pm \log(1 + (1/u - 1) / (1 - p)), \quad \text{positive if the bit is set.}
 
-    Each bit has a noise of its own: the others' bits say nothing about it.
+    Each bit has independent noise, which does not depend on the other bits.
 
     :param probabilities: (batch, n_agents, k)
     :param q: see the module's docstring, M = 1
     :param temperature: of the sigmoid in the backward pass
-    :param n_samples: of the noise, to average over
+    :param n_samples: number of noise samples to average over
     :return: (batch, n_agents)
     """
     bits, inner = _sampled_binary(probabilities), _inside(probabilities)
@@ -323,20 +328,21 @@ def rao_blackwell_categorical(
     logits: th.Tensor, q: CriticOfOwnAction, temperature: float, n_samples: int = 10
 ) -> th.Tensor:
     r"""
-    Gumbel-Rao Monte Carlo (Paulus et al. 2021, arXiv:2010.04838): ``straight_through_categorical``, its backward pass
-    averaged over the Gumbel noise that would have sampled the same category D. Same mean, less variance, still one
-    evaluation of the critic. With :math:`p` = softmax(l) and :math:`E_1..E_K` independent exponential variables, the
-    perturbed logits given D are, up to a constant that softmax does not see,
+    Gumbel-Rao Monte Carlo estimator (Paulus et al. 2021, arXiv:2010.04838): ``straight_through_categorical`` with its
+    backward pass averaged over the Gumbel noise that would have sampled the same category D. It has the same mean and
+    less variance, and still evaluates the critic once. With :math:`p` = softmax(l) and :math:`E_1..E_K` independent
+    exponential variables, the perturbed logits given D are, up to a constant that does not change the softmax,
 
-    .. math:: -\log E_D \text{ for D, and } -\log(E_a / p_a + E_D) \text{ for the others:}
+    .. math:: -\log E_D \text{ for D, and } -\log(E_a / p_a + E_D) \text{ for the others.}
 
-    the largest of all is a Gumbel variable, whichever D, and the others are Gumbel variables cut off there. The noise
-    counts as independent of the logits in the backward pass: a derivative through it would change the mean.
+    The largest of all is a Gumbel variable, whatever D is, and the others are Gumbel variables truncated there. The
+    noise counts as independent of the logits in the backward pass, because a derivative through it would change the
+    mean.
 
     :param logits: (batch, n_agents, H, K)
     :param q: see the module's docstring, M = 1
     :param temperature: of the softmax in the backward pass
-    :param n_samples: of the noise, to average over
+    :param n_samples: number of noise samples to average over
     :return: (batch, n_agents)
     """
     sample = _sampled_categorical(logits)

@@ -1,4 +1,4 @@
-"""Models on the Hugging Face Hub: a file that runs no code, and a card that says what it is."""
+"""Upload of models to the Hugging Face Hub, with a model card and in files that run no code."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ import yaml
 from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.utils import shown
 
-_BESIDE = ("config.yml", "evaluations.npz")  # of a run's folder, what belongs to a model
+_BESIDE = ("config.yml", "evaluations.npz")  # files of a run's folder that belong to its model
 
 
 def write_model_folder(
     model: MADDPG, folder: Path, repo_id: str, run: Path | None = None, lean: Lean | None = "critic"
 ) -> None:
     """
-    Write what ``publish`` uploads: ``model.zip``, ``README.md``, the model's card, and of its run the recipe and the
-    evaluations during the training.
+    Write the files that ``publish`` uploads: ``model.zip``, the model card ``README.md``, and from the run the recipe
+    and the evaluations during training.
 
     :param model: the model
-    :param folder: an empty one, or one that is made
-    :param repo_id: of the repository, for the card
-    :param run: folder of the run that trained it
-    :param lean: see ``MADDPG.save``; None keeps all that a training goes on from
-    :raises ValueError: the model cannot be saved without pickle
+    :param folder: an empty or new folder
+    :param repo_id: id of the repository, for the model card
+    :param run: folder of the run that trained the model
+    :param lean: see ``MADDPG.save``; None keeps everything that training needs to resume
+    :raises ValueError: if the model cannot be saved without pickle
     """
     folder.mkdir(parents=True, exist_ok=True)
     model.save(folder / "model.zip", lean=lean)
@@ -44,9 +44,9 @@ def write_model_folder(
 def model_card(model: MADDPG, repo_id: str, evaluations: Path | None = None) -> str:
     """
     :param model: the model
-    :param repo_id: of the repository
-    :param evaluations: ``evaluations.npz`` of its training
-    :return: the card, Markdown after a YAML header as the Hub reads it
+    :param repo_id: id of the repository
+    :param evaluations: ``evaluations.npz`` of the training
+    :return: the model card, in Markdown with the Hub's YAML header
     """
     algorithm, spec = type(model).__name__, model.env_spec or {}
     env_id = str(spec.get("id", "a team environment"))
@@ -72,7 +72,7 @@ def model_card(model: MADDPG, repo_id: str, evaluations: Path | None = None) -> 
         "",
     ]
     if result is not None:
-        lines += [f"Return of the last evaluation in the training, mean and standard deviation: {result}.", ""]
+        lines += [f"Return of the last evaluation during training, mean and standard deviation: {result}.", ""]
     lines += [
         "```python",
         "from huggingface_hub import hf_hub_download",
@@ -85,7 +85,7 @@ def model_card(model: MADDPG, repo_id: str, evaluations: Path | None = None) -> 
         "",
     ]
     if spec.get("kwargs"):
-        # What the environment was made with, without which the model means nothing
+        # A model is useless without its environment's arguments
         lines += ["The environment's arguments:", "", "```yaml", yaml.safe_dump(_plain(spec["kwargs"])).rstrip(), "```"]
     return f"---\n{yaml.safe_dump(header, sort_keys=False)}---\n\n" + "\n".join(lines) + "\n"
 
@@ -102,13 +102,13 @@ def publish(
     Upload a model with its card to the Hugging Face Hub.
 
     :param model: the model
-    :param repo_id: ``NAME/REPOSITORY``, which is made if it does not exist
-    :param run: folder of the run that trained it
+    :param repo_id: id of the repository, ``NAME/REPOSITORY``, which is created if it does not exist
+    :param run: folder of the run that trained the model
     :param lean: see ``MADDPG.save``
-    :param private: whether a new repository is
-    :param token: of the account; by default the one that ``hf auth login`` keeps
-    :return: the address
-    :raises ValueError: no such name of a repository, or ``huggingface_hub`` is not installed
+    :param private: whether a new repository is private
+    :param token: access token, by default the one that ``hf auth login`` stored
+    :return: the repository's URL
+    :raises ValueError: if the id is invalid, or ``huggingface_hub`` is not installed
     """
     if not isinstance(repo_id, str) or repo_id.count("/") != 1 or not all(repo_id.split("/")):
         raise ValueError(f"repo_id={shown(repo_id)} must be NAME/REPOSITORY.")
@@ -125,13 +125,13 @@ def publish(
 
 
 def _beside(run: Path | None) -> list[Path]:
-    """What of a run's folder belongs to its model."""
+    """:return: the files of a run's folder that belong to its model"""
     if run is None:
         return []
     places = [
         run,
         *(path for path in run.iterdir() if path.is_dir()),
-    ]  # rl_zoo3 keeps the recipe in a folder of its own
+    ]  # rl_zoo3 writes the recipe into a subfolder
     return [path for name in _BESIDE for place in places if (path := place / name).is_file()]
 
 

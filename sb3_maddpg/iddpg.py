@@ -17,14 +17,14 @@ from sb3_maddpg.team import Team
 
 class IndependentCritic(StackedCritic):
     """
-    One multi-layer perceptron per agent that reads what its actor reads, and its own action: Q_i(z_i, a_i).
+    One multi-layer perceptron per agent, which reads the agent's own observation and action: Q_i(z_i, a_i).
 
     :param team: the team
-    :param actions: how it acts
+    :param actions: the team's actions
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
-    :param groups: for each agent the number of its network
-    :param n_critics: number of critics
+    :param activation_fn: activation function between the layers
+    :param groups: index of each agent's network
+    :param n_critics: number of critics per agent
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class IndependentCritic(StackedCritic):
         agents = th.arange(self.n_agents, device=own.device) if factors is None else factors
         layers = self.net.layers()
         weight, bias = (self.net.of_networks(parameter, agents) for parameter in layers[0])
-        # The first layer is linear: the observation passes it once for all alternatives
+        # The first layer is linear, so the observation passes through it only once for all alternatives
         seen = th.baddbmm(bias, weight[..., : self.obs_dim], obs[:, agents, : self.obs_dim].permute(1, 2, 0))
         chosen = own.permute(1, 3, 2, 0)
         shape = chosen.shape[2:]
@@ -60,13 +60,13 @@ class IndependentCritic(StackedCritic):
 
 
 class IndependentPolicy(MADDPGPolicy):
-    """``MADDPGPolicy`` with critics that read what their own agent sees and does, and nothing else."""
+    """``MADDPGPolicy`` with critics that read only their own agent's observation and action."""
 
     def _make_critic(self, actions: TeamActions, net_arch: list[int]) -> Critic:
         if isinstance(self.share_critic, str):
             raise ValueError(
-                f"share_critic={self.share_critic!r}: independent critics value each agent. Give True, False "
-                "or lists of agents, or train MADDPG."
+                f"share_critic={self.share_critic!r} requires a centralised critic, but IDDPG has independent critics. "
+                "Pass True, False or a list of lists of agents, or use MADDPG."
             )
         groups = sharing_groups(self.share_critic, self.team, "share_critic")
         return IndependentCritic(self.team, actions, net_arch, self.activation_fn, groups, self.n_critics)
@@ -74,8 +74,8 @@ class IndependentPolicy(MADDPGPolicy):
 
 class IDDPG(MADDPG):
     """
-    Independent DDPG (IDDPG): each agent learns by itself, with a critic of what it sees and does. The baseline that
-    tells what centralised critics are worth; all else is ``MADDPG``, also its arguments.
+    Independent DDPG (IDDPG): each agent learns alone, with a critic of its own observation and action. This baseline
+    shows what centralised critics are worth. All else is the same as in ``MADDPG``, including the arguments.
 
     Independent learners are compared with MADDPG in Lowe et al. (2017), https://arxiv.org/abs/1706.02275.
     """

@@ -64,9 +64,9 @@ from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, Train
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
 
-# Arguments of policies that the algorithm gives itself
+# Arguments that the algorithm itself passes to the policy
 NOT_POLICY_KWARGS = {"observation_space", "action_space", "lr_schedule"}
-# Arguments of replay buffers that the algorithm gives itself
+# Arguments that the algorithm itself passes to the replay buffer
 NOT_BUFFER_KWARGS = {
     "buffer_size",
     "observation_space",
@@ -76,31 +76,34 @@ NOT_BUFFER_KWARGS = {
     "optimize_memory_usage",
     "args",
 }
-# Arguments of replay buffers that are the algorithm's too
+# Arguments that the algorithm and the replay buffer share
 OWN_BUFFER_KWARGS = ("n_steps", "gamma")
-# Arguments that a model for a team of another size does not take over
+# Arguments that a model resized to another team does not inherit
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
-# Of the actions that ``expected`` looks at in one update; the critics' layers take as much again, or more
+# Limit for the alternative actions that ``expected`` evaluates in one update; the critics' layers need at least as much
 MOST_BYTES_OF_ALTERNATIVES = 4 * 2**30
-# What PyTorch and NumPy say of arrays that no machine can hold, beside MemoryError
+# Fragments of PyTorch's and NumPy's messages about arrays that exceed the memory, which are not all MemoryErrors
 NO_MEMORY = ("allocate memory", "out of memory", "Storage size", "dimension exceeded", "array is too big")
 
 
 class MADDPG(OffPolicyAlgorithm):
     """
-    Multi-Agent Deep Deterministic Policy Gradient (MADDPG): centralised training of critics that read all observations
-    and actions, decentralised execution by actors that read their own observation.
+    Multi-Agent Deep Deterministic Policy Gradient (MADDPG): centralised training with critics that read the
+    observations and actions of all agents, decentralised execution with actors that read only their own observation.
 
     Paper: https://arxiv.org/abs/1706.02275 (Lowe et al., 2017), original code https://github.com/openai/maddpg.
-    Threshold actions: Serra-Gomez et al., IROS 2020. Code based on SB3's TD3.
+    Threshold actions: Serra-Gomez et al., IROS 2020. The code is based on SB3's TD3.
 
-    The environment is a PettingZoo parallel environment, or a team environment: one Gymnasium environment with
-    observation ``Box(n_agents, obs_dim)``, a flat joint action (``MultiBinary``, ``Box`` or ``MultiDiscrete`` of length
-    ``n_agents * k``), a scalar team reward, and, where agents differ, ``info["agent_rewards"]``,
-    ``info["agent_terminated"]`` and ``info["agent_active"]``, all (n_agents,). Numbers in ``info["metrics"]`` are
-    logged as means. Of the environment's attributes it reads ``agent_names``, ``image_space`` (see ``CnnPolicy``),
-    ``observation_layout`` (see ``PairPolicy``) and, with ``use_action_cost``, ``action_cost``: what an action costs as
-    long as the reward holds that as a plain sum over the encoded action, a float or (n_agents, width).
+    The environment is a PettingZoo environment or a team environment: a single Gymnasium environment with the
+    observation space ``Box(n_agents, obs_dim)``, a flat joint action space (``MultiBinary``, ``Box`` or
+    ``MultiDiscrete`` of length ``n_agents * k``) and a scalar team reward. Where agents differ, it also reports
+    ``info["agent_rewards"]``, ``info["agent_terminated"]`` and ``info["agent_active"]``, each of shape (n_agents,).
+    The means of the numbers in ``info["metrics"]`` are logged.
+
+    The algorithm reads these attributes of the environment, if it has them: ``agent_names``, ``image_space`` (see
+    ``CnnPolicy``), ``observation_layout`` (see ``PairPolicy``) and, with ``use_action_cost``, ``action_cost``. The
+    latter is the price of one unit of the encoded action, a float or an array of shape (n_agents, width); the reward
+    must contain the cost as a plain sum over the encoded action.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -115,24 +118,26 @@ class MADDPG(OffPolicyAlgorithm):
         tuple of frequency and unit like ``(5, "step")`` or ``(2, "episode")``.
     :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``),
         ``-1`` means as many as environment steps were done
-    :param action_noise: the action noise type, for continuous actions only, in place of ``exploration_noise``
+    :param action_noise: the action noise type, for continuous actions only; replaces ``exploration_noise``
     :param replay_buffer_class: Replay buffer class to use, ``TeamReplayBuffer`` if ``None``
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
-    :param n_steps: number of rewards in a return before the critic's estimate takes over
-    :param use_action_cost: take the environment's ``action_cost`` as known; critics then learn the rest of the return
-    :param threshold_price: for binary actions: a cost of every 1 that no reward holds and no critic sees. It rises
-        geometrically with the threshold, from the first number at 0 to the second at 1. A probability then
-        says up to which price its action is worth it, and the policy's ``threshold`` chooses the price after the
-        training.
+    :param n_steps: number of rewards in the n-step return before the target critic bootstraps
+    :param use_action_cost: treat the environment's ``action_cost`` as known, so that critics learn only the rest of
+        the return
+    :param threshold_price: for binary actions only: an extra price of every 1, which is not part of the reward and
+        which critics do not see. It rises geometrically with the threshold, from the first number at threshold 0 to
+        the second at threshold 1. The probability of an action then tells up to which price the action is worth
+        taking, so the policy's ``threshold`` can set the price after training.
     :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
-        [-1, 1]; two numbers go from the first to the second over the training. Binary actions
-        explore by a random threshold, categorical ones by their probabilities.
-    :param estimator: gradient through binary and categorical actions, see ``sb3_maddpg.estimators``; unused for
+        [-1, 1]; a pair is annealed linearly from the first to the second number over training. Binary actions
+        explore with a random threshold, categorical actions by sampling from their probabilities.
+    :param estimator: gradient estimator for binary and categorical actions, see ``sb3_maddpg.estimators``; unused for
         continuous actions
-    :param temperature: of the estimators that relax, can be a function of the current progress remaining
-    :param policy_delay: the policy and the target networks are updated every ``policy_delay`` critic updates
-    :param max_grad_norm: largest gradient norm of each agent's network, ``None`` for no limit
+    :param temperature: temperature of the estimators that relax actions,
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param policy_delay: the policy and the target networks are updated once every ``policy_delay`` critic updates
+    :param max_grad_norm: maximum norm of the gradient of each agent's network, ``None`` for no clipping
     :param policy_regularization: weight of the mean squared actor output before squashing (1e-3 in the original code)
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``MADDPGPolicy``
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
@@ -150,7 +155,7 @@ class MADDPG(OffPolicyAlgorithm):
         "CnnPolicy": CnnPolicy,
         "PairPolicy": PairPolicy,
     }
-    # A class reads the files of its bases of the same name, see ``load``
+    # A class also loads files saved by its base classes with the same name, see ``load``
     algorithm_name: ClassVar[str] = "MADDPG"
     arguments: ClassVar[type[Arguments]] = TrainingArguments
     policy_class: type[MADDPGPolicy]
@@ -197,9 +202,9 @@ class MADDPG(OffPolicyAlgorithm):
         if isinstance(policy, str) and policy not in self.policy_aliases:
             raise ValueError(suggest("policy", policy, self.policy_aliases))
         if not isinstance(policy, (str, type)):
-            raise ValueError(f"policy={shown(policy)} is neither MlpPolicy, PairPolicy nor a class of policies.")
+            raise ValueError(f"policy={shown(policy)} is neither MlpPolicy, CnnPolicy, PairPolicy nor a policy class.")
         if env is None and _init_setup_model:
-            raise ValueError("env=None: give an environment, or the id of one.")
+            raise ValueError("env=None: pass an environment or the id of one.")
         given = validated(
             RunArguments,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -212,7 +217,9 @@ class MADDPG(OffPolicyAlgorithm):
         )
         for name in OWN_BUFFER_KWARGS:
             if replay_buffer_kwargs and name in replay_buffer_kwargs:
-                raise ValueError(f"replay_buffer_kwargs[{name!r}] is the algorithm's own: give it {name} itself.")
+                raise ValueError(
+                    f"replay_buffer_kwargs[{name!r}] is an argument of the algorithm: pass {name} to it instead."
+                )
         super().__init__(
             policy,
             env,
@@ -226,7 +233,7 @@ class MADDPG(OffPolicyAlgorithm):
             gradient_steps,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),  # copies, which take what the environment says
+            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),  # a copy, since _read_env adds to it
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
             policy_kwargs=dict(policy_kwargs or {}),
@@ -250,7 +257,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.action_cost: np.ndarray | None = None
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
-        self.lean: Lean | None = None  # what the file holds that this was loaded from
+        self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
         self.algorithm = type(self).__name__
         self.file_format = FILE_FORMAT
 
@@ -266,13 +273,13 @@ class MADDPG(OffPolicyAlgorithm):
         if self.env is not None:
             if is_vecenv_wrapped(self.env, VecFrameStack):
                 raise ValueError(
-                    "VecFrameStack mixes up whose numbers are where. Stack the frames of each agent by "
+                    "VecFrameStack mixes up the observations of different agents. Stack the frames of each agent with "
                     "supersuit.frame_stack_v2 on the PettingZoo environment, or in the environment itself."
                 )
             self._read_env(self.env)
             self._check_normalization(self.env)
-        # SB3 knows n_steps of its own buffer only, and would make the buffer of a model that is loaded without an
-        # environment, only to predict, at full size
+        # SB3 supports n_steps with its own buffer only. It would also allocate the full buffer for a model that is
+        # loaded without an environment, just to predict.
         n_steps, buffer_size = self.n_steps, self.buffer_size
         self.n_steps, self.buffer_size = 1, buffer_size if self.env is not None else 1
         self.replay_buffer_class = self.replay_buffer_class or TeamReplayBuffer
@@ -283,7 +290,9 @@ class MADDPG(OffPolicyAlgorithm):
             text = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not any(words in text for words in NO_MEMORY):
                 raise
-            raise ValueError(f"buffer_size={buffer_size} or the networks need too much memory: {text}") from error
+            raise ValueError(
+                f"buffer_size={buffer_size} or the networks need more memory than there is: {text}"
+            ) from error
         finally:
             self.n_steps, self.buffer_size = n_steps, buffer_size
         self._create_aliases()
@@ -291,13 +300,14 @@ class MADDPG(OffPolicyAlgorithm):
         actions = self.policy.actions
         if self.action_noise is not None and not actions.has_continuous:
             raise ValueError(
-                f"action_noise={self.action_noise} is for continuous actions, the action space is {self.action_space}. "
-                "Leave it out: binary actions explore by a random threshold, categorical ones by their probabilities."
+                f"action_noise={self.action_noise} is for continuous actions, but the action space is "
+                f"{self.action_space}. Leave it out: binary actions explore with a random threshold, categorical ones "
+                "by sampling."
             )
         self._spread_action_cost()
 
     def _read_env(self, env: VecEnv) -> None:
-        """What an environment says of itself beside its spaces."""
+        """Read what the environment tells about itself beyond its spaces."""
         self._read_task(env)
         self.policy_kwargs = dict(self.policy_kwargs)
         for name in self.policy_class.env_attributes:
@@ -313,14 +323,14 @@ class MADDPG(OffPolicyAlgorithm):
         layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
         if normalizer is not None and any(getattr(normalizer.observation_space, "masks", ())):
             raise ValueError(
-                "VecNormalize(norm_obs=True) moves the numbers of action masks, which are positive where an action is "
-                "allowed. Set norm_obs=False and scale observations in the environment."
+                "VecNormalize(norm_obs=True) shifts the action masks in the observations, which must be positive where "
+                "an action is legal. Set norm_obs=False and scale observations in the environment."
             )
         if layout is not None and normalizer is not None and not layout.get("complete", False):
             raise ValueError(
-                "VecNormalize(norm_obs=True) moves the zeros by which PairPolicy knows absent neighbours: they would "
+                "VecNormalize(norm_obs=True) shifts the zeros that mark absent neighbours for PairPolicy: they would "
                 "all look present. Set norm_obs=False and scale observations in the environment; or, if every "
-                "neighbour is always there, let the environment's observation_layout say `complete: True`."
+                "neighbour is always present, set `complete: True` in the environment's observation_layout."
             )
 
     def _read_task(self, env: VecEnv) -> None:
@@ -332,7 +342,7 @@ class MADDPG(OffPolicyAlgorithm):
             self.action_cost = env.get_attr("action_cost", indices=0)[0]
 
     def _spread_action_cost(self) -> None:
-        """The cost of every number of the encoded action, (n_agents, width)."""
+        """Broadcast the action cost to the encoded action, (n_agents, width)."""
         self._cost_of_encoded: th.Tensor | None = None
         if self.action_cost is None:
             return
@@ -341,12 +351,12 @@ class MADDPG(OffPolicyAlgorithm):
             cost = np.broadcast_to(np.asarray(self.action_cost, np.float32), shape)
         except ValueError as error:
             raise ValueError(
-                f"action_cost of shape {np.shape(self.action_cost)} does not fit (n_agents, width) = {shape}."
+                f"action_cost of shape {np.shape(self.action_cost)} cannot be broadcast to (n_agents, width) = {shape}."
             ) from error
         self._cost_of_encoded = th.as_tensor(cost.copy(), device=self.device)
 
     def _scaled_action_cost(self) -> th.Tensor | None:
-        """:return: the price on the scale of the rewards that critics are fitted to, (n_agents, width)"""
+        """:return: the action cost on the scale of the normalised rewards, (n_agents, width), None if unknown"""
         env = self._vec_normalize_env
         if self._cost_of_encoded is None or env is None or not env.norm_reward:
             return self._cost_of_encoded
@@ -355,7 +365,7 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
             name = self.policy_class.__name__
-            raise ValueError(f"{name} is no policy of a team: use MlpPolicy, CnnPolicy or PairPolicy.")
+            raise ValueError(f"{name} is not a policy for a team: use MlpPolicy, CnnPolicy or PairPolicy.")
         if not isinstance(self.estimator, str) or self.estimator not in ESTIMATORS:
             raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
         names = self.arguments.model_fields
@@ -363,23 +373,23 @@ class MADDPG(OffPolicyAlgorithm):
             setattr(self, name, value)
         if self.batch_size > self.buffer_size:
             raise ValueError(
-                f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}: a batch is drawn from "
-                "the replay buffer. Lower the one or raise the other."
+                f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}, from which batches are "
+                "sampled. Lower batch_size or raise buffer_size."
             )
         if self.n_steps > self.buffer_size // self.n_envs:
             raise ValueError(
-                f"n_steps={self.n_steps} is more than buffer_size={self.buffer_size} keeps of each of the "
-                f"{self.n_envs} environment(s): lower the one or raise the other."
+                f"n_steps={self.n_steps} is more than buffer_size={self.buffer_size} stores of each of the "
+                f"{self.n_envs} environment(s): lower n_steps or raise buffer_size."
             )
         if self.threshold_price is not None and not isinstance(self.action_space, spaces.MultiBinary):
             raise ValueError(
-                f"threshold_price is for binary actions (MultiBinary), the action space is {self.action_space}."
+                f"threshold_price is for binary actions (MultiBinary), but the action space is {self.action_space}."
             )
         for name in self.policy_kwargs:
             if name not in (known := arguments_of(self.policy_class)):
                 raise ValueError(suggest("argument in policy_kwargs", name, known - NOT_POLICY_KWARGS))
         self._check_replay_buffer_arguments()
-        if self.env is not None:  # better now than after the training
+        if self.env is not None:  # warn before training about what save() would refuse after it
             for name in ("policy_class", "replay_buffer_class", "learning_rate", "temperature", "policy_kwargs"):
                 try:
                     encode(getattr(self, name), name)
@@ -389,14 +399,16 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_replay_buffer_arguments(self) -> None:
         buffer = self.replay_buffer_class
         if isinstance(buffer, str):
-            raise ValueError(f"replay_buffer_class={shown(buffer)} is a name, which only recipes know: give the class.")
+            raise ValueError(
+                f"replay_buffer_class={shown(buffer)} is a name, which only recipes accept: pass the class."
+            )
         if buffer is not None and not isinstance(buffer, type):
             raise ValueError(
-                f"replay_buffer_class={shown(buffer)} is no class: give TeamReplayBuffer or one derived from it."
+                f"replay_buffer_class={shown(buffer)} is not a class: pass TeamReplayBuffer or a subclass of it."
             )
         if buffer is not None and not issubclass(buffer, TeamReplayBuffer):
             raise ValueError(
-                f"replay_buffer_class={buffer.__name__} knows no agents: derive it from "
+                f"replay_buffer_class={buffer.__name__} does not store the rewards of agents: derive it from "
                 "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
                 "observations, which a team does not have."
             )
@@ -405,14 +417,14 @@ class MADDPG(OffPolicyAlgorithm):
                 raise ValueError(suggest("argument in replay_buffer_kwargs", name, known))
 
     def _check_memory(self) -> None:
-        """Refuse an expectation over so many actions that no machine could hold them."""
+        """Refuse an expectation over more actions than fit into memory."""
         if self.estimator != "expected" or self.env is None:
             return
         factors, team = self.policy.critic.factors, self.policy.team
         for kind in factors.kinds:
             if isinstance(kind, Continuous):
                 continue
-            # As many alternatives as columns, each of them an encoded action in single precision
+            # One alternative per column, each an encoded action in single precision
             of_sample = 4 * len(kind.agents) * kind.width**2
             if self.batch_size * of_sample > MOST_BYTES_OF_ALTERNATIVES:
                 widest = max(range(len(kind.agents)), key=lambda row: sum(kind.sizes[row]))
@@ -454,19 +466,19 @@ class MADDPG(OffPolicyAlgorithm):
         return actions.unscale(flat).astype(self.action_space.dtype), flat
 
     def _present_obs(self) -> th.Tensor:
-        """What the team sees now, (n_envs, n_agents, obs_dim or more)."""
+        """:return: the current observations, (n_envs, n_agents, obs_dim or more)"""
         assert isinstance(self._last_obs, np.ndarray)
         self.policy.check_finite(self._last_obs)
         return th.as_tensor(self._last_obs, dtype=th.float32, device=self.device)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
-        # The last rollout may exceed total_timesteps, where schedules would go on below their last values
+        # The last rollout may exceed total_timesteps, and schedules must not go below their final values
         self._current_progress_remaining = max(self._current_progress_remaining, 0.0)
 
     @property
     def noise_std(self) -> float:
-        """Present standard deviation of the exploration noise."""
+        """Current standard deviation of the exploration noise."""
         if not isinstance(self.exploration_noise, tuple):
             return self.exploration_noise
         first, last = self.exploration_noise
@@ -475,7 +487,7 @@ class MADDPG(OffPolicyAlgorithm):
     def _target_actions(self, next_obs: th.Tensor) -> th.Tensor:
         """
         :param next_obs: (batch, n_agents, obs_dim)
-        :return: the target policy's actions there, (batch, n_agents, width)
+        :return: the target policy's actions for these observations, (batch, n_agents, width)
         """
         return self.actor_target.act(next_obs)
 
@@ -497,14 +509,14 @@ class MADDPG(OffPolicyAlgorithm):
             if replay_data.active is not None:
                 actions = actions * replay_data.active.unsqueeze(2)
 
-            # Optimize the centralised critics
+            # Optimize the critics
             losses, q_value = self._critic_loss(replay_data, obs, actions)
             critic_losses.append(self._descend(self.critic, losses))
             q_values.append(q_value)
 
             # Delayed policy updates
             if self._n_updates % self.policy_delay == 0:
-                # Optimize the decentralised actors
+                # Optimize the actors
                 losses, output = self._actor_loss(replay_data, obs, actions)
                 actor_losses.append(self._descend(self.actor, losses))
                 outputs.append(output)
@@ -538,12 +550,12 @@ class MADDPG(OffPolicyAlgorithm):
         if by_pair and replay_data.pair_rewards is not None:
             rewards = replay_data.pair_rewards.flatten(1)
         with th.no_grad():
-            # Select actions by the target actors
+            # Select actions with the target actors
             next_obs = replay_data.next_observations.float()
             next_actions = self._target_actions(next_obs)
             if replay_data.next_active is not None:
                 next_actions = next_actions * replay_data.next_active.unsqueeze(2)
-            # Compute the next Q-values: min over all critics targets
+            # Compute the next Q-values: min over all target critics
             next_q_values = self.critic_target(next_obs, next_actions).amin(dim=0)
             if action_cost is not None:
                 next_q_values = next_q_values - critic.known_cost(next_actions, action_cost)
@@ -553,10 +565,10 @@ class MADDPG(OffPolicyAlgorithm):
                 discounts = discounts * pair_goes_on.flatten(1)
             target_q_values = rewards + discounts * next_q_values
 
-        # Get current Q-values estimates for each critic network
+        # Get the current Q-value estimates of each critic network
         current_q_values = critic(obs, actions)
 
-        # Losses of agents are summed: each gradient is that of the agent's own mean squared error
+        # The agents' losses are summed, so each network gets the gradient of its agent's own mean squared error
         errors = (current_q_values - target_q_values).square().sum(dim=0)
         active = None if replay_data.active is None else critic.per_value(replay_data.active)
         if isinstance(self.replay_buffer, PrioritizedTeamReplayBuffer) and replay_data.indices is not None:
@@ -568,9 +580,9 @@ class MADDPG(OffPolicyAlgorithm):
     def _actor_loss(
         self, replay_data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """:return: the loss of each agent, (n_agents,), and all probabilities, (batch, any number)"""
+        """:return: the loss of each agent, (n_agents,), and the probabilities of all discrete actions, (batch, n)"""
         critic, action_cost = self.critic, self._scaled_action_cost()
-        # The other agents' actions are those of the replay buffer, as in the original code
+        # The other agents' actions come from the replay buffer, as in the original code
 
         def q(own: th.Tensor, factors: th.Tensor | None) -> th.Tensor:
             q_values = critic.forward_alternatives(obs, actions, own, factors)
@@ -594,11 +606,11 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _descend(self, network: Actor | Critic, losses: th.Tensor) -> float:
         """
-        A step of gradient descent.
+        Take a step of gradient descent.
 
-        :param losses: of agents or of value heads, (n,)
-        :return: their sum
-        :raises ValueError: it is not finite
+        :param losses: losses of the agents or value heads, (n,)
+        :return: the sum of the losses
+        :raises ValueError: if the sum is not finite
         """
         loss = losses.sum()
         value = loss.item()
@@ -616,7 +628,7 @@ class MADDPG(OffPolicyAlgorithm):
 
     @th.no_grad()
     def _check_diverged(self) -> None:
-        """Once for all updates of a call, which is cheap: parameters that are not finite stay so."""
+        """Check the parameters once per call of ``train``: one that is not finite stays so in later updates."""
         groups = [*self.actor.optimizer.param_groups, *self.critic.optimizer.param_groups]
         if not all(math.isfinite(parameter.sum().item()) for group in groups for parameter in group["params"]):
             raise self._diverged(self.policy.not_finite(self.policy.state_dict()) or "parameters grew without limit")
@@ -625,29 +637,31 @@ class MADDPG(OffPolicyAlgorithm):
         return ValueError(
             f"The training diverged at step {self.num_timesteps} (update {self._n_updates}): {what}. Lower "
             f"learning_rate={self.learning_rate}, scale the rewards down (VecNormalize(norm_obs=False) divides them "
-            "by their spread), or limit gradients by max_grad_norm."
+            "by their spread), or clip gradients with max_grad_norm."
         )
 
     def agent_policy(self, agent: str | int) -> AgentPolicy:
         """
-        What one agent needs to act by itself, without the team and without the critics.
+        Extract the policy of one agent, which acts without the rest of the team and without critics.
 
-        :param agent: its name or its number
-        :raises ValueError: no such agent, or parameters that are not finite
+        :param agent: name or index of the agent
+        :return: the agent's policy
+        :raises ValueError: if there is no such agent, or its parameters are not finite
         """
         if _normalizer_of_observations(self.env) is not None:
             warnings.warn(
-                "The environment's observations are normalised by VecNormalize(norm_obs=True), whose statistics are no "
-                "part of the agent's policy: give it observations normalised in the same way.",
+                "VecNormalize(norm_obs=True) normalises the environment's observations, but its statistics are not "
+                "part of the agent's policy: normalise observations in the same way before passing them to it.",
                 stacklevel=2,
             )
         return AgentPolicy.of(self.policy, agent)
 
     def set_threshold(self, threshold: float) -> None:
         """
-        Set the threshold delta over which binary actions are 1, in this model and in what it saves.
+        Set the threshold delta of binary actions: an action is 1 if its probability exceeds the threshold. The
+        threshold is saved with the model.
 
-        :param threshold: in [0, 1)
+        :param threshold: the threshold, in [0, 1)
         """
         self.policy.set_threshold(threshold)
         self.policy_kwargs = {**self.policy_kwargs, "threshold": threshold}
@@ -656,23 +670,25 @@ class MADDPG(OffPolicyAlgorithm):
         self, observation_space: spaces.Space, action_space: spaces.Space, observation_layout: ObservationLayout
     ) -> PairPolicy:
         """
-        The same policy for a team of another size, which can act at once.
+        Return the same policy for a team of another size, which can act without further training.
 
-        :param observation_space: of that team
-        :param action_space: of that team
-        :param observation_layout: of that team, see ``ObservationLayout``
-        :raises ValueError: the policy is no ``PairPolicy``, or observations hold something else
+        :param observation_space: observation space of the other team
+        :param action_space: action space of the other team
+        :param observation_layout: observation layout of the other team, see ``ObservationLayout``
+        :return: a policy with the same weights
+        :raises ValueError: if the policy is not a ``PairPolicy``, or the other team's agents observe something else
         """
         return self._resizable_policy().resized(observation_space, action_space, observation_layout)
 
     def resized(self: SelfMADDPG, env: GymEnv, **kwargs: Any) -> SelfMADDPG:
         """
-        A model for a team of another size: the same networks, optimizers and arguments. Its counters start at 0 and its
-        replay buffer empty.
+        Return a model for a team of another size, with the same networks, optimizer states and arguments. Its counters
+        start at 0 and its replay buffer is empty.
 
-        :param env: of that team
-        :param kwargs: arguments of the algorithm, over those that this model was made with
-        :raises ValueError: the policy is no ``PairPolicy``, or agents observe something else
+        :param env: environment of the other team
+        :param kwargs: arguments of the algorithm, which override those of this model
+        :return: the new model
+        :raises ValueError: if the policy is not a ``PairPolicy``, or the other team's agents observe something else
         """
         policy = self._resizable_policy()
         vec_env = as_vec_env(env)
@@ -692,7 +708,7 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _resizable_policy(self) -> PairPolicy:
         if not isinstance(self.policy, PairPolicy):
-            raise ValueError(f"{type(self.policy).__name__} fits one size of team; train with PairPolicy.")
+            raise ValueError(f"{type(self.policy).__name__} fits a single team size; train with PairPolicy.")
         return self.policy
 
     def learn(
@@ -707,7 +723,7 @@ class MADDPG(OffPolicyAlgorithm):
         given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
         if self.lean is not None:
             missing = "the optimizers' state" if self.lean == "critic" else "critics and the optimizers' state"
-            warnings.warn(f"This model was saved without {missing}, which begin anew.", stacklevel=2)
+            warnings.warn(f"This model was saved without {missing}, which are initialised afresh.", stacklevel=2)
             self.lean = None
         super().learn(
             total_timesteps=math.ceil(given["total_timesteps"]),
@@ -717,7 +733,7 @@ class MADDPG(OffPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-        # Episodes since the last of SB3's tables, all of them in a short training
+        # Log the episodes since SB3's last log, which are all of them in a short training
         if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
         return self
@@ -732,10 +748,11 @@ class MADDPG(OffPolicyAlgorithm):
         before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
         if self.replay_buffer.size() and self.replay_buffer.n_envs != n_envs:
             raise ValueError(
-                f"The replay buffer holds transitions of {self.replay_buffer.n_envs} environment(s) side by side and "
-                f"cannot take those of {n_envs}: give as many, or empty it by `model.replay_buffer.reset()`."
+                f"The replay buffer holds transitions of {self.replay_buffer.n_envs} parallel environment(s) and "
+                f"cannot store those of {n_envs}: pass as many environments, or empty the buffer with "
+                "`model.replay_buffer.reset()`."
             )
-        self.n_envs = n_envs  # SB3 would refuse another number, whether or not there are transitions to keep
+        self.n_envs = n_envs  # SB3 would refuse another number even if the replay buffer is empty
         try:
             with _remedy_for_other_team():
                 super().set_env(env, force_reset)
@@ -751,7 +768,7 @@ class MADDPG(OffPolicyAlgorithm):
         if self.replay_buffer.size() == 0 and (self.replay_buffer.buffer_size, self.replay_buffer.n_envs) != (
             rows,
             self.n_envs,
-        ):  # loaded without an environment, see _setup_model(), or made for another number of environments
+        ):  # the model was loaded without an environment, see _setup_model(), or had another number of environments
             self.replay_buffer = self.replay_buffer_class(
                 self.buffer_size,
                 self.observation_space,
@@ -775,11 +792,12 @@ class MADDPG(OffPolicyAlgorithm):
         **kwargs,
     ) -> SelfMADDPG:
         """
-        SB3's ``load``, which runs no code that the file holds unless it is told to.
+        Load a model from a file, like SB3's ``load``, without running code from the file unless ``trust`` is set.
 
-        :param trust: load pickled values too, which run code, of older files and those of ``save(pickle=True)``; None:
-            as the environment variable ``SB3_MADDPG_TRUST`` says, 1 for yes
-        :raises ValueError: no model of this algorithm, a damaged one, or pickled values without ``trust``
+        :param trust: also load pickled values, which can run code. Older files and those of ``save(pickle=True)``
+            contain them. By default, the environment variable ``SB3_MADDPG_TRUST`` decides (1 means yes).
+        :raises ValueError: if the file holds no model of this algorithm, is damaged, or holds pickled values that are
+            not trusted
         """
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
         if env is not None:
@@ -802,19 +820,22 @@ class MADDPG(OffPolicyAlgorithm):
         lean: Lean | None = None,
     ) -> None:
         """
-        SB3's ``save``, whole or not at all: a file that was there stays until the new one is complete. The file holds
-        JSON and weights, and nothing that runs code when it is loaded.
+        Save the model, like SB3's ``save``, but atomically: an existing file stays until the new one is complete. The
+        file holds JSON and weights, and nothing that runs code when it is loaded.
 
-        :param pickle: write as SB3 does, pickling what is no JSON; such a file needs ``load(trust=True)``
-        :param lean: leave out what only training needs: ``"actor"`` keeps the actors alone, a tenth of the file,
-            ``"critic"`` the critics too, and neither keeps target networks or the optimizers' state. A training that
-            goes on from such a file makes anew what is missing
-        :raises ValueError: a parameter is not finite, which nothing could be done with, or an attribute cannot be
-            written as JSON, such as a function as a schedule
+        :param pickle: write the file as SB3 does, pickling what JSON cannot hold; loading it needs
+            ``load(trust=True)``
+        :param lean: leave out what only training needs. ``"actor"`` keeps the actors only (a tenth of the file),
+            ``"critic"`` also keeps the critics; neither keeps target networks or optimizer states. Training resumed
+            from such a file initialises the missing parts afresh.
+        :raises ValueError: if a parameter is not finite, or an attribute cannot be written as JSON, such as a schedule
+            that is a function
         """
         check_path(path)
         if lean is not None and (lean not in get_args(Lean) or pickle):
-            raise ValueError(f"lean={shown(lean)}, pickle={pickle}: lean is one of {get_args(Lean)}, without pickle.")
+            raise ValueError(
+                f"lean={shown(lean)}, pickle={pickle}: lean must be one of {get_args(Lean)}, and pickle False."
+            )
         if problem := self._not_finite(self.get_parameters()):
             raise ValueError(f"This model cannot be saved: {problem}")
         write = super().save if pickle else functools.partial(self._save_without_pickle, lean=lean)
@@ -830,7 +851,7 @@ class MADDPG(OffPolicyAlgorithm):
         include: Iterable[str] | None,
         lean: Lean | None,
     ) -> None:
-        """What ``BaseAlgorithm.save`` does, with values as JSON that says their types."""
+        """Do what ``BaseAlgorithm.save`` does, but write attributes as typed JSON."""
         left_out = {*(exclude or ()), *self._excluded_save_params()} - {*(include or ())}
         left_out |= {name.split(".")[0] for name in self._get_torch_save_params()[0]}
         parameters = self.get_parameters()
@@ -843,7 +864,10 @@ class MADDPG(OffPolicyAlgorithm):
         save_to_zip_file(file, data=data | {"lean": lean}, params=parameters, pytorch_variables={})
 
     def _with_what_is_missing(self, parameters: dict[str, Any], lean: Lean) -> dict[str, Any]:
-        """The parameters of a lean file, with target networks like the networks, and this model's where it has none."""
+        """
+        Complete the parameters of a lean file: target networks are copies of the networks, and what else is missing
+        comes from this model.
+        """
         given, own = parameters.get("policy", {}), self.get_parameters()
         weights: dict[str, th.Tensor] = dict(own["policy"])
         for name in weights:
@@ -860,9 +884,9 @@ class MADDPG(OffPolicyAlgorithm):
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        SB3's ``set_parameters``, which ``load`` calls too.
+        Load parameters from a file or dictionary, like SB3's ``set_parameters``.
 
-        :raises ValueError: parameters that are not finite or fit other networks; nothing has changed then
+        :raises ValueError: if parameters are not finite or do not fit the networks; the model is unchanged then
         """
         parameters, lean = cast(dict[str, Any], load_path_or_dict), self.lean
         if not isinstance(load_path_or_dict, dict):
@@ -883,7 +907,7 @@ class MADDPG(OffPolicyAlgorithm):
                 (name for name, one in parameters.get("policy", {}).items() if not one.is_floating_point()), ""
             ):
                 raise UnusableParametersError(
-                    f"These parameters cannot be used: parameter {name} holds no real numbers."
+                    f"These parameters cannot be used: parameter {name} does not hold floating-point numbers."
                 )
             super().set_parameters(parameters, exact_match, device)
             if problem := self._not_finite(self.get_parameters()):  # numbers too large for single precision
@@ -893,12 +917,14 @@ class MADDPG(OffPolicyAlgorithm):
             if isinstance(error, UnusableParametersError):
                 raise
             raise UnusableParametersError(
-                "These parameters cannot be used, they are damaged or of other networks than this model's: "
+                "These parameters cannot be used, they are damaged or do not fit this model's networks: "
                 + " ".join(str(error).split())[:400]
             ) from error
 
     def _not_finite(self, parameters: dict[str, Any]) -> str | None:
-        """:return: which of the parameters (see ``get_parameters``) are not finite, and what to do, None if all are"""
+        """
+        :return: which of the parameters (see ``get_parameters``) are not finite and the remedy, None if all are finite
+        """
         for name, state in parameters.items():
             if name == "policy":
                 problem = self.policy.not_finite(state)
@@ -915,11 +941,12 @@ class MADDPG(OffPolicyAlgorithm):
         trust: bool | None = None,
     ) -> None:
         """
-        SB3's ``load_replay_buffer``, which runs no code that the file holds unless it is told to.
+        Load a replay buffer from a file, like SB3's ``load_replay_buffer``, without running code from the file unless
+        ``trust`` is set.
 
-        :param trust: load a pickled buffer, which runs code, as older versions write it, see ``load``
-        :raises ValueError: a buffer of another kind, team or number of environments, or a pickled one without
-            ``trust``; the present one stays then
+        :param trust: also load a pickled buffer, which can run code; older versions write such files, see ``load``
+        :raises ValueError: if the buffer is of another kind, team or number of environments, or is pickled and not
+            trusted; the model keeps its buffer then
         """
         check_path(path)
         if isinstance(path, (str, os.PathLike)) and not pathlib.Path(path).suffix:
@@ -933,8 +960,8 @@ class MADDPG(OffPolicyAlgorithm):
                     super().load_replay_buffer(path, truncate_last_traj)
                 else:
                     raise ValueError(
-                        f"{path} is no replay buffer that this version writes. If it is a pickled one, it may run any "
-                        "code when it is loaded: where you trust whoever wrote it, load it with `trust=True` (on the "
+                        f"{path} is not a replay buffer that this version writes. If it is pickled, it may run any "
+                        "code when it is loaded: if you trust its author, load it with `trust=True` (on the "
                         "command line `--trust`)."
                     )
             self._check_replay_buffer(self.replay_buffer, path)
@@ -944,28 +971,26 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
         if not isinstance(buffer, TeamReplayBuffer):
-            raise ValueError(
-                f"{path} holds a {type(buffer).__name__}, which knows no agents; the model needs a TeamReplayBuffer."
-            )
+            raise ValueError(f"{path} holds a {type(buffer).__name__}, but the model needs a TeamReplayBuffer.")
         n_pairs = self.replay_buffer_kwargs.get("n_pairs", 0)
         for what, loaded, needed in (
-            ("transitions of {} environment(s) side by side", buffer.n_envs, self.n_envs),
+            ("transitions of {} parallel environment(s)", buffer.n_envs, self.n_envs),
             ("observations of {}", buffer.observation_space, self.observation_space),
             ("actions of {}", buffer.action_space, self.action_space),
             ("rewards of {} neighbours of each agent", buffer.n_pairs, n_pairs),
         ):
             if loaded != needed:
                 raise ValueError(
-                    f"{path} holds {what.format(loaded)}, the model needs {what.format(needed)}: resume with the "
+                    f"{path} holds {what.format(loaded)}, but the model needs {what.format(needed)}: resume with the "
                     "environment and arguments of the training that saved it, or without its replay buffer."
                 )
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
-        The replay buffer as JSON and arrays. The file is called ``.pkl`` unless its name says otherwise, since that is
-        where rl_zoo3 looks for it, but nothing in it is pickled.
+        Save the replay buffer as JSON and arrays. The file's suffix defaults to ``.pkl``, because rl_zoo3 looks for
+        that, but nothing in it is pickled.
 
-        :raises ValueError: there is none, or it is of a class that files may not name, see ``allow_in_files``
+        :raises ValueError: if there is no replay buffer, or files may not name its class, see ``allow_in_files``
         """
         check_path(path)
         if not isinstance(self.replay_buffer, TeamReplayBuffer):
@@ -976,7 +1001,7 @@ class MADDPG(OffPolicyAlgorithm):
             write_buffer(self.replay_buffer, file)  # type: ignore[arg-type]
 
     def _excluded_save_params(self) -> list[str]:
-        # The last observations of many environments are larger than the networks, and loading begins new episodes
+        # The last observations of many environments are larger than the networks, and loading starts new episodes
         last = ["_last_obs", "_last_original_obs"]
         networks = ["actor", "critic", "actor_target", "critic_target"]
         return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded"]
@@ -987,30 +1012,33 @@ class MADDPG(OffPolicyAlgorithm):
 
 def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
     """
-    :param env: a PettingZoo environment, a team environment, or a vector of team environments
+    Wrap an environment the way the algorithms train on it.
+
+    :param env: a PettingZoo environment, a team environment, or a vectorised team environment
     :param verbose: see SB3's ``BaseAlgorithm``
     :param monitor_wrapper: see SB3's ``BaseAlgorithm``
-    :return: the environment as algorithms train on it
-    :raises ValueError: spaces that describe no team
+    :return: the vectorised environment
+    :raises ValueError: if the spaces do not describe a team
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
         raise ValueError(
-            f"env={shown(env)} is no environment: give a PettingZoo or Gymnasium environment, or a VecEnv of "
+            f"env={shown(env)} is not an environment: pass a PettingZoo or Gymnasium environment, or a VecEnv of "
             "Stable-Baselines3."
         )
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-    Team.from_spaces(vec_env.observation_space, vec_env.action_space)  # SB3 would advise policies that are not here
+    # SB3's own error would suggest policies that do not exist here
+    Team.from_spaces(vec_env.observation_space, vec_env.action_space)
     return vec_env
 
 
 def _price_up_to(probabilities: th.Tensor, prices: tuple[float, float]) -> th.Tensor:
     """
-    :param probabilities: of binary actions, any shape
-    :param prices: at the thresholds 0 and 1, geometric in between
-    :return: the mean price that actions of these probabilities pay where the threshold is uniform in [0, 1]: its
-        integral from 0 to the probability
+    :param probabilities: probabilities of binary actions, any shape
+    :param prices: prices at the thresholds 0 and 1; in between, the price is geometric
+    :return: the expected price of each action if the threshold is uniform in [0, 1]: the integral of the price from 0
+        to the probability
     """
     first, growth = prices[0], math.log(prices[1] / prices[0])
     return first * th.expm1(growth * probabilities) / growth
@@ -1018,10 +1046,10 @@ def _price_up_to(probabilities: th.Tensor, prices: tuple[float, float]) -> th.Te
 
 def _mean_over_batch(values: th.Tensor, active: th.Tensor | None, weights: th.Tensor | None) -> th.Tensor:
     """
-    :param values: (batch, n)
-    :param active: which of them count, (batch, n), None for all
-    :param weights: how much the samples count, (batch,), None for 1
-    :return: (n,)
+    :param values: values to average, (batch, n)
+    :param active: 1 for the values that count, else 0, (batch, n), None for all
+    :param weights: importance weights of the samples, (batch,), None for 1
+    :return: the means, (n,)
     """
     if weights is not None:
         values = values * weights.unsqueeze(1)
@@ -1034,7 +1062,7 @@ def _role(network: Actor | Critic) -> str:
 
 @contextmanager
 def _no_gradients(network: th.nn.Module) -> Iterator[None]:
-    """Leave the network's parameters out of the backward pass, where only its inputs' gradients are wanted."""
+    """Exclude the network's parameters from the backward pass, where only the gradients of its inputs are needed."""
     network.requires_grad_(False)
     try:
         yield
@@ -1050,20 +1078,20 @@ def _normalizer_of_observations(env: GymEnv | None) -> VecNormalize | None:
 
 class UnusableParametersError(ValueError, RuntimeError):
     """
-    Parameters that are not finite, or fit other networks. Also a RuntimeError, for SB3's ``load`` takes a mere
-    ValueError for a sign of an older file.
+    Raised for parameters that are not finite or do not fit the networks. It is also a RuntimeError, because SB3's
+    ``load`` takes a plain ValueError for the sign of an older file.
     """
 
 
 @contextmanager
 def _remedy_for_other_team() -> Iterator[None]:
-    """Say what to do where SB3 says that the spaces of model and environment differ."""
+    """Add the remedy to SB3's error about differing spaces of model and environment."""
     try:
         yield
     except ValueError as error:
         if "spaces do not match" not in str(error):
             raise
         raise ValueError(
-            f"{error}. A model fits only the team it was trained for (the first space is the model's): make the "
-            "environment with the same arguments, which `MADDPG.load(path).env_spec` holds, or train a new model."
+            f"{error}. A model fits only the team it was trained for (the first space is the model's): create the "
+            "environment with the same arguments, see `MADDPG.load(path).env_spec`, or train a new model."
         ) from error

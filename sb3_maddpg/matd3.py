@@ -21,8 +21,8 @@ class MATD3(MADDPG):
     Multi-Agent Twin Delayed DDPG (MATD3): MADDPG with twin critics, delayed policy updates and target policy smoothing.
 
     Paper: https://arxiv.org/abs/1910.01465 (Ackermann et al., 2019). Based on TD3, https://arxiv.org/abs/1802.09477.
-    Binary and categorical actions are smoothed by drawing the target action as in exploration, instead of taking the
-    best one.
+    Binary and categorical target actions are smoothed by sampling them as in exploration instead of taking the most
+    probable ones.
 
     :param policy: The policy model to use (MlpPolicy, PairPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -37,24 +37,26 @@ class MATD3(MADDPG):
         tuple of frequency and unit like ``(5, "step")`` or ``(2, "episode")``.
     :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``),
         ``-1`` means as many as environment steps were done
-    :param action_noise: the action noise type, for continuous actions only, in place of ``exploration_noise``
+    :param action_noise: the action noise type, for continuous actions only; replaces ``exploration_noise``
     :param replay_buffer_class: Replay buffer class to use, ``TeamReplayBuffer`` if ``None``
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer, see SB3's ``ReplayBuffer``
-    :param n_steps: number of rewards in a return before the critic's estimate takes over
-    :param use_action_cost: take the environment's ``action_cost`` as known; critics then learn the rest of the return
-    :param threshold_price: for binary actions: a cost of every 1 that no reward holds and no critic sees. It rises
-        geometrically with the threshold, from the first number at 0 to the second at 1. A probability then
-        says up to which price its action is worth it, and the policy's ``threshold`` chooses the price after the
-        training.
+    :param n_steps: number of rewards in the n-step return before the target critic bootstraps
+    :param use_action_cost: treat the environment's ``action_cost`` as known, so that critics learn only the rest of
+        the return
+    :param threshold_price: for binary actions only: an extra price of every 1, which is not part of the reward and
+        which critics do not see. It rises geometrically with the threshold, from the first number at threshold 0 to
+        the second at threshold 1. The probability of an action then tells up to which price the action is worth
+        taking, so the policy's ``threshold`` can set the price after training.
     :param exploration_noise: standard deviation of the Gaussian noise on continuous actions, which are scaled to
-        [-1, 1]; two numbers go from the first to the second over the training. Binary actions
-        explore by a random threshold, categorical ones by their probabilities.
-    :param estimator: gradient through binary and categorical actions, see ``sb3_maddpg.estimators``; unused for
+        [-1, 1]; a pair is annealed linearly from the first to the second number over training. Binary actions
+        explore with a random threshold, categorical actions by sampling from their probabilities.
+    :param estimator: gradient estimator for binary and categorical actions, see ``sb3_maddpg.estimators``; unused for
         continuous actions
-    :param temperature: of the estimators that relax, can be a function of the current progress remaining
-    :param policy_delay: the policy and the target networks are updated every ``policy_delay`` critic updates
-    :param max_grad_norm: largest gradient norm of each agent's network, ``None`` for no limit
+    :param temperature: temperature of the estimators that relax actions,
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param policy_delay: the policy and the target networks are updated once every ``policy_delay`` critic updates
+    :param max_grad_norm: maximum norm of the gradient of each agent's network, ``None`` for no clipping
     :param policy_regularization: weight of the mean squared actor output before squashing (1e-3 in the original code)
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see ``MADDPGPolicy``;
         ``n_critics`` is 2 unless given
@@ -67,7 +69,7 @@ class MATD3(MADDPG):
     :param device: Device (cpu, cuda, ...) on which the code should be run
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :param target_policy_noise: standard deviation of the Gaussian noise on continuous target actions
-    :param target_noise_clip: limit for absolute value of that noise
+    :param target_noise_clip: limit for the absolute value of the target policy noise
     """
 
     algorithm_name = "MATD3"

@@ -1,4 +1,4 @@
-"""Model files: whose they are, and whether what they hold can be used."""
+"""Checks of model files: which algorithm wrote them, and whether their contents are valid."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from stable_baselines3.common.save_util import open_path
 from sb3_maddpg.typed_json import decode
 from sb3_maddpg.utils import shown
 
-# Raised whenever older versions could not read the file
+# Incremented when older versions cannot read new files
 FILE_FORMAT = 3
-_READABLE_FORMATS = (2, 3)  # in the first of these, values are pickled
+_READABLE_FORMATS = (2, 3)  # values are pickled in the first of these
 _WEIGHTS = ("policy.pth", "actor.optimizer.pth", "critic.optimizer.pth", "pytorch_variables.pth")
 _MEMBERS = {"data", *_WEIGHTS, "_stable_baselines3_version", "system_info.txt"}
 _MOST_DATA = 2**24  # bytes of the member `data`
-_MOST_TIMES_LARGER = 50  # than on disk: members are not compressed
+_MOST_TIMES_LARGER = 50  # limit of a member's size relative to the file's, since members are not compressed
 _PICKLED = ":serialized:"
-# What --trust on the command line sets, for the processes that it starts too
+# Environment variable that --trust on the command line sets, also for subprocesses
 TRUST_VARIABLE = "SB3_MADDPG_TRUST"
-# Attributes in files that are neither arguments, which have their checks, nor made anew
+# Attributes in files that are neither arguments, which have their own checks, nor recreated
 _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
     (int,): (
         "num_timesteps",
@@ -54,8 +54,8 @@ _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
 
 def check_path(path: Any) -> None:
     """
-    :param path: of a file, or a file
-    :raises ValueError: it is neither
+    :param path: path of a file, or an open file
+    :raises ValueError: if it is neither
     """
     if not (isinstance(path, (str, os.PathLike)) or hasattr(path, "read")):
         raise ValueError(f"{shown(path)} is neither a path nor a file.")
@@ -63,14 +63,13 @@ def check_path(path: Any) -> None:
 
 def read_data(path: str | pathlib.Path | io.BufferedIOBase, algorithm: str, readable: set[str]) -> dict[str, Any]:
     """
-    The attributes in a model's file as they are written. Refuses what is no such file, or too large to be one, before
-    anything in it is taken for anything.
+    Read the attributes in a model file as JSON, after checking the file.
 
-    :param path: of the file, or the file
-    :param algorithm: that is to load it
+    :param path: path of the file, or the open file
+    :param algorithm: algorithm that loads the file
     :param readable: algorithms whose files it can load
     :return: values as JSON, see ``attributes``
-    :raises ValueError: another algorithm or format, or members that no such file has
+    :raises ValueError: if the file is of another algorithm or format, or has members that no model file has
     """
 
     def check(data: dict[str, Any]) -> None:
@@ -81,7 +80,7 @@ def read_data(path: str | pathlib.Path | io.BufferedIOBase, algorithm: str, read
             raise ValueError(f"{path} holds a model of another algorithm than {algorithm}.")
         if data.get("file_format", 1) not in _READABLE_FORMATS:
             raise ValueError(
-                f"{path} has format {data.get('file_format', 1)}, this version of sb3-maddpg reads format "
+                f"{path} has format {data.get('file_format', 1)}, but this version of sb3-maddpg reads format "
                 f"{FILE_FORMAT}: install the version that wrote it, or train again."
             )
 
@@ -92,18 +91,18 @@ def check_members(
     path: str | pathlib.Path | io.BufferedIOBase, check: Callable[[dict[str, Any]], None] = lambda data: None
 ) -> dict[str, Any]:
     """
-    Refuse a file with members that no model has, or larger ones, before any is read.
+    Check the members of a model file before reading them.
 
-    :param path: of the file, or the file
-    :param check: raises where its attributes are no model's
-    :return: the attributes as they are written
-    :raises ValueError: no zip file, or such a member
+    :param path: path of the file, or the open file
+    :param check: function that raises an error if the attributes are not a model's
+    :return: the attributes as JSON
+    :raises ValueError: if the file is not a zip file, or a member is unexpected or too large
     """
     check_path(path)
     file = open_path(path, "r", verbose=0, suffix="zip")
     try:
         if not zipfile.is_zipfile(file):
-            raise ValueError(f"{path} is no zip file, and a model is one.")
+            raise ValueError(f"{path} is not a model: models are zip files.")
         with zipfile.ZipFile(file) as archive:
             _check_sizes(path, archive)
             names = archive.namelist()
@@ -114,7 +113,7 @@ def check_members(
                 )
             check(data)
             if strange := {name for name in names if name not in _MEMBERS or names.count(name) > 1}:
-                raise ValueError(f"{path} has members that no model has, or has twice: {shown(sorted(strange))}.")
+                raise ValueError(f"{path} has unexpected or duplicate members: {shown(sorted(strange))}.")
             for name in {*_WEIGHTS} & {*names}:
                 with archive.open(name) as member, zipfile.ZipFile(member) as weights:
                     _check_sizes(f"{path}: {name}", weights)
@@ -140,29 +139,30 @@ def _check_sizes(path: Any, archive: zipfile.ZipFile) -> None:
 
 def trusted(trust: bool | None) -> bool:
     """
-    :param trust: whether files may run code; None: as the environment variable ``SB3_MADDPG_TRUST`` says, 1 for yes
-    :return: whether they may
+    :param trust: whether files may run code; by default, the environment variable ``SB3_MADDPG_TRUST`` decides (1
+        means yes)
+    :return: whether files may run code
     """
     return os.environ.get(TRUST_VARIABLE) == "1" if trust is None else trust
 
 
 def attributes(data: dict[str, Any], path: Any, trust: bool | None, given: Mapping[str, Any]) -> dict[str, Any]:
     """
-    The values of a model's attributes.
+    Decode the attributes of a model.
 
     :param data: see ``read_data``
-    :param path: of the file, for a message
-    :param trust: leave pickled values to Stable-Baselines3, which runs what they hold, see ``trusted``
-    :param given: what is taken instead of the file's
-    :return: values by name, but for those that are pickled
-    :raises ValueError: a pickled value, or one that cannot be read
+    :param path: path of the file, for error messages
+    :param trust: leave pickled values to Stable-Baselines3, which may run their code, see ``trusted``
+    :param given: values that replace the file's
+    :return: values by name, except pickled ones
+    :raises ValueError: if a value is pickled and not trusted, or cannot be decoded
     """
     pickled = _pickled(data) - set(given)
     if pickled and not trusted(trust):
         raise ValueError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), which may run any code when they are loaded. "
-            "If you trust whoever wrote it, load it with `trust=True` (on the command line `--trust`), or make a file "
-            f"without any of it: `sb3-maddpg convert {path} NEW.zip --trust`."
+            "If you trust their author, load the file with `trust=True` (on the command line `--trust`), or convert it "
+            f"to a file without pickled values: `sb3-maddpg convert {path} NEW.zip --trust`."
         )
     return {
         key: given[key] if key in given else decode(value, f"{path}: {key}")
@@ -172,15 +172,17 @@ def attributes(data: dict[str, Any], path: Any, trust: bool | None, given: Mappi
 
 
 def _pickled(data: dict[str, Any]) -> set[str]:
-    """:return: the names of what Stable-Baselines3 would unpickle"""
+    """:return: the names of values that Stable-Baselines3 would unpickle"""
     return {key for key, value in data.items() if isinstance(value, dict) and _PICKLED in value}
 
 
 def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[str, Any]) -> None:
     """
-    :param path: of a model of any algorithm of Stable-Baselines3, or the file
-    :param given: values that are taken instead of the file's
-    :raises ValueError: it holds others that would be unpickled
+    Refuse a model file with pickled values.
+
+    :param path: path of a model of any Stable-Baselines3 algorithm, or the open file
+    :param given: values that replace the file's
+    :raises ValueError: if any other value is pickled
     """
     file = open_path(path, "r", verbose=0, suffix="zip")
     try:
@@ -194,28 +196,30 @@ def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[
     if pickled := _pickled(data) - set(given):
         raise ValueError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), as the files of most algorithms do. They may "
-            "run any code when they are loaded: if you trust whoever wrote it, give --trust."
+            "run any code when they are loaded: if you trust their author, pass --trust."
         )
 
 
 def refuse_pickled_file(path: Any) -> None:
     """
-    :param path: of a file that is nothing but a pickle
-    :raises ValueError: in any case
+    Refuse a pickle.
+
+    :param path: path of the file
+    :raises ValueError: always
     """
     raise ValueError(
-        f"{path} is a pickle, which may run any code when it is loaded: if you trust whoever wrote it, give --trust."
+        f"{path} is a pickle, which may run any code when it is loaded: if you trust its author, pass --trust."
     )
 
 
 @contextmanager
 def as_damage(path: Any, kind: str = "model") -> Iterator[None]:
     """
-    Whatever the content of a file makes PyTorch, pickle and others raise, as one line about the file.
+    Replace errors that a file's content causes in PyTorch, pickle and other libraries by one line about the file.
 
-    :param path: of the file
-    :param kind: what it should hold
-    :raises ValueError: in place of theirs
+    :param path: path of the file
+    :param kind: what the file should hold
+    :raises ValueError: instead of the original error
     """
     try:
         yield
@@ -226,22 +230,22 @@ def as_damage(path: Any, kind: str = "model") -> Iterator[None]:
         if isinstance(error, ValueError) and raised_in.is_relative_to(pathlib.Path(__file__).parent):
             raise
         told = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-        raise ValueError(f"{path} is damaged, or holds no {kind} of sb3-maddpg ({told}).") from error
+        raise ValueError(f"{path} is damaged or does not hold a {kind} of sb3-maddpg ({told}).") from error
 
 
 def check_attributes(model: Any, path: Any) -> None:
     """
-    Refuse counters and the like that no training has written.
+    Check counters and similar attributes of a loaded model.
 
-    :param model: as it was loaded
-    :param path: of its file
-    :raises ValueError: the name and the value
+    :param model: the model
+    :param path: path of its file
+    :raises ValueError: if a value is invalid
     """
     for kinds, names in _ATTRIBUTES.items():
         for name in names:
             value = getattr(model, name)
             fits = isinstance(value, kinds) and (bool in kinds or not isinstance(value, bool))
-            if isinstance(value, float):  # the progress falls a little below 0 where the last rollout ends late
+            if isinstance(value, float):  # the progress can drop slightly below 0 in the last rollout
                 fits = fits and math.isfinite(value)
             elif isinstance(value, int):
                 fits = fits and value >= 0
@@ -251,9 +255,9 @@ def check_attributes(model: Any, path: Any) -> None:
 
 def optimizer_problem(state: Mapping[str, Any], present: th.optim.Optimizer) -> str | None:
     """
-    :param state: that the optimizer is to take, see its ``state_dict``
+    :param state: state to load into the optimizer, see its ``state_dict``
     :param present: the optimizer
-    :return: what does not fit, None if all does
+    :return: what does not fit, None if everything does
     """
     if optimizer_not_finite(state):
         return "holds NaN or infinity"
@@ -270,8 +274,8 @@ def optimizer_problem(state: Mapping[str, Any], present: th.optim.Optimizer) -> 
 
 def optimizer_not_finite(state: Mapping[str, Any]) -> bool:
     """
-    :param state: of an optimizer, see its ``state_dict``
-    :return: whether any tensor in it holds NaN or infinity
+    :param state: state of an optimizer, see its ``state_dict``
+    :return: whether any of its tensors holds NaN or infinity
     """
     return any(not tensor.isfinite().all() for tensor in _tensors(state))
 

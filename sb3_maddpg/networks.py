@@ -1,4 +1,4 @@
-"""Multi-layer perceptrons of many agents, every layer in one tensor with a leading axis of networks."""
+"""Stacked multi-layer perceptrons: each layer of all networks is one tensor with a leading axis of networks."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import nn
 
 class StackedMLP(nn.Module):
     """
-    Many multi-layer perceptrons, evaluated together. Initialised like ``torch.nn.Linear``.
+    Several multi-layer perceptrons, evaluated together and initialised like ``torch.nn.Linear``.
 
-    Features come before the batch: matrix products with few rows and many columns are much faster than the reverse.
+    The batch is the last axis, because matrix products with few rows and many columns are faster than the reverse.
 
-    :param groups: for each network, which set of parameters it uses; networks of one group share theirs
-    :param in_features: inputs of each
-    :param out_features: outputs of each
+    :param groups: index of each network's set of parameters; networks of the same group share them
+    :param in_features: number of inputs per network
+    :param out_features: number of outputs per network
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
+    :param activation_fn: activation function between the layers
     """
 
     groups: th.Tensor
@@ -37,7 +37,7 @@ class StackedMLP(nn.Module):
         self.n_groups = max(groups) + 1
         self.separate = list(groups) == list(range(self.n_networks))
         self.register_buffer("groups", th.tensor(groups), persistent=False)
-        # In place, which spares a copy of every hidden layer
+        # In place to avoid a copy of every hidden layer
         self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for width, next_width in pairwise([in_features, *net_arch, out_features]):
@@ -47,15 +47,17 @@ class StackedMLP(nn.Module):
 
     def layers(self) -> list[tuple[th.Tensor, th.Tensor]]:
         """:return: weights (n_groups, out, in) and biases (n_groups, out, 1) of each layer"""
-        # Where nn.Module itself looks them up: indexing a ParameterList is so slow that acting shows it
+        # nn.Module's own dictionaries, because indexing a ParameterList slows down acting measurably
         weights, biases = (self._modules[name]._parameters for name in ("weights", "biases"))  # type: ignore[union-attr]
         return list(zip(weights.values(), biases.values(), strict=True))
 
     def of_networks(self, parameter: th.Tensor, networks: th.Tensor | None = None) -> th.Tensor:
         """
+        Expand a parameter of groups to networks.
+
         :param parameter: a weight or a bias, with a leading axis of groups
-        :param networks: which networks, None for all
-        :return: the same with a leading axis of networks
+        :param networks: indices of the networks, None for all
+        :return: the parameter, with a leading axis of networks
         """
         if networks is not None:
             return parameter[self.groups[networks]]
@@ -67,9 +69,11 @@ class StackedMLP(nn.Module):
         self, x: th.Tensor, layers: Sequence[tuple[th.Tensor, th.Tensor]], networks: th.Tensor | None = None
     ) -> th.Tensor:
         """
-        :param x: the first layer's outputs before its activation, (n_networks, width, batch); not valid afterwards
+        Evaluate all layers but the first.
+
+        :param x: outputs of the first layer before its activation, (n_networks, width, batch); overwritten
         :param layers: all layers, see ``layers``
-        :param networks: which networks, None for all
+        :param networks: indices of the networks, None for all
         :return: outputs, (n_networks, out_features, batch)
         """
         for weight, bias in layers[1:]:
@@ -78,8 +82,8 @@ class StackedMLP(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
-        :param x: (n_networks, in_features, batch)
-        :return: (n_networks, out_features, batch)
+        :param x: inputs, (n_networks, in_features, batch)
+        :return: outputs, (n_networks, out_features, batch)
         """
         layers = self.layers()
         weight, bias = layers[0]
@@ -87,10 +91,11 @@ class StackedMLP(nn.Module):
 
     def single(self, network: int, n_inputs: int) -> nn.Sequential:
         """
-        :param network: which one
-        :param n_inputs: leave out the inputs after so many
-        :return: that network by itself, with its own copy of the parameters; maps (batch, n_inputs) to (batch,
-            out_features)
+        Extract a single network.
+
+        :param network: index of the network
+        :param n_inputs: number of inputs to keep
+        :return: the network with a copy of its parameters, which maps (batch, n_inputs) to (batch, out_features)
         """
         modules: list[nn.Module] = []
         group = int(self.groups[network])
@@ -105,9 +110,9 @@ class StackedMLP(nn.Module):
 
     def clip_grad_norm_(self, max_norm: float) -> None:
         """
-        Clip the gradient of each set of parameters by its own norm, so that no agent slows another.
+        Clip the gradient of each set of parameters by its own norm, so that no agent's gradient scales another's.
 
-        :param max_norm: largest Euclidean norm
+        :param max_norm: maximum Euclidean norm
         """
         gradients = [parameter.grad for parameter in chain(*self.layers()) if parameter.grad is not None]
         norms = [th.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]
@@ -120,11 +125,11 @@ class StackedMLP(nn.Module):
 @th.no_grad()
 def polyak_update(parameters: Iterable[th.Tensor], targets: Iterable[th.Tensor], tau: float) -> None:
     """
-    SB3's ``polyak_update`` with one operation, not two, for each parameter.
+    Update target networks like SB3's ``polyak_update``, but with one operation per parameter instead of two.
 
-    :param parameters: of the network
-    :param targets: of its target network, updated in place
-    :param tau: the soft update coefficient, 1 copies the parameters
+    :param parameters: parameters of the network
+    :param targets: parameters of its target network, updated in place
+    :param tau: the soft update coefficient; 1 copies the parameters
     """
     for parameter, target in zip(parameters, targets, strict=True):
         target.lerp_(parameter, tau)

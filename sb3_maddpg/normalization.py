@@ -1,4 +1,4 @@
-"""``VecNormalize`` whose statistics are JSON in files."""
+"""``VecNormalize`` with statistics saved as JSON."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ class SafeVecNormalize(VecNormalize):
 
     def save(self, save_path: str) -> None:
         """
-        :param save_path: of the file, which appears whole or not at all
+        Save the statistics atomically.
+
+        :param save_path: path of the file
         """
         rms = self.obs_rms if self.norm_obs else {}
         data = {
@@ -53,11 +55,15 @@ class SafeVecNormalize(VecNormalize):
     @staticmethod
     def load(load_path: str, venv: VecEnv, trust: bool | None = None) -> VecNormalize:
         """
-        :param load_path: of a file that ``save`` wrote
-        :param venv: to wrap
-        :param trust: load a pickled file, which runs code, as Stable-Baselines3 writes it; None: as the environment
-            variable ``SB3_MADDPG_TRUST`` says, 1 for yes
-        :raises ValueError: another content, statistics of other observations, or a pickle without ``trust``
+        Load statistics and wrap a vectorised environment.
+
+        :param load_path: path of a file that ``save`` wrote
+        :param venv: the environment to wrap
+        :param trust: also load a pickled file of Stable-Baselines3, which can run code. By default, the environment
+            variable ``SB3_MADDPG_TRUST`` decides (1 means yes).
+        :return: the wrapped environment
+        :raises ValueError: if the file holds no statistics, or statistics of other observations, or is pickled and not
+            trusted
         """
         path = Path(load_path)
         with path.open("rb") as file:
@@ -67,15 +73,17 @@ class SafeVecNormalize(VecNormalize):
                 if trusted(trust):
                     return VecNormalize.load(load_path, venv)
                 raise ValueError(
-                    f"{path} holds no statistics that this version writes. If they are pickled, they may run any code "
-                    "when they are loaded: where you trust whoever wrote them, load them with `trust=True` (on the "
-                    "command line `--trust`)."
+                    f"{path} does not hold statistics that this version writes. If it is pickled, it may run any code "
+                    "when it is loaded: if you trust its author, load it with `trust=True` (on the command line "
+                    "`--trust`)."
                 )
             if path.stat().st_size > _MOST_BYTES:
                 raise ValueError(f"{path} is too large to hold statistics.")
             data = json.loads(path.read_bytes())
             if data.get("format") != _FORMAT:
-                raise ValueError(f"{path} has format {data.get('format')}, this version of sb3-maddpg reads {_FORMAT}.")
+                raise ValueError(
+                    f"{path} has format {data.get('format')}, but this version of sb3-maddpg reads {_FORMAT}."
+                )
             settings = decode(data["settings"], f"{path}: settings")
             found = SafeVecNormalize(venv, **{name: settings[name] for name in _SETTINGS})
             if isinstance(found.obs_rms if found.norm_obs else None, dict):
@@ -96,7 +104,7 @@ def _set_moments(rms: RunningMeanStd, data: Any, name: str) -> None:
     for array in (mean, var):
         if not isinstance(array, np.ndarray) or array.shape != np.shape(rms.mean):
             raise ValueError(
-                f"{name} has the shape {np.shape(array)}, the environment's is {np.shape(rms.mean)}: these are the "
+                f"{name} has shape {np.shape(array)}, but the environment needs {np.shape(rms.mean)}: these are "
                 "statistics of other observations."
             )
     if not (np.isfinite(mean).all() and np.isfinite(var).all() and (var >= 0).all() and 0 < count < np.inf):

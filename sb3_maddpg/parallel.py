@@ -1,4 +1,4 @@
-"""PettingZoo's parallel environments as team environments."""
+"""Wrappers that turn PettingZoo environments into team environments."""
 
 from __future__ import annotations
 
@@ -23,52 +23,54 @@ MASK = "action_mask"
 
 
 class _Action(NamedTuple):
-    """Where an agent's action lies in the joint action, and what it has to become."""
+    """The place of an agent's action in the joint action, and how to convert it."""
 
     begin: int
     end: int
     space: spaces.Space
     clips: bool
-    """Whether to clip once more, in a precision other than the joint action's"""
+    """Whether to clip again, because the space's precision is not that of the joint action"""
     start: Any
 
 
 class TeamEnv(gymnasium.Env):
     """
-    A PettingZoo ``ParallelEnv`` as one environment for the whole team, see "The team convention" in CONTRIBUTING.md.
+    Wrapper that turns a PettingZoo environment into a single environment for the whole team, see "The team convention"
+    in CONTRIBUTING.md.
 
-    The observation, ``TeamObservation``, has a row per possible agent: its own observation, flattened as Gymnasium's
-    ``flatten`` does it. The action is that of ``joint_action_space``. The reward is the mean over all possible
-    agents, of which one that takes no part has none, so that the return is the mean of the agents' returns. An
-    agent that ends is shown its last observation once; from then on its row is zero and it is sent no action. The
-    episode ends with the last agent: by truncation, if it was truncated (or one that ended in the same step was).
+    The observation space, ``TeamObservation``, has a row per possible agent with its observation, flattened by
+    Gymnasium's ``flatten``. The action space is that of ``joint_action_space``. The reward is the mean over all
+    possible agents, where inactive agents count as 0, so the return is the mean of the agents' returns. When an agent
+    is terminated or truncated, its row holds its final observation once. From then on the row is zero, and the agent
+    acts no more. The episode ends with the last agent. It is truncated if that agent, or another that ended in the same
+    step, was truncated but not terminated.
 
-    Where an agent observes a dict with an entry ``action_mask``, as PettingZoo's environments with illegal moves do, it
-    chooses only what the mask allows, while it explores as well as in the targets and gradients of the training.
+    If an agent observes a dict with an entry ``action_mask``, as in PettingZoo's environments with illegal moves, it
+    chooses only legal actions, both during exploration and in the targets and gradients of training.
 
-    MADDPG makes a ``TeamEnv`` of a ``ParallelEnv`` by itself. Stable-Baselines3's functions need one where they take an
-    environment: ``evaluate_policy(model, Monitor(TeamEnv(env)))``, and likewise ``EvalCallback``.
+    MADDPG wraps PettingZoo environments in a ``TeamEnv`` automatically. Functions of Stable-Baselines3 need the
+    wrapper: ``evaluate_policy(model, Monitor(TeamEnv(env)))``, and likewise ``EvalCallback``.
 
-    Where all agents see images of one size, ``image_space`` is the space of one of them, which ``CnnPolicy`` reads.
+    If all agents observe images of the same size, the attribute ``image_space`` is the space of one image, which
+    ``CnnPolicy`` reads.
 
-    What the environment offers besides, such as ``observation_layout`` or a curriculum, is found by Gymnasium's
-    ``get_wrapper_attr``, hence by ``get_attr`` and ``env_method`` of SB3's vector environments.
+    Other attributes of the environment, such as ``observation_layout`` or a curriculum, are available through
+    Gymnasium's ``get_wrapper_attr``, and thus through ``get_attr`` and ``env_method`` of SB3's vectorised environments.
 
-    What the environment returns is checked in each step; what does not fit is refused with the agent, the step and the
-    value.
+    Everything that the environment returns is checked in each step. Errors name the agent, the step and the value.
 
-    ``info`` of a step, see ``TeamInfo``, all but the last two with one entry per agent:
+    Entries of ``info``, see ``TeamInfo``; the first four are arrays with one entry per agent:
 
-    - ``agent_rewards``: float32
-    - ``agent_terminated``, ``agent_truncated``: whether it ended in this step
-    - ``agent_active``: whether it acted in this step
-    - ``agent_infos``: what the environment says about the agents, by name; left out where it says nothing
+    - ``agent_rewards``: rewards, float32
+    - ``agent_terminated``, ``agent_truncated``: whether the agent was terminated or truncated in this step
+    - ``agent_active``: whether the agent acted in this step
+    - ``agent_infos``: the environment's infos by agent name, left out if they are all empty
     - ``metrics``: at the end of an episode, ``rollout/ep_rew_NAME`` of each agent that took part
 
-    :param env: the environment, turn-based ones too
+    :param env: the environment, parallel or turn-based
     :param state: append ``env.state()`` to the observation, for the critics
-    :param info_mask: take the action masks from ``infos[agent]["action_mask"]``; who is given none may choose anything
-    :raises ValueError: an environment or a space that cannot be treated so
+    :param info_mask: read action masks from ``infos[agent]["action_mask"]``; agents without one may choose any action
+    :raises ValueError: if the environment or one of its spaces is not supported
     """
 
     observation_space: TeamObservation
@@ -111,17 +113,17 @@ class TeamEnv(gymnasium.Env):
         self._returns = [0.0] * len(agents)
 
     def has_wrapper_attr(self, name: str) -> bool:
-        """Whether this or the PettingZoo environment has the attribute."""
+        """:return: whether this wrapper or the PettingZoo environment has the attribute"""
         return hasattr(self, name) or hasattr(self.parallel_env, name)
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """The attribute of this, or else of the PettingZoo environment."""
+        """:return: the attribute of this wrapper, or else of the PettingZoo environment"""
         return getattr(self if hasattr(self, name) else self.parallel_env, name)
 
     def _lay_out(self, action_spaces: Sequence[Any]) -> None:
         ends = np.cumsum([len(heads_of(space)) for space in action_spaces]).tolist()
         self._actions = []
-        # Continuous actions are clipped to the first two, all have to lie within the last two
+        # Continuous actions are clipped to the first two bounds, all actions must lie within the last two
         self._low = np.full(ends[-1], -np.inf, np.float32)
         self._high = np.full(ends[-1], np.inf, np.float32)
         self._least = np.full(ends[-1], np.finfo(np.float32).min)
@@ -137,10 +139,10 @@ class TeamEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """
-        :param seed: for the environment, an integer of at least 0
-        :param options: for the environment
+        :param seed: seed of the environment, a non-negative integer
+        :param options: options of the environment
         :return: observation, (n_agents, columns), and info
-        :raises ValueError: a seed that is none, or something the environment must not return
+        :raises ValueError: if the seed is invalid, or the environment returns something invalid
         """
         seed = as_seed(seed)
         super().reset(seed=seed)
@@ -151,20 +153,22 @@ class TeamEnv(gymnasium.Env):
             raise ValueError(self._unknown(unknown))
         self._live = [row for row, agent in enumerate(self._agents) if agent in present]
         if not self._live:
-            raise ValueError(f"After reset(), agents of {self.parallel_env} is empty: it must list who takes part.")
+            raise ValueError(
+                f"After reset(), `agents` of {self.parallel_env} is empty: it must list the active agents."
+            )
         self._taking_part = self._live
         self._returns = [0.0] * len(self._agents)
         return self._observe(self._with_masks(observations, infos), self._live), _agent_infos(infos)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
-        :param action: joint action, flat
-        :return: observation, (n_agents, columns), mean reward, terminated, truncated, info
-        :raises ValueError: an action outside of its space, or something the environment must not return
+        :param action: flat joint action
+        :return: observation, (n_agents, columns), mean reward, terminated, truncated, and info
+        :raises ValueError: if the action is outside its space, or the environment returns something invalid
         """
         acted = self._live
         if not acted:
-            raise gymnasium.error.ResetNeeded("No agent is left in this episode, or none has begun: call reset().")
+            raise gymnasium.error.ResetNeeded("The episode has ended or has not begun: call reset().")
         actions = self._decode(action)
         self._steps += 1
         observations, agent_rewards, terminations, truncations, infos = self._parts(
@@ -182,7 +186,7 @@ class TeamEnv(gymnasium.Env):
             except KeyError:
                 raise ValueError(
                     f"step() of {self.parallel_env} left out reward, termination or truncation of agent {agent!r} "
-                    f"{self._when}: it must give them for every agent that acted."
+                    f"{self._when}: it must return them for every agent that acted."
                 ) from None
             if type(reward) is not float:
                 reward = self._number(agent, reward)
@@ -193,7 +197,7 @@ class TeamEnv(gymnasium.Env):
             self._returns[row] += reward
             if not (ends or cut):
                 live.append(row)
-            # Nothing is learned from what a terminated agent sees last, and some environments do not give it
+            # Some environments leave out the final observation of a terminated agent, which training does not need
             if not ends or cut or agent in observations:
                 seen.append(row)
         if len(left) != len(live) or not all(agents[row] in left for row in live):
@@ -217,7 +221,7 @@ class TeamEnv(gymnasium.Env):
         return self._observe(self._with_masks(observations, infos), seen), total / n_agents, over and not cut, cut, info
 
     def render(self) -> Any:
-        """What the environment renders."""
+        """Render the environment."""
         return self.parallel_env.render()
 
     def close(self) -> None:
@@ -229,7 +233,7 @@ class TeamEnv(gymnasium.Env):
         return f"in step {self._steps} of the episode" if self._steps else "after reset()"
 
     def _parts(self, method: str, returned: Any) -> Sequence[Mapping[Any, Any]]:
-        """The dicts that the environment returned, ``infos`` empty where it gives none."""
+        """:return: the dicts that the environment returned, after checks; ``infos`` is empty if it was None"""
         names = ["observations", "infos"]
         if method == "step":
             names = ["observations", "rewards", "terminations", "truncations", "infos"]
@@ -240,15 +244,15 @@ class TeamEnv(gymnasium.Env):
         for name, part in zip(names, returned, strict=True):
             if type(part) is not dict and not isinstance(part, Mapping) and not (part is None and name == "infos"):
                 raise ValueError(
-                    f"{method}() of {self.parallel_env} gave {shown(part)} as {name} {self._when}: it must give a "
-                    "dict with an entry for each agent."
+                    f"{method}() of {self.parallel_env} returned {shown(part)} as {name} {self._when}: it must return "
+                    "a dict with an entry for each agent."
                 )
         *others, infos = returned
         for agent, info in (infos or {}).items():
             if type(info) is not dict and info is not None and not isinstance(info, Mapping):
                 raise ValueError(
-                    f"{method}() of {self.parallel_env} gave {shown(info)} as info of agent {agent!r} {self._when}: "
-                    "it must be a dict."
+                    f"{method}() of {self.parallel_env} returned {shown(info)} as info of agent {agent!r} "
+                    f"{self._when}: it must be a dict."
                 )
         return *others, infos or {}
 
@@ -258,8 +262,8 @@ class TeamEnv(gymnasium.Env):
             return set(agents)  # type: ignore[arg-type]
         except TypeError:
             raise ValueError(
-                f"`agents` of {self.parallel_env} is {shown(agents)} {self._when}: it must be the list of agents that "
-                "are taking part."
+                f"`agents` of {self.parallel_env} is {shown(agents)} {self._when}: it must be the list of active "
+                "agents."
             ) from None
 
     def _number(self, agent: Any, reward: Any) -> float:
@@ -267,25 +271,25 @@ class TeamEnv(gymnasium.Env):
             with suppress(TypeError, ValueError, OverflowError):
                 return float(reward)
         raise ValueError(
-            f"{self.parallel_env} gave a reward of {shown(reward)} for agent {agent!r} {self._when}: a reward must be "
-            "a number."
+            f"{self.parallel_env} returned a reward of {shown(reward)} for agent {agent!r} {self._when}: a reward must "
+            "be a number."
         )
 
     def _flag(self, agent: Any, name: str, value: Any) -> bool:
         if isinstance(value, (bool, np.bool_, int, np.integer)) or getattr(value, "shape", None) == ():
             return bool(value)
         raise ValueError(
-            f"{self.parallel_env} gave {shown(value)} as {name} of agent {agent!r} {self._when}: it must be True or "
-            "False."
+            f"{self.parallel_env} returned {shown(value)} as {name} of agent {agent!r} {self._when}: it must be True "
+            "or False."
         )
 
     def _decode(self, action: Any) -> dict[Any, Any]:
-        """The actions of the live agents, each as its own space has it."""
+        """:return: the actions of the live agents, each in its own space"""
         values = np.asarray(action)
         if values.shape != self.action_space.shape:
             raise ValueError(
-                f"The joint action has shape {values.shape}, not {self.action_space.shape}: it is flat, agent after "
-                f"agent ({', '.join(self.agent_names)})."
+                f"The joint action has shape {values.shape}, not {self.action_space.shape}: it must be flat, agent "
+                f"after agent ({', '.join(self.agent_names)})."
             )
         if values.dtype.kind not in "biuf" or not self._inside(values).all():
             self._refuse_action(values)
@@ -310,7 +314,7 @@ class TeamEnv(gymnasium.Env):
         return actions
 
     def _inside(self, values: np.ndarray) -> np.ndarray:
-        """Which numbers are finite and, unless they will be clipped, in their space, (length,)."""
+        """:return: which numbers are finite and, unless they will be clipped, in their space, (length,)"""
         return (values >= self._least) & (values <= self._most)
 
     def _refuse_action(self, values: np.ndarray) -> None:
@@ -318,19 +322,19 @@ class TeamEnv(gymnasium.Env):
             if values.dtype.kind not in "biuf" or not self._inside(values)[begin:end].all():
                 raise ValueError(
                     f"The action of agent {agent!r} is {values[begin:end].tolist()} in step {self._steps + 1} of the "
-                    f"episode, but its space is {space}: give finite numbers, binary actions as 0 or 1, categories "
-                    "from 0 on."
+                    f"episode, but its space is {space}: pass finite numbers, binary actions as 0 or 1, and categories "
+                    "counting from 0."
                 )
 
     def _observe(self, observations: Mapping[Any, Any], rows: list[int]) -> np.ndarray:
-        """The team's observation, all rows but the given ones zero, (n_agents, columns)."""
+        """:return: the team's observation, (n_agents, columns), in which all but the given rows are zero"""
         team = self.observation_space
         matrix = np.zeros(team.shape, np.float32)
         for row in rows:
             agent, space, length = self._agents[row], self._observation_spaces[row], team.obs_dims[row]
             if agent not in observations:
                 raise ValueError(
-                    f"{self.parallel_env} gave no observation for agent {agent!r}, which takes part or was just "
+                    f"{self.parallel_env} returned no observation for agent {agent!r}, which is active or was just "
                     f"truncated, {self._when}: reset() and step() must return one."
                 )
             observation = observations[agent]
@@ -358,12 +362,12 @@ class TeamEnv(gymnasium.Env):
             whose = f"The observation of agent {self._agents[row]!r}" if column < team.obs_dim else "The state"
             raise ValueError(
                 f"{whose} is {matrix[row, column]} in column {column} {self._when} of {self.parallel_env}: it must be "
-                "finite. Bound it, or end the episode before a simulation diverges."
+                "finite. Clip it, or end the episode before a simulation diverges."
             )
         return matrix
 
     def _with_masks(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> Mapping[Any, Any]:
-        """Observations with the masks that infos hold, where these are asked for."""
+        """:return: observations with the action masks in infos, if ``info_mask`` is set"""
         if not self._info_mask:
             return observations
         masked = {}
@@ -379,11 +383,13 @@ class TeamEnv(gymnasium.Env):
         try:
             state = np.asarray(flatten(self._state_space, self.parallel_env.state()))
         except NotImplementedError as error:
-            raise ValueError(f"{self.parallel_env} has a state_space but no state(): choose state=False.") from error
+            raise ValueError(f"{self.parallel_env} has a state_space but no state(): set state=False.") from error
         except (TypeError, ValueError, LookupError) as error:
             raise ValueError(f"state() of {self.parallel_env} does not fit its state_space: {error}.") from error
         if state.size != size:
-            raise ValueError(f"state() of {self.parallel_env} has {state.size} numbers, its state_space {size}.")
+            raise ValueError(
+                f"state() of {self.parallel_env} has {state.size} numbers, but its state_space has {size}."
+            )
         return state
 
     def _check_left(
@@ -394,22 +400,22 @@ class TeamEnv(gymnasium.Env):
         terminations: Mapping[Any, bool],
         truncations: Mapping[Any, bool],
     ) -> None:
-        """Whether ``agents`` of the environment and the ends it reported go together."""
+        """Check that ``agents`` of the environment agrees with the terminations and truncations it returned."""
         if unknown := left - self._rows.keys():
             raise ValueError(self._unknown(unknown))
         for row in live:
             if (agent := self._agents[row]) not in left:
                 raise ValueError(
-                    f"Agent {agent!r} left {self.parallel_env} without an end: set its termination or its truncation "
-                    "in the step in which it is dropped from `agents`."
+                    f"Agent {agent!r} left {self.parallel_env} without termination or truncation: set one of them in "
+                    "the step that removes the agent from `agents`."
                 )
         for agent in left - {self._agents[row] for row in acted}:
-            # An environment may go on listing an agent as long as it says that it has ended
+            # An environment may keep an agent in `agents` as long as it reports it as terminated or truncated
             if not (terminations.get(agent) or truncations.get(agent)):
-                how = "came back to life" if self._rows[agent] in self._taking_part else "joined"
+                how = "returned" if self._rows[agent] in self._taking_part else "joined"
                 raise ValueError(
-                    f"Agent {agent!r} {how} in the middle of an episode: the agents of an episode are those that "
-                    f"{self.parallel_env} lists after reset(), until they end."
+                    f"Agent {agent!r} {how} in the middle of an episode: only agents that {self.parallel_env} lists "
+                    "after reset() may take part, until they are terminated or truncated."
                 )
 
     def _unknown(self, agents: Iterable[Any]) -> str:
@@ -424,19 +430,19 @@ class TeamEnv(gymnasium.Env):
             name: reward for name, reward in zip(self.agent_names, rewards, strict=True) if not math.isfinite(reward)
         }
         wrong = ", ".join(f"{reward} for agent {name!r}" for name, reward in found.items())
-        raise ValueError(f"{self.parallel_env} gave a reward of {wrong} {self._when}: rewards must be finite.")
+        raise ValueError(f"{self.parallel_env} returned a reward of {wrong} {self._when}: rewards must be finite.")
 
 
 class TurnBased(ParallelEnv):
     """
-    A PettingZoo environment with turns (``AECEnv``) as a parallel one. In each step one agent moves. The others see the
-    board too, but their action masks allow the first action alone, which is not read: nothing is learned from it, while
-    their critics learn from every step.
+    Wrapper that turns a turn-based PettingZoo environment (``AECEnv``) into a parallel one. One agent moves in each
+    step. The other agents also observe the board, but their action masks allow only the first action, which is ignored.
+    Their actors learn nothing from it, while their critics learn from every step.
 
-    ``TeamEnv`` makes one of an ``AECEnv`` by itself.
+    ``TeamEnv`` applies this wrapper to an ``AECEnv`` automatically.
 
-    :param env: with ``Discrete`` actions
-    :raises ValueError: other actions, or an environment whose agents could act at once
+    :param env: an environment with ``Discrete`` actions
+    :raises ValueError: if actions are not ``Discrete``, or the environment is parallelizable
     """
 
     metadata: dict[str, Any]
@@ -444,7 +450,7 @@ class TurnBased(ParallelEnv):
     def __init__(self, env: AECEnv):
         if getattr(env, "metadata", {}).get("is_parallelizable"):
             raise ValueError(
-                f"{env} takes turns only in form: take its parallel_env, or "
+                f"{env} is parallelizable, so its agents need not take turns: use its parallel_env, or "
                 "pettingzoo.utils.conversions.aec_to_parallel(env)."
             )
         self.env = env
@@ -459,8 +465,8 @@ class TurnBased(ParallelEnv):
         for agent, space in self._action_spaces.items():
             if not isinstance(space, spaces.Discrete):
                 raise ValueError(
-                    f"Agent {agent!r} of {env}, an environment with turns, has the action space {space}: who is not to "
-                    "move is left one action by its mask, so it must be Discrete."
+                    f"Agent {agent!r} of {env}, a turn-based environment, has the action space {space}: it must be "
+                    "Discrete, because masks leave one action to agents that wait for their turn."
                 )
             seen = _space_of(env, "observation_space", agent)
             masked = isinstance(seen, spaces.Dict) and MASK in seen.spaces
@@ -469,11 +475,11 @@ class TurnBased(ParallelEnv):
             self.state_space = env.state_space
 
     def observation_space(self, agent: Any) -> spaces.Space:
-        """What an agent observes: a dict with its action mask."""
+        """:return: the observation space of an agent, a dict with its action mask"""
         return self._observation_spaces[agent]
 
     def action_space(self, agent: Any) -> spaces.Space:
-        """How an agent moves."""
+        """:return: the action space of an agent"""
         return self._action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
@@ -484,7 +490,7 @@ class TurnBased(ParallelEnv):
 
     def step(self, actions: dict[Any, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """
-        :param actions: by agent; only that of the agent whose turn it is is read
+        :param actions: actions by agent; all but that of the agent whose turn it is are ignored
         :return: observations, rewards, terminations, truncations and infos by agent
         """
         env, agents = self.env, self.agents
@@ -495,7 +501,7 @@ class TurnBased(ParallelEnv):
         infos = {agent: dict(env.infos.get(agent) or {}) for agent in agents}
         observations = self._observe()
         while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
-            env.step(None)  # who has ended is taken off by PettingZoo's rules
+            env.step(None)  # PettingZoo's way to remove an agent that has ended
         self.agents = [agent for agent in agents if not (ended[agent] or cut[agent])]
         return observations, rewards, ended, cut, infos
 
@@ -521,7 +527,7 @@ class TurnBased(ParallelEnv):
         return self.env.state()
 
     def render(self) -> Any:
-        """What the environment renders."""
+        """Render the environment."""
         return self.env.render()
 
     def close(self) -> None:
@@ -536,7 +542,10 @@ def _agent_infos(infos: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _fits(space: spaces.Space, value: Any) -> bool:
-    """Whether a value has the space's structure, shapes and categories. Unlike ``contains`` it takes any data type."""
+    """
+    Check whether a value has the structure, shapes and categories of a space. Unlike ``contains``, this accepts any
+    data type.
+    """
     if isinstance(space, spaces.Box):
         return np.shape(value) == space.shape
     if isinstance(space, spaces.Dict):
@@ -557,13 +566,13 @@ def _fits(space: spaces.Space, value: Any) -> bool:
 
 def _possible_agents(env: Any) -> tuple[Any, ...]:
     if not isinstance(env, ParallelEnv):
-        raise ValueError(f"{shown(env)} is no PettingZoo ParallelEnv.")
+        raise ValueError(f"{shown(env)} is not a PettingZoo ParallelEnv.")
     agents = getattr(env, "possible_agents", None) or ()
     agents = tuple(agents) if isinstance(agents, Iterable) else ()
     if not agents:
         raise ValueError(f"{env} has no possible_agents: it must name every agent that can ever take part.")
     if len(set(map(str, agents))) < len(agents):
-        raise ValueError(f"possible_agents of {env} has a name twice: {', '.join(map(str, agents))}.")
+        raise ValueError(f"possible_agents of {env} contains a name twice: {', '.join(map(str, agents))}.")
     return agents
 
 
@@ -571,15 +580,16 @@ def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:
     """
     :param env: the environment
     :param kind: "observation_space" or "action_space"
-    :param agent: of the environment
-    :raises ValueError: there is none
+    :param agent: an agent of the environment
+    :return: the agent's space
+    :raises ValueError: if there is none
     """
     try:
         space = getattr(env, kind)(agent)
     except (LookupError, AttributeError, TypeError, NotImplementedError) as error:
         raise ValueError(
-            f"{kind}({agent!r}) of {env} failed ({type(error).__name__}: {error}): it must give a space for every "
-            "agent in possible_agents."
+            f"{kind}({agent!r}) of {env} failed ({type(error).__name__}: {error}): it must return a space for "
+            "every agent in possible_agents."
         ) from error
     if not isinstance(space, spaces.Space):
         raise ValueError(f"{kind}({agent!r}) of {env} is {shown(space)}: it must be a Gymnasium space.")
@@ -590,19 +600,19 @@ def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
     flat: spaces.Space
     try:
         flat = flatten_space(space)
-    except (NotImplementedError, ValueError):  # of a space that is not known, or empty
+    except (NotImplementedError, ValueError):  # the space is empty or of an unknown type
         flat = space
     if not isinstance(flat, spaces.Box):
         raise ValueError(
             f"The space that {what}, {space}, is empty or has no fixed length and cannot become a row of numbers."
         )
     if not np.prod(flat.shape):
-        raise ValueError(f"The space that {what}, {space}, is empty: where there is nothing, give Box(0, 1, (1,)).")
+        raise ValueError(f"The space that {what}, {space}, is empty: use Box(0, 1, (1,)) as a placeholder.")
     return flat
 
 
 def _image_space(observations: Sequence[spaces.Space]) -> spaces.Box | None:
-    """The space of each agent's image, None if they see different things, or no images."""
+    """:return: the space of an agent's image, None if the agents' spaces differ or are not images"""
     first = observations[0]
     if isinstance(first, spaces.Box) and len(first.shape) == 3 and all(space == first for space in observations):
         return first
@@ -613,12 +623,12 @@ def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:
     heads = heads_of(action)
     length = len(heads) if isinstance(action, spaces.MultiBinary) else sum(heads)
     if not length:
-        raise ValueError(f"info_mask=True: {action} is continuous, and nothing of it can be masked.")
+        raise ValueError(f"info_mask=True: {action} is continuous and cannot be masked.")
     return spaces.Dict({MASK: spaces.Box(0, 1, (length,), np.int8), "observation": observation})
 
 
 def _mask_columns(space: spaces.Space) -> list[int]:
-    """Where a flat observation holds the action mask, by PettingZoo's convention an entry of that name in a dict."""
+    """:return: the columns of a flat observation that hold the action mask, PettingZoo's dict entry of that name"""
     if not isinstance(space, spaces.Dict) or MASK not in space.spaces:
         return []
     begin = 0
@@ -632,7 +642,7 @@ def _mask_columns(space: spaces.Space) -> list[int]:
 def _state_space(env: Any) -> spaces.Box:
     space = getattr(env, "state_space", None)
     if space is None:
-        raise ValueError(f"{env} has no state_space, which state=True needs: choose state=False.")
+        raise ValueError(f"{env} has no state_space, which state=True needs: set state=False.")
     return _flat_space(space, f"the state of {env} has")
 
 
@@ -644,14 +654,16 @@ def make(
     **kwargs: Any,
 ) -> TeamEnv:
     """
-    Make a team environment out of a module with a function ``parallel_env``, as PettingZoo's modules are.
+    Create a team environment from a module with a function ``parallel_env``, such as PettingZoo's modules.
 
-    :param entry: the module, e.g. "mpe2.simple_spread_v3"
+    :param entry: name of the module, e.g. "mpe2.simple_spread_v3"
     :param state: append the global state to the observation, for the critics
-    :param wrappers: of the parallel environment, the innermost first: dotted paths, or dicts from such a path to the
-        wrapper's arguments, e.g. ``["supersuit.pad_observations_v0", {"supersuit.frame_stack_v2": {"stack_size": 2}}]``
+    :param wrappers: wrappers of the parallel environment, innermost first. Each is a dotted path, or a dict from the
+        path to the wrapper's arguments, e.g.
+        ``["supersuit.pad_observations_v0", {"supersuit.frame_stack_v2": {"stack_size": 2}}]``
     :param info_mask: see ``TeamEnv``
     :param kwargs: arguments of ``parallel_env``
+    :return: the team environment
     """
     return TeamEnv(make_parallel_env(entry, wrappers, **kwargs), state=state, info_mask=info_mask)
 
@@ -660,20 +672,22 @@ def make_parallel_env(
     entry: str, wrappers: Iterable[str | Mapping[str, Any]] | None = None, **kwargs: Any
 ) -> ParallelEnv:
     """
-    Make the parallel environment of a module, with its wrappers.
+    Create the parallel environment of a module and apply wrappers.
 
     :param entry: see ``make``
     :param wrappers: see ``make``
     :param kwargs: arguments of ``parallel_env``
-    :raises ValueError: no such module or wrapper, or ``black_death``, with which episodes hardly ever end
+    :return: the wrapped environment
+    :raises ValueError: if there is no such module or wrapper, or the wrapper is ``black_death``, with which episodes
+        hardly ever end
     """
     pairs = _wrappers(wrappers)
     for path, _ in pairs:
         if path.rpartition(".")[2].startswith("black_death"):
             raise ValueError(
-                f"The wrapper {path} keeps agents that ended in the episode, which then hardly ever ends (in SuperSuit "
-                "3.11 only where all agents terminate and are truncated in one step). Leave it out of `wrappers`: "
-                "agents that end before the others are dealt with here."
+                f"The wrapper {path} keeps dead agents in the episode, which then hardly ever ends (in SuperSuit 3.11 "
+                "only if all agents are both terminated and truncated in the same step). Remove it from `wrappers`: "
+                "TeamEnv handles agents that end before the others."
             )
     env = find_parallel_env(entry)(**kwargs)
     for path, arguments in pairs:
@@ -704,18 +718,18 @@ def _load(path: str) -> Callable[..., Any]:
 
 
 def find_module(name: str) -> ModuleType | None:
-    """The module, or None if there is no such module."""
+    """:return: the module, or None if there is no such module"""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             return None
-        raise ValueError(f"{name} cannot be imported: {error}. Install what it needs.") from error
+        raise ValueError(f"{name} cannot be imported: {error}. Install its dependencies.") from error
 
 
 def find_parallel_env(entry: str) -> Callable[..., ParallelEnv | AECEnv]:
     module = find_module(entry)
-    make_env = getattr(module, "parallel_env", None) or getattr(module, "env", None)  # the latter takes turns
+    make_env = getattr(module, "parallel_env", None) or getattr(module, "env", None)  # the latter is turn-based
     if not callable(make_env):
         raise ValueError(f"There is no function parallel_env in {entry}: name a module that has one.")
     return make_env

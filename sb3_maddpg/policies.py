@@ -25,12 +25,14 @@ Sharing = bool | Sequence[Sequence[str | int]]
 
 def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
     """
-    :param share: True: all agents share one network (parameter sharing), False: each has its own, or lists of agents
-        that share one
-    :param team: whose agents
-    :param argument: name of the argument, for the error's message
-    :return: for each agent the number of its network
-    :raises ValueError: something else, an agent in two lists, or heterogeneous agents in one
+    Assign agents to networks.
+
+    :param share: True if all agents share one network (parameter sharing), False if each has its own, or lists of the
+        agents that share one
+    :param team: the team
+    :param argument: name of the argument, for error messages
+    :return: the index of each agent's network
+    :raises ValueError: if ``share`` is anything else, names an agent twice, or lists heterogeneous agents together
     """
     if isinstance(share, bool):
         lists = [list(range(team.n_agents))] if share else []
@@ -41,18 +43,18 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
             lists = [[team.index(agent) for agent in agents] for agents in share]
         except TypeError:
             raise ValueError(
-                f"{argument}={shown(share)} must be True, False or lists of agents that share a network; share_critic "
-                'may also be "team".'
+                f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network; "
+                'share_critic may also be "team".'
             ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
-        raise ValueError(f"{argument}={share} names an agent twice: an agent has one network.")
+        raise ValueError(f"{argument}={share} names an agent twice, but an agent has only one network.")
     for first, *others in filter(None, lists):
         for other in others:
             if not team.homogeneous(first, other):
                 raise ValueError(
                     f"{argument}={share}: {team.names[first]} and {team.names[other]} have different spaces and "
-                    "cannot share a network. Give lists of homogeneous agents, or False."
+                    "cannot share a network. Pass lists of homogeneous agents, or False."
                 )
     lists += [[agent] for agent in range(team.n_agents) if agent not in named]
     groups = [0] * team.n_agents
@@ -64,9 +66,9 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
 
 class Actor(nn.Module):
     """
-    Decentralised actors: agent i's output depends on its own observation only.
+    Base class of decentralised actors: the output for agent i depends only on its own observation.
 
-    :param actions: how the team acts
+    :param actions: the team's actions
     """
 
     optimizer: th.optim.Optimizer
@@ -77,37 +79,45 @@ class Actor(nn.Module):
 
     def logits(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :return: the networks' outputs before they are squashed, minus infinity where an action mask forbids a choice
-            (``TeamActions.mask``), (batch, n_agents, width)
+        Compute the networks' outputs before squashing.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :return: the outputs, (batch, n_agents, width), minus infinity where an action mask forbids a choice, see
+            ``TeamActions.mask``
         """
         raise NotImplementedError
 
     def single(self, agent: int) -> nn.Module:
         """
-        :param agent: which one
-        :return: a network that maps its observation without padding, (batch, its obs_dim), to outputs, (batch, width),
-            which no action mask has touched
+        Extract the network of one agent.
+
+        :param agent: index of the agent
+        :return: a network that maps the agent's observations without padding, (batch, the agent's obs_dim), to outputs
+            without action masks applied, (batch, width)
         """
         raise NotImplementedError
 
     def clip_grad_norm_(self, max_norm: float) -> None:
         """
-        :param max_norm: largest norm of each network's gradient
+        Clip the gradient of each network.
+
+        :param max_norm: maximum norm of a network's gradient
         """
         raise NotImplementedError
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
+        :param obs: observations, (batch, n_agents, obs_dim or more)
         :return: probabilities or continuous actions, (batch, n_agents, width)
         """
         return self.actions.squash(self.logits(obs))
 
     def act(self, obs: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param deterministic: without exploration, see ``TeamActions``
+        Choose actions.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param deterministic: whether to act without exploration, see ``TeamActions``
         :return: encoded actions, (batch, n_agents, width)
         """
         return self.actions.act(self.logits(obs), deterministic)
@@ -115,13 +125,13 @@ class Actor(nn.Module):
 
 class MLPActor(Actor):
     """
-    One multi-layer perceptron per agent.
+    Actors with one multi-layer perceptron per agent.
 
     :param team: the team
-    :param actions: how it acts
+    :param actions: the team's actions
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
-    :param groups: for each agent the number of its network
+    :param activation_fn: activation function between the layers
+    :param groups: index of each agent's network
     """
 
     def __init__(
@@ -149,16 +159,16 @@ class MLPActor(Actor):
 
 class Critic(nn.Module):
     """
-    Centralised critics (centralised training, decentralised execution): they read all observations and all actions.
+    Base class of centralised critics, which read the observations and actions of all agents.
 
-    Credit assignment: an agent may have several value heads, each fitted to rewards of its own, and its action may be
-    made of several factors, whose policy gradients are estimated independently. Heads and factors lie agent after
-    agent, the same number for each; in the plain case each agent has one of both.
+    For credit assignment, an agent may have several value heads, each fitted to its own rewards, and its action may
+    consist of several factors, whose policy gradients are estimated independently. Heads and factors are ordered by
+    agent, and each agent has the same number of them. By default, each agent has one head and one factor.
 
-    :param factors: how the factors of the joint action act
+    :param factors: the actions of the factors
     :param n_agents: number of agents
-    :param values_per_agent: number of value heads of an agent
-    :param n_critics: number of critics (two for MATD3)
+    :param values_per_agent: number of value heads per agent
+    :param n_critics: number of critics per agent (two for MATD3)
     """
 
     optimizer: th.optim.Optimizer
@@ -175,8 +185,8 @@ class Critic(nn.Module):
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param actions: (batch, n_agents, width)
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param actions: encoded actions, (batch, n_agents, width)
         :return: Q-values, (n_critics, batch, n_values)
         """
         raise NotImplementedError
@@ -185,72 +195,82 @@ class Critic(nn.Module):
         self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
     ) -> th.Tensor:
         """
-        The first critic's Q-value with one factor's action replaced and everything else kept.
+        Compute the first critic's Q-values with the action of one factor replaced and all else kept.
 
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param actions: (batch, n_agents, width); the factor's own part is not read
-        :param own: alternatives for the factor's action, (batch, len(factors), M, the factors' width)
-        :param factors: which factors, None for all
-        :return: (batch, len(factors), M)
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param actions: encoded actions, (batch, n_agents, width); the factor's own action does not affect the result
+        :param own: M alternatives for the action of each factor, (batch, len(factors), M, the factors' width)
+        :param factors: indices of the factors, None for all
+        :return: Q-values, (batch, len(factors), M)
         """
         raise NotImplementedError
 
     def clip_grad_norm_(self, max_norm: float) -> None:
         """
-        :param max_norm: largest norm of each network's gradient
+        Clip the gradient of each network.
+
+        :param max_norm: maximum norm of a network's gradient
         """
         raise NotImplementedError
 
     def factored(self, actions: th.Tensor) -> th.Tensor:
         """
-        :param actions: actions or logits of agents, (batch, n_agents, width)
-        :return: those of factors, (batch, n_factors, the factors' width)
+        Split actions into factors.
+
+        :param actions: actions or logits of the agents, (batch, n_agents, width)
+        :return: actions or logits of the factors, (batch, n_factors, the factors' width)
         """
         return actions.reshape(len(actions), -1, self.factors.width)
 
     def rewards(self, of_agents: th.Tensor) -> th.Tensor:
         """
-        :param of_agents: (batch, n_agents)
-        :return: what each value head is fitted to, (batch, n_values)
+        :param of_agents: rewards of the agents, (batch, n_agents)
+        :return: rewards of the value heads, (batch, n_values)
         """
         return of_agents
 
     def per_value(self, of_agents: th.Tensor) -> th.Tensor:
         """
-        :param of_agents: (batch, n_agents)
-        :return: broadcast to the agents' value heads, (batch, n_values)
+        Broadcast values of agents to their value heads.
+
+        :param of_agents: values of the agents, (batch, n_agents)
+        :return: values of the heads, (batch, n_values)
         """
         one_each = len(self.agent_of_value) == self.n_agents
         return of_agents if one_each else of_agents[..., self.agent_of_value]
 
     def owners(self, values: th.Tensor) -> th.Tensor:
         """
-        :param values: numbers of value heads, (any number,)
-        :return: the agents whose values these are, (any number,)
+        :param values: indices of value heads, (n,)
+        :return: indices of the agents whose values these heads predict
         """
         return self.agent_of_value[values]
 
     def cost_of_factors(self, action_cost: th.Tensor) -> th.Tensor:
         """
-        :param action_cost: (n_agents, width)
-        :return: what a factor's action takes from its agent's value, (n_factors, the factors' width)
+        :param action_cost: costs of the agents' actions, (n_agents, width)
+        :return: costs of the factors' actions in units of a value head, (n_factors, factor width)
         """
         return self.factored(action_cost.unsqueeze(0))[0]
 
     def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
         """
-        :param values: of value heads or of factors, (..., n)
-        :return: their sums over each agent's, (..., n_agents)
+        Sum over the value heads or factors of each agent.
+
+        :param values: values of all heads or factors, (..., n)
+        :return: sums, (..., n_agents)
         """
-        # The same number for each agent: a reshape does what index_add would
+        # Every agent has the same number, so a reshape replaces index_add
         one_each = values.shape[-1] == self.n_agents
         return values if one_each else values.unflatten(-1, (self.n_agents, -1)).sum(dim=-1)
 
     def known_cost(self, actions: th.Tensor, action_cost: th.Tensor) -> th.Tensor:
         """
-        :param actions: (batch, n_agents, width)
-        :param action_cost: (n_agents, width)
-        :return: what the actions cost, as each value head's rewards hold it, (batch, n_values)
+        Compute the cost of actions for each value head, as its rewards contain it.
+
+        :param actions: encoded actions, (batch, n_agents, width)
+        :param action_cost: price of one unit of the encoded action, (n_agents, width)
+        :return: the costs, (batch, n_values)
         """
         cost = self.factored(actions * action_cost).sum(dim=-1)
         if cost.shape[-1] == len(self.agent_of_value):
@@ -261,15 +281,15 @@ class Critic(nn.Module):
 
 class StackedCritic(Critic):
     """
-    Critics that are one multi-layer perceptron per agent.
+    Base class of critics with one multi-layer perceptron per agent.
 
     :param team: the team
-    :param actions: how it acts
-    :param in_features: length of what each reads
+    :param actions: the team's actions
+    :param in_features: length of each network's input
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
-    :param groups: for each agent the number of its network
-    :param n_critics: number of critics
+    :param activation_fn: activation function between the layers
+    :param groups: index of each agent's network
+    :param n_critics: number of critics per agent
     """
 
     def __init__(
@@ -283,7 +303,7 @@ class StackedCritic(Critic):
         n_critics: int,
     ):
         super().__init__(actions, team.n_agents, n_critics=n_critics)
-        # Raises at once if so many do not fit into memory, where the list below would fill it first
+        # Fails at once if the networks exceed the memory, before the list below fills it
         th.empty(n_critics, team.n_agents, in_features, *net_arch[:1])
         networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
         self.net = StackedMLP(networks, in_features, 1, net_arch, activation_fn)
@@ -300,15 +320,17 @@ class StackedCritic(Critic):
         networks: th.Tensor | None,
     ) -> th.Tensor:
         """
-        :param changes: of actions, (batch, n, M, width)
-        :param first: what the first layer makes of the unchanged input, (n, hidden, batch)
-        :param own_weight: what it makes of changes, (n, hidden, width)
-        :param layers: of the networks, see ``StackedMLP.after_first``
-        :param networks: which networks, None for all
-        :return: values with each of the changes, (batch, n, M)
+        Evaluate alternative actions, given the first layer's output for the original actions.
+
+        :param changes: differences of the alternatives from the original actions, (batch, n, M, width)
+        :param first: output of the first layer for the original actions, (n, hidden, batch)
+        :param own_weight: weights of the first layer for the changed actions, (n, hidden, width)
+        :param layers: layers of the networks, see ``StackedMLP.after_first``
+        :param networks: indices of the networks, None for all
+        :return: values of the alternatives, (batch, n, M)
         """
-        # The batch comes last: what is added to every alternative then runs along memory. Views would be slow here:
-        # what is changed in place later must not be one.
+        # With the batch as the last axis, the sum below is contiguous in memory. Later layers change it in place, so
+        # it must not be a view.
         changes = changes.permute(1, 3, 2, 0)
         shape = changes.shape[2:]
         first = first.repeat(1, 1, shape[0]) if shape[0] > 1 else first
@@ -317,24 +339,25 @@ class StackedCritic(Critic):
 
     def by_critic(self, outputs: th.Tensor) -> th.Tensor:
         """
-        :param outputs: of the networks, (n_critics * n_agents, 1, batch)
-        :return: (n_critics, batch, n_agents)
+        :param outputs: outputs of the networks, (n_critics * n_agents, 1, batch)
+        :return: Q-values, (n_critics, batch, n_agents)
         """
         return outputs.squeeze(1).unflatten(0, (self.n_critics, -1)).transpose(1, 2)
 
 
 class MLPCritic(StackedCritic):
     """
-    One multi-layer perceptron per agent, Q_i(z_1..z_n, a_1..a_n), or Q_i(s, a_1..a_n) with a global state s. Critics
-    that share parameters read the agents in another order each: the own agent first, then those it shares with, then
-    the others. So they know whose value they give; with a global state a further input tells them.
+    Centralised critics with one multi-layer perceptron per agent, Q_i(z_1..z_n, a_1..a_n), or Q_i(s, a_1..a_n) with a
+    global state s. So that critics with shared parameters know whose value they estimate, each reads the agents in its
+    own order: its own agent first, then the agents it shares parameters with, then the others. With a global state, it
+    also gets the index of its agent as a one-hot input.
 
     :param team: the team
-    :param actions: how it acts
+    :param actions: the team's actions
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
-    :param groups: for each agent the number of its network
-    :param n_critics: number of critics
+    :param activation_fn: activation function between the layers
+    :param groups: index of each agent's network
+    :param n_critics: number of critics per agent
     """
 
     columns: th.Tensor
@@ -356,7 +379,7 @@ class MLPCritic(StackedCritic):
         columns = np.arange(team.state_dim)[None].repeat(n, axis=0)
         for width in parts:
             block = columns.shape[1] + np.arange(n * width).reshape(n, width)
-            # Where in the own view, if there is one, each agent stands
+            # The position of each agent in the critic's own order, if there is one
             place = np.array([_places(groups, agent) if shared else np.arange(n) for agent in range(n)])
             columns = np.concatenate([columns, block[place].reshape(n, -1)], axis=1)
         own = columns.reshape(n, -1)[:, -n * actions.width :].reshape(n, n, -1)[np.arange(n), np.arange(n)]
@@ -371,7 +394,7 @@ class MLPCritic(StackedCritic):
         self.register_buffer("own_columns", th.as_tensor(own), persistent=False)
 
     def _inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """:return: what all critics read, (features, batch)"""
+        """:return: the joint input of all critics, (features, batch)"""
         inputs = _joint_inputs(self.team, obs, actions)
         if self.tells_agent:
             inputs.append(actions.new_ones(len(actions), 1))
@@ -382,7 +405,7 @@ class MLPCritic(StackedCritic):
     ) -> th.Tensor:
         """:return: the first layer's outputs, (n_networks, width, batch)"""
         weight, bias = (self.net.of_networks(parameter, networks) for parameter in layer)
-        if self.shared:  # reordering the few weights does what reordering the whole batch would
+        if self.shared:  # reorder the few weights instead of the whole batch
             columns = self.columns if networks is None else self.columns[networks]
             weight = weight.gather(2, columns.unsqueeze(1).expand(-1, weight.shape[1], -1))
         return th.baddbmm(bias, weight, inputs.expand(len(weight), -1, -1))
@@ -394,7 +417,7 @@ class MLPCritic(StackedCritic):
     def forward_alternatives(
         self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
     ) -> th.Tensor:
-        # The first layer is linear: it reads the wide joint input once, and every alternative adds its few columns
+        # The first layer is linear: it reads the wide joint input once, and each alternative only adds its few columns
         agents = th.arange(self.team.n_agents, device=own.device) if factors is None else factors
         networks = None if factors is None and self.n_critics == 1 else agents
         layers = self.net.layers()
@@ -406,14 +429,15 @@ class MLPCritic(StackedCritic):
 
 class TeamCritic(StackedCritic):
     """
-    One multi-layer perceptron for the whole team, Q(z_1..z_n, a_1..a_n), fitted to the mean of the agents' rewards: for
-    cooperative teams, where agents get the same reward or maximise the team's. With n agents a critic update takes
-    about an n-th of the time that one value for each agent takes. An episode goes on as long as any agent is in it.
+    Multi-layer perceptron with a single value for the whole team, Q(z_1..z_n, a_1..a_n), trained on the mean of the
+    agents' rewards. It is meant for cooperative teams, in which all agents get the same reward or maximise that of the
+    team. With n agents, a critic update takes about 1/n of the time that it takes with one value per agent. The value
+    bootstraps until all agents have terminated.
 
     :param team: the team
-    :param actions: how it acts
+    :param actions: the team's actions
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
+    :param activation_fn: activation function between the layers
     :param n_critics: number of critics
     """
 
@@ -456,7 +480,7 @@ class TeamCritic(StackedCritic):
     def forward_alternatives(
         self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
     ) -> th.Tensor:
-        # The first layer is linear: it reads the joint input once, and every alternative adds its few columns
+        # The first layer is linear, so it processes the joint input once and adds the changes of each alternative
         agents = th.arange(self.n_agents, device=own.device) if factors is None else factors
         layers = self.net.layers()
         weight, bias = (parameter[0] for parameter in layers[0])
@@ -468,16 +492,16 @@ class TeamCritic(StackedCritic):
 
 
 def _joint_inputs(team: Team, obs: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
-    """:return: what centralised critics read: the global state, if there is one, else all observations; all actions"""
+    """:return: inputs of centralised critics: the global state if there is one, else all observations; all actions"""
     seen = obs[..., team.obs_dim :] if team.state_dim else obs[..., : team.obs_dim]
     return [seen.flatten(1)[:, : team.state_dim or None], actions.flatten(1)]
 
 
 def _places(groups: Sequence[int], agent: int) -> list[int]:
     """
-    :param groups: for each agent the number of its network
-    :param agent: whose critic
-    :return: for each agent its place in what that critic reads
+    :param groups: index of each agent's network
+    :param agent: index of the agent whose critic it is
+    :return: the position of each agent in that critic's input
     """
     n = len(groups)
     order = sorted(range(n), key=lambda other: (groups[other] != groups[agent], (other - agent) % n))
@@ -486,23 +510,25 @@ def _places(groups: Sequence[int], agent: int) -> list[int]:
 
 class MADDPGPolicy(BasePolicy):
     """
-    Policy of MADDPG: actors, critics and their targets, a multi-layer perceptron for each agent.
+    Policy of MADDPG: actors, critics and their target networks, with one multi-layer perceptron per agent.
 
     :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
     :param action_space: flat joint action, see ``Team.from_spaces``
     :param lr_schedule: learning rate schedule (could be constant)
     :param net_arch: widths of the hidden layers, as a list or as ``dict(pi=[...], qf=[...])``
-    :param activation_fn: between the layers
-    :param share_actor: parameter sharing; True: one actor network for all agents, False: one for each; or lists of
-        agents (names or numbers) that share one
-    :param share_critic: the same for critics; "team": one value for the whole team, see ``TeamCritic``
-    :param threshold: delta in [0, 1): a binary action is 1 where its probability exceeds it. For ``MultiBinary`` alone.
-    :param random_thresholds: share of the thresholds that are drawn to explore, the others are delta
-    :param n_critics: number of critics of each agent
-    :param agent_names: by default those of the observation space, or agent_0, agent_1, ...
-    :param normalize_images: kept for Stable-Baselines3, a team observation is never an image
-    :param optimizer_class: ``th.optim.Adam`` by default, in its fused form
-    :param optimizer_kwargs: further keyword arguments for the optimizer, the learning rate excluded
+    :param activation_fn: activation function between the layers
+    :param share_actor: parameter sharing of actors: True for one network for all agents, False for one network per
+        agent, or lists of the agents (names or indices) that share a network
+    :param share_critic: parameter sharing of critics, like ``share_actor``, or "team" for a single value for the whole
+        team, see ``TeamCritic``
+    :param threshold: delta in [0, 1): a binary action is 1 if its probability exceeds delta. For ``MultiBinary`` only.
+    :param random_thresholds: fraction of the thresholds that are drawn at random during exploration, the others
+        are delta
+    :param n_critics: number of critics per agent
+    :param agent_names: names of the agents, by default those of the observation space, or agent_0, agent_1, ...
+    :param normalize_images: ignored, exists for compatibility with Stable-Baselines3
+    :param optimizer_class: the optimizer, ``th.optim.Adam`` by default, which runs fused
+    :param optimizer_kwargs: additional keyword arguments, excluding the learning rate, to pass to the optimizer
     """
 
     # Attributes of the environment that are arguments of the policy, see MADDPG
@@ -574,7 +600,9 @@ class MADDPGPolicy(BasePolicy):
                 )
             except (TypeError, ValueError, RuntimeError) as error:
                 name = self.optimizer_class.__name__
-                raise ValueError(f"optimizer_kwargs={self.optimizer_kwargs} do not fit {name}: {error}.") from error
+                raise ValueError(
+                    f"optimizer_kwargs={self.optimizer_kwargs} cannot be passed to {name}: {error}."
+                ) from error
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
 
@@ -613,8 +641,10 @@ class MADDPGPolicy(BasePolicy):
 
     def not_finite(self, parameters: Mapping[str, th.Tensor]) -> str | None:
         """
-        :param parameters: of this policy by their names, see ``state_dict``
-        :return: which of them hold NaN or infinity, and of which agents, None if none does
+        Find parameters that hold NaN or infinity.
+
+        :param parameters: parameters of this policy by name, see ``state_dict``
+        :return: the name of the first such parameter and its agents, None if all are finite
         """
         for name, parameter in parameters.items():
             finite = parameter.isfinite()
@@ -631,7 +661,9 @@ class MADDPGPolicy(BasePolicy):
 
     def set_threshold(self, threshold: float) -> None:
         """
-        :param threshold: delta in [0, 1), for the binary actions of all agents from now on
+        Set the threshold of the binary actions of all agents.
+
+        :param threshold: delta in [0, 1)
         """
         threshold = validated(ThresholdArgument, threshold=threshold)["threshold"]
         self.threshold = threshold
@@ -643,16 +675,16 @@ class MADDPGPolicy(BasePolicy):
             numbers = as_numbers(observation)
         except ValueError:
             raise ValueError(
-                f"observation={shown(observation)} is no array of numbers of shape {self.observation_space.shape}, or "
-                "several of them."
+                f"observation={shown(observation)} is not an array of numbers of shape {self.observation_space.shape} "
+                "or a batch of them."
             ) from None
         self.check_finite(numbers)
         return super().obs_to_tensor(numbers)
 
     def check_finite(self, observation: np.ndarray) -> None:
         """
-        :param observation: (..., n_agents, obs_dim or more)
-        :raises ValueError: NaN or infinity
+        :param observation: observations, (..., n_agents, obs_dim or more)
+        :raises ValueError: if an observation holds NaN or infinity
         """
         if all_finite(observation):
             return
@@ -661,11 +693,11 @@ class MADDPGPolicy(BasePolicy):
         agents = np.flatnonzero(~finite.all(axis=-1).reshape(-1, self.team.n_agents).all(axis=0))
         raise ValueError(
             f"The observation of agent(s) {', '.join(self.team.names[agent] for agent in agents)} holds NaN or "
-            "infinity. An action for it would mean nothing: clip or replace such values in the environment."
+            "infinity, so it determines no action: clip or replace such values in the environment."
         )
 
     def set_training_mode(self, mode: bool) -> None:
-        if self.training != mode:  # SB3 asks for it at each prediction, and going through all modules takes its time
+        if self.training != mode:  # SB3 sets the mode at each prediction, and visiting all modules is slow
             super().set_training_mode(mode)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
@@ -673,9 +705,11 @@ class MADDPGPolicy(BasePolicy):
 
     def flat_actions(self, obs: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param deterministic: without exploration
-        :return: buffer actions, (batch, length)
+        Choose actions in the format of the replay buffer.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param deterministic: whether to act without exploration
+        :return: flat joint actions, (batch, length)
         """
         return self.actions.decode(self.actor.act(obs.float(), deterministic))
 

@@ -15,8 +15,10 @@ from sb3_maddpg.utils import suggest
 
 def pretrained_models() -> dict[str, Path]:
     """
-    Every installed model by its name: the folder with its ``model.zip`` and what belongs to it. Packages offer them
-    by an entry point of the group ``sb3_maddpg.models`` that names a package with a folder for each model.
+    List the installed pretrained models. Packages provide them through an entry point of the group
+    ``sb3_maddpg.models``, which names a package with one folder per model.
+
+    :return: name -> folder of the model with its ``model.zip``
     """
     packages = [Path(str(files(offer.value))) for offer in entry_points(group="sb3_maddpg.models")]
     found = {path.parent.name: path.parent for package in packages for path in package.glob("*/model.zip")}
@@ -25,14 +27,15 @@ def pretrained_models() -> dict[str, Path]:
 
 def pretrained(name: str, env: GymEnv | None = None, **kwargs) -> MADDPG:
     """
-    A trained model that comes with the package. Beside its ``model.zip`` lie the recipe and the command that made it,
-    its training's curve and its results, see ``pretrained_folder``.
+    Load a pretrained model. Its folder also holds the recipe and the command that trained it, its learning curve and
+    its results, see ``pretrained_folder``.
 
-    :param name: see ``pretrained_models``
-    :param env: to fly in or to train on; a team of another size is welcome where the policy is a ``PairPolicy``
-    :param kwargs: further arguments of ``MADDPG.load``; with a team of another size, of ``MADDPG``, over those that the
-        model was trained with
-    :raises ValueError: no such model, or an environment that it does not fit
+    :param name: name of the model, see ``pretrained_models``
+    :param env: environment to run or train in; with ``PairPolicy``, its team may have another size
+    :param kwargs: additional arguments of ``MADDPG.load``; for a team of another size also of ``MADDPG``, which
+        override those that the model was trained with
+    :return: the model
+    :raises ValueError: if there is no such model, or it does not fit the environment
     """
     model = MADDPG.load(pretrained_folder(name) / "model.zip", **kwargs)
     if env is None:
@@ -47,9 +50,9 @@ def pretrained(name: str, env: GymEnv | None = None, **kwargs) -> MADDPG:
 
 def pretrained_folder(name: str) -> Path:
     """
-    :param name: see ``pretrained_models``
-    :return: the folder with ``model.zip`` and what belongs to it
-    :raises ValueError: no such model
+    :param name: name of the model, see ``pretrained_models``
+    :return: the folder with ``model.zip`` and its other files
+    :raises ValueError: if there is no such model
     """
     known = pretrained_models()
     if not isinstance(name, str) or name not in known:

@@ -1,4 +1,4 @@
-"""Environments in the processes of a Ray cluster, for those that are slow to step."""
+"""Vectorised environment in the processes of a Ray cluster, for environments that are slow to step."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ Call = tuple[str, tuple[Any, ...]]
 
 class RayVecEnv(VecEnv):
     """
-    A vector of environments in shards, each a process of a Ray cluster (https://docs.ray.io). What they return, and so
-    what is learned, is to the last bit what the same shards would return in this process.
+    Vectorised environment that consists of shards, each a process of a Ray cluster (https://docs.ray.io). It returns
+    exactly what the same shards would return in this process, so training gives bit-identical results.
 
-    A process that dies is not begun empty: a new one takes the last snapshot of its shard and repeats what was done
-    since. Environments that do not tell their state (``state_dict``) are wrapped in ``Replayable``, which takes them to
-    do the same after the same seed and actions.
+    If a process dies, a new one restores the last snapshot of its shard and repeats the calls since. Environments
+    without ``state_dict`` are wrapped in ``Replayable``, which assumes that they are deterministic given the seed and
+    the actions.
 
-    It pays where a step takes long: an empty one takes some milliseconds. Wrap it in ``VecMonitor`` for statistics.
+    Ray adds some milliseconds per step, so this pays off for slow environments only. Wrap it in ``VecMonitor`` for
+    episode statistics.
 
-    :param shards: functions that make a vector environment each, all with the same spaces
-    :param snapshot_every: steps from one snapshot to the next
-    :param address: of a running cluster, ``auto`` or ``HOST:PORT``; None begins one on this machine and ends it again
-    :raises ValueError: Ray is not installed, or there is no such cluster, or no shard
+    :param shards: functions that each create a vectorised environment, all with the same spaces
+    :param snapshot_every: number of steps between snapshots
+    :param address: address of a running cluster, ``auto`` or ``HOST:PORT``; None starts a cluster on this machine and
+        stops it on ``close``
+    :raises ValueError: if Ray is not installed, there is no such cluster, or there are no shards
     """
 
     def __init__(self, shards: Sequence[Callable[[], VecEnv]], snapshot_every: int = 100, address: str | None = None):
         if not shards or snapshot_every < 1:
-            raise ValueError(
-                f"{len(shards)} shards and snapshot_every={snapshot_every}: there must be at least one of each."
-            )
+            raise ValueError(f"{len(shards)} shards and snapshot_every={snapshot_every}: both must be at least 1.")
         try:
             import ray
         except ImportError as error:
@@ -48,7 +48,7 @@ class RayVecEnv(VecEnv):
         self._ray = ray
         self._begun = not ray.is_initialized()
         if self._begun:
-            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unasked
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked
             try:
                 ray.init(
                     address=address,
@@ -58,7 +58,7 @@ class RayVecEnv(VecEnv):
                     logging_level=WARNING,
                 )
             except (ConnectionError, ValueError, RuntimeError) as error:
-                raise ValueError(f"address={shown(address)}: no Ray cluster answers there ({error}).") from error
+                raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
         self._shards = [_Remote(ray, make) for make in shards]
         self.snapshot_every = snapshot_every
         described = self._all("describe")
@@ -77,7 +77,7 @@ class RayVecEnv(VecEnv):
         return [slice(begin, end) for begin, end in zip([0, *self._ends], self._ends, strict=False)]
 
     def _all(self, method: str, *arguments: Any) -> list[Any]:
-        """Call all shards at once with the same arguments."""
+        """Call a method of all shards in parallel, with the same arguments."""
         for shard in self._shards:
             shard.begin(method, *arguments)
         return [shard.result() for shard in self._shards]
@@ -118,23 +118,23 @@ class RayVecEnv(VecEnv):
             self._ray.shutdown()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of the given environments."""
+        """:return: the attribute of each of the given environments"""
         return self._at("get_attr", indices, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the attribute in the given environments."""
+        """Set an attribute of the given environments."""
         self._at("set_attr", indices, attr_name, value)
 
     def env_method(self, method_name: str, *method_args, indices: VecEnvIndices = None, **method_kwargs) -> list[Any]:
-        """Call the method of the given environments."""
+        """Call a method of the given environments and return the results."""
         return self._at("env_method", indices, method_name, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Whether the given environments have the wrapper."""
+        """:return: whether each of the given environments has the wrapper"""
         return self._at("env_is_wrapped", indices, wrapper_class)
 
     def _at(self, method: str, indices: VecEnvIndices, *arguments: Any) -> list[Any]:
-        """Call a method for some environments, which may lie in some of the shards."""
+        """Call a method for the given environments in the shards that hold them."""
         wanted = list(self._get_indices(indices))
         found: dict[int, Any] = {}
         for shard, part in zip(self._shards, self._parts, strict=True):
@@ -146,7 +146,7 @@ class RayVecEnv(VecEnv):
 
 
 class _Remote:
-    """A shard as this process sees it: the actor, its last snapshot, and what was done since."""
+    """Handle of a shard: its Ray actor, its last snapshot, and the calls since."""
 
     def __init__(self, ray: Any, make: Callable[[], VecEnv]):
         self._ray, self._make = ray, make
@@ -161,26 +161,26 @@ class _Remote:
         return actor.remote(self._make, self._snapshot, self._done)
 
     def begin(self, method: str, *arguments: Any) -> None:
-        """Call a method of the shard, whose result ``result`` waits for."""
+        """Call a method of the shard without waiting for its result, see ``result``."""
         self._present = (method, arguments)
         self._reference = self._actor.call.remote(method, arguments)
 
     def result(self) -> Any:
-        """:return: what was begun; where its process has died, from a new one"""
+        """:return: the result of the call that ``begin`` started, from a new process if the old one died"""
         assert self._present is not None
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 result = self._ray.get(self._reference)
                 break
             except self._ray.exceptions.RayTaskError as error:
-                raise error.cause from error  # the environment's own
+                raise error.cause from error  # the environment's own exception
             except self._ray.exceptions.RayActorError as error:
                 if attempt == _ATTEMPTS:
                     reason = str(error).strip().splitlines()[-1]
                     raise ValueError(
-                        f"{attempt} processes died at {self._present[0]}() of a shard: {reason}"
+                        f"{attempt} processes died during {self._present[0]}() of a shard: {reason}"
                     ) from error
-                self._ray.kill(self._actor)  # it may be unreachable only
+                self._ray.kill(self._actor)  # it may only be unreachable
                 self._actor = self._hire()
                 self.begin(self._present[0], *self._present[1])
         if self._present[0] in _CHANGES:
@@ -188,27 +188,27 @@ class _Remote:
         return result
 
     def take_snapshot(self) -> None:
-        """From here on a new process goes on."""
+        """Take a snapshot, from which a new process can continue."""
         self.begin("state")
         self._snapshot, self._done = self.result(), []
 
     def end(self) -> None:
-        """End the process."""
+        """Stop the process."""
         self._ray.kill(self._actor)
 
 
-_ATTEMPTS = 4  # at a call, before the environment's own fault is assumed
-# What a new process has to repeat
+_ATTEMPTS = 4  # attempts at a call before the environment itself is assumed to be at fault
+# Calls that a new process must repeat
 _CHANGES = ("reset", "step", "set_attr", "env_method")
 
 
 class _Shard:
     """
-    A vector environment in a process of its own.
+    Ray actor that holds a vectorised environment.
 
-    :param make: makes it
-    :param snapshot: its state, None as it is made
-    :param done: what was done since
+    :param make: creates the environment
+    :param snapshot: state to restore, None for a new environment
+    :param done: calls to repeat after that
     """
 
     def __init__(self, make: Callable[[], VecEnv], snapshot: dict[str, Any] | None, done: Sequence[Call]):
@@ -216,7 +216,7 @@ class _Shard:
         if isinstance(self.env, DummyVecEnv):
             self.env.envs = [one if tells_state(one) else Replayable(one) for one in self.env.envs]
         if snapshot is not None:
-            load_vec_env_state(self.env, deepcopy(snapshot))  # Ray gives arrays that cannot be written to
+            load_vec_env_state(self.env, deepcopy(snapshot))  # Ray's arrays are read-only
         for call in done:
             self.call(*call)
 
@@ -238,7 +238,7 @@ class _Shard:
         try:
             return vec_env_state(self.env)
         except NoStateError as error:
-            raise ValueError(f"A shard cannot be rebuilt where its process dies: {error}") from error
+            raise ValueError(f"A shard could not be restored if its process died: {error}") from error
 
     def _get_attr(self, indices: list[int], name: str) -> list[Any]:
         return self.env.get_attr(name, self._given(indices))
@@ -253,5 +253,5 @@ class _Shard:
         return self.env.env_is_wrapped(wrapper_class, self._given(indices))
 
     def _given(self, indices: list[int]) -> list[int] | None:
-        """All of them as None, which is all that some vector environments take."""
+        """:return: None for all environments, since some vectorised environments accept nothing else"""
         return None if len(indices) == self.env.num_envs else indices

@@ -1,4 +1,4 @@
-"""Relational networks: actors and critics that look at an agent's neighbours one by one and share what they learn."""
+"""Relational networks: actors and critics that process an agent's neighbours one by one with shared parameters."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from sb3_maddpg.validation import PairPolicyArguments, validated
 
 class ObservationLayout(TypedDict, total=False):
     """
-    What the numbers of an agent's observation are about, the same for all agents. An environment tells it by an
+    Meaning of the columns of an agent's observation, the same for all agents. An environment provides it as its
     attribute ``observation_layout``.
 
     - ``own``: columns about the agent itself;
-    - ``neighbours``: for each neighbour the columns about it, all of one length, in one order;
-    - ``who``: for each agent the numbers of its neighbours; all others in ascending order, unless given;
-    - ``who_columns``: instead of ``who``, where neighbours change: for each neighbour the column that holds its number,
-      counted from 1, and 0 for nobody. Critics read it and actors do not. Who stays a neighbour stays where it is, and
-      ``info["pair_terminated"]`` says who does not;
-    - ``acts_on_neighbours``: the action falls into equal parts, one for each neighbour;
-    - ``critic``: for each neighbour further columns that critics read and actors do not, because no agent knows them
-      when it acts;
-    - ``action_mask``: for each neighbour a column that is positive where the agent may act on it, for binary actions on
-      neighbours; elsewhere the action is 0;
-    - ``complete``: every neighbour is always there. Otherwise one whose columns are all zero is absent.
+    - ``neighbours``: the columns about each neighbour, of the same number and order for all neighbours;
+    - ``who``: the indices of each agent's neighbours, by default all other agents in ascending order;
+    - ``who_columns``: instead of ``who`` if neighbours change: one column per neighbour, which contains its index plus
+      1, or 0 without a neighbour, and which only critics read. A neighbour keeps its position as long as it remains
+      one; ``info["pair_terminated"]`` marks the positions that change;
+    - ``acts_on_neighbours``: whether the action consists of equal parts, one for each neighbour;
+    - ``critic``: additional columns about each neighbour that only critics read, because agents do not know them
+      when they act;
+    - ``action_mask``: for binary actions on neighbours, one column per neighbour, which is positive if the agent may
+      act on that neighbour; otherwise the action is 0;
+    - ``complete``: whether every neighbour is always present. If not, a neighbour whose columns are all zero is absent.
 
-    Columns that lie side by side, neighbour after neighbour, are read fastest.
+    Reading is fastest if the columns are contiguous, neighbour after neighbour.
     """
 
     own: Sequence[int]
@@ -55,11 +55,11 @@ def _others(n_agents: int) -> list[list[int]]:
 
 
 def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[int]] | None:
-    """:return: for each agent the numbers of its neighbours; None if they change"""
+    """:return: the indices of each agent's neighbours, None if they change"""
     if not {"own", "neighbours"} <= set(layout) <= set(ObservationLayout.__annotations__):
         raise ValueError(
-            f"observation_layout has entries {sorted(layout)}, but needs `own` and `neighbours`, and beside them knows "
-            "`who`, `who_columns`, `acts_on_neighbours`, `critic`, `action_mask` and `complete` only."
+            f"observation_layout has entries {sorted(layout)}, but needs `own` and `neighbours`, and may only add "
+            "`who`, `who_columns`, `acts_on_neighbours`, `critic`, `action_mask` and `complete`."
         )
     neighbours = layout["neighbours"]
     hidden = layout.get("critic", [[]] * len(neighbours))
@@ -73,43 +73,45 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
         or not all(0 <= column < team.obs_dim for column in used)
     ):
         raise ValueError(
-            f"observation_layout={dict(layout)}: every neighbour needs as many columns as the next, each from 0 to "
+            f"observation_layout={dict(layout)}: every neighbour needs the same number of columns, each from 0 to "
             f"{team.obs_dim - 1}."
         )
     binary = all(isinstance(space, spaces.MultiBinary) for space in team.action_spaces)
     if "action_mask" in layout and not (binary and layout.get("acts_on_neighbours")):
         raise ValueError(
-            "observation_layout: `action_mask` is for MultiBinary actions on neighbours, and the actions are "
-            f"{team.action_spaces[0]}, acts_on_neighbours={layout.get('acts_on_neighbours', False)}."
+            "observation_layout: `action_mask` is for MultiBinary actions on neighbours, but the actions are "
+            f"{team.action_spaces[0]} and acts_on_neighbours={layout.get('acts_on_neighbours', False)}."
         )
     if "who_columns" in layout:
         if "who" in layout or layout.get("complete"):
             raise ValueError(
-                "observation_layout: neighbours whose numbers stand in `who_columns` change: leave out `who` and "
-                "`complete`."
+                "observation_layout: `who_columns` is for neighbours that change, so it cannot be combined with `who` "
+                "or complete=True."
             )
         return None
     who = layout.get("who") or _others(team.n_agents)
     if {len(row) for row in who} != {len(neighbours)} or len(who) != team.n_agents:
         raise ValueError(
             f"observation_layout has columns for {len(neighbours)} neighbours, but the {team.n_agents} agents have "
-            f"{[len(row) for row in who]}: give `who`, `who_columns` or the other columns."
+            f"{[len(row) for row in who]}: add `who`, `who_columns` or the missing columns."
         )
     if not all(set(row) <= set(others) for row, others in zip(who, _others(team.n_agents), strict=True)):
-        raise ValueError(f"observation_layout: who={who} must name others, by numbers from 0 to {team.n_agents - 1}.")
+        raise ValueError(
+            f"observation_layout: who={who} must name other agents, by indices from 0 to {team.n_agents - 1}."
+        )
     return who
 
 
 class NeighbourViews(nn.Module):
     """
-    An observation as an agent's own part and its views of its neighbours.
+    Splits an observation into the agent's own part and its views of its neighbours.
 
-    :ivar changing: whether it depends on the observation who the neighbours are
+    :ivar changing: whether the neighbours change, so that they are read from the observation
 
     :param layout: see ``ObservationLayout``
     :param team: a team of homogeneous agents
-    :param of_critic: with the columns that only critics read
-    :raises ValueError: a layout that does not fit the team
+    :param of_critic: whether to include the columns that only critics read
+    :raises ValueError: if agents are heterogeneous, or the layout does not fit the team
     """
 
     neighbour_indices: th.Tensor
@@ -123,7 +125,7 @@ class NeighbourViews(nn.Module):
         for agent in range(1, team.n_agents):
             if not team.homogeneous(0, agent):
                 raise ValueError(
-                    f"PairPolicy is for teams of homogeneous agents, and {team.names[0]} and {team.names[agent]} have "
+                    f"PairPolicy is for teams of homogeneous agents, but {team.names[0]} and {team.names[agent]} have "
                     "different spaces: use MlpPolicy."
                 )
         who = _check_layout(layout, team)
@@ -147,9 +149,9 @@ class NeighbourViews(nn.Module):
 
     def forward(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :return: own parts (batch, n_agents, own_dim), views of neighbours (batch, n_agents, n_neighbours,
-            neighbour_dim), and which neighbours are present (batch, n_agents, n_neighbours, 1), None if all are
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :return: own parts, (batch, n_agents, own_dim), views of neighbours, (batch, n_agents, n_neighbours,
+            neighbour_dim), and which neighbours are present, (batch, n_agents, n_neighbours, 1), None if all are
         """
         neighbours = self.neighbours(obs)
         present = None if self.complete else (neighbours != 0).any(dim=-1, keepdim=True).to(obs.dtype)
@@ -157,9 +159,11 @@ class NeighbourViews(nn.Module):
 
     def of_neighbours(self, obs: th.Tensor, what: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param what: something that agents have, (batch, n_agents, ...)
-        :return: what each neighbour has, (batch, n_agents, n_neighbours, ...); of absent ones anything
+        Return the values of each agent's neighbours.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param what: values of all agents, (batch, n_agents, ...)
+        :return: values of the neighbours, (batch, n_agents, n_neighbours, ...), arbitrary for absent neighbours
         """
         if not self.changing:
             return what[:, self.neighbour_indices]
@@ -167,9 +171,12 @@ class NeighbourViews(nn.Module):
 
     def towards_agent(self, obs: th.Tensor, what: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param what: something that agents have for each neighbour, (batch, n_agents, n_neighbours, width)
-        :return: what each neighbour has for the agent, of the same shape; 0 where it is no neighbour of its neighbour
+        Swap the roles in values that agents have for their neighbours.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param what: values that agents have for each neighbour, (batch, n_agents, n_neighbours, width)
+        :return: values that each neighbour has for the agent, of the same shape, 0 if the agent is not one of its
+            neighbours
         """
         if not self.changing:
             return what[:, self.neighbour_indices, self.reverse_indices.clamp(min=0)] * (
@@ -182,7 +189,7 @@ class NeighbourViews(nn.Module):
         return what[_batch(what), who.clamp(min=0), back] * mutual.unsqueeze(-1)
 
     def _who(self, obs: th.Tensor) -> th.Tensor:
-        """:return: numbers of the neighbours, -1 for nobody, (batch, n_agents, n_neighbours)"""
+        """:return: indices of the neighbours, -1 without a neighbour, (batch, n_agents, n_neighbours)"""
         return self.numbers(obs).squeeze(-1).round().long() - 1
 
 
@@ -195,7 +202,7 @@ class _Columns(nn.Module):
     """
     Reads columns of observations.
 
-    :param table: rows of columns, all of one length
+    :param table: indices of the columns, (rows, width)
     """
 
     table: th.Tensor
@@ -212,8 +219,8 @@ class _Columns(nn.Module):
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
-        :param obs: (..., obs_dim)
-        :return: (..., rows, width)
+        :param obs: observations, (..., obs_dim)
+        :return: their columns, (..., rows, width)
         """
         if not self.regular:
             return obs[..., self.table]
@@ -223,18 +230,18 @@ class _Columns(nn.Module):
 
 class PairNet(nn.Module):
     """
-    A function of every pair (agent, neighbour) and of the agent's whole neighbourhood: each view is encoded, the
-    encodings are pooled (mean and maximum, as in Deep Sets, Zaheer et al. 2017), and a second network reads the
-    encoding, the pool and further inputs.
+    Network of every pair (agent, neighbour) that also depends on the agent's whole neighbourhood. A first layer encodes
+    each view. The encodings are pooled (mean and maximum, as in Deep Sets, Zaheer et al. 2017). A second network reads
+    the encoding, the pool and additional inputs.
 
-    Nothing is changed in place that is a view, which a layer with a bias gives of more than two axes: autograd would
-    copy its gradient.
+    In-place operations avoid tensors that are views, because autograd would copy their gradients. Linear layers with a
+    bias return views for inputs with more than two axes.
 
     :param in_features: length of a view
-    :param extras: lengths of the further inputs, see ``extra``
-    :param out_features: outputs for each pair
-    :param net_arch: widths of the hidden layers, the first of them that of the encoding
-    :param activation_fn: between the layers
+    :param extras: lengths of the additional inputs, see ``extra``
+    :param out_features: number of outputs per pair
+    :param net_arch: widths of the hidden layers, the first of which is the width of the encoding
+    :param activation_fn: activation function between the layers
     """
 
     def __init__(
@@ -247,7 +254,9 @@ class PairNet(nn.Module):
     ):
         super().__init__()
         if not net_arch:
-            raise ValueError("net_arch=[]: PairPolicy needs a hidden layer, which encodes what an agent sees.")
+            raise ValueError(
+                "net_arch=[]: PairPolicy needs at least one hidden layer, which encodes the views of neighbours."
+            )
         width, *later = net_arch
         self.activation = nn.ReLU(inplace=True) if activation_fn is nn.ReLU else activation_fn()
         self.goes_below_zero = bool((self.activation(th.linspace(-9.0, 9.0, 181)) < 0).any())
@@ -260,10 +269,12 @@ class PairNet(nn.Module):
 
     def encode(self, views: th.Tensor, present: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param views: (..., n_neighbours, in_features)
-        :param present: (..., n_neighbours, 1), None for all
-        :return: what the second network makes of encoding and pool, before its activation, (..., n_neighbours, width),
-            and the pool, (..., 2 * the encoding's width)
+        Encode views and pool the encodings.
+
+        :param views: views of neighbours, (..., n_neighbours, in_features)
+        :param present: which neighbours are present, (..., n_neighbours, 1), None for all
+        :return: the contribution of encoding and pool to the second network's first layer, before its activation,
+            (..., n_neighbours, width), and the pool, (..., 2 * the encoding's width)
         """
         encoded = self.activation(self.encoder(views.flatten(end_dim=-2))).unflatten(0, views.shape[:-1])
         if present is None:
@@ -271,7 +282,7 @@ class PairNet(nn.Module):
         else:
             encoded = encoded * present
             mean = encoded.sum(dim=-2) / present.sum(dim=-2).clamp(min=1.0)
-        if present is not None and self.goes_below_zero:  # the zeros of absent neighbours could be the largest
+        if present is not None and self.goes_below_zero:  # the zeros of absent neighbours could be the maximum
             largest = encoded.masked_fill(present == 0, -th.inf).amax(dim=-2).masked_fill(~present.any(dim=-2), 0.0)
         else:
             largest = encoded.amax(dim=-2)
@@ -281,16 +292,16 @@ class PairNet(nn.Module):
 
     def extra(self, index: int, x: th.Tensor) -> th.Tensor:
         """
-        :param index: which of the further inputs
-        :param x: (..., its length)
-        :return: what it adds before the second network's first activation, (..., width)
+        :param index: index of the additional input
+        :param x: the input, (..., its length)
+        :return: its contribution to the second network's first layer, before its activation, (..., width)
         """
         return self.of_extras[index](x)
 
     def head(self, hidden: th.Tensor) -> th.Tensor:
         """
-        :param hidden: before the activation, (..., width)
-        :return: (..., out_features)
+        :param hidden: outputs of the second network's first layer, before its activation, (..., width)
+        :return: the outputs, (..., out_features)
         """
         shape = hidden.shape[:-1]
         for layer in self.later:
@@ -303,14 +314,14 @@ _NEVER = -120.0  # a logit whose probability is 0 in single precision
 
 class PairActor(Actor):
     """
-    One actor for all agents that looks at its neighbours one by one; permutation-equivariant, and the same for any
-    number of agents. It acts on each neighbour, or by itself on what it makes of all of them.
+    Relational actor, shared by all agents: it processes neighbours one by one, is permutation-equivariant, and fits any
+    number of agents. It returns an action on each neighbour, or one action that depends on all neighbours.
 
-    :param views: the layout of observations
-    :param actions: how the team acts
-    :param on_neighbours: the action falls into parts, one for each neighbour
+    :param views: splits observations into views of neighbours
+    :param actions: the team's actions
+    :param on_neighbours: whether the action consists of parts, one for each neighbour
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
+    :param activation_fn: activation function between the layers
     """
 
     def __init__(
@@ -349,7 +360,7 @@ class PairActor(Actor):
 
 
 class _SinglePairActor(nn.Module):
-    """The actor of one agent: a team of one."""
+    """The actor of a single agent, as a team of one."""
 
     def __init__(self, actor: PairActor):
         super().__init__()
@@ -361,16 +372,17 @@ class _SinglePairActor(nn.Module):
 
 class PairCritic(Critic):
     """
-    An agent's value as a sum over its pairs, Q_i = sum_j Q_ij. Q_ij reads i's own part, i's view of j, j's own part,
-    the pool of i's neighbourhood, and the two agents' actions towards each other (or their whole actions). With
-    ``pair_credit`` each Q_ij is a value head, fitted to the rewards of the pair, ``info["pair_rewards"]``.
+    Relational critic: an agent's value is the sum over its pairs, Q_i = sum_j Q_ij. Q_ij reads i's own part, i's view
+    of j, j's own part, the pool of i's neighbourhood, and the two agents' actions on each other (or their whole
+    actions). With ``pair_credit`` each Q_ij is a value head, fitted to the rewards of the pair,
+    ``info["pair_rewards"]``.
 
-    :param views: the layout of observations
-    :param factors: how the factors of the joint action act: pairs, or agents where they do not act on neighbours
-    :param on_neighbours: the action falls into parts, one for each neighbour
+    :param views: splits observations into views of neighbours
+    :param factors: the actions of the factors, which are pairs if agents act on neighbours, otherwise agents
+    :param on_neighbours: whether the action consists of parts, one for each neighbour
     :param net_arch: widths of the hidden layers
-    :param activation_fn: between the layers
-    :param pair_credit: pairs have rewards of their own
+    :param activation_fn: activation function between the layers
+    :param pair_credit: whether pairs have their own rewards
     :param n_critics: number of critics
     """
 
@@ -390,20 +402,20 @@ class PairCritic(Critic):
         self.on_neighbours = on_neighbours
         features = 2 * views.own_dim + views.neighbour_dim
         nets = (PairNet(features, [factors.width] * 2, 1, net_arch, activation_fn) for _ in range(n_critics))
-        # Saved models know the networks by this name
+        # Saved models contain this name
         self.modules_of_nets = cast("Sequence[PairNet]", nn.ModuleList(nets))
 
     def _pairs(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param actions: (batch, n_agents, width)
-        :return: i's action towards j and j's towards i, both (batch, n_agents, n_neighbours, the factors' width)
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param actions: encoded actions, (batch, n_agents, width)
+        :return: i's action on j and j's action on i, both (batch, n_agents, n_neighbours, the factors' width)
         """
         if not self.on_neighbours:
             mine = actions.unsqueeze(2).expand(-1, -1, self.views.n_neighbours, -1)
             return mine, self.views.of_neighbours(obs, actions)
         parts = actions.unflatten(-1, (self.views.n_neighbours, -1))
-        # Where j does not see i it does nothing to it
+        # If i is not a neighbour of j, j does not act on i
         return parts, self.views.towards_agent(obs, parts)
 
     def _hidden(self, net: PairNet, obs: th.Tensor, theirs: th.Tensor) -> tuple[th.Tensor, th.Tensor | float]:
@@ -415,8 +427,10 @@ class PairCritic(Critic):
 
     def of_pairs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        :param obs: (batch, n_agents, obs_dim or more)
-        :param actions: (batch, n_agents, width)
+        Compute the values of pairs.
+
+        :param obs: observations, (batch, n_agents, obs_dim or more)
+        :param actions: encoded actions, (batch, n_agents, width)
         :return: Q_ij, (n_critics, batch, n_agents * n_neighbours)
         """
         mine, theirs = self._pairs(obs, actions)
@@ -448,18 +462,20 @@ class PairCritic(Critic):
 
 class PairPolicy(MADDPGPolicy):
     """
-    Policy for teams of homogeneous agents that see each other: one relational actor and one relational critic for all.
-    The same parameters fit a team of any size: ``MADDPG("PairPolicy", larger_env).set_parameters("small_team.zip")``.
+    Policy for teams of homogeneous agents that observe each other, with one relational actor and one relational critic
+    for all agents. The same parameters fit a team of any size:
+    ``MADDPG("PairPolicy", larger_env).set_parameters("small_team.zip")``.
 
     :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
     :param action_space: flat joint action, see ``Team.from_spaces``
     :param lr_schedule: learning rate schedule (could be constant)
-    :param observation_layout: see ``ObservationLayout``; MADDPG takes it from the environment unless given
+    :param observation_layout: see ``ObservationLayout``; by default MADDPG reads it from the environment
     :param pair_credit: fit the critic of each pair to ``info["pair_rewards"]``, (n_agents, n_neighbours), whose sums
         over neighbours are the agents' rewards
-    :param shared_threshold: explore with one threshold for all bits of an agent; otherwise, where agents act on
-        neighbours, with one for each neighbour
-    :param kwargs: see ``MADDPGPolicy``; networks are always shared
+    :param shared_threshold: explore with one threshold for all bits of an agent. By default, agents that act on
+        neighbours explore with one threshold per neighbour.
+
+    The other parameters are those of ``MADDPGPolicy``, except that all agents always share their networks.
     """
 
     env_attributes: ClassVar[tuple[str, ...]] = ("agent_names", "observation_layout")
@@ -484,9 +500,9 @@ class PairPolicy(MADDPGPolicy):
     ):
         if observation_layout is None:
             raise ValueError(
-                "PairPolicy has to know which part of an observation is about whom: give the environment an attribute "
-                "`observation_layout` (see sb3_maddpg.relational.ObservationLayout), or policy_kwargs one; or use "
-                "MlpPolicy."
+                "PairPolicy needs to know which columns of an observation are about which neighbour: add an "
+                "`observation_layout` (see sb3_maddpg.relational.ObservationLayout) to the environment as an attribute "
+                "or to policy_kwargs, or use MlpPolicy."
             )
         own = validated(PairPolicyArguments, pair_credit=pair_credit, shared_threshold=shared_threshold)
         self.observation_layout = observation_layout
@@ -532,12 +548,13 @@ class PairPolicy(MADDPGPolicy):
         self, observation_space: spaces.Space, action_space: spaces.Space, observation_layout: ObservationLayout
     ) -> PairPolicy:
         """
-        The same policy for a team of another size, which can act at once.
+        Return the same policy for a team of another size, which can act without further training.
 
-        :param observation_space: of that team
-        :param action_space: of that team
-        :param observation_layout: of that team
-        :raises ValueError: agents observe something else
+        :param observation_space: observation space of the other team
+        :param action_space: action space of the other team
+        :param observation_layout: observation layout of the other team
+        :return: a policy with the same weights
+        :raises ValueError: if the other team's agents observe something else
         """
         arguments = self._get_constructor_parameters()
         del arguments["agent_names"]
@@ -566,28 +583,31 @@ class PairPolicy(MADDPGPolicy):
 
 @contextmanager
 def remedy_for_other_observations() -> Iterator[None]:
-    """Say what is wrong where PyTorch says that the shapes of parameters differ."""
+    """Add the remedy to PyTorch's error about differing shapes of parameters."""
     try:
         yield
     except RuntimeError as error:
         raise ValueError(
-            "The model was trained with other observations or networks than this team has: make the environment with "
-            f"the arguments in the model's `env_spec`, but for the number of agents. {error}"
+            "The model was trained with other observations or networks than this team has: create the environment "
+            f"with the arguments in the model's `env_spec`, except the number of agents. {error}"
         ) from error
 
 
 def _split(space: AgentActionSpace, n_parts: int) -> list[AgentActionSpace]:
     """
+    Split an action space into equal parts.
+
     :param space: an agent's action space
     :param n_parts: number of equal parts
     :return: the spaces of the parts
+    :raises ValueError: if the space cannot be split
     """
     length = 1 if isinstance(space, spaces.Discrete) else space.shape[0]
     equal = not isinstance(space, spaces.MultiDiscrete) or len(set(space.nvec.tolist())) == 1
     if length % n_parts or not equal:
         raise ValueError(
-            f"observation_layout says that agents act on {n_parts} neighbours, but {space} does not fall into as many "
-            "equal parts."
+            f"observation_layout says that agents act on {n_parts} neighbours, but {space} cannot be split into as "
+            "many equal parts."
         )
     k = length // n_parts
     if isinstance(space, spaces.MultiBinary):

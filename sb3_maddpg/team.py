@@ -1,6 +1,6 @@
 """
-What a team is: how many agents, what each observes, how each acts. Read from an environment's two spaces. And what else
-a team environment may say of itself, see ``TeamEnvironment``, ``TeamAttributes`` and ``TeamInfo``.
+Teams: the number of agents, their observations and their actions, read from the spaces of an environment. The protocols
+``TeamEnvironment``, ``TeamAttributes`` and ``TeamInfo`` describe what a team environment provides.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ ACTION_SPACES = (spaces.MultiBinary, spaces.Box, spaces.Discrete, spaces.MultiDi
 
 class TeamInfo(TypedDict, total=False):
     """
-    What ``info`` of a step of a team environment may hold. Each entry may be left out, and may hold any array-like.
+    The ``info`` dictionary that ``step`` of a team environment returns. All entries are optional; arrays may be any
+    array-like.
     """
 
     agent_rewards: np.ndarray
-    """(n_agents,), each agent's reward. If left out: the team's reward for each"""
+    """Each agent's reward, (n_agents,). By default, every agent gets the team's reward."""
     agent_terminated: np.ndarray
-    """(n_agents,) bool, whether the agent terminated in this step, not counting truncation. If left out: none did
-    before the team"""
+    """Whether each agent terminated in this step, (n_agents,) bool. Truncation does not count. By default, no agent
+    terminates before the team."""
     agent_active: np.ndarray
-    """(n_agents,) bool, whether the agent acted in this step. If left out: all did"""
+    """Whether each agent acted in this step, (n_agents,) bool. By default, all agents acted."""
     pair_rewards: np.ndarray
-    """(n_agents, n_neighbours), the part of an agent's reward that belongs to each of its neighbours. If left out:
-    ``pair_credit`` is refused"""
+    """The part of each agent's reward that belongs to each of its neighbours, (n_agents, n_neighbours). Required for
+    ``pair_credit``."""
     pair_terminated: np.ndarray
-    """(n_agents, n_neighbours) bool, whether what follows in this place is about another neighbour, or none. If left
-    out: ``pair_credit`` is refused where neighbours change"""
+    """Whether another neighbour, or none, takes the place of each neighbour after this step, (n_agents, n_neighbours)
+    bool. Required for ``pair_credit`` if neighbours change."""
     is_success: bool
-    """In the last step of an episode, for ``rollout/success_rate`` and ``CurriculumCallback``"""
+    """Whether the episode succeeded, in its last step. Used by ``rollout/success_rate`` and ``CurriculumCallback``."""
     metrics: dict[str, float]
-    """Numbers, averaged and logged under their names"""
+    """Numbers whose means are logged under their keys."""
 
 
 InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards", "pair_terminated"]
@@ -47,53 +48,59 @@ InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rew
 
 class TeamEnvironment(Protocol):
     """
-    What MADDPG needs of an environment: Gymnasium's interface with these spaces. ``check_team_env`` tells whether an
-    environment keeps to it. Nothing has to be imported from here: the names are all that counts.
+    The interface of a team environment: Gymnasium's interface with the following spaces. ``check_team_env`` checks
+    whether an environment follows it. Environments need not inherit from this protocol.
     """
 
     observation_space: spaces.Box
-    """(n_agents, obs_dim), a row per agent; ``TeamObservation`` where rows are padded or carry a global state"""
+    """Observations, (n_agents, obs_dim), one row per agent. ``TeamObservation`` if rows are padded or hold a global
+    state."""
     action_space: spaces.MultiBinary | spaces.MultiDiscrete | spaces.Box
-    """Flat joint action, agent after agent, of length n_agents * k; ``MixedActions`` where agents act differently"""
+    """Flat joint action of length n_agents * k, agent after agent. ``MixedActions`` if the agents' action spaces
+    differ."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """:return: observation, (n_agents, obs_dim), and info"""
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
-        :param action: joint action, flat
-        :return: observation, the team's reward, terminated, truncated, and info, see ``TeamInfo``
+        :param action: flat joint action
+        :return: observation, team reward, terminated, truncated, and info, see ``TeamInfo``
         """
 
 
 class TeamAttributes(Protocol):
-    """What a team environment may have besides. Each attribute may be left out."""
+    """Optional attributes of a team environment."""
 
     agent_names: Sequence[str]
-    """Names of the agents, for ``agent_policy``, parameter sharing and messages. If left out: agent_0, agent_1, ..."""
+    """Names of the agents, for ``agent_policy``, parameter sharing and messages. By default agent_0, agent_1, ..."""
     observation_layout: Mapping[str, Any]
-    """Which columns are about which neighbour, ``sb3_maddpg.relational.ObservationLayout``. If left out:
-    ``PairPolicy`` is refused"""
+    """Meaning of the columns of an observation, see ``sb3_maddpg.relational.ObservationLayout``. Required for
+    ``PairPolicy``."""
     action_cost: float | np.ndarray
-    """Cost of an action that the reward holds as a plain sum, a number or (n_agents, width). If left out:
-    ``use_action_cost`` is refused"""
+    """Price of one unit of the encoded action, a number or (n_agents, width). The reward must contain the cost as a
+    plain sum over the encoded action. Required for ``use_action_cost``."""
     n_curriculum_levels: int
-    """Number of levels, for ``CurriculumCallback``, which is refused if this or the next is left out"""
+    """Number of curriculum levels. Required for ``CurriculumCallback``, as is ``set_curriculum_level``."""
 
     def set_curriculum_level(self, level: int) -> None:
-        """:param level: from 0 to ``n_curriculum_levels - 1``, for the next episodes"""
+        """
+        Set the curriculum level of the next episodes.
+
+        :param level: the level, from 0 to ``n_curriculum_levels - 1``
+        """
 
 
 class TeamObservation(spaces.Box):
     """
-    ``Box(n_agents, columns)`` that remembers whose rows it has. Each row is an agent's flat observation, padded with
-    zeros to the longest, then the agent's share of the global state, which is laid out row after row in as many
-    further columns as it needs.
+    ``Box(n_agents, columns)`` with the names and observation spaces of the agents. Each row holds an agent's flat
+    observation, padded with zeros to the longest. Additional columns hold the global state, if there is one, which
+    continues from row to row.
 
     :param agents: name and flat observation space of each agent
-    :param state: flat space of the global state, if critics are to read it
-    :param masks: for agents whose observation holds an action mask the columns of it: one for each category, sub-action
-        after sub-action, or for each bit; positive where the agent may choose it
+    :param state: flat space of the global state, if critics should read it
+    :param masks: by agent, the columns of its observation that hold its action mask: one column per category,
+        sub-action after sub-action, or one per bit, positive if the choice is legal
     """
 
     def __init__(
@@ -110,7 +117,7 @@ class TeamObservation(spaces.Box):
         columns = -(-self.state_dim // n_agents)
         bounds = np.zeros((2, n_agents, self.obs_dim + columns), np.float32)
         for row, (space, length) in enumerate(zip(agents.values(), self.obs_dims, strict=True)):
-            # A dead agent's row is zero, which the bounds have to admit
+            # The row of a dead agent is zero, so the bounds must contain zero
             low, high = _bounds(space)
             bounds[0, row, :length], bounds[1, row, :length] = np.minimum(low, 0), np.maximum(high, 0)
         if state is not None:
@@ -135,8 +142,8 @@ class TeamObservation(spaces.Box):
 
 class MixedActions(spaces.Box):
     """
-    The joint action of a team with heterogeneous action spaces, as one flat ``Box``: agent after agent, continuous
-    actions as they are, binary ones as 0 or 1, categorical ones as their index from 0.
+    Joint action space of a team with heterogeneous action spaces, as one flat ``Box``: agent after agent, with
+    continuous actions unchanged, binary actions as 0 or 1, and categorical actions as indices from 0.
 
     :param agent_spaces: each agent's action space
     """
@@ -152,7 +159,7 @@ class MixedActions(spaces.Box):
         return super().seed(seed)
 
     def sample(self, mask: None = None, probability: None = None) -> np.ndarray:
-        """Uniform in each agent's own space."""
+        """Sample uniformly from each agent's own action space."""
         return np.concatenate([np.ravel(_from_zero(space, space.sample())) for space in self.agent_spaces]).astype(
             np.float32
         )
@@ -166,10 +173,10 @@ class MixedActions(spaces.Box):
 
 class CategoricalActions(spaces.MultiDiscrete):
     """
-    The joint action of a team whose agents all have categorical actions: a ``MultiDiscrete`` of their indices from 0
-    that remembers the agents' own spaces.
+    Joint action space of a team whose agents all have categorical actions: a ``MultiDiscrete`` of indices from 0 that
+    also holds the agents' own spaces.
 
-    :param agent_spaces: each agent's action space, all of one length
+    :param agent_spaces: each agent's action space, all of the same length
     """
 
     def __init__(self, agent_spaces: Sequence[spaces.Discrete | spaces.MultiDiscrete]):
@@ -186,7 +193,7 @@ def _from_zero(space: AgentActionSpace, action: Any) -> Any:
 
 
 def _bounds(space: AgentActionSpace) -> tuple[np.ndarray, np.ndarray]:
-    """Flat bounds in the networks' precision, in which a huge bound of double precision is infinite."""
+    """:return: flat bounds in the networks' single precision, in which large double-precision bounds are infinite"""
     if isinstance(space, spaces.Box):
         with np.errstate(over="ignore"):
             return space.low.ravel().astype(np.float32), space.high.ravel().astype(np.float32)
@@ -197,7 +204,7 @@ def _bounds(space: AgentActionSpace) -> tuple[np.ndarray, np.ndarray]:
 def heads_of(space: AgentActionSpace) -> tuple[int, ...]:
     """
     :param space: an agent's action space
-    :return: number of values of each of its sub-actions, 0 for a continuous one
+    :return: number of values of each sub-action, 0 for a continuous one
     """
     if isinstance(space, spaces.Box):
         return (0,) * int(np.prod(space.shape))
@@ -210,10 +217,11 @@ def heads_of(space: AgentActionSpace) -> tuple[int, ...]:
 
 def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
     """
-    The joint action space of a team, flat, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` where all
-    agents have such a space of one length, else ``MixedActions``. Categories count from 0.
+    Return the joint action space of a team, flat, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` if
+    all agents have such a space of the same length, else ``MixedActions``. Categories count from 0.
 
     :param agent_spaces: each agent's action space
+    :return: the joint action space
     """
     kinds = {type(space) for space in agent_spaces}
     sizes = [heads_of(space) for space in agent_spaces]
@@ -232,15 +240,14 @@ def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space
 @dataclass(frozen=True)
 class Team:
     """
-    A team as its networks see it.
+    Description of a team for its networks.
 
-    :param names: of the agents, each once
+    :param names: unique names of the agents
     :param obs_dims: length of each agent's observation without padding
-    :param obs_dim: the longest of them
-    :param state_dim: length of the global state, 0 without
+    :param obs_dim: length of the longest observation
+    :param state_dim: length of the global state, 0 without one
     :param action_spaces: each agent's action space, categories counting from 0
-    :param masks: columns of each agent's action mask, none for an agent without, see ``TeamObservation``; empty where
-        no agent has one
+    :param masks: columns of each agent's action mask, see ``TeamObservation``; empty if no agent has one
     """
 
     names: tuple[str, ...]
@@ -257,9 +264,9 @@ class Team:
 
     def index(self, agent: str | int) -> int:
         """
-        :param agent: name or number of an agent
-        :return: its number
-        :raises ValueError: no such agent
+        :param agent: name or index of an agent
+        :return: the agent's index
+        :raises ValueError: if there is no such agent
         """
         if isinstance(agent, str) and agent in self.names:
             return self.names.index(agent)
@@ -271,9 +278,9 @@ class Team:
 
     def homogeneous(self, agent: int, other: int) -> bool:
         """
-        :param agent: number of an agent
-        :param other: number of another
-        :return: whether they observe and act in the same spaces, so that they could share a network
+        :param agent: index of an agent
+        :param other: index of another agent
+        :return: whether the agents have the same observation and action spaces, so that they could share a network
         """
         same_obs = self.obs_dims[agent] == self.obs_dims[other]
         same_masks = not self.masks or self.masks[agent] == self.masks[other]
@@ -284,13 +291,14 @@ class Team:
         cls, observation_space: spaces.Space, action_space: spaces.Space, names: Sequence[str] | None = None
     ) -> Team:
         """
-        Read the team out of its spaces and refuse spaces that do not describe one.
+        Create the description of a team from its spaces.
 
         :param observation_space: ``Box(n_agents, obs_dim)`` or ``TeamObservation``
         :param action_space: flat joint action, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` of
             length ``n_agents * k``, or ``MixedActions``
-        :param names: of the agents; those of the observation space, or agent_0, agent_1, ..., unless given
-        :raises ValueError: other spaces, or names that do not fit
+        :param names: names of the agents, by default those of the observation space, or agent_0, agent_1, ...
+        :return: the team
+        :raises ValueError: if the spaces do not describe a team, or the names do not fit
         """
         if isinstance(observation_space, spaces.Dict):
             raise ValueError(
@@ -304,8 +312,8 @@ class Team:
             )
         if not all(observation_space.shape):
             raise ValueError(
-                f"The observation space {observation_space} is empty: a team needs at least one agent, and an agent at "
-                "least one column."
+                f"The observation space {observation_space} is empty: a team needs at least one agent, and an agent "
+                "needs at least one column."
             )
         n_agents, obs_dim = observation_space.shape
         if isinstance(observation_space, TeamObservation):
@@ -331,9 +339,11 @@ class Team:
 
 def check_action_space(agent: Any, space: spaces.Space) -> None:
     """
-    :param agent: its name, for the message
-    :param space: its action space
-    :raises ValueError: an action space that actors cannot have
+    Check that actors support an action space.
+
+    :param agent: name of the agent, for error messages
+    :param space: the agent's action space
+    :raises ValueError: if the action space is not supported
     """
     if not isinstance(space, ACTION_SPACES) or not heads_of(space):
         raise ValueError(
@@ -346,23 +356,25 @@ def check_action_space(agent: Any, space: spaces.Space) -> None:
             span = high - low
         if not (np.isfinite(span) & (span >= 0)).all():
             raise ValueError(
-                f"Agent {agent!r} has the action space {space} without bounds, which say how far actions reach, or "
-                "with bounds too large for single precision. Give it smaller, finite ones."
+                f"Agent {agent!r} has the action space {space}, whose bounds are infinite or too large for single "
+                "precision. Actions are scaled to the bounds: choose smaller, finite ones."
             )
 
 
 def check_mask(agent: Any, space: spaces.Space, length: int) -> None:
     """
-    :param agent: its name, for the message
-    :param space: its action space
-    :param length: of its action mask
-    :raises ValueError: a mask that does not fit
+    Check that an action mask fits an action space.
+
+    :param agent: name of the agent, for error messages
+    :param space: the agent's action space
+    :param length: length of its action mask
+    :raises ValueError: if the mask does not fit
     """
     heads = heads_of(space)  # type: ignore[arg-type]
     expected = len(heads) if isinstance(space, spaces.MultiBinary) else sum(heads)  # 0 for continuous actions
     if length != expected:
-        rule = "one number for each category, or for each bit" if expected else "none: it has continuous actions"
-        raise ValueError(f"Agent {agent!r} has an action mask of {length} numbers; its space {space} takes {rule}.")
+        rule = f"needs {expected}, one per category or bit" if expected else "is continuous and takes no mask"
+        raise ValueError(f"Agent {agent!r} has an action mask of {length} numbers, but its space {space} {rule}.")
 
 
 def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace, ...]:
@@ -373,19 +385,20 @@ def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActi
         return parts
     if not isinstance(action_space, ACTION_SPACES) or action_space.shape is None or len(action_space.shape) != 1:
         raise ValueError(
-            f"A team action is flat, a MultiBinary, Box or MultiDiscrete of length n_agents * action_dim, not "
-            f"{action_space}. Flatten it in the environment and reshape it there to (n_agents, action_dim)."
+            f"A team action is a flat MultiBinary, Box or MultiDiscrete of length n_agents * action_dim, not "
+            f"{action_space}. Flatten the space in the environment and reshape actions to (n_agents, action_dim) in "
+            "step()."
         )
     (length,) = action_space.shape
     if isinstance(action_space, spaces.MultiDiscrete) and action_space.start.any():
         raise ValueError(
-            f"The categories of a team action count from 0, but those of {action_space} from "
-            f"start={action_space.start.tolist()}. Leave `start` out and add it in step(), or make a TeamEnv of a "
-            "PettingZoo environment, which does so."
+            f"The categories of a team action count from 0, but those of {action_space} count from "
+            f"start={action_space.start.tolist()}. Leave `start` out and add it in step(), or wrap a PettingZoo "
+            "environment in a TeamEnv, which does so."
         )
     if length % n_agents:
         raise ValueError(
-            f"A joint action of {length} numbers cannot be shared out evenly among {n_agents} agents. "
+            f"A joint action of {length} numbers cannot be divided evenly among {n_agents} agents. "
             "Give every agent the same number of actions, or describe the team with sb3_maddpg.team.MixedActions."
         )
     k = length // n_agents

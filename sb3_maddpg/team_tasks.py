@@ -1,7 +1,7 @@
 """
-Small team tasks with known optimum, to check that a learner learns. Import this module to register them.
+Small team tasks with a known optimum, to check that a learner learns. Import this module to register them.
 
-Every step the observations are drawn anew, so that the best joint policy maximises each step's reward by itself and the
+Observations are drawn independently at every step, so the best joint policy maximises each step's reward and the
 optimum has a closed form. Episodes are truncated after ten steps.
 """
 
@@ -16,11 +16,11 @@ from sb3_maddpg.utils import as_seed, shown
 
 class TeamTask(gym.Env):
     """
-    A repeated game with fresh observations. Sub-classes give ``payoff`` and the constants.
+    Base class of repeated games with fresh observations. Subclasses define ``payoff`` and the constants.
 
-    :param episode_length: steps until the episode is truncated
+    :param episode_length: number of steps until the episode is truncated
     :param render_mode: None or "rgb_array"
-    :raises ValueError: an episode without a step
+    :raises ValueError: if the episode length is not at least 1
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012 - Gymnasium's own convention
@@ -44,17 +44,21 @@ class TeamTask(gym.Env):
 
     def draw(self, rng: np.random.Generator, batch: int) -> np.ndarray:
         """
-        :param rng: source of randomness
-        :param batch: how many
-        :return: observations, independent signs, (batch, n_agents, obs_dim)
+        Draw observations, which are independent signs.
+
+        :param rng: random number generator
+        :param batch: number of observations
+        :return: observations, (batch, n_agents, obs_dim)
         """
         return rng.choice(np.array([-1.0, 1.0], np.float32), size=(batch, self.n_agents, self.obs_dim))
 
     def payoff(self, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """
-        :param obs: (batch, n_agents, obs_dim)
-        :param actions: (batch, n_agents, action_dim)
-        :return: each agent's reward, (batch, n_agents); the team's is the mean
+        Compute rewards. The team's reward is the mean over agents.
+
+        :param obs: observations, (batch, n_agents, obs_dim)
+        :param actions: actions, (batch, n_agents, action_dim)
+        :return: each agent's reward, (batch, n_agents)
         """
         raise NotImplementedError
 
@@ -76,7 +80,7 @@ class TeamTask(gym.Env):
         return self._obs[0], float(rewards.mean()), False, self._steps >= self.episode_length, info
 
     def render(self) -> np.ndarray | None:
-        """A row per agent: its observation in grey, then the binary actions it just set in white."""
+        """Draw a row per agent: its observation in grey, then its last actions in white."""
         if self.render_mode is None or self._obs is None:
             return None
         cells = np.hstack([96 + 64 * self._obs[0], 255.0 * np.clip(self._actions, 0, 1)])
@@ -84,10 +88,13 @@ class TeamTask(gym.Env):
 
     def play(self, model: Any, n_steps: int = 10_000, seed: int = 0) -> float:
         """
-        :param model: anything with SB3's ``predict``
-        :param n_steps: over how many draws of the observations
-        :param seed: of the draws
-        :return: mean team reward per step of the deterministic policy, 0 for random actions, 1 for the optimum
+        Evaluate a model.
+
+        :param model: any object with SB3's ``predict``
+        :param n_steps: number of steps
+        :param seed: seed of the observations
+        :return: mean team reward per step of the deterministic policy, scaled to 0 for random actions and 1 for the
+            optimum
         """
         obs = self.draw(np.random.default_rng(seed), n_steps)
         actions, _ = model.predict(obs, deterministic=True)
@@ -96,7 +103,7 @@ class TeamTask(gym.Env):
 
 
 class OwnBit(TeamTask):
-    """The best binary actions are the signs of the own observation. Each right one pays 1 to its agent."""
+    """Each bit that matches a sign of the agent's own observation pays the agent 1."""
 
     n_agents, action_dim, obs_dim = 3, 3, 3
     optimum, random = 3.0, 1.5
@@ -107,10 +114,10 @@ class OwnBit(TeamTask):
 
 class OtherBit(TeamTask):
     """
-    A bit pays only together with the other agent's: two bits set pay the sum s_0 + s_1 of the two agents' signs, less
-    a half, to both. An agent knows its own sign only; what its bit is worth hangs on the other's sign and bit, which
-    the critic sees and the actor does not. The best policy sets a bit where the own sign is positive: then 3/2 is paid
-    in one case of four.
+    A bit pays only if both agents set it: both then get the sum s_0 + s_1 of their signs, minus a half. An agent
+    observes only its own sign. The value of its bit depends on the other agent's sign and bit, which the critic sees
+    and the actor does not. The best policy sets a bit if the agent's own sign is positive, which pays 3/2 in one of
+    four cases.
     """
 
     n_agents, action_dim, obs_dim = 2, 2, 2
@@ -123,8 +130,8 @@ class OtherBit(TeamTask):
 
 class PricedBit(TeamTask):
     """
-    Every bit costs 0.4 and pays 1 where both signs of its pair in the own observation are positive, in one case of
-    four: asking always loses, asking never gains nothing.
+    Every bit costs 0.4 and pays 1 if both signs of its pair in the agent's own observation are positive, which is one
+    of four cases. Setting all bits loses, and setting none gains nothing.
     """
 
     n_agents, action_dim, obs_dim = 3, 3, 6
@@ -138,8 +145,8 @@ class PricedBit(TeamTask):
 
 class OneOfBits(TeamTask):
     """
-    One of an agent's three bits must be set, and just one: the one its observation points to by the signs of its two
-    numbers (none points to "no bit"). The set as a whole pays 1, anything else nothing: no bit has a worth by itself.
+    Exactly one of an agent's three bits must be set, the one that the two signs of its observation select; no bit if
+    both are negative. The right combination pays 1 and any other nothing, so no bit has a value of its own.
     """
 
     n_agents, action_dim, obs_dim = 2, 3, 2
@@ -153,8 +160,8 @@ class OneOfBits(TeamTask):
 
 class AllBits(TeamTask):
     """
-    An agent whose first sign is positive gains 1 by setting all of its three bits; each bit costs 0.25, whatever comes
-    of it. Every bit is a loss without the other two.
+    An agent whose first sign is positive gains 1 by setting all three of its bits. Each bit costs 0.25 in any case, so
+    it is a loss without the other two.
     """
 
     n_agents, action_dim, obs_dim = 2, 3, 2
@@ -167,8 +174,8 @@ class AllBits(TeamTask):
 
 class FollowTarget(TeamTask):
     """
-    A continuous action in [-2, 1] is to be brought to a point that the own observation gives. The squared distance is
-    the price.
+    A continuous action in [-2, 1] must hit a target that the agent's own observation determines. The reward is the
+    negative squared distance.
     """
 
     n_agents, action_dim, obs_dim = 2, 1, 2
@@ -184,7 +191,7 @@ class FollowTarget(TeamTask):
 
 
 class OwnCategory(TeamTask):
-    """One of four categories is to be chosen, the one that the two signs of the own observation point to. It pays 1."""
+    """The one of four categories that the two signs of the agent's own observation select pays 1."""
 
     n_agents, action_dim, obs_dim = 3, 1, 2
     optimum, random = 1.0, 1 / 4

@@ -1,4 +1,4 @@
-"""Values of models as JSON that says their types: to read it runs no code, and imports nothing that a file names."""
+"""Typed JSON for the values of models. Reading it runs no code and imports nothing that a file names."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from sb3_maddpg.utils import shown, suggest
 Json = Any
 _TYPE = "$"
 _DEEPEST = 50
-_SMALL = 64  # numbers that stay in the JSON where larger arrays may stand outside
-_LARGEST_ARRAY = 10**7  # numbers, of a space's bounds for example
+_SMALL = 64  # arrays with more numbers may be stored outside the JSON
+_LARGEST_ARRAY = 10**7  # maximum number of values in an array, e.g. the bounds of a space
 
 _Class = TypeVar("_Class", bound=type)
 _allowed: dict[str, type] = {}
@@ -44,17 +44,18 @@ _PLAIN_OBJECTS = (
 
 def allow_in_files(cls: _Class) -> _Class:
     """
-    Let model files name a class of yours: a policy, a replay buffer, a feature extractor, a schedule. Whoever loads
-    the file has to have done so too. Packages name modules that do it by an entry point of the group
-    ``sb3_maddpg.allowed_in_files``. Also a decorator.
+    Allow model files to name a custom class, such as a policy, a replay buffer, a features extractor or a schedule. The
+    class must be registered both when saving and when loading. Packages can name modules that register classes in an
+    entry point of the group ``sb3_maddpg.allowed_in_files``. Also usable as a decorator.
 
-    :param cls: the class; of instances, such as schedules, the attributes are written
-    :raises ValueError: no class, or one that its module does not know by its name
+    :param cls: the class; instances, such as schedules, are saved as their attributes
+    :return: the class
+    :raises ValueError: if ``cls`` is not a class, or cannot be imported from its module by its name
     """
     if not isinstance(cls, type) or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
         raise ValueError(
-            f"{shown(cls)} cannot be named in files: give a class that stands at the top of a module which both who "
-            "saves and who loads can import."
+            f"{shown(cls)} cannot be named in files: pass a class that is defined at the top level of an importable "
+            "module."
         )
     _allowed[_name(cls)] = cls
     return cls
@@ -62,22 +63,26 @@ def allow_in_files(cls: _Class) -> _Class:
 
 def encode(value: Any, name: str, arrays: dict[str, np.ndarray] | None = None) -> Json:
     """
-    :param value: of a model
-    :param name: what it is, for a message
-    :param arrays: takes in larger arrays, which the JSON then only names; otherwise it holds them
-    :return: the same in JSON's types
-    :raises ValueError: no such thing can be written
+    Convert a value to typed JSON.
+
+    :param value: value of a model
+    :param name: name of the value, for error messages
+    :param arrays: receives larger arrays, which the JSON then only refers to; by default the JSON holds them
+    :return: the value as JSON
+    :raises ValueError: if the value cannot be written
     """
     return _encode(value, name, 0, arrays)
 
 
 def decode(value: Json, name: str, arrays: Mapping[str, np.ndarray] | None = None) -> Any:
     """
-    :param value: what ``encode`` made, or anything
-    :param name: what it is, for a message
-    :param arrays: those that ``encode`` took out
+    Convert typed JSON back to a value.
+
+    :param value: JSON from ``encode``, or from an untrusted file
+    :param name: name of the value, for error messages
+    :param arrays: arrays that ``encode`` stored outside the JSON
     :return: the value
-    :raises ValueError: it names an unknown type or class, or holds what that type cannot be made of
+    :raises ValueError: if the JSON names an unknown type or class, or does not fit its type
     """
     try:
         return _decode(value, 0, arrays or {})
@@ -101,7 +106,7 @@ def _name(cls: type) -> str:
 
 @cache
 def _built_in() -> dict[str, type]:
-    """The classes that files may name beside those of users: what models are made of."""
+    """:return: the classes that files may always name, which are the parts of models"""
     from sb3_maddpg import buffers as own_buffers
     from sb3_maddpg import cnn_policy, iddpg, policies, relational
 
@@ -144,14 +149,14 @@ def _class_of(name: Any) -> type:
     known = _built_in() | _allowed
     if not isinstance(name, str) or name not in known:
         raise ValueError(
-            f"{suggest('class', name, known) if isinstance(name, str) else f'{shown(name)} is no class.'} A class of "
-            "your own needs `sb3_maddpg.allow_in_files` before the file is read."
+            f"{suggest('class', name, known) if isinstance(name, str) else f'{shown(name)} is not a class.'} Register "
+            "custom classes with `sb3_maddpg.allow_in_files` before loading the file."
         )
     return known[name]
 
 
 class _Codec(NamedTuple):
-    """How values of a type are written and read. Both take a function for the parts."""
+    """Functions that write and read values of a type. Both take a function for the value's parts."""
 
     type: type
     write: Callable[[Any, Callable[[Any], Json]], dict[str, Json]]
@@ -160,7 +165,7 @@ class _Codec(NamedTuple):
 
 def _write_array(array: np.ndarray, part: Callable[[Any], Json]) -> dict[str, Json]:
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"has an array of {array.dtype}, which is no number")
+        raise ValueError(f"has an array of {array.dtype}, which is not a numeric type")
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     header = {"dtype": array.dtype.str.lstrip("<>=|"), "shape": list(array.shape)}
     first = little.ravel()[:1]
@@ -175,7 +180,9 @@ def _read_array(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> np.nd
     if dtype.kind not in "biuf":
         raise ValueError(f"it has an array of {shown(entry['dtype'])}")
     if not all(isinstance(length, int) and length >= 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
-        raise ValueError(f"it has an array of shape {shown(shape)}, more than {_LARGEST_ARRAY} numbers or none at all")
+        raise ValueError(
+            f"it has an array of shape {shown(shape)}, which is invalid or has more than {_LARGEST_ARRAY} numbers"
+        )
     values = np.frombuffer(base64.b64decode(entry["base64"], validate=True), dtype)
     if entry.get("repeated", False):
         (value,) = values
@@ -208,7 +215,7 @@ def _read_team(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamOb
     low, high = (bound[:, own:].ravel()[:length] for bound in (box.low, box.high))
     masks = dict(zip(entry["names"], entry.get("masks", []), strict=False))
     if any(not 0 <= column < own for mask in masks.values() for column in mask):
-        raise ValueError(f"it has action masks in columns that its observation of length {own} lacks")
+        raise ValueError(f"it has action masks outside its observation of length {own}")
     space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None, masks)
     if space.shape != box.shape:
         raise ValueError(f"it has a team's observation of shape {box.shape} instead of {space.shape}")
@@ -232,7 +239,7 @@ def _agent_spaces(space: MixedActions | CategoricalActions, part: Callable[[Any]
     return {"agents": [part(one) for one in space.agent_spaces]}
 
 
-# A type stands before those that it inherits from
+# Subclasses come before their base classes
 _CODECS: dict[str, _Codec] = {
     "tuple": _Codec(tuple, lambda v, part: {"items": [*map(part, v)]}, lambda e, part: tuple(map(part, e["items"]))),
     "deque": _Codec(
@@ -294,12 +301,12 @@ def _sizes(n: Any) -> Any:
 def _torch_dtype(name: str) -> th.dtype:
     dtype = getattr(th, name.removeprefix("torch."), None)
     if not isinstance(dtype, th.dtype):
-        raise ValueError(f"{shown(name)} is no type of PyTorch")
+        raise ValueError(f"{shown(name)} is not a PyTorch dtype")
     return dtype
 
 
 def _encode_special(value: Any, arrays: dict[str, np.ndarray] | None) -> Json:
-    """What is written without its parts: arrays that stand outside, classes, and a tuple with a meaning."""
+    """:return: the JSON of arrays stored outside, of classes and of ``TrainFreq``, None for other values"""
     if arrays is not None and isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.size > _SMALL:
         arrays[key := str(len(arrays))] = value
         return {_TYPE: "outside", "key": key}
@@ -328,7 +335,7 @@ def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | N
         return {key: part(one) for key, one in value.items()}
     if (special := _encode_special(value, arrays)) is not None:
         return special
-    if _name(type(value)) == "rl_zoo3.utils.SimpleLinearSchedule":  # in older files; to read it would take rl_zoo3
+    if _name(type(value)) == "rl_zoo3.utils.SimpleLinearSchedule":  # in older files; reading it would need rl_zoo3
         value = utils.LinearSchedule(value.initial_value, 0.0, 1.0)
     for kind, codec in _CODECS.items():
         if isinstance(value, codec.type):
@@ -337,8 +344,8 @@ def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | N
         return {_TYPE: "object"} | _attributes_of(value, part)
     raise ValueError(
         f"{name}={shown(value)} cannot be saved: a {type(value).__name__} is neither a number, an array, a space nor "
-        "of a class that files may name. Name the class with `sb3_maddpg.allow_in_files`, leave it out with "
-        f"`save(path, exclude=[{name!r}])`, or write what runs code when it is loaded: `save(path, pickle=True)`."
+        "an instance of a class that files may name. Register its class with `sb3_maddpg.allow_in_files`, leave it out "
+        f"with `save(path, exclude=[{name!r}])`, or pickle it with `save(path, pickle=True)`."
     )
 
 

@@ -18,47 +18,50 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
-# Arguments that gymnasium.make and make_vec take and keep among those of the environment
+# Arguments of gymnasium.make and make_vec that end up among the environment's own
 NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"}
-# A temporary file that nobody has written to for so long is left over
+# A temporary file that has not been written to for this long is left over
 LEFT_OVER_SECONDS = 3600
 
 
 def shown(value: Any, most: int = 200) -> str:
     """
-    :param value: any, as it was given
-    :param most: number of characters
-    :return: the value as Python writes it, for a message: in one line, and shortened where it is long
+    Format a value for a message.
+
+    :param value: any value
+    :param most: maximum number of characters
+    :return: the value's ``repr`` on one line, shortened if it is long
     """
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # of an object of somebody else's, or of an integer of too many digits for Python
+    except Exception:  # from a foreign class, or an integer with too many digits for Python
         text = f"<{type(value).__name__}>"
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 3) :]}"
 
 
 def suggest(kind: str, name: Any, known: Iterable[str]) -> str:
     """
-    Message for a name that is not known, with the nearest one that is.
+    Compose a message about an unknown name that suggests the closest known one.
 
-    :param kind: what is named, e.g. "estimator"
-    :param name: the name that was given
-    :param known: the names that exist
+    :param kind: kind of the name, e.g. "estimator"
+    :param name: the unknown name
+    :param known: the known names
+    :return: the message
     """
     known, name = sorted(known), name if isinstance(name, str) else shown(name)
     nearest = difflib.get_close_matches(name, known, n=1)
     if nearest:
         return f"Unknown {kind} '{name[:100]}': did you mean '{nearest[0]}'?"
-    return f"Unknown {kind} '{name[:100]}'. There are: {', '.join(known)}."
+    return f"Unknown {kind} '{name[:100]}'. Choose one of: {', '.join(known)}."
 
 
 def describe_env(env: VecEnv) -> dict[str, Any] | None:
     """
-    What is needed to build a training environment again.
+    Describe a training environment so that it can be created again.
 
-    :param env: vectorised environment; its first one is described
-    :return: ``{"id": ..., "kwargs": ...}``, or None where it was not made by ``gymnasium.make`` or its arguments
-        cannot be written as JSON. What is no part of the task is left out: the render mode, the number of copies.
+    :param env: vectorised environment, whose first environment is described
+    :return: ``{"id": ..., "kwargs": ...}`` without arguments that do not define the task, such as the render mode. None
+        if the environment was not created by ``gymnasium.make`` or its arguments cannot be written as JSON.
     """
     try:
         spec = env.get_attr("spec", indices=0)[0]
@@ -76,17 +79,18 @@ def describe_env(env: VecEnv) -> dict[str, Any] | None:
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO]:
     """
-    Write a file that appears whole or not at all: what stood there before stays until the last byte is on disk.
+    Write a file atomically: an existing file stays until the last byte of the new one is on disk.
 
-    :param path: where to write; missing folders are made
-    :param suffix: added to a path without suffix, as Stable-Baselines3 does
-    :raises OSError: the path is a folder or cannot be written, said before anything is done
+    :param path: path of the file; missing folders are created
+    :param suffix: suffix added to a path without one, as Stable-Baselines3 does
+    :return: the file to write to
+    :raises OSError: if the path is a folder or cannot be written; raised before anything is written
     """
     target = Path(path)
     if not target.suffix:
         target = Path(f"{target}.{suffix}")
     if target.is_dir() or Path(path).name in ("", ".."):
-        raise IsADirectoryError(errno.EISDIR, "This is a folder: name a file in it", str(target))
+        raise IsADirectoryError(errno.EISDIR, "This is a folder: pass the path of a file", str(target))
     # In the same folder, because a file cannot be renamed across file systems
     temporary = target.with_name(f".{target.name}.{os.getpid()}")
     try:
@@ -108,11 +112,11 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
 
 
 def _remove_left_over(target: Path) -> None:
-    """Remove temporary files of processes that were killed while they wrote this file."""
+    """Remove temporary files of processes that were killed while writing this file."""
     prefix = f".{target.name}."
     for path in target.parent.glob(f"{glob.escape(prefix)}*"):
         process = path.name.removeprefix(prefix)
-        # The process may run on another machine, but not for so long without writing
+        # The process may run on another machine, but would not pause for that long
         if not process.isdecimal() or time.time() - path.stat().st_mtime <= LEFT_OVER_SECONDS:
             continue
         if not process_runs(int(process)):
@@ -121,16 +125,16 @@ def _remove_left_over(target: Path) -> None:
 
 def process_runs(process: int) -> bool:
     """
-    :param process: id of a process of this machine
-    :return: whether it runs
+    :param process: id of a process on this machine
+    :return: whether the process is running
     """
-    if os.name == "nt":  # to ask for a process there would end it
+    if os.name == "nt":  # os.kill would terminate the process there
         return process == os.getpid()
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OverflowError:  # no process has such a number
+    except OverflowError:  # too large for a process id
         return False
     except PermissionError:
         return True
@@ -138,7 +142,7 @@ def process_runs(process: int) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Without it the new name of a file may be gone after a loss of power."""
+    """Flush a folder to disk, so that the new name of a file survives a power loss."""
     if os.name == "nt":  # folders cannot be opened there
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -150,8 +154,8 @@ def sync_folder(folder: Path) -> None:
 
 def arguments_of(cls: type) -> set[str]:
     """
-    :param cls: a class, which may hand ``**kwargs`` on to its base class
-    :return: names of the arguments of its constructor
+    :param cls: a class, which may pass ``**kwargs`` on to its base class
+    :return: the names of all arguments of its constructor
     """
     names: set[str] = set()
     for base in cls.__mro__:
@@ -167,22 +171,22 @@ def arguments_of(cls: type) -> set[str]:
 
 def all_finite(values: np.ndarray) -> bool:
     """
-    :param values: any shape
-    :return: whether all are finite numbers in the networks' single precision
+    :param values: an array of any shape
+    :return: whether all values are finite in single precision, which networks use
     """
     if values.dtype != np.float32:
         if values.dtype.kind != "f":
             return True
         with np.errstate(over="ignore"):
             values = values.astype(np.float32)
-    # One quick look at all of them. Large numbers fail it too, and pass the thorough one
+    # A fast check first, which large finite numbers may also fail
     return math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
 
 
 def not_finite_at(values: np.ndarray) -> tuple[int, ...] | None:
     """
-    :param values: any shape
-    :return: index of the first of them that is not finite in the networks' single precision, None if all are
+    :param values: an array of any shape
+    :return: index of the first value that is not finite in single precision, None if all are
     """
     if all_finite(values):
         return None
@@ -192,9 +196,11 @@ def not_finite_at(values: np.ndarray) -> tuple[int, ...] | None:
 
 def as_numbers(values: Any) -> np.ndarray:
     """
+    Convert numbers to an array.
+
     :param values: array-like of real numbers
-    :return: in single precision
-    :raises ValueError: anything else
+    :return: the numbers in single precision
+    :raises ValueError: if they are not real numbers
     """
     array = np.asarray(values)
     if array.dtype.kind not in "biufO":
@@ -208,9 +214,11 @@ def as_numbers(values: Any) -> np.ndarray:
 
 def as_seed(seed: Any) -> int | None:
     """
-    :param seed: None, or an integer of any type
-    :return: the same as Gymnasium takes it
-    :raises ValueError: anything else
+    Convert a seed to the type that Gymnasium needs.
+
+    :param seed: None, or a non-negative integer of any type
+    :return: the seed
+    :raises ValueError: if the seed is anything else
     """
     if seed is None:
         return None

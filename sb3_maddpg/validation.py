@@ -1,4 +1,4 @@
-"""Arguments are checked once, where they enter, by pydantic, whose errors become plain ones of one line."""
+"""Validation of arguments by pydantic, whose errors become a ValueError with one line."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from sb3_maddpg.utils import shown, suggest
 
 AtLeastZero = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
-# Beyond these a price is 0, or infinite, in single precision
+# Outside these bounds, a price becomes 0 or infinite in single precision
 Price = Annotated[float, Field(ge=1e-12, le=1e12)]
-LARGEST = 2**63  # beyond it integers fit no array
+LARGEST = 2**63  # larger integers do not fit into an array
 Natural = Annotated[int, Field(ge=1, lt=LARGEST)]
 NaturalOrZero = Annotated[int, Field(ge=0, lt=LARGEST)]
 Widths = list[Natural]
@@ -29,7 +29,7 @@ Schedule = Callable[[float], float]
 
 
 class Arguments(BaseModel):
-    """Arguments whose descriptions say what is allowed: messages quote them, or else what pydantic says."""
+    """Base class of arguments. Messages quote the fields' descriptions, which say what is allowed."""
 
     model_config = ConfigDict(allow_inf_nan=False, arbitrary_types_allowed=True, extra="forbid")
 
@@ -48,10 +48,10 @@ def _device(device: Any) -> Any:
 
 
 class RunArguments(Arguments):
-    """Of any algorithm of Stable-Baselines3, which reads them before it asks its sub-classes."""
+    """Arguments of every algorithm of Stable-Baselines3, whose base class reads them before its subclasses can."""
 
-    replay_buffer_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by their names, or None")
-    policy_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by their names, or None")
+    replay_buffer_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by name, or None")
+    policy_kwargs: dict[str, Any] | None = Field(description="a dict of arguments by name, or None")
     stats_window_size: int = Field(ge=1, le=10**9, description="a number of episodes, at least 1")
     tensorboard_log: str | Path | None = Field(description="a folder, or None")
     verbose: NaturalOrZero = Field(description="0, 1 or 2")
@@ -62,11 +62,11 @@ class RunArguments(Arguments):
 
 
 class LearnArguments(Arguments):
-    """Of ``learn``."""
+    """Arguments of ``learn``."""
 
     total_timesteps: float = Field(ge=0, lt=LARGEST, description="a finite number of steps of at least 0")
     callback: InstanceOf[BaseCallback] | list[InstanceOf[BaseCallback]] | Callable[..., Any] | None = Field(
-        description="a callback of Stable-Baselines3, a list of them, a function (but no class), or None"
+        description="a callback of Stable-Baselines3, a list of them, a function (not a class), or None"
     )
     log_interval: int | None = Field(description="a number of episodes, or None")
 
@@ -79,16 +79,16 @@ class LearnArguments(Arguments):
 
 
 class TrainingArguments(Arguments):
-    """Of ``MADDPG``."""
+    """Arguments of ``MADDPG``."""
 
-    # 0 too: rl_zoo3 loads models so to watch them
+    # 0 is allowed, because rl_zoo3 loads models with it to render them
     learning_rate: Annotated[float, Field(ge=0)] | Schedule = Field(
         description="a finite number that is not negative, or a schedule"
     )
     buffer_size: Natural = Field(description="a number of transitions, at least 1")
     learning_starts: NaturalOrZero = Field(description="a number of steps, at least 0")
     batch_size: Natural = Field(description="a number of transitions, at least 1")
-    tau: float = Field(gt=0, le=1, description="a number between 0 and 1, and not 0")
+    tau: float = Field(gt=0, le=1, description="a number above 0 and up to 1")
     gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
     train_freq: InstanceOf[TrainFreq] | Natural | tuple[Natural, Literal["step", "episode"]] = Field(
         description='at least 1, or such a number with its unit, (1, "step") or (1, "episode")'
@@ -123,30 +123,30 @@ class TrainingArguments(Arguments):
 
 
 class SmoothedTrainingArguments(TrainingArguments):
-    """Of ``MATD3``."""
+    """Arguments of ``MATD3``."""
 
     target_policy_noise: float = Field(ge=0, description="a finite standard deviation, which must not be negative")
     target_noise_clip: float = Field(ge=0, description="a finite number, which must not be negative")
 
 
 class ThresholdArgument(Arguments):
-    """Of policies with binary actions."""
+    """Argument of policies with binary actions."""
 
     threshold: float = Field(ge=0, lt=1, description="a number with 0 <= threshold < 1, as probabilities are")
 
 
 class PolicyArguments(ThresholdArgument):
-    """Of ``MADDPGPolicy``."""
+    """Arguments of ``MADDPGPolicy``."""
 
     net_arch: Widths | dict[str, Widths] = Field(
         description="a list of widths, each at least 1, or dict(pi=[...], qf=[...]) of such lists"
     )
-    random_thresholds: float = Field(gt=0, le=1, description="a share above 0, up to 1: at 0 nothing is explored")
+    random_thresholds: float = Field(gt=0, le=1, description="a fraction above 0 and up to 1 (0 would not explore)")
     n_critics: Natural = Field(description="at least 1")
     activation_fn: type[nn.Module] = Field(description="a class of torch.nn, such as torch.nn.ReLU")
     optimizer_class: type[th.optim.Optimizer] = Field(description="a class of torch.optim, such as torch.optim.Adam")
     optimizer_kwargs: dict[str, Any] | None = Field(description="a dict of the optimizer's arguments, or None")
-    agent_names: list[str] | tuple[str, ...] | None = Field(description="a list of names, one of each agent, or None")
+    agent_names: list[str] | tuple[str, ...] | None = Field(description="a list of names, one per agent, or None")
     normalize_images: bool = Field(description="True or False")
 
     @field_validator("net_arch")
@@ -158,7 +158,7 @@ class PolicyArguments(ThresholdArgument):
 
 
 class ReplayBufferArguments(Arguments):
-    """Of ``TeamReplayBuffer``."""
+    """Arguments of ``TeamReplayBuffer``."""
 
     buffer_size: Natural = Field(description="an integer of at least 1")
     n_envs: Natural = Field(description="an integer of at least 1")
@@ -171,22 +171,24 @@ class ReplayBufferArguments(Arguments):
 
 
 class PriorityArguments(Arguments):
-    """Of ``PrioritizedTeamReplayBuffer``, beside those of ``TeamReplayBuffer``."""
+    """Arguments of ``PrioritizedTeamReplayBuffer`` beyond those of ``TeamReplayBuffer``."""
 
     alpha: float = Field(ge=0, le=1, description="a number between 0 and 1")
     beta: float = Field(ge=0, le=1, description="a number between 0 and 1")
-    epsilon: float = Field(gt=0, description="positive and finite: without it, what has no error is never sampled")
+    epsilon: float = Field(
+        gt=0, description="positive and finite: with 0, transitions without TD error would never be sampled"
+    )
 
 
 class CurriculumArguments(Arguments):
-    """Of ``CurriculumCallback``."""
+    """Arguments of ``CurriculumCallback``."""
 
-    success_threshold: float = Field(gt=0, le=1, description="a share of episodes above 0, up to 1")
+    success_threshold: float = Field(gt=0, le=1, description="a fraction of episodes above 0 and up to 1")
     window: Natural = Field(description="a number of episodes, at least 1")
 
 
 class PairPolicyArguments(Arguments):
-    """Of ``PairPolicy``, beside those of ``MADDPGPolicy``."""
+    """Arguments of ``PairPolicy`` beyond those of ``MADDPGPolicy``."""
 
     pair_credit: bool = Field(description="True or False")
     shared_threshold: bool = Field(description="True or False")
@@ -194,10 +196,12 @@ class PairPolicyArguments(Arguments):
 
 def validated(arguments: type[Arguments], **values: Any) -> dict[str, Any]:
     """
-    :param arguments: what they are and what is allowed
-    :param values: of all of them
-    :return: the values, converted to the types that are expected
-    :raises ValueError: one line that names the argument, its value and what is allowed
+    Validate arguments.
+
+    :param arguments: class of the arguments
+    :param values: values of all arguments
+    :return: the values, converted to the expected types
+    :raises ValueError: if a value is not allowed, with one line that names the argument, its value and what is allowed
     """
     return validated_as(arguments, values, "{}".format)
 
@@ -206,13 +210,13 @@ def validated_as(
     arguments: type[Arguments], values: Mapping[str, Any], as_written: Callable[[str], str]
 ) -> dict[str, Any]:
     """
-    ``validated`` for values that the user did not write as arguments of Python.
+    Validate values that the user did not write as Python arguments.
 
-    :param arguments: what they are and what is allowed
-    :param values: by their names
-    :param as_written: how the user wrote the argument of a name
-    :return: the values, converted to the types that are expected
-    :raises ValueError: one line that names the argument, its value and what is allowed
+    :param arguments: class of the arguments
+    :param values: values by name
+    :param as_written: maps a name to the form in which the user wrote the argument
+    :return: the values, converted to the expected types
+    :raises ValueError: see ``validated``
     """
     try:
         return dict(arguments.model_validate(dict(values)))

@@ -1,4 +1,4 @@
-"""Gymnasium's vector environments as Stable-Baselines3's."""
+"""Adapter from Gymnasium's vector environments to Stable-Baselines3's."""
 
 from typing import Any
 
@@ -13,25 +13,25 @@ from sb3_maddpg.utils import as_seed, not_finite_at, shown
 
 class GymnasiumVecEnv(VecEnv):
     """
-    Presents a Gymnasium ``VectorEnv`` as an SB3 ``VecEnv``, so that environments which step many copies in one call
-    keep that speed. Wrap it in ``VecMonitor`` for episode statistics.
+    Adapter that turns a Gymnasium ``VectorEnv`` into an SB3 ``VecEnv``, so that environments that step many copies in
+    one call keep their speed. Wrap it in ``VecMonitor`` for episode statistics.
 
-    :param envs: a vector environment that begins anew in the step in which an episode ends
-        (``AutoresetMode.SAME_STEP``), as SB3's do
-    :raises ValueError: no vector environment, or another autoreset mode
+    :param envs: a vector environment that resets in the step in which an episode ends (``AutoresetMode.SAME_STEP``),
+        as SB3's vectorised environments do
+    :raises ValueError: if ``envs`` is not a vector environment or has another autoreset mode
     """
 
     def __init__(self, envs: VectorEnv):
         if not isinstance(envs, VectorEnv):
             raise ValueError(
-                f"{shown(envs)} is no Gymnasium VectorEnv: make one with gymnasium.make_vec. For a single environment "
-                "use Stable-Baselines3's make_vec_env."
+                f"{shown(envs)} is not a Gymnasium VectorEnv: create one with gymnasium.make_vec. For a single "
+                "environment use Stable-Baselines3's make_vec_env."
             )
         mode = envs.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(
                 f"The vector environment has autoreset mode {mode}; Stable-Baselines3 needs {AutoresetMode.SAME_STEP}. "
-                'Make it with gymnasium.make_vec(..., vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}).'
+                'Create it with gymnasium.make_vec(..., vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}).'
             )
         self.envs = envs
         self._actions: np.ndarray | None = None
@@ -50,9 +50,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """
-        :param actions: (num_envs, ...)
-        :raises ValueError: actions of another shape, or not finite
-        :raises ResetNeeded: before the first ``reset``
+        :param actions: actions of all environments, (num_envs, ...)
+        :raises ValueError: if actions have another shape or are not finite
+        :raises ResetNeeded: if ``reset`` has not been called yet
         """
         if not self._begun:
             raise ResetNeeded("The environments have not begun: call reset() before step().")
@@ -75,8 +75,8 @@ class GymnasiumVecEnv(VecEnv):
         for k in np.flatnonzero(dones):
             if "final_obs" not in rows[k]:
                 raise ValueError(
-                    f"{self.envs} ended an episode of environment {k} without info['final_obs'], its last observation, "
-                    "which AutoresetMode.SAME_STEP promises."
+                    f"{self.envs} ended an episode of environment {k} without info['final_obs'], the final "
+                    "observation, which AutoresetMode.SAME_STEP requires."
                 )
             # The info that came with the observation belongs to the next episode.
             self.reset_infos[k] = {name: v for name, v in rows[k].items() if name not in ("final_obs", "final_info")}
@@ -89,23 +89,23 @@ class GymnasiumVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of the vector environment, once for each of the given environments."""
+        """:return: the attribute of the vector environment, once for each of the given environments"""
         value = getattr(self.envs if hasattr(self.envs, attr_name) else self.envs.unwrapped, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the attribute of the vector environment, which all environments share."""
+        """Set an attribute of the vector environment, which all environments share."""
         self._only_all(indices, attr_name)
         setattr(self.envs.unwrapped, attr_name, value)
 
     def env_method(self, method_name: str, *method_args, indices: VecEnvIndices = None, **method_kwargs) -> list[Any]:
-        """Call the method of the vector environment once; its result is given once for each environment."""
+        """Call a method of the vector environment once and return its result once for each environment."""
         self._only_all(indices, method_name)
         result = getattr(self.envs.unwrapped, method_name)(*method_args, **method_kwargs)
         return [result for _ in range(self.num_envs)]
 
     def env_is_wrapped(self, wrapper_class: type[Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Never: single environments do not exist here."""
+        """:return: False, since there are no single environments"""
         return [False for _ in self._get_indices(indices)]
 
     def _only_all(self, indices: VecEnvIndices, name: str) -> None:
@@ -115,11 +115,12 @@ class GymnasiumVecEnv(VecEnv):
 
 def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
     """
-    Gymnasium's batched infos as one dict per environment.
+    Split Gymnasium's batched infos into one dict per environment.
 
-    :param infos: arrays with a leading axis of environments, some in dicts, each with a mask under its name with a
-        leading underscore
+    :param infos: arrays with a leading axis of environments, possibly in nested dicts, each with a mask under the same
+        name with a leading underscore
     :param num_envs: number of environments
+    :return: the dicts
     """
     rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
     for name, value in infos.items():

@@ -1,6 +1,6 @@
-"""Studies: what is claimed of the packages, with the code and the data behind it."""
+"""Studies: code and data behind the claims about the packages."""
 
 import os
 
-# Before numpy is imported: studies share out the cores by processes
+# Before NumPy is imported: studies use one process per core
 os.environ.setdefault("OMP_NUM_THREADS", "1")

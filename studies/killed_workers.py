@@ -1,9 +1,9 @@
-"""Kill the workers of evaluations and searches, and the commands themselves, and compare what they end with.
+"""Kill the workers of evaluations and searches, or the commands themselves, and compare the results.
 
-``python -m studies.killed_workers [--what evaluation search] [--kills 20] [--json F]``. An evaluation with two
-processes loses one of them, or is killed as a whole and started again, at random moments; its table has to be that of
-the evaluation left alone. Two workers of one search for hyperparameters are killed and started again; no trial may be
-lost, and the search has to end with as many finished trials as were asked for. JSON: a row for each of the two.
+``python -m studies.killed_workers [--what evaluation search] [--kills 20] [--json F]``. At random times, an evaluation
+with two processes loses one of them, or is killed as a whole and restarted. Its table must equal that of an undisturbed
+evaluation. The two workers of a hyperparameter search are killed and restarted. No trial may be lost, and the search
+must end with the requested number of finished trials. JSON: one row for each of the two.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ SEARCH += ["--n-eval-envs", "1", "--max-total-trials", str(TRIALS), "--storage",
 
 
 def start(words: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    """A command of ours in a folder that also holds its cache of pieces."""
+    """Start a command of sb3-maddpg in a folder that also holds its cache of pieces."""
     env = {**os.environ, "OMP_NUM_THREADS": "1", "QUAD_SWARM_CACHE": str(folder / "cache")}
     command = [sys.executable, "-m", "sb3_maddpg", *words]
     return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def children(process: int) -> list[int]:
-    """Ids of the processes that another one has begun to work with."""
+    """Return the ids of a process's workers."""
     found = []
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -55,20 +55,20 @@ def children(process: int) -> list[int]:
 
 
 def gone(process: int) -> bool:
-    """Whether a process ends within ten seconds."""
+    """Return whether a process ends within ten seconds."""
     for _ in range(100):
         try:
             state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
         except OSError:
             return True
-        if state == "Z":  # waits for the system to take note
+        if state == "Z":  # a zombie
             return True
         time.sleep(0.1)
     return False
 
 
 def kill(process: int) -> bool:
-    """Whether there was such a process."""
+    """Kill a process and return whether it existed."""
     try:
         os.kill(process, signal.SIGKILL)
     except ProcessLookupError:
@@ -77,19 +77,19 @@ def kill(process: int) -> bool:
 
 
 def untimed(path: Path) -> list[dict[str, Any]]:
-    """The rows of an evaluation without what differs from run to run."""
+    """Read the rows of an evaluation without the timings, which differ between runs."""
     return [{key: value for key, value in row.items() if key != "solve_us"} for row in read_rows(path)]
 
 
 def evaluation(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
-    """Kill workers of an evaluation, and each fourth time the evaluation."""
+    """Kill workers of an evaluation, and every fourth time the evaluation itself."""
     words = [*EVALUATE, "--json", str(folder / "table.json")]
     start([*EVALUATE, "--json", str(folder / "alone.json")], folder).wait()
     orphans = commands = workers = 0
     process = start(words, folder)
     while workers + commands < count:
         time.sleep(rng.uniform(0.5, 2.5))
-        if process.poll() is not None:  # it was faster than the kills
+        if process.poll() is not None:  # it finished before enough kills
             process = start(words, folder)
             continue
         found = children(process.pid)
@@ -123,7 +123,7 @@ def search(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
             killed += 1
             workers[k] = start(SEARCH, folder)
     codes = [worker.wait() for worker in workers]
-    codes.append(start(SEARCH, folder).wait())  # takes up what was killed last
+    codes.append(start(SEARCH, folder).wait())  # repeats trials that were killed last
     study = optuna.load_study(storage=open_storage(str(folder / "search.log")), study_name="s")
     states = [trial.state for trial in study.trials]
     counts = {state.name.lower(): states.count(state) for state in TrialState}
@@ -136,10 +136,12 @@ TRIED = {"evaluation": evaluation, "search": search}
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--what", nargs="+", choices=TRIED, default=list(TRIED), help="both unless named")
-    parser.add_argument("--kills", type=int, default=20, help="of workers, in each of the two (%(default)s)")
+    parser.add_argument("--what", nargs="+", choices=TRIED, default=list(TRIED), help="default: both")
+    parser.add_argument(
+        "--kills", type=int, default=20, help="number of kills in each of the two (default %(default)s)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     rows = []

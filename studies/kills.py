@@ -1,11 +1,11 @@
-"""Kill a training again and again, resume it each time, and compare what it ends with.
+"""Kill a training repeatedly, resume it each time, and compare its result with that of an uninterrupted run.
 
 ``python -m studies.kills [--kills 50] [--every SECONDS] [--steps N] [--json F]``. Half of the kills come after a random
-time, half at the points of a commit, one after the other: before and after each write, sync and rename. Then the disk
-is full at each of these points, the newest checkpoint is truncated, and a bit of it is flipped, each `DAMAGED` times,
-and a second process wants the same folder. With ``--every`` there are only kills, so many seconds apart. The
-uninterrupted run of the same seed tells what the digest (`sb3_maddpg.checkpoints.digest`) has to be. JSON: one row for
-each kill and fault, and one for the end.
+time, half at successive points of a commit: before and after each write, sync and rename. Then the disk is full at each
+of these points, the newest checkpoint is truncated or has a bit flipped, each `DAMAGED` times, and a second process
+tries to use the same folder. With ``--every`` there are only kills, with this interval in seconds. The result must have
+the same digest (`sb3_maddpg.checkpoints.digest`) as an uninterrupted run with the same seed. JSON: one row for each
+kill and fault, and one for the result.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _FULL = "STUDIES_KILLS_FULL"  # the point at which its disk is full
 
 
 def train(folder: Path, steps: int) -> str:
-    """Train, or go on where a checkpoint is, to the end.
+    """Train to the end, starting from a checkpoint if there is one.
 
     :return: digest of the model
     """
@@ -85,7 +85,7 @@ def train(folder: Path, steps: int) -> str:
 
 
 def child(folder: Path, steps: int) -> None:
-    """What is killed."""
+    """Train in the child process, which is killed."""
     full = os.environ.get(_FULL)
 
     def fault(name: str) -> None:
@@ -93,7 +93,7 @@ def child(folder: Path, steps: int) -> None:
         if name == os.environ.get(_FAULT):
             os.kill(os.getpid(), signal.SIGKILL)
         if name == full:
-            full = None  # there is space again
+            full = None  # the disk is full only once
             raise OSError(errno.ENOSPC, "No space left on device")
 
     checkpoints.fault = fault
@@ -101,10 +101,12 @@ def child(folder: Path, steps: int) -> None:
 
 
 def start(folder: Path, steps: int, fault: str = "", full: str = "") -> subprocess.Popen[str]:
-    """A child that trains.
+    """Start a child process that trains.
 
-    :param fault: point of a commit at which it kills itself
-    :param full: point of a commit at which the disk is full, once
+    :param folder: folder of the checkpoints
+    :param steps: number of steps of the training
+    :param fault: point of a commit at which the child kills itself
+    :param full: point of a commit at which the disk is full once
     """
     env = {**os.environ, "OMP_NUM_THREADS": "1", _FAULT: fault, _FULL: full}
     command = [sys.executable, "-m", "studies.kills", "--child", str(folder), "--steps", str(steps)]
@@ -112,13 +114,13 @@ def start(folder: Path, steps: int, fault: str = "", full: str = "") -> subproce
 
 
 def newest_step(folder: Path) -> int:
-    """Step of the newest whole checkpoint, 0 without one."""
+    """Return the step of the newest complete checkpoint, 0 without one."""
     path = checkpoints.newest(folder)
     return int(path.name.rpartition("-")[2]) if path else 0
 
 
 def wait_for_checkpoints(folder: Path, process: subprocess.Popen[str], count: int) -> None:
-    """Until a child has written so many new checkpoints, or ended."""
+    """Wait until a child has written ``count`` new checkpoints, or has ended."""
     step, end = newest_step(folder), time.monotonic() + 300
     while count and process.poll() is None and time.monotonic() < end:
         time.sleep(0.05)
@@ -127,18 +129,20 @@ def wait_for_checkpoints(folder: Path, process: subprocess.Popen[str], count: in
 
 
 def row_of(kind: str, folder: Path, before: int, process: subprocess.Popen[str]) -> dict[str, Any]:
-    """The row of a child that has ended; `done` where it came to its end."""
+    """Return the row of a child that has ended, with its digest in ``done`` if it finished the training."""
     output = process.communicate()[0]
     row = {"kill": kind, "from_step": before, "kept_step": newest_step(folder)}
     return row | {"done": output.strip() or None, "leftovers": len(list(folder.glob("*.unfinished")))}
 
 
 def kill(folder: Path, steps: int, fault: str = "", seconds: float = 0.0, full: str = "") -> dict[str, Any]:
-    """Start a child, and kill it.
+    """Start a child and kill it.
 
-    :param fault: the point of a commit at which it dies; else it dies a time after its first new checkpoint
-    :param seconds: that time
-    :param full: the point of a commit at which its disk is full before that
+    :param folder: folder of the checkpoints
+    :param steps: number of steps of the training
+    :param fault: point of a commit at which the child dies; by default it dies after its first new checkpoint
+    :param seconds: time between that checkpoint and the kill (s)
+    :param full: point of a commit at which the disk is full before the kill
     """
     before = newest_step(folder)
     process = start(folder, steps, fault, full)
@@ -150,7 +154,7 @@ def kill(folder: Path, steps: int, fault: str = "", seconds: float = 0.0, full: 
 
 
 def damage(folder: Path, kind: str, rng: random.Random) -> dict[str, Any]:
-    """Truncate a file of the newest checkpoint, or flip a bit of it."""
+    """Truncate a file of the newest checkpoint, or flip one of its bits."""
     newest = checkpoints.newest(folder)
     assert newest is not None
     path = rng.choice(sorted(newest.iterdir()))
@@ -165,7 +169,7 @@ def damage(folder: Path, kind: str, rng: random.Random) -> dict[str, Any]:
 
 
 def second_process(folder: Path, steps: int) -> dict[str, Any]:
-    """Start a child beside another one: it must not touch the folder."""
+    """Start a second child in the same folder, which must refuse to use it."""
     before = newest_step(folder)
     first = start(folder, steps)
     wait_for_checkpoints(folder, first, 1)
@@ -176,7 +180,7 @@ def second_process(folder: Path, steps: int) -> dict[str, Any]:
 
 
 def kills(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
-    """The kills of a command line, a row each."""
+    """Run the kills and return a row for each."""
     rng, points = random.Random(args.seed), itertools.cycle(POINTS)
     rows: list[dict[str, Any]] = []
     for number in tqdm(range(args.kills), disable=not sys.stderr.isatty()):
@@ -193,7 +197,7 @@ def kills(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
 
 
 def faults(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
-    """Full disks, damaged checkpoints and a second process, a row each."""
+    """Run the faults (full disks, damaged checkpoints, a second process) and return a row for each."""
     rng = random.Random(args.seed)
     rows = [kill(folder, args.steps, full=point, seconds=rng.uniform(0, 1)) for point in POINTS]
     for kind in ("truncated", "flipped"):
@@ -203,13 +207,15 @@ def faults(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--every", type=float, metavar="SECONDS", help="kill so long after a checkpoint, nothing else")
-    parser.add_argument("--faults", action=argparse.BooleanOptionalAction, default=True, help="what follows the kills")
-    parser.add_argument("--steps", type=int, default=40_000, help="of the training (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments (%(default)s)")
+    parser.add_argument("--every", type=float, metavar="SECONDS", help="only kill, this long after each checkpoint")
+    parser.add_argument(
+        "--faults", action=argparse.BooleanOptionalAction, default=True, help="also inject faults after the kills"
+    )
+    parser.add_argument("--steps", type=int, default=40_000, help="steps of the training (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the times (default %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -222,14 +228,14 @@ def main() -> None:
             rows += faults(args, Path(parts))
         found = start(Path(parts), args.steps).communicate()[0].strip()
     early = [row for row in rows if row["done"]]
-    # A damaged checkpoint is passed over; everything else keeps what was committed
+    # Damaged checkpoints are skipped; all other checkpoints must survive
     lost = [row for row in rows if row["kept_step"] < row["from_step"] and ":" not in row["kill"]]
     intruded = [row for row in rows if not row.get("refused", True)]
     same = bool(expected) and found == expected
-    verdict = "the same" if same else "ANOTHER"
+    verdict = "the same" if same else "DIFFERENT"
     print(
-        f"{args.kills} kills, {len(rows) - args.kills} faults and kills after them, {len(lost)} lost a checkpoint, "
-        f"{len(early)} came after the end; the digest is {verdict}: {found}"
+        f"{args.kills} kills, {len(rows) - args.kills} faults and kills after them, {len(lost)} lost checkpoints, "
+        f"{len(early)} kills after the end; the digest is {verdict}: {found}"
     )
     if args.json:
         write_rows(args.json, [*rows, {"kills": args.kills, "lost": len(lost), "expected": expected, "found": found}])

@@ -1,9 +1,8 @@
-"""Damage every kind of file in every way, load it, and see what happens.
+"""Damage all kinds of files in many ways and try to load them.
 
-``python -m studies.mutated_files [--count 10000] [--seed 0] [--json F]``. Each file has to be refused with an error
-that says so, or loaded; within a second, within 1 GB, and without anything being unpickled: every function that does so
-raises. JSON: one row for each kind of file and of damage, with how many were refused and loaded, and the cases that
-went wrong.
+``python -m studies.mutated_files [--count 10000] [--seed 0] [--json F]``. Each file must either be refused with a clear
+error or be loaded, within a second and 1 GB, and without unpickling anything (all unpickling functions raise). JSON:
+one row for each kind of file and damage with the numbers of refused and loaded files, and one for each failure.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from sb3_maddpg.env_states import Replayable
 from sb3_maddpg.team_tasks import OwnBit
 
 SECONDS, BYTES = 1.0, 2**30
-# What a loader may raise; everything else is a traceback in somebody's face
+# Errors that a loader may raise; all others count as failures
 REFUSALS = (ValueError, OSError, yaml.YAMLError)
 _TRAP = {":type:": "x", ":serialized:": base64.b64encode(pickle.dumps(print)).decode()}
 NASTY: list[Any] = [
@@ -53,7 +52,7 @@ NASTY: list[Any] = [
 
 
 def flip(content: bytes, rng: random.Random) -> bytes:
-    """Some bits changed."""
+    """Flip some bits."""
     changed = bytearray(content)
     for _ in range(rng.choice((1, 1, 3, 30))):
         changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
@@ -61,12 +60,12 @@ def flip(content: bytes, rng: random.Random) -> bytes:
 
 
 def truncate(content: bytes, rng: random.Random) -> bytes:
-    """The beginning."""
+    """Cut off the end."""
     return content[: rng.randrange(len(content))]
 
 
 def splice(content: bytes, rng: random.Random) -> bytes:
-    """A piece repeated, or put elsewhere."""
+    """Insert a copy of one part elsewhere."""
     start, to = rng.randrange(len(content)), rng.randrange(len(content))
     return content[:to] + content[start : start + rng.randrange(1, 400)] + content[to:]
 
@@ -79,14 +78,14 @@ def _members(content: bytes) -> dict[str, bytes]:
 def _zipped(members: list[tuple[str, bytes]], compression: int = zipfile.ZIP_STORED) -> bytes:
     stream = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(stream, "w", compression) as archive:
-        warnings.simplefilter("ignore")  # of names that are there twice
+        warnings.simplefilter("ignore")  # duplicate names cause warnings
         for name, content in members:
             archive.writestr(name, content)
     return stream.getvalue()
 
 
 def members(content: bytes, rng: random.Random) -> bytes:
-    """Members swapped, left out, doubled, renamed, added, or blown up."""
+    """Swap, drop, duplicate, rename, add, inflate or damage members of a zip file."""
     found = list(_members(content).items())
     i, j = rng.randrange(len(found)), rng.randrange(len(found))
     kind = rng.choice(("swap", "drop", "double", "rename", "add", "bomb", "damage"))
@@ -114,7 +113,7 @@ def _places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def _changed(text: bytes, rng: random.Random) -> bytes:
-    """One value of some JSON replaced by a nasty one, or nested deeply."""
+    """Replace a value of some JSON by a nasty one, or nest it deeply."""
     tree = json.loads(text)
     if rng.random() < 0.05:
         return text.replace(b"[", b"[" * rng.choice((60, 5000, 200_000)), 1)
@@ -127,7 +126,7 @@ def _changed(text: bytes, rng: random.Random) -> bytes:
 
 
 def values(content: bytes, rng: random.Random) -> bytes:
-    """A value changed in the JSON that the file is, or that one of its members is."""
+    """Change a value in a JSON file, or in a JSON member of a zip file."""
     if content[:2] != b"PK":
         return _changed(content, rng)
     found = _members(content)
@@ -137,7 +136,7 @@ def values(content: bytes, rng: random.Random) -> bytes:
 
 
 def tags(content: bytes, rng: random.Random) -> bytes:
-    """YAML that names Python, or nests."""
+    """Insert YAML that names Python objects or is deeply nested."""
     line = rng.choice(
         (
             b"- !!python/object/apply:os.system [echo]",
@@ -154,7 +153,7 @@ def tags(content: bytes, rng: random.Random) -> bytes:
 
 
 def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
-    """One of each kind, and what loads it."""
+    """Create a file of each kind, and return its content and its loader."""
     env = SafeVecNormalize(DummyVecEnv([lambda: Replayable(OwnBit())]))
     model = MADDPG("MlpPolicy", env, learning_starts=20, batch_size=8, train_freq=5, buffer_size=60, seed=0)
     model.learn(80, callback=[checkpoints.RunCheckpoint(folder / "run", 30)])
@@ -173,7 +172,7 @@ def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
             content = path.read_bytes()
             (found / name).write_bytes(content)
             sums = {one.name: checkpoints._sha256(one) for one in found.iterdir() if one.name != "manifest.json"}
-            if name != "manifest.json":  # somebody who damages it on purpose
+            if name != "manifest.json":  # as after deliberate damage
                 (found / "manifest.json").write_text(json.dumps(sums))
             again = checkpoints.resume(folder / "run", env)
             if again is None:
@@ -197,7 +196,7 @@ def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
 
 
 def damages(name: str) -> list[Callable[[bytes, random.Random], bytes]]:
-    """What can be done to a kind of file."""
+    """Return the damages that apply to a kind of file."""
     common: list[Callable[[bytes, random.Random], bytes]] = [flip, truncate, splice]
     if name.endswith(".yml"):
         return [*common, tags]
@@ -213,7 +212,7 @@ def _poisoned(*args: Any, **kwargs: Any) -> Any:
 def attempt(load: Callable[[Path], Any], path: Path) -> tuple[str, str]:
     """Load a file.
 
-    :return: "refused" or "loaded", or what went wrong, and the error
+    :return: "refused", "loaded" or the kind of failure, and the error
     """
 
     def late(*_: Any) -> None:
@@ -245,7 +244,7 @@ def attempt(load: Callable[[Path], Any], path: Path) -> tuple[str, str]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
@@ -283,7 +282,7 @@ def main() -> None:
     outcomes = sorted({outcome for _, _, outcome in tally})
     for kind, what in sorted({key[:2] for key in tally}):
         print(f"{kind:24} {what:10}", *(f"{outcome} {tally[kind, what, outcome]:5}" for outcome in outcomes))
-    print(f"{args.count} files: {len(wrong)} went wrong")
+    print(f"{args.count} files: {len(wrong)} failures")
     if args.json:
         rows = [{"file": k, "damage": d, "outcome": o, "count": count} for (k, d, o), count in sorted(tally.items())]
         write_rows(args.json, [*rows, *wrong])

@@ -1,8 +1,8 @@
-"""Fly many episodes in one process that should not grow: ``python -m studies.soak [--episodes N] [--json F]``.
+"""Fly many episodes in one process and check that it does not grow.
 
-Four robots of `flight` fly in batches as in an evaluation, and one environment after the other is made, flown and
-closed as in a script. Memory, open files, threads and objects are counted once the first tenth is flown, and at the
-end. JSON: one row with these and what they grew by.
+``python -m studies.soak [--episodes N] [--json F]``. Four robots of `flight` fly in batches as in an evaluation, and
+environments are created, flown and closed one after the other as in a script. Memory, open files, threads and objects
+are measured after the first tenth and at the end. JSON: one row with the measurements and their growth.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from quad_swarm.world.presets import make_config
 from studies.swarm.protocol import condition
 
 BATCH = 500
-GROWTH = 32.0  # MB that the process may grow by: noise of the allocator, less than half a kilobyte an episode
+GROWTH = 32.0  # maximum growth of the process (MB): allocator noise, less than half a kilobyte per episode
 POLICIES = ("full", "plan:1.1s&stale:4")
 
 
 def counts() -> dict[str, float]:
-    """What a process could grow by."""
+    """Measure the resources of the process."""
     gc.collect()
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return {
@@ -63,9 +63,9 @@ def fly(batch: int) -> int:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=100_000, help="%(default)s unless given")
+    parser.add_argument("--episodes", type=int, default=100_000, help="default %(default)s")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     started, episodes, before = time.monotonic(), 0, None

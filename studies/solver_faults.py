@@ -1,8 +1,8 @@
-"""Let the planner's solver fail, and see what the swarm does.
+"""Make the planner's solver fail and evaluate the swarm.
 
-``python -m studies.solver_faults [--episodes 1000] [--json F]``. A share of the solves of full communication in
-`flight` fails: reports failure, gives NaN with success or without, or the whole batch raises. Steps have to go on, and
-what leaves them has to be finite. JSON: one row for each share and kind, with the keys of `summarise`.
+``python -m studies.solver_faults [--episodes 1000] [--json F]``. With full communication in `flight`, a fraction of the
+solves fails: the solver reports failure, returns NaN with or without success, or raises for the whole batch. Steps must
+continue, and their results must be finite. JSON: one row for each share and kind, with the keys of `summarise`.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _BATCH = 100
 
 
 class FailingSolver:
-    """A solver that fails now and then.
+    """Solver that fails at random.
 
-    :param solver: the solver
-    :param share: of the problems that fail; of the batches, where it raises
-    :param kind: how, of `KINDS`
-    :param rng: draws which
+    :param solver: the wrapped solver
+    :param share: fraction of problems that fail, or of batches if the solver raises
+    :param kind: kind of failure, one of `KINDS`
+    :param rng: random number generator
     """
 
     def __init__(self, solver: Solver, share: float, kind: str, rng: np.random.Generator):
@@ -59,9 +59,9 @@ class FailingSolver:
 
 
 def fly(scenario: str, share: float, kind: str, episodes: Sequence[int]) -> Rows:
-    """Figures of episodes, see `run_episodes`.
+    """Fly episodes and return their statistics, see `run_episodes`.
 
-    :raises FloatingPointError: a state or a plan is not finite
+    :raises FloatingPointError: if a state or a plan is not finite
     """
     one, rows = condition("full", scenario, make_config("flight")), []
     for start in range(0, len(episodes), _BATCH):
@@ -81,14 +81,14 @@ def fly(scenario: str, share: float, kind: str, episodes: Sequence[int]) -> Rows
 
 
 def row(scenario: str, share: float, kind: str, episodes: int) -> dict[str, Any]:
-    """The row of a condition."""
+    """Return the row of a condition."""
     first = first_episode(VALIDATION)
     flown = fly(scenario, share, kind, range(first, first + episodes))
     return {"scenario": scenario, "share": share, "kind": kind, **summarise(flown, make_config("flight"))}
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=1000)
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)

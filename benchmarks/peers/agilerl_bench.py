@@ -1,10 +1,10 @@
 """MADDPG of AgileRL, see ``common``.
 
-Agents whose names share what stands before the last underscore share their networks, without a switch; for separate
-networks they are renamed. Shared networks make a step for each of their agents. Forced: three hidden layers in the
-actor, layer normalisation, no limit on the gradient, exploration of a constant size. After the last step of an episode
-its environment wrapper shows the first observation of the next one, which is stored as the next observation of a step
-that did not terminate; and the loop evaluates, here once at the end.
+Agents whose names have the same part before the last underscore always share their networks; for separate networks they
+are renamed. Shared networks make one step per agent. Forced: three hidden layers in the actor, layer normalisation, no
+gradient clipping, constant exploration noise. After the last step of an episode, its environment wrapper returns the
+first observation of the next episode, which is stored as the next observation of a step that did not terminate. The
+training loop always evaluates, here once at the end.
 """
 
 from typing import Any
@@ -19,12 +19,12 @@ from torch import nn
 
 from benchmarks.peers import common
 
-# Its actors answer in [-1, 1], twice as wide as the actions
+# Its actors' outputs are in [-1, 1], twice as wide as the actions
 NOISE = common.SIGMA_START + common.SIGMA_END
 
 
 class Renamed(BaseParallelWrapper):
-    """``agent_0`` becomes ``agent0``, which belongs to no group."""
+    """Rename ``agent_0`` to ``agent0``, which does not belong to a group."""
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
@@ -52,7 +52,7 @@ class Renamed(BaseParallelWrapper):
         return observations, rewards, terminations, truncations, infos
 
     def rename(self, values: dict) -> dict:
-        """The same values under the new names."""
+        """Rename the keys of a dictionary."""
         return {self.names[agent]: value for agent, value in values.items()}
 
 
@@ -68,7 +68,7 @@ class Policy(nn.Module):
 
 
 class AgileRL:
-    """A population of one, evaluated for one episode at the end of a training, which its loop does not go without."""
+    """Population of one, evaluated for one episode at the end of training, which the library's loop requires."""
 
     first_update = common.LEARNING_STARTS
 
@@ -98,7 +98,7 @@ class AgileRL:
         self.steps = 0
 
     def make_env(self) -> Any:
-        """Its environment, seeded."""
+        """Create the library's seeded environment."""
         env = common.parallel_env(self.task.env)
         env.reset(seed=self.task.seed)
         return env if self.task.shared else Renamed(env)
@@ -111,7 +111,7 @@ class AgileRL:
         clock.stop()
 
     def learn(self, steps: int) -> None:
-        """Its own loop for so many more steps. One stretch of evolution, as that ends with an evaluation."""
+        """Run the library's own loop for more steps, in one evolution step, since each ends with an evaluation."""
         self.steps += steps
         train_multi_agent_off_policy(
             self.env,

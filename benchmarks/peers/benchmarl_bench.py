@@ -1,8 +1,9 @@
 """MADDPG of BenchMARL, see ``common``.
 
-Forced: the critic of an agent sees the global state and the actions of its own group, so in a task with two sides not
-the other side's; the limit on the gradient is that of a group's networks together; it learns from the first batch of
-``train_freq`` steps on. A shared critic has one value for the whole group and no agent's id: ``--networks team``.
+Forced: an agent's critic sees the global state and the actions of its own group only, so in a task with two sides not
+those of the other side; gradients are clipped by the norm of all networks of a group together; learning starts after
+the first batch of ``train_freq`` steps. A shared critic has a single value for the whole group without an agent id:
+``--networks team``.
 """
 
 from pathlib import Path
@@ -23,7 +24,7 @@ from benchmarl.experiment import Callback, Experiment, ExperimentConfig  # noqa:
 from benchmarl.models.mlp import MlpConfig  # noqa: E402
 from torchrl.envs.utils import ExplorationType, set_exploration_type  # noqa: E402
 
-# All that its own configuration would set differently
+# Settings that differ from the library's own configuration
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "simple_spread_v3": ("SIMPLE_SPREAD", {"N": 3, "local_ratio": 0.5}),
     "simple_tag_v3": ("SIMPLE_TAG", {"num_good": 1, "num_adversaries": 3, "num_obstacles": 2}),
@@ -47,14 +48,14 @@ class StartClock(Callback):
 
 
 class Squash(nn.Module):
-    """Its ``TanhDelta`` on [0, 1], which adds the middle of the bounds before the hyperbolic tangent."""
+    """The library's ``TanhDelta`` on [0, 1], which adds the centre of the bounds before the hyperbolic tangent."""
 
     def forward(self, outputs: th.Tensor) -> th.Tensor:
         return 0.5 * ((outputs + 0.5).tanh() + 1.0)
 
 
 class BenchMARL:
-    """Its ``Experiment``, without loggers and evaluation."""
+    """The library's ``Experiment`` without loggers and evaluation."""
 
     first_update = 0
 
@@ -79,7 +80,7 @@ class BenchMARL:
 
     @staticmethod
     def settings(task: common.Task) -> dict[str, Any]:
-        """What differs from the library's own configuration."""
+        """:return: settings that differ from the library's own configuration"""
         return {
             "share_policy_params": task.shared,
             "gamma": common.GAMMA,

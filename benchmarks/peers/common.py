@@ -1,12 +1,12 @@
-"""What the drivers of all libraries share: the settings, the clock, the evaluation and the command line.
+"""Common parts of the libraries' drivers: settings, clock, evaluation and command line.
 
-A driver runs in the Python of its own library and prints one line of JSON::
+A driver runs in its library's Python and prints one line of JSON::
 
     python -m benchmarks.peers.xuance_bench speed --networks separate
     python -m benchmarks.peers.xuance_bench learn --env simple_tag_v3 --steps 100000 --seed 0 --export actors
 
-With ``--export`` it leaves each agent's policy as a TorchScript program, so that other libraries' agents can play with
-it. It stays on one core and one thread, works in a scratch directory, and sends all that the library prints to stderr.
+``--export`` writes each agent's policy as a TorchScript program, so that it can play with other libraries' agents. A
+driver uses one core and one thread, works in a scratch directory, and redirects all output of the library to stderr.
 """
 
 import argparse
@@ -28,7 +28,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-# Lowe et al. (2017) and https://github.com/openai/maddpg, but for the start: there it is 25,600 steps
+# Settings of Lowe et al. (2017) and https://github.com/openai/maddpg, where training starts after 25,600 steps
 LEARNING_RATE = 1e-2
 GAMMA = 0.95
 TAU = 0.01
@@ -37,7 +37,7 @@ BATCH_SIZE = 1024
 BUFFER_SIZE = 1_000_000
 HIDDEN = (64, 64)
 LEARNING_STARTS = BATCH_SIZE
-# Gaussian exploration at the first and at the last step, in units of the actions, which lie in [0, 1]
+# Gaussian exploration at the first and the last step, in units of the actions, which are in [0, 1]
 SIGMA_START, SIGMA_END = 0.3, 0.05
 
 EVALUATION_SEEDS = range(10_000, 10_100)
@@ -46,14 +46,14 @@ EVALUATION_SEEDS = range(10_000, 10_100)
 @dataclass(frozen=True)
 class Task:
     """
-    What to train.
+    Settings of a training.
 
     :param env: name of a module of mpe2
-    :param steps: environment steps of the whole training, over which exploration declines
+    :param steps: environment steps of the whole training, over which exploration is annealed
     :param train_freq: environment steps per update
-    :param networks: "separate", an actor and a critic for each agent; "shared", one of each for all agents; "team",
-        that shared actor, and a critic with one value for the whole team
-    :param seed: of environment, networks and exploration
+    :param networks: "separate" for an actor and a critic per agent, "shared" for one of each for all agents, "team" for
+        the shared actor and a critic with one value for the whole team
+    :param seed: seed of environment, networks and exploration
     """
 
     env: str
@@ -69,15 +69,15 @@ class Task:
 
 
 class Clock:
-    """Processor and wall time of one stretch of work."""
+    """Clock of processor and wall time."""
 
     def start(self) -> None:
-        """Begin now."""
+        """Start the clock."""
         gc.collect()
         self.cpu, self.wall = time.process_time(), time.perf_counter()
 
     def stop(self) -> None:
-        """End now."""
+        """Stop the clock."""
         self.cpu, self.wall = time.process_time() - self.cpu, time.perf_counter() - self.wall
 
 
@@ -94,37 +94,38 @@ class Driver(Protocol):
 
     def train(self, warm_up: int, clock: Clock) -> None:
         """
-        Train for ``Task.steps`` with the library's own loop; ``clock`` times what comes after the warm-up.
+        Train for ``Task.steps`` with the library's own loop; ``clock`` measures the time after the warm-up.
 
         :param warm_up: steps before the clock starts
         """
 
     def update(self) -> None:
-        """Sample from the buffer, make one step of every critic and every actor, move the target networks."""
+        """Sample from the replay buffer and update all critics, all actors and the target networks."""
 
     def act(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
-        :param observations: of every agent
-        :return: its action without exploration
+        :param observations: observation of each agent
+        :return: action of each agent without exploration
         """
 
     def network(self, agent: str) -> nn.Module:
         """
-        :param agent: of separate networks
-        :return: what ``act`` does for it, observations (batch, obs_dim) to actions in the environment's units
+        :param agent: an agent with its own network
+        :return: the agent's part of ``act``, which maps observations, (batch, obs_dim), to actions in the environment's
+            units
         """
 
 
 def parallel_env(name: str) -> Any:
     """
-    :param name: of a module of mpe2
-    :return: its environment with continuous actions and the default episodes of 25 steps
+    :param name: name of a module of mpe2
+    :return: its environment with continuous actions and the default episode length of 25 steps
     """
     return importlib.import_module(f"mpe2.{name}").parallel_env(continuous_actions=True)
 
 
 def restore_pettingzoo_mpe() -> None:
-    """Put mpe2 where PettingZoo had the environments until they moved: the library still imports them from there."""
+    """Make mpe2 importable as ``pettingzoo.mpe``, from which the library still imports it."""
     mpe = importlib.import_module("mpe2")
     sys.modules["pettingzoo.mpe"] = mpe
     importlib.import_module("pettingzoo").mpe = mpe  # type: ignore[attr-defined]
@@ -135,16 +136,16 @@ def restore_pettingzoo_mpe() -> None:
 
 def sigma_at(progress: float) -> float:
     """
-    :param progress: share of the training that is done
-    :return: standard deviation of the exploration
+    :param progress: fraction of the training that is finished
+    :return: standard deviation of the exploration noise
     """
     return SIGMA_START + min(progress, 1.0) * (SIGMA_END - SIGMA_START)
 
 
 def evaluate(driver: Driver, name: str) -> dict[str, float]:
     """
-    :param driver: trained
-    :param name: environment
+    :param driver: a trained driver
+    :param name: name of the environment
     :return: mean return of each agent over the episodes of ``EVALUATION_SEEDS``
     """
     env = parallel_env(name)
@@ -163,7 +164,7 @@ def evaluate(driver: Driver, name: str) -> dict[str, float]:
 
 
 class Clipped(nn.Module):
-    """A policy that keeps to the bounds of its actions, as ``evaluate`` does."""
+    """Policy that clips its actions to their bounds, as ``evaluate`` does."""
 
     low: th.Tensor
     high: th.Tensor
@@ -182,10 +183,10 @@ def export(driver: Driver, name: str, folder: Path) -> None:
     """
     Write the policy of each agent as ``agent.pt``: TorchScript, observations (batch, obs_dim) to actions.
 
-    :param driver: trained
-    :param name: environment
-    :param folder: for the files
-    :raises AssertionError: a program does not act as the driver does
+    :param driver: a trained driver
+    :param name: name of the environment
+    :param folder: folder for the files
+    :raises AssertionError: if a program and the driver act differently
     """
     folder.mkdir(parents=True, exist_ok=True)
     env = parallel_env(name)
@@ -209,16 +210,17 @@ def export(driver: Driver, name: str, folder: Path) -> None:
 
 def rates(name: str, count: int, clock: Clock) -> dict[str, float]:
     """
-    :param name: of the rate
-    :param count: what was done while the clock ran
-    :param clock: stopped
-    :return: the rate per second of processor time, and of wall time
+    :param name: name of the rate
+    :param count: number of events while the clock ran
+    :param clock: the stopped clock
+    :return: the rates per second of processor time and of wall time
     """
     return {name: count / clock.cpu, f"{name}_wall": count / clock.wall}
 
 
 def speed(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
-    """Updates per second, and steps per second of the library's own loop: an update every 100 steps, and every step."""
+    """Measure updates per second, and steps per second of the library's loop with an update every 100 steps and every
+    step."""
     result: dict[str, Any] = {"networks": arguments.networks}
     clock = Clock()
     for train_freq, steps in ((100, arguments.steps_100), (1, arguments.steps_1)):
@@ -262,28 +264,28 @@ def learn(make: type[Driver], arguments: argparse.Namespace) -> dict[str, Any]:
 
 def main(library: str, distribution: str, make: type[Driver]) -> None:
     """
-    The command line of a driver.
+    Run the command line of a driver.
 
-    :param library: name in the tables
+    :param library: name of the library in tables
     :param distribution: package whose version is reported
-    :param make: prepares a training
+    :param make: function that prepares a training
     """
     parser = argparse.ArgumentParser(description=f"{library}: speed or learning of MADDPG, one line of JSON")
     modes = parser.add_subparsers(dest="mode", required=True)
     measure = modes.add_parser("speed", help="updates and steps per second on simple_spread_v3")
     measure.add_argument("--updates", type=int, default=300)
     measure.add_argument("--steps-100", type=int, default=5_000, help="steps with an update every 100")
-    measure.add_argument("--steps-1", type=int, default=400, help="steps with an update each")
+    measure.add_argument("--steps-1", type=int, default=400, help="steps with an update every step")
     training = modes.add_parser("learn", help="train, then measure each agent's return")
     training.add_argument("--env", default="simple_spread_v3", help="module of mpe2")
     training.add_argument("--steps", type=int, default=100_000)
     training.add_argument("--train-freq", type=int, default=100, help="environment steps per update (default 100)")
     training.add_argument("--export", type=lambda path: Path(path).resolve(), metavar="FOLDER",
-                          help="write each agent's policy there, separate networks only")  # fmt: skip
+                          help="folder for the agents' policies, for separate networks only")  # fmt: skip
     for mode in (measure, training):
         mode.add_argument("--networks", choices=("separate", "shared", "team"), default="separate")
         mode.add_argument("--seed", type=int, default=0)
-        mode.add_argument("--core", type=int, help="pin to this core (default: the last one that is allowed)")
+        mode.add_argument("--core", type=int, help="core to pin to (default: the last allowed one)")
     arguments = parser.parse_args()
     if arguments.mode == "learn" and arguments.export and arguments.networks != "separate":
         parser.error("--export is for separate networks")

@@ -1,6 +1,6 @@
 """MATD3 of this repository with the settings of the other drivers, see ``common``.
 
-Not like for like: twin critics, an actor that learns every second time, and noise on target actions.
+Not directly comparable: twin critics, delayed actor updates, and noise on target actions.
 """
 
 from benchmarks.peers import common

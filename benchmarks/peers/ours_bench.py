@@ -10,7 +10,7 @@ from sb3_maddpg import MADDPG
 
 
 class Ours:
-    """``MADDPG`` on the environment as PettingZoo has it."""
+    """``MADDPG`` in the unmodified PettingZoo environment."""
 
     algorithm: type[MADDPG] = MADDPG
     first_update = common.LEARNING_STARTS
@@ -28,7 +28,7 @@ class Ours:
             gamma=common.GAMMA,
             train_freq=task.train_freq,
             gradient_steps=1,
-            # On the scale of [-1, 1], twice as wide as the actions
+            # In units of [-1, 1], which is twice as wide as the actions
             exploration_noise=(2 * common.SIGMA_START, 2 * common.SIGMA_END),
             max_grad_norm=common.MAX_GRAD_NORM,
             policy_kwargs={

@@ -1,6 +1,6 @@
-"""MADDPG as a plain PyTorch loop: what one would write by hand. See ``common``.
+"""MADDPG as a plain handwritten PyTorch loop, see ``common``.
 
-One ``nn.Sequential`` and one Adam for each actor and critic, a loop over the agents, and a numpy ring buffer.
+It uses one ``nn.Sequential`` and one Adam per actor and critic, a loop over the agents, and a NumPy ring buffer.
 """
 
 import copy
@@ -14,20 +14,20 @@ from benchmarks.peers import common
 
 
 def mlp(inputs: int, outputs: int) -> nn.Sequential:
-    """A network with hidden layers of rectifiers."""
+    """Create a network with ReLU hidden layers."""
     widths = (inputs, *common.HIDDEN)
     layers: list[nn.Module] = [layer for pair in pairwise(widths) for layer in (nn.Linear(*pair), nn.ReLU())]
     return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
 
 
 class Plain:
-    """Separate networks only."""
+    """Driver with separate networks only."""
 
     first_update = common.LEARNING_STARTS
 
     def __init__(self, task: common.Task) -> None:
         if task.shared:
-            raise ValueError("The plain loop has separate networks only.")
+            raise ValueError("The plain loop supports separate networks only.")
         self.task = task
         self.env = common.parallel_env(task.env)
         self.agents: list[str] = self.env.possible_agents
@@ -113,7 +113,7 @@ class Plain:
 
     @staticmethod
     def descend(net: nn.Module, optimizer: th.optim.Optimizer, loss: th.Tensor) -> None:
-        """One clipped step of one network."""
+        """Take one gradient step of a network with clipping."""
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(net.parameters(), common.MAX_GRAD_NORM)

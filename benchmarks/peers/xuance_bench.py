@@ -1,7 +1,7 @@
 """MADDPG of XuanCe, see ``common``.
 
-Forced: it always logs to TensorBoard. Networks start orthogonal. Shared networks are told the agent by an id, in one
-batch of all agents.
+Forced: it always logs to TensorBoard. Networks have orthogonal initialisation. Shared networks get an agent id and
+process all agents in one batch.
 """
 
 from argparse import Namespace
@@ -22,7 +22,7 @@ from xuance.torch.agents import MADDPG_Agents  # noqa: E402
 
 
 class Policy(nn.Module):
-    """An actor after its representation, which answers with a dictionary."""
+    """An actor after its representation, which returns a dictionary."""
 
     def __init__(self, representation: nn.Module, actor: nn.Module):
         super().__init__()
@@ -33,13 +33,13 @@ class Policy(nn.Module):
 
 
 class XuanCe:
-    """Its ``MADDPG_Agents`` with the environment through its own adapter."""
+    """The library's ``MADDPG_Agents`` with its own adapter of the environment."""
 
     first_update = common.LEARNING_STARTS
 
     def __init__(self, task: common.Task) -> None:
         configs = Path(xuance.__file__).parent / "configs"
-        # Those of MADDPG in MPE are the same for each environment but for the sizes
+        # The library's settings of MADDPG in MPE only differ in sizes between environments
         settings = yaml.safe_load((configs / "basic.yaml").read_text())
         settings |= yaml.safe_load((configs / "maddpg/mpe/simple_spread_v3.yaml").read_text())
         settings |= {

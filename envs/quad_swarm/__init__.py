@@ -1,6 +1,6 @@
-"""A quadrotor swarm with NMPC planners whose robots may ask each other for their plans (Serra-Gomez et al., IROS 2020).
+"""A quadrotor swarm with NMPC planners whose robots may request each other's plans (Serra-Gomez et al., IROS 2020).
 
-Importing registers ``QuadSwarm-v0`` with Gymnasium; `parallel_env` makes the PettingZoo interface.
+Importing the package registers ``QuadSwarm-v0`` in Gymnasium. `parallel_env` creates the PettingZoo environment.
 """
 
 import gymnasium

@@ -7,24 +7,24 @@ from collections.abc import Iterable
 
 
 def shown(value: object, most: int = 200) -> str:
-    """A value for a message, as Python writes it: in one line, and shortened where it is long.
+    """Format a value for a message: its ``repr`` on one line, shortened if it is long.
 
-    :param value: any, as it was given
-    :param most: number of characters
+    :param value: any value
+    :param most: maximum number of characters
     """
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # of an object of somebody else's, or of an integer of too many digits for Python
+    except Exception:  # from a foreign class, or an integer with too many digits for Python
         text = f"<{type(value).__name__}>"
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 3) :]}"
 
 
 def unknown_name(kind: str, value: object, known: Iterable[str]) -> ValueError:
-    """The error for a name that is not among ``known``: it lists them and suggests the nearest.
+    """Create the error for an unknown name, which lists the known names and suggests the closest one.
 
-    :param kind: what the name stands for, e.g. ``"scenario"``
-    :param value: the name that was given
-    :param known: the names that exist
+    :param kind: kind of the name, e.g. ``"scenario"``
+    :param value: the unknown name
+    :param known: the known names
     """
     names = sorted(known)
     near = difflib.get_close_matches(value if isinstance(value, str) else shown(value), names, n=1, cutoff=0.4)

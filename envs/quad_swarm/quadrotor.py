@@ -3,9 +3,9 @@
 State ``x`` (9): position ``p`` (m, world frame, z up), velocity ``v`` (m/s), roll ``phi``, pitch ``theta``, yaw ``psi``
 (rad). Input ``u`` (4): commanded roll and pitch (rad), commanded climb rate (m/s), commanded yaw rate (rad/s).
 
-The model and its values are those of the simulator that the paper's laboratory published (Parrot Bebop 2;
-tud-amr/mrca-mav, dynamics/bebop_dynamics.m): drag is linear in the velocity, attitude and climb rate answer their
-commands with first-order lags, and yaw does not couple into the translation.
+The model and its parameters come from the simulator that the paper's laboratory published (Parrot Bebop 2;
+tud-amr/mrca-mav, dynamics/bebop_dynamics.m). Drag is linear in the velocity, attitude and climb rate follow their
+commands with first-order lags, and yaw does not affect the translation.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ N_INPUTS = 4
 POSITION = slice(0, 3)
 VELOCITY = slice(3, 6)
 ATTITUDE = slice(6, 9)
-_WORTH_COMPILING = 32  # robots, from which on a call is worth some tenths of a second once for each machine
+_WORTH_COMPILING = 32  # robots, from which compiling (some tenths of a second, once per machine) pays off
 
 
-# Larger ones overflow within a step
+# Larger values overflow within a step
 _Moderate = Annotated[float, Field(gt=0, le=1e4)]
 
 
 @checked
 @dataclass(frozen=True)
 class QuadrotorParams:
-    """Physical parameters; source of every value but gravity: Parrot Bebop 2, identified by tud-amr/mrca-mav.
+    """Physical parameters. All defaults except gravity are those of a Parrot Bebop 2, identified by tud-amr/mrca-mav.
 
     :param gravity: gravitational acceleration (m/s^2)
     :param drag_x: drag coefficient along x (1/s)
@@ -51,7 +51,7 @@ class QuadrotorParams:
     :param pitch_time_constant: time constant of the pitch response (s)
     :param climb_gain: steady-state gain of the climb-rate command (-)
     :param climb_time_constant: time constant of the climb-rate response (s)
-    :raises ValueError: a drag is negative, or another value not positive
+    :raises ValueError: if a drag coefficient is negative, or another value is not positive
     """
 
     gravity: _Moderate = 9.81
@@ -66,27 +66,27 @@ class QuadrotorParams:
 
     @property
     def longest_step(self) -> float:
-        """The longest step (s) in which `rk4_step` is stable: its stability interval over the fastest decay."""
+        """Longest step (s) for which `rk4_step` is stable: its stability interval divided by the fastest decay rate."""
         lags = (1 / self.roll_time_constant, 1 / self.pitch_time_constant, 1 / self.climb_time_constant)
         return 2.785 / max(self.drag_x, self.drag_y, *lags)
 
 
-# What may differ from robot to robot, in the order of the factors that `QuadrotorModel.step` takes.
+# The parameters that may vary between robots, in the order of the factors of `QuadrotorModel.step`.
 VEHICLE_PARAMETERS = tuple(field.name for field in fields(QuadrotorParams) if field.name != "gravity")
 
 
 def scaled(params: QuadrotorParams, factors: ca.SX) -> Any:
-    """The parameters of a vehicle unlike its model, as expressions: each of `VEHICLE_PARAMETERS` times its factor."""
+    """Return the parameters of a vehicle as expressions: each of `VEHICLE_PARAMETERS` times its factor."""
     values = {name: getattr(params, name) * factors[k] for k, name in enumerate(VEHICLE_PARAMETERS)}
     return SimpleNamespace(gravity=params.gravity, **values)
 
 
 def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -> ca.SX:
-    """Time derivative of the state.
+    """Compute the time derivative of the state.
 
     :param x: state, (9,)
     :param u: input, (4,)
-    :param wind: horizontal velocity of the air, (2,), world frame (m/s); drag acts on the velocity relative to it
+    :param wind: horizontal velocity of the air, (2,), world frame (m/s); drag acts on the velocity relative to the air
     :param params: physical parameters
     :return: dx/dt, (9,)
     """
@@ -105,7 +105,7 @@ def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -
 
 
 def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float | ca.SX) -> ca.SX:
-    """One classical Runge-Kutta step of length ``dt`` (s) with held input (eq. 1); shapes as `state_derivative`."""
+    """Take one classical Runge-Kutta step of length ``dt`` (s) with constant input (eq. 1), see `state_derivative`."""
     k1 = state_derivative(x, u, wind, params)
     k2 = state_derivative(x + dt / 2 * k1, u, wind, params)
     k3 = state_derivative(x + dt / 2 * k2, u, wind, params)
@@ -114,10 +114,11 @@ def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float
 
 
 def step_function(params: QuadrotorParams, dt: float | None, varied: bool = False) -> ca.Function:
-    """The discrete dynamics as a CasADi function ``(x, u, wind) -> x_next`` with shapes (9,), (4,), (2,) -> (9,).
+    """Create the discrete dynamics as a CasADi function ``(x, u, wind) -> x_next``, (9,), (4,), (2,) -> (9,).
 
-    :param dt: length of the step (s); None makes it a further argument
-    :param varied: a further argument, (8,), holds the factors of `VEHICLE_PARAMETERS`
+    :param params: physical parameters
+    :param dt: length of the step (s); None makes it an additional argument
+    :param varied: whether the factors of `VEHICLE_PARAMETERS`, (8,), are an additional argument
     """
     x, u, wind = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS), ca.SX.sym("wind", 2)
     inputs = {"x": x, "u": u, "wind": wind}
@@ -132,7 +133,7 @@ def step_function(params: QuadrotorParams, dt: float | None, varied: bool = Fals
 
 @functools.lru_cache(maxsize=256)
 def _compiled_step(params: QuadrotorParams, dt: float | None, varied: bool) -> RowFunction | None:
-    """`step_function` for many rows; None where it cannot be compiled, of which the planner warns."""
+    """Compile `step_function` for many rows. Returns None if that fails, of which the planner warns."""
     try:
         return RowFunction(step_function(params, dt, varied))
     except BuildError:
@@ -140,7 +141,7 @@ def _compiled_step(params: QuadrotorParams, dt: float | None, varied: bool) -> R
 
 
 class QuadrotorModel:
-    """The discrete dynamics of many quadrotors at once, on NumPy arrays; threads may share it.
+    """Discrete dynamics of a batch of quadrotors, on NumPy arrays. Thread-safe.
 
     :param params: physical parameters
     :param dt: length of a step (s)
@@ -149,17 +150,17 @@ class QuadrotorModel:
     def __init__(self, params: QuadrotorParams, dt: float):
         self.params = params
         self.dt = dt
-        self._local = threading.local()  # calls write into buffers, so every thread has its own
+        self._local = threading.local()  # calls write into buffers, so each thread has its own
 
     def step(
         self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None, factors: np.ndarray | None = None
     ) -> np.ndarray:
-        """Next states.
+        """Compute the next states.
 
         :param x: states, (..., 9)
         :param u: inputs, (..., 4)
         :param wind: velocity of the air, (..., 2) (m/s); None for still air
-        :param factors: of each vehicle's `VEHICLE_PARAMETERS`, (..., 8); None for vehicles like the model
+        :param factors: factors of each vehicle's `VEHICLE_PARAMETERS`, (..., 8); None for the nominal parameters
         :return: states one step later, (..., 9)
         """
         if factors is None:
@@ -167,7 +168,7 @@ class QuadrotorModel:
         return self._call(x, [x, u, wind, factors], self.dt, True)
 
     def ahead(self, x: np.ndarray, u: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """States after times of their own, in still air: (..., 9), (..., 4), (...) (s) -> (..., 9)."""
+        """Compute states after individual times, in still air: (..., 9), (..., 4), (...) (s) -> (..., 9)."""
         return self._call(x, [x, u, None, time], None, False)
 
     def _call(self, x: np.ndarray, arguments: list[np.ndarray | None], dt: float | None, varied: bool) -> np.ndarray:
@@ -176,7 +177,7 @@ class QuadrotorModel:
             return x.copy()
         if count >= _WORTH_COMPILING and (compiled := _compiled_step(self.params, dt, varied)) is not None:
             return compiled(count, arguments).reshape(x.shape)
-        capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches do not pile up functions
+        capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches need few functions
         calls: dict[Any, _BufferedCall] = self._local.__dict__
         key = (dt, varied, capacity)
         if key not in calls:
@@ -184,7 +185,7 @@ class QuadrotorModel:
         return calls[key](count, arguments).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """States that follow from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
+        """Roll out states from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
         states = np.empty((x.shape[0], u.shape[1] + 1, N_STATES))
         states[:, 0] = x
         for k in range(u.shape[1]):
@@ -196,7 +197,7 @@ class QuadrotorModel:
 
 
 class _BufferedCall:
-    """Calls a CasADi function on preallocated memory: a plain call converts every array to a CasADi matrix and back."""
+    """Calls a CasADi function on preallocated memory. A plain call would convert all arrays to CasADi matrices."""
 
     def __init__(self, function: ca.Function, capacity: int):
         self._arguments = [np.ones((capacity, function.numel_in(k))) for k in range(function.n_in())]

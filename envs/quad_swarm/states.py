@@ -1,4 +1,4 @@
-"""What the states of environments are made of: arrays and random generators, as plain numbers."""
+"""Arrays and random number generators of environment states, as plain values."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ import numpy as np
 
 
 def generator_state(rng: np.random.Generator) -> dict[str, Any]:
-    """What makes the same generator again, see `generator_of`."""
+    """Return the state of a random number generator, see `generator_of`."""
     return dict(rng.bit_generator.state)
 
 
 def generator_of(state: dict[str, Any]) -> np.random.Generator:
-    """The generator of a state.
+    """Create the random number generator of a state.
 
-    :raises ValueError: a generator that NumPy does not have by this name, or another one's state
+    :raises ValueError: if NumPy has no such generator, or the state does not fit it
     """
     bits = getattr(np.random, str(state.get("bit_generator")), None)
     if not (isinstance(bits, type) and issubclass(bits, np.random.BitGenerator)):
-        raise ValueError(f"bit_generator={state.get('bit_generator')!r} is none of NumPy's.")
+        raise ValueError(f"bit_generator={state.get('bit_generator')!r} is not one of NumPy's.")
     generator = np.random.Generator(bits())
     generator.bit_generator.state = state
     return generator
 
 
 def like(present: np.ndarray, given: Any, name: str) -> np.ndarray:
-    """A copy of an array that is to take another one's place.
+    """Copy an array that replaces another one.
 
-    :param present: the array that is there
-    :param given: the other one
-    :param name: what it is, for messages
-    :raises ValueError: another shape or type
+    :param present: the array to replace
+    :param given: its replacement
+    :param name: name of the array, for error messages
+    :raises ValueError: if shape or data type differ
     """
     array = np.array(given)
     if array.shape != present.shape or array.dtype != present.dtype:
         raise ValueError(
-            f"{name}: the state has {array.dtype} of shape {array.shape}, this environment {present.dtype} of shape "
-            f"{present.shape}. A state fits only an environment with the same arguments."
+            f"{name}: the state has {array.dtype} of shape {array.shape}, but this environment has {present.dtype} of "
+            f"shape {present.shape}. A state fits only an environment with the same arguments."
         )
     return array

@@ -1,6 +1,6 @@
-"""Settings and arguments are checked once, where they enter: pydantic checks, and one line says what is wrong.
+"""Validation of settings and arguments by pydantic, with error messages of one line.
 
-Texts are read as what they stand for ("false", "1e-3", "10"), as they come from YAML and from command lines.
+Text is converted to the value it stands for ("false", "1e-3", "10"), as it comes from YAML and command lines.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-# Beyond these (m) nothing flies, and squares lose their meaning before they overflow.
+# Limit of lengths and coordinates (m), far beyond any flight and small enough for precise squares
 _FARTHEST = 1e4
 Length = Annotated[float, pydantic.Field(ge=0, le=_FARTHEST)]
 PositiveLength = Annotated[float, pydantic.Field(gt=0, le=_FARTHEST)]
@@ -31,7 +31,7 @@ Coordinate = Annotated[float, pydantic.Field(ge=-_FARTHEST, le=_FARTHEST)]
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] > pair[1]:
-        raise ValueError("it must be lowest first, highest second")
+        raise ValueError("it must be the lowest value first, then the highest")
     return pair
 
 
@@ -39,9 +39,9 @@ Range = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ascend
 
 
 def checked(cls: type[T]) -> type[T]:
-    """Decorator of a frozen dataclass: its fields are converted to their types and checked against their bounds.
+    """Decorate a frozen dataclass so that its fields are converted to their types and checked against their bounds.
 
-    A nested dataclass may be given as a mapping. What does not fit raises a `ValueError` of one line.
+    Nested dataclasses may be mappings. Invalid values raise a `ValueError` with one line.
     """
     strict = pydantic.dataclasses.dataclass(frozen=True, config=_STRICT)(cls)
     construct = strict.__init__
@@ -58,9 +58,9 @@ def checked(cls: type[T]) -> type[T]:
 
 
 def checked_arguments(function: F) -> F:
-    """Decorator: arguments are converted to their annotated types and checked, as the fields of `checked` are."""
+    """Decorate a function so that its arguments are converted and checked like the fields of `checked`."""
 
-    @functools.cache  # made at the first call, to keep the import fast
+    @functools.cache  # created at the first call to keep the import fast
     def call() -> Callable[..., Any]:
         return pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False))(function)
 
@@ -75,12 +75,13 @@ def checked_arguments(function: F) -> F:
 
 
 def replaced(config: T, changes: Mapping[str, Any], *path: str) -> T:
-    """A `checked` dataclass with some of its fields replaced, nested ones by mappings of what to replace in them.
+    """Replace fields of a `checked` dataclass. Mappings replace fields of nested dataclasses.
 
     :param config: the dataclass
     :param changes: field name -> new value
-    :param path: where the dataclass stands among the user's arguments, for messages
-    :raises ValueError: unknown field or wrong value; the message names its path
+    :param path: path of the dataclass in the user's arguments, for error messages
+    :return: the new dataclass
+    :raises ValueError: if a field is unknown or a value is invalid; the message names its path
     """
     validator = type(config).__pydantic_validator__  # type: ignore[attr-defined]
     try:
@@ -98,11 +99,11 @@ def _values(config: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueError:
-    """A validation error as one line: where, which value, what is allowed.
+    """Convert a validation error to one line that names the argument, its value and what is allowed.
 
-    :param error: what pydantic found
+    :param error: pydantic's error
     :param owner: the dataclass or function that was called
-    :param path: where it stands among the user's arguments
+    :param path: path of the owner in the user's arguments
     """
     errors = error.errors(include_url=False)
     place, value = errors[0]["loc"], errors[0]["input"]
@@ -111,20 +112,20 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         where = ".".join((*path, *parents))
         kind = f"{where or owner.__name__} parameter" if isinstance(owner, type) else "argument"
         return unknown_name(kind, name, _names(owner, parents))
-    if "str" in place:  # of a union: each of its members has a complaint, under the name of its type
+    if "str" in place:  # in a union, each member reports an error under the name of its type
         place = place[: place.index("str")]
         errors = [each for each in errors if each["loc"][: len(place)] == place]
     else:
         errors = errors[:1]
-    if place and isinstance(place[0], int):  # by position
+    if place and isinstance(place[0], int):  # a positional argument
         place = (_names(owner)[place[0]], *place[1:])
     told = " or ".join(dict.fromkeys(_told(each["msg"]) for each in errors))
     name = ".".join((*path, *(str(part) for part in place)))
     if errors[0]["type"] == "value_error" and not isinstance(value, (tuple, list)):
         return ValueError(
             told if told.endswith(("?", ".")) else f"{told}."
-        )  # from `__post_init__`, which names the fields that do not go together
-    if errors[0]["type"] == "missing":  # of a tuple
+        )  # from `__post_init__`, which names the conflicting fields
+    if errors[0]["type"] == "missing":  # in a tuple
         name, told = name.rpartition(".")[0], "it has too few entries"
     return ValueError(f"{name}={shown(value)}: {told}.")
 
@@ -135,7 +136,7 @@ def _told(message: str) -> str:
 
 
 def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
-    """Names of the parameters of a function, or of the fields of the dataclass at ``path`` inside a dataclass."""
+    """Return the names of a function's parameters, or of the fields of the dataclass at ``path`` in a dataclass."""
     if not dataclasses.is_dataclass(owner):
         return list(inspect.signature(owner).parameters)
     for name in path:

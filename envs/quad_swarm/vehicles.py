@@ -1,4 +1,4 @@
-"""Vehicles by name, and vehicle files as ``sb3-maddpg identify`` writes them."""
+"""Vehicles by name, and vehicle files of ``sb3-maddpg identify``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from quad_swarm.errors import shown, unknown_name
 from quad_swarm.quadrotor import QuadrotorParams
 
 VEHICLES: dict[str, QuadrotorParams] = {
-    # Parrot Bebop 2, the paper's: identified by tud-amr/mrca-mav
+    # Parrot Bebop 2, the paper's vehicle: identified by tud-amr/mrca-mav
     "bebop2": QuadrotorParams(),
     # Bitcraze Crazyflie 2.1 Brushless, with our climb loop: sb3-maddpg identify --plant crazyflow:cf21B_500
     "crazyflie21": QuadrotorParams(
@@ -47,7 +47,7 @@ VEHICLES: dict[str, QuadrotorParams] = {
         climb_time_constant=0.255,
     ),
     # A racer of the 250 mm class: drag as identified by Faessler, Franchi and Scaramuzza (RA-L 2018, 610 g); attitude
-    # and climb are ours, as fast as rate loops of such vehicles are.
+    # and climb are our own values, as fast as the rate loops of such vehicles.
     "racer250": QuadrotorParams(
         drag_x=0.544,
         drag_y=0.386,
@@ -62,11 +62,11 @@ VEHICLES: dict[str, QuadrotorParams] = {
 
 
 def load_vehicle(name: str) -> QuadrotorParams:
-    """The parameters of a vehicle.
+    """Load the parameters of a vehicle.
 
-    :param name: of `VEHICLES`, or the path of a vehicle file (``.yml``)
-    :raises ValueError: unknown name, or a file that holds something else
-    :raises OSError: the file cannot be read
+    :param name: a name of `VEHICLES`, or the path of a vehicle file (``.yml``)
+    :raises ValueError: if the name is unknown, or the file is not a valid vehicle file
+    :raises OSError: if the file cannot be read
     """
     if not name.endswith((".yml", ".yaml")):
         if name not in VEHICLES:
@@ -78,6 +78,6 @@ def load_vehicle(name: str) -> QuadrotorParams:
         return QuadrotorParams(**values)
     except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError) as error:
         raise ValueError(
-            f"{name} is no vehicle file ({shown(str(error))}): `sb3-maddpg identify --out` writes one, with the "
+            f"{name} is not a vehicle file ({shown(str(error))}): `sb3-maddpg identify --out` writes one, with the "
             "vehicle's values under `parameters`."
         ) from None

@@ -1,1 +1,1 @@
-"""The command line: `sb3-maddpg`, rl_zoo3 with MADDPG, searches and the stopwatch."""
+"""The command line `sb3-maddpg`: rl_zoo3 with MADDPG, hyperparameter searches and benchmarks."""

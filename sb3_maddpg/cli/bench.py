@@ -17,15 +17,17 @@ from sb3_maddpg.cli.experiment import TeamExperimentManager
 from sb3_maddpg.cli.options import check_writable, common_options
 from sb3_maddpg.cli.recipes import LengthOption, check_options
 
-# What of an algorithm is timed, by the attribute that does it. Those that an algorithm lacks take no time of their own.
+# Timed parts of an algorithm and their methods. A method that the algorithm lacks counts as 0 seconds.
 PARTS = {"learning": "train", "acting": "_sample_action"}
 
 
 def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any]:
     """
-    :param function: any
-    :param total: its only entry grows by the seconds of each call
-    :return: the function, with a stopwatch
+    Measure the time of a function's calls.
+
+    :param function: any function
+    :param total: list with one entry, to which the seconds of each call are added
+    :return: the timed function
     """
 
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -40,9 +42,9 @@ def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any
 
 class BenchManager(TeamExperimentManager):
     """
-    Trains with a stopwatch, and keeps nothing but the times.
+    Experiment manager that measures training times and saves nothing else.
 
-    :param result: where the times are put, for rl_zoo3 keeps its manager to itself
+    :param result: receives the times, since rl_zoo3 does not expose its manager
     """
 
     def __init__(self, result: dict[str, Any], *args: Any, **kwargs: Any):
@@ -51,7 +53,9 @@ class BenchManager(TeamExperimentManager):
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
-        :param model: a new one
+        Train a model and measure the times.
+
+        :param model: a new model
         """
         totals = {name: [0.0] for name in (*PARTS, "environments")}
         for name, attribute in PARTS.items():
@@ -76,7 +80,9 @@ class BenchManager(TeamExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
-        :param model: not worth saving
+        Do nothing.
+
+        :param model: unused
         """
 
 
@@ -111,4 +117,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit("error: this module is no command: use `sb3-maddpg bench` or `python -m sb3_maddpg bench`.")
+    sys.exit("error: this module is not a command: use `sb3-maddpg bench` or `python -m sb3_maddpg bench`.")

@@ -1,4 +1,4 @@
-"""The command ``sb3-maddpg``: everything that is done often, in one line."""
+"""The command ``sb3-maddpg`` with its subcommands for frequent tasks."""
 
 import argparse
 import importlib
@@ -30,7 +30,7 @@ from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.utils import suggest
 
-# Mistakes in what the user gave, and what the system refuses. Their messages say what to do, so one line is enough.
+# Errors in the user's input and errors of the system. Their messages name the remedy, so no traceback is shown.
 USER_ERRORS = (ValueError, OSError, AssertionError, ImportError, gymnasium.error.Error, yaml.YAMLError)
 
 DESCRIPTION = """\
@@ -38,30 +38,30 @@ Multi-agent reinforcement learning with MADDPG and MATD3 for Stable-Baselines3.
 
 {commands}
 
-`<command> --help` lists a command's options and shows an example. Those of train, tune, enjoy and record are rl_zoo3's.
-What differs: --algo is maddpg unless given, the packaged recipe is used unless --conf-file names another, --env-kwargs
-are merged over the recipe's, --num-threads is 1 unless given, and -i MODEL.zip continues the training where it ended.
-Values of --env-kwargs and -params are written as in Python or YAML; nothing is evaluated.
---gym-packages PACKAGE ... imports packages that register environments, rules or scenarios, in every command.
---env PACKAGE/MODULE is a PettingZoo environment (MODULE for a file in the present folder); its --env-kwargs are those
-of its parallel_env, `state:true` for critics that read the global state, and `wrappers` by SuperSuit. There, an
-algorithm of Stable-Baselines3's, such as --algo ppo, trains one policy whose parameters all agents share. Where a
-command takes a model's zip, `latest:LOGDIR` is the newest one there and `pretrained:NAME` a pretrained one. --trust,
-with any command, loads files that may run code: models of earlier versions and of other algorithms."""
+`<command> --help` lists a command's options and shows an example. train, tune, enjoy and record have rl_zoo3's options,
+with these differences: --algo defaults to maddpg, --conf-file to the packaged recipe and --num-threads to 1;
+--env-kwargs are merged over those of the recipe; and -i MODEL.zip continues training where it ended.
+Values of --env-kwargs and -params are written in Python or YAML; nothing is evaluated.
+--gym-packages PACKAGE ... imports packages that register environments, rules or scenarios, with every command.
+--env PACKAGE/MODULE selects a PettingZoo environment (MODULE for a file in the current folder). Its --env-kwargs are
+the arguments of its parallel_env, `state:true` for critics that read the global state, and SuperSuit `wrappers`. With
+an algorithm of Stable-Baselines3, such as --algo ppo, all agents share one policy. Commands that take a model's zip
+file also accept `latest:LOGDIR` for the newest model in a folder and `pretrained:NAME`. --trust, with any command,
+loads files that may run code: models of earlier versions and of other algorithms."""
 
 
 class Command(NamedTuple):
-    """What a command does, and how it is called."""
+    """A subcommand with its help and examples."""
 
     run: Callable[[list[str]], int]
     help: str
     examples: str
     offers: str = ""
-    """Group of entry points by which packages offer the command for their environments"""
+    """Group of the entry points through which packages provide the command for their environments"""
 
 
 def _zoo(command: str) -> Callable[[list[str]], int]:
-    """A command of the zoo; rl_zoo3 is imported only now, for the others do without it."""
+    """Return a command of the zoo. It imports rl_zoo3 only when called, since other commands do not need it."""
 
     def run(argv: list[str]) -> int:
         zoo = importlib.import_module("sb3_maddpg.cli.zoo")
@@ -85,9 +85,11 @@ def _identify(argv: list[str]) -> int:
 
 def _hand_over(group: str, argv: list[str]) -> int:
     """
-    Call what a package offers for its environment; without --env the only one that is offered for.
+    Call the command that a package provides for its environment. ``--env`` is optional if there is only one.
 
-    :param group: last part of the entry points' group
+    :param group: last part of the name of the entry points' group
+    :param argv: arguments of the command
+    :return: exit status
     """
     offers = entry_points(group=f"sb3_maddpg.{group}")
     known, rest = common_options().parse_known_args(argv)
@@ -120,7 +122,7 @@ def _hand_over(group: str, argv: list[str]) -> int:
 
 
 def _model(word: str, algo: str, env_id: str) -> str:
-    """The path that ``latest:LOGDIR`` and ``pretrained:NAME`` stand for, with the threshold that may follow them."""
+    """Replace ``latest:LOGDIR`` and ``pretrained:NAME`` by the path of the model, keeping a threshold after ``@``."""
     name, at, threshold = word.partition("@")
     if name.startswith("latest:"):
         return latest_model(name, algo, env_id) + at + threshold
@@ -128,19 +130,21 @@ def _model(word: str, algo: str, env_id: str) -> str:
         return str(pretrained_folder(name.removeprefix("pretrained:")) / "model.zip") + at + threshold
     kind, colon, _ = name.partition(":")
     if colon and (hint := did_you_mean(kind, ("latest", "pretrained"), cutoff=0.8)):
-        raise ValueError(f"{word} names no model; latest:LOGDIR and pretrained:NAME do.{hint}")
+        raise ValueError(f"{word} is not a model; use latest:LOGDIR or pretrained:NAME.{hint}")
     return word
 
 
 def latest_model(word: str, algo: str, env_id: str) -> str:
     """
+    Find the newest model in a log folder.
+
     :param word: ``latest:LOGDIR``
     :param algo: name of the algorithm
     :param env_id: Gymnasium id
-    :return: the final model of the newest run that has one, else its best model so far
-    :raises FileNotFoundError: there is none
+    :return: path of the final model of the newest run that has a model, or else of that run's best model so far
+    :raises FileNotFoundError: if there is no model
     """
-    folder, name = Path(word.removeprefix("latest:"), algo), env_id.replace("/", "-")  # as rl_zoo3 calls it
+    folder, name = Path(word.removeprefix("latest:"), algo), env_id.replace("/", "-")  # as in rl_zoo3
     runs = [path for path in folder.glob(f"{name}_*") if path.name[len(name) + 1 :].isdigit()]
     for run in sorted(runs, key=lambda path: int(path.name[len(name) + 1 :]), reverse=True):
         for model in (run / f"{name}.zip", run / "best_model.zip"):
@@ -159,10 +163,10 @@ def _bench(argv: list[str]) -> int:
 
 
 def _pretrained(argv: list[str]) -> int:
-    """List the pretrained models, or show one or copy it."""
+    """List the pretrained models, or show or copy one."""
     parser = argparse.ArgumentParser(prog=f"{PROG} pretrained")
-    parser.add_argument("name", nargs="?", metavar="NAME", help=f"{', '.join(pretrained_models())}; all unless given")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="copy the model and what belongs to it into DIR/NAME")
+    parser.add_argument("name", nargs="?", metavar="NAME", help=f"{', '.join(pretrained_models())}; default: all")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="copy the model's folder to DIR/NAME")
     args = parser.parse_args(argv)
     if args.name is None:
         if args.out:
@@ -184,12 +188,14 @@ def _pretrained(argv: list[str]) -> int:
 def _convert(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog=f"{PROG} convert",
-        description="Write a model's file anew, as this version does: without anything that runs code when it is "
-        "loaded. To read an older file runs what it holds, hence --trust.",
+        description="Convert a model's file to this version's format, which runs no code when it is loaded. Reading an "
+        "older file may run the code it holds, and therefore needs --trust.",
     )
     parser.add_argument("old", type=Path, metavar="OLD.zip")
     parser.add_argument("new", type=Path, metavar="NEW.zip")
-    parser.add_argument("--algo", choices=sorted(ALGORITHMS), default="maddpg", help="whose model it is (%(default)s)")
+    parser.add_argument(
+        "--algo", choices=sorted(ALGORITHMS), default="maddpg", help="the model's algorithm (default %(default)s)"
+    )
     parser.add_argument("--lean", choices=get_args(Lean), help="keep only the actors, or the critics too")
     args = parser.parse_args(argv)
     check_writable(args.new)
@@ -201,14 +207,14 @@ def _convert(argv: list[str]) -> int:
 def _publish(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog=f"{PROG} publish",
-        description="Upload a model to the Hugging Face Hub: a file that runs no code when it is loaded, a card, and "
-        "the recipe and evaluations of its run. Log in before with `hf auth login`.",
+        description="Upload a model to the Hugging Face Hub: a file that runs no code when it is loaded, a model card, "
+        "and the recipe and evaluations of its run. Log in first with `hf auth login`.",
     )
     parser.add_argument("model", metavar="MODEL.zip", help="or latest:LOGDIR, pretrained:NAME")
     parser.add_argument("repository", metavar="NAME/REPOSITORY")
     parser.add_argument("--algo", default="maddpg", choices=sorted(ALGORITHMS), help="default %(default)s")
     parser.add_argument("--env", default="QuadSwarm-v0", help="for latest:LOGDIR (default %(default)s)")
-    parser.add_argument("--whole", action="store_true", help="with all that a training goes on from")
+    parser.add_argument("--whole", action="store_true", help="include everything that training needs to resume")
     parser.add_argument("--private", action="store_true", help="make a new repository private")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write it all into this folder instead")
     args = parser.parse_args(argv)
@@ -225,15 +231,15 @@ def _publish(argv: list[str]) -> int:
 
 
 def _headline(readme: Path) -> str:
-    """The first sentence of a model's README, without Markdown; a colon ends it too."""
+    """:return: the first sentence of a model's README without Markdown; a colon also ends it"""
     text = " ".join(readme.read_text().split("\n\n")[0].split()) if readme.is_file() else ""
     return re.split(r"(?<=[.:])\s", text.lstrip("# ").replace("`", ""), maxsplit=1)[0].rstrip(".:")
 
 
 def examples(name: str) -> str:
     """
-    :param name: of a command
-    :return: its examples, for a command that packages offer those of theirs: ``EXAMPLES`` of the module that has it
+    :param name: name of a command
+    :return: the command's examples. For a command that packages provide, these are ``EXAMPLES`` of their modules.
     """
     command = COMMANDS[name]
     if not command.offers:
@@ -248,7 +254,7 @@ def examples(name: str) -> str:
 COMMANDS: dict[str, Command] = {
     "train": Command(
         _zoo("train"),
-        "train a team and evaluate it now and then",
+        "train a team and evaluate it periodically",
         f"""\
   {PROG} train --env mpe2/simple_spread_v3 --progress --tensorboard-log logs/tensorboard
   {PROG} train --algo matd3 --env mpe2/simple_spread_v3 --env-kwargs continuous_actions:false
@@ -276,19 +282,19 @@ COMMANDS: dict[str, Command] = {
     ),
     "replay": Command(
         _replay,
-        "make a page that replays an episode in three dimensions",
+        "write a web page that replays an episode in three dimensions",
         f"  {PROG} replay --env ENV --policy latest:logs --out replay.html",
         "replays",
     ),
     "identify": Command(
         _identify,
-        "fit the model of an environment's vehicle to a simulator",
+        "fit the vehicle model of an environment to a simulator",
         f"  {PROG} identify --env ENV --plant SIMULATOR:VEHICLE --out vehicle.yml",
         "identifiers",
     ),
     "bench": Command(
         _bench,
-        "measure how fast a recipe trains on this machine, and where the time goes",
+        "measure how fast a recipe trains on this machine and where the time goes",
         f"  {PROG} bench --env mpe2/simple_spread_v3 --n-timesteps 20000",
     ),
     "publish": Command(
@@ -298,7 +304,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "convert": Command(
         _convert,
-        "write a model's file anew, without anything that runs code when it is loaded",
+        "convert a model's file to one that runs no code when it is loaded",
         f"  {PROG} convert old.zip new.zip --trust",
     ),
     "pretrained": Command(
@@ -310,7 +316,7 @@ COMMANDS: dict[str, Command] = {
 
 
 class _Parser(argparse.ArgumentParser):
-    """Looks at what is installed only for the help, for that takes a second."""
+    """Parser that lists the installed environments and models for ``--help`` only, since that takes a second."""
 
     def format_help(self) -> str:
         self.epilog = f"{overview()}\n\nexamples:\n" + "\n".join(map(examples, COMMANDS))
@@ -333,8 +339,8 @@ def _parser() -> argparse.ArgumentParser:
 @contextmanager
 def _present_folder(words: list[str]) -> Iterator[None]:
     """
-    Import from the present folder if ``--gym-packages`` or ``--env`` names a module that lies there, and only then:
-    what a recipe names is never taken from wherever the user happens to be.
+    Import from the current folder only if ``--gym-packages`` or ``--env`` names a module in it, so that names in a
+    recipe are never imported from there by accident.
 
     :param words: arguments of the command
     """
@@ -352,7 +358,7 @@ def _present_folder(words: list[str]) -> Iterator[None]:
 
 @contextmanager
 def _trust() -> Iterator[None]:
-    """Load files that may run code, in this process and in those that it starts."""
+    """Allow files to run code, in this process and its subprocesses."""
     before = os.environ.get(TRUST_VARIABLE)
     os.environ[TRUST_VARIABLE] = "1"
     try:
@@ -365,14 +371,16 @@ def _trust() -> Iterator[None]:
 
 def main(argv: list[str] | None = None) -> int:
     """
-    :param argv: arguments, those of the command line by default
-    :return: exit status, 2 for a mistake in what the user gave
+    Run a command.
+
+    :param argv: arguments, by default those of the command line
+    :return: exit status, 2 for an error in the user's input
     """
     with nearest_options():
         arguments = _parser().parse_args(argv)
     command, rest = arguments.command, arguments.arguments
     debug = arguments.debug or "--debug" in rest
-    # What a package offers for its environment may have such an option, rl_zoo3 has none
+    # Commands of packages may have this option, rl_zoo3's do not
     if command not in ("evaluate", "replay"):
         rest = [word for word in rest if word != "--debug"]
     trusts, rest = "--trust" in rest, [word for word in rest if word != "--trust"]

@@ -1,4 +1,4 @@
-"""rl_zoo3's experiment manager, with its known faults around environment arguments, resuming and tuning mended."""
+"""rl_zoo3's experiment manager with fixes for environment arguments, resuming and tuning."""
 
 import contextlib
 import functools
@@ -45,8 +45,8 @@ from sb3_maddpg.team import Team
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
-# Tables in a training of an off-policy algorithm, unless --log-interval says otherwise: SB3's one every four episodes
-# fills the screen, and short trainings end before the first.
+# Default number of log tables when training an off-policy algorithm. SB3's default of one every four episodes floods
+# the screen, and short trainings end before the first table.
 TABLES = 100
 FEWEST_STEPS_PER_TABLE = 1000
 
@@ -55,37 +55,39 @@ COMMAND_FILE, CHECKPOINTS = "command.json", "checkpoints"
 
 
 class Checkpoints(NamedTuple):
-    """What the command line says about checkpoints."""
+    """The command line's settings of checkpoints."""
 
     every: int | None
-    """Steps from one to the next, None: by time"""
+    """Number of steps between checkpoints, None for checkpoints by time"""
     command: dict[str, Any]
-    """With which the run began"""
+    """Command that started the run"""
     run: Path | None = None
-    """The run's folder, where one is resumed"""
+    """Folder of the run to resume"""
 
 
 class TeamExperimentManager(ExperimentManager):
     """
-    - ``--env-kwargs`` are merged over the recipe's ``env_kwargs``, and both reach the evaluation environment, there
-      with ``eval_env_kwargs`` and ``--eval-env-kwargs`` merged over them;
+    Experiment manager of rl_zoo3 with these changes:
+
+    - ``--env-kwargs`` are merged over the recipe's ``env_kwargs``, and both also apply to the evaluation environment,
+      where ``eval_env_kwargs`` and ``--eval-env-kwargs`` are merged over them;
     - options and recipes are checked before anything runs, see ``recipes``; no text of a recipe is evaluated;
-    - a run's folder is claimed: trainings that start together take different ones;
-    - an algorithm for single agents on a PettingZoo environment trains one policy for all agents, ``AgentsVecEnv``;
-    - ``vec_env: gymnasium`` takes the environment's own Gymnasium vector environment, see ``GymnasiumVecEnv``;
-    - ``replay_buffer_class`` can be a dotted path, as ``policy`` can;
-    - models load where rl_zoo3 is not installed: a linear schedule is Stable-Baselines3's;
-    - every model, not only MADDPG's, carries the environment it was trained in as ``env_spec``;
-    - resuming (``-i``) goes on with the counters, the schedules and without a second random warm-up; with a team of
-      another size a ``PairPolicy`` goes on with its networks alone;
-    - ``--trial-id`` takes any trial of a study, also the first, whose number is 0;
-    - tuning (``-optimize``) keeps the recipe's other ``policy_kwargs``, leaves no run folder behind and draws other
-      hyperparameters in each worker of a study. A trial is pruned if its networks diverged; any other error ends the
-      search, instead of being counted as a bad trial. The best trial is written as a recipe.
+    - each run claims its folder, so that trainings that start at the same time use different ones;
+    - a single-agent algorithm on a PettingZoo environment trains one policy for all agents, see ``AgentsVecEnv``;
+    - ``vec_env: gymnasium`` uses the environment's own Gymnasium vector environment, see ``GymnasiumVecEnv``;
+    - ``replay_buffer_class`` can be a dotted path, like ``policy``;
+    - models can be loaded without rl_zoo3, because linear schedules are Stable-Baselines3's;
+    - every model, not only MADDPG's, stores the environment it was trained in as ``env_spec``;
+    - resuming (``-i``) continues counters and schedules and skips the random warm-up; with a team of another size, a
+      ``PairPolicy`` keeps its networks only;
+    - ``--trial-id`` accepts every trial of a study, including the first, whose number is 0;
+    - tuning (``-optimize``) keeps the recipe's other ``policy_kwargs``, leaves no run folder behind and draws different
+      hyperparameters in each worker of a study. A trial is pruned if its networks diverge; any other error ends the
+      search instead of counting as a bad trial. The best trial is written as a recipe.
     """
 
-    study: optuna.Study | None = None  # that was searched
-    continues = False  # with a study of other workers or of an earlier command
+    study: optuna.Study | None = None  # the study of the search
+    continues = False  # whether the study has trials of other workers or of an earlier command
 
     def __init__(
         self, args: Any, *rest: Any, uuid_str: str = "", checkpoints: Checkpoints | None = None, **kwargs: Any
@@ -98,9 +100,8 @@ class TeamExperimentManager(ExperimentManager):
         self.shares_parameters = shares_parameters(ALGOS[self.algo], self.env_name.gym_id)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        # rl_zoo3 would replace the recipe's arguments by these
+        # rl_zoo3 would replace the recipe's arguments with these, and would ignore trial 0
         given, self.env_kwargs = self.env_kwargs, {}
-        # and would take no trial for trial 0
         trial_id, self.trial_id = self.trial_id, None
         read_recipe(self.config, self.algo, self.env_name.gym_id)
         hyperparams, _ = super().read_hyperparameters()
@@ -120,13 +121,13 @@ class TeamExperimentManager(ExperimentManager):
         eval_env_kwargs = {**(hyperparams.pop("eval_env_kwargs", None) or {}), **(self._eval_env_kwargs_args or {})}
         self.eval_env_kwargs = {**env_kwargs, **eval_env_kwargs}
         hyperparams["env_kwargs"] = env_kwargs
-        # As it was written, for classes have no plain form in YAML
+        # Keep the original text, because YAML has no plain form for classes
         self.recipe = {**as_written, "env_kwargs": env_kwargs, "eval_env_kwargs": eval_env_kwargs}
         check_env_kwargs(self.env_name.gym_id, self.eval_env_kwargs)
         return hyperparams, dict(sorted(self.recipe.items()))
 
     def _read_vec_env(self, hyperparams: dict[str, Any]) -> bool:
-        """Whether training steps the environment's own vector environment."""
+        """:return: whether to train in the environment's own vector environment"""
         vec_env = hyperparams.pop("vec_env", None)
         if vec_env not in (None, "gymnasium"):
             raise ValueError(
@@ -138,22 +139,23 @@ class TeamExperimentManager(ExperimentManager):
             )
         if vec_env and (wrappers := {"env_wrapper", "frame_stack", "monitor_kwargs"} & set(hyperparams)):
             raise ValueError(
-                f"vec_env: gymnasium in the recipe does not go with {', '.join(sorted(wrappers))}: leave one out."
+                f"vec_env: gymnasium in the recipe cannot be combined with {', '.join(sorted(wrappers))}: remove one "
+                "of them."
             )
         others = ("env_wrapper", "frame_stack", "monitor_kwargs", "normalize", "vec_env_wrapper")
         if self.shares_parameters and (refused := [key for key in others if hyperparams.get(key)]):
             raise ValueError(
                 f"{', '.join(refused)} in the recipe: {self.algo} shares its policy among the agents of "
-                f"{self.env_name.gym_id}, whose wrappers are PettingZoo's. Name them in `wrappers` of env_kwargs, such "
-                "as supersuit.frame_stack_v2."
+                f"{self.env_name.gym_id}, which needs wrappers of PettingZoo. Name them in `wrappers` of env_kwargs, "
+                "such as supersuit.frame_stack_v2."
             )
         return vec_env is not None
 
     def _read_trial(self, trial_id: int) -> dict[str, Any]:
-        """The arguments of the algorithm in a trial of the study that ``--storage`` and ``--study-name`` name."""
+        """:return: the algorithm's arguments in a trial of the study given by ``--storage`` and ``--study-name``"""
         if not self.storage or not self.study_name:
-            raise ValueError(f"--trial-id {trial_id} needs to know of which study: give --storage and --study-name.")
-        if self.storage.endswith(".log") and not Path(self.storage).is_file():  # optuna would make an empty one
+            raise ValueError(f"--trial-id {trial_id} needs a study: pass --storage and --study-name.")
+        if self.storage.endswith(".log") and not Path(self.storage).is_file():  # Optuna would create an empty file
             raise FileNotFoundError(f"There is no file {self.storage}.")
         storage = open_storage(self.storage)
         try:
@@ -169,7 +171,7 @@ class TeamExperimentManager(ExperimentManager):
         raise ValueError(f"Study {self.study_name} has no trial {trial_id}, only {len(study.trials)}, counted from 0.")
 
     def create_log_folder(self) -> None:
-        """Make the run's folder; a search has none, each trial's log goes to ``--optimization-log-path``."""
+        """Create the run's folder. A search has none: the log of each trial goes to ``--optimization-log-path``."""
         if self.optimize_hyperparameters:
             return
         if self.checkpoints is not None and self.checkpoints.run is not None:
@@ -190,13 +192,13 @@ class TeamExperimentManager(ExperimentManager):
             {key: one for key, one in hyperparams.items() if one is not None}
         )
         for key, one in found.items():
-            if isinstance(one, SimpleLinearSchedule):  # to load a model with it takes rl_zoo3
+            if isinstance(one, SimpleLinearSchedule):  # loading a model with it would need rl_zoo3
                 found[key] = LinearSchedule(one.initial_value, 0.0, 1.0)
         return found
 
     def create_callbacks(self) -> None:
-        """rl_zoo3's, and what TensorBoard shows beside the curves."""
-        if self.shares_parameters:  # rl_zoo3 counts in steps of all copies and in episodes
+        """Create rl_zoo3's callbacks and the TensorBoard dashboard."""
+        if self.shares_parameters:  # rl_zoo3 counts steps of all copies, and episodes
             env = self.create_envs(1, eval_env=True)
             env.close()
             self.eval_freq = max(self.eval_freq // env.num_envs, 1) if self.eval_freq > 0 else -1
@@ -209,7 +211,7 @@ class TeamExperimentManager(ExperimentManager):
         name = self.env_name.gym_id
         offer = offers[name].load() if name in offers.names else None
         evaluation = next((one for one in self.callbacks if isinstance(one, EvalCallback)), None)
-        if evaluation is None:  # no pictures either
+        if evaluation is None:  # without evaluations, there are no figures
             self.callbacks.append(DashboardCallback(layout=offer and offer.LAYOUT))
             return
         draw = offer and functools.partial(offer.draw, env_kwargs=self.eval_env_kwargs)
@@ -218,9 +220,12 @@ class TeamExperimentManager(ExperimentManager):
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
+        Create the vectorised environment.
+
         :param n_envs: number of environments
-        :param eval_env: whether they are for evaluation
-        :param no_log: write no monitor file
+        :param eval_env: whether the environments are for evaluation
+        :param no_log: whether to write no monitor file
+        :return: the environment
         """
         no_log = no_log or eval_env or self.optimize_hyperparameters
         if self.shares_parameters:
@@ -240,7 +245,7 @@ class TeamExperimentManager(ExperimentManager):
         algorithm = cast("type[MADDPG]", ALGOS[self.algo])
         found = resume(run / CHECKPOINTS, env, algorithm, self.checkpoints.every, device=self.device)
         if found is None:
-            raise ValueError(f"{run} has no checkpoint that is whole.")
+            raise ValueError(f"{run} has no complete checkpoint.")
         model, self.checkpoint = found
         model.tensorboard_log, model.verbose = self.tensorboard_log, self.verbose
         self.n_timesteps -= model.num_timesteps
@@ -248,7 +253,7 @@ class TeamExperimentManager(ExperimentManager):
         return model
 
     def _make_replayable(self) -> None:
-        """Where exact checkpoints are asked for, environments that do not tell their state replay their episodes."""
+        """Wrap environments that do not provide their state in ``Replayable`` if exact checkpoints are requested."""
         if self.checkpoints is None or self.checkpoints.every is None or isinstance(self.env_wrapper, _Replaying):
             return
         env = gymnasium.make(self.env_name.gym_id, **self.env_kwargs)
@@ -264,8 +269,8 @@ class TeamExperimentManager(ExperimentManager):
             trained = algorithm.load(self.trained_agent, device=self.device)
             n_agents = Team.from_spaces(env.observation_space, env.action_space).n_agents
             if n_agents != trained.policy.team.n_agents:
-                print(f"Going on with a team of {n_agents} instead of {trained.policy.team.n_agents}, from step 0")
-                # As rl_zoo3 does: the policy stays as it was trained
+                print(f"Continuing with a team of {n_agents} instead of {trained.policy.team.n_agents}, from step 0")
+                # The policy's arguments stay as trained, as in rl_zoo3
                 arguments = {key: one for key, one in hyperparams.items() if key not in ("policy", "policy_kwargs")}
                 return trained.resized(
                     env, tensorboard_log=self.tensorboard_log, seed=self.seed, verbose=self.verbose, **arguments
@@ -279,6 +284,8 @@ class TeamExperimentManager(ExperimentManager):
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
+        Train a model.
+
         :param model: a new or a loaded model
         """
         assert model.env is not None
@@ -299,7 +306,7 @@ class TeamExperimentManager(ExperimentManager):
             locks = locked(folder)
         try:
             with locks, warnings.catch_warnings():
-                # Evaluation goes episode by episode, whatever steps the training
+                # Evaluation runs episode by episode, with any kind of training environment
                 warnings.filterwarnings("ignore", "Training and eval env are not of the same type")
                 model.learn(
                     self.n_timesteps,
@@ -316,12 +323,12 @@ class TeamExperimentManager(ExperimentManager):
             model.env.close()
 
     def _logger(self, name: str) -> Logger:
-        """Tables on the screen, unless a progress bar is there, and curves for TensorBoard."""
+        """:return: a logger of tables on the screen, unless there is a progress bar, and of curves for TensorBoard"""
         prints = self.verbose > 0 and not self.show_progress
         if self.checkpoint is not None and self.checkpoint.logger_folder and self.tensorboard_log:
             logger = configure(self.checkpoint.logger_folder, [*(["stdout"] if prints else []), "tensorboard"])
             for output in logger.output_formats:
-                if isinstance(output, TensorBoardOutputFormat):  # without what came after the checkpoint
+                if isinstance(output, TensorBoardOutputFormat):  # drop events after the checkpoint
                     output.writer.close()
                     output.writer = SummaryWriter(
                         self.checkpoint.logger_folder, purge_step=self.checkpoint.saved_at + 1
@@ -345,13 +352,13 @@ class TeamExperimentManager(ExperimentManager):
         else:
             sampler = super()._create_sampler(sampler_method)
         if self.continues:
-            sampler.reseed_rng()  # workers with one --seed, or a search that is continued, would repeat trials
+            sampler.reseed_rng()  # otherwise workers with the same --seed and continued searches would repeat trials
         return sampler
 
     def hyperparameters_optimization(self) -> None:
-        """Search, alone or with other workers, and write the best trial as a recipe."""
+        """Search hyperparameters, alone or with other workers, and write the best trial as a recipe."""
         best = Path(self.log_path, f"{self.env_name}_best.yml")
-        check_writable(best)  # as the report beside it
+        check_writable(best)
         kept = None
         if self.storage is None:
             kept = kept_search(Path(self.log_path), str(self.env_name), (self.recipe, *self._search_settings()))
@@ -363,14 +370,14 @@ class TeamExperimentManager(ExperimentManager):
         self.continues = kept is None or kept.is_file()
         study = self._bring_back()
         if kept is not None:
-            self.study = study  # which may lack nothing but its report
+            self.study = study  # may be complete except for its report
         super().hyperparameters_optimization()
-        if self.study is None:  # no trial was left to this worker
+        if self.study is None:  # no trial was left for this worker
             return
         params = HYPERPARAMS_CONVERTER[self.algo](self.study.best_params)
         with atomic_write(best, "yml") as file:
             file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
-        print(f"The best trial as a recipe: {best}. To train by it:")
+        print(f"Recipe of the best trial: {best}. To train with it:")
         print(f"  {PROG} train --algo {self.algo} --env {self.env_name.gym_id} --conf-file {best}")
         if kept is not None and self._over():
             kept.unlink(missing_ok=True)
@@ -380,32 +387,34 @@ class TeamExperimentManager(ExperimentManager):
         return tuple(getattr(self, name) for name in (*names, "n_eval_episodes", "n_eval_envs", "sampler", "pruner"))
 
     def _bring_back(self) -> optuna.Study | None:
-        """Take up the trials of processes that were killed, if there is such a study already."""
+        """Load the study if it exists, and queue trials of killed processes again."""
         assert self.storage is not None
         if self.study_name is None or (self.storage.endswith(".log") and not Path(self.storage).is_file()):
             return None
         try:
             study = optuna.load_study(storage=open_storage(self.storage), study_name=self.study_name)
-        except KeyError:  # a new one
+        except KeyError:  # the study is new
             return None
         count, finished = bring_back(study), _finished(study)
         if finished or count:
-            print(f"The search goes on after {finished} finished trials; {count} that were killed begin again.")
+            print(f"The search continues after {finished} finished trials; {count} killed trials are repeated.")
         return study
 
     def _over(self) -> bool:
-        """Whether a search without ``--storage`` has made all its trials: it may have been interrupted."""
+        """:return: whether a search without ``--storage`` has finished all its trials; it may have been interrupted"""
         assert self.study is not None
         assert self.max_total_trials is not None
         if _finished(self.study) < self.max_total_trials:
-            print(f"The search was interrupted; the same command goes on. Its trials are kept in {self.storage}.")
+            print(f"The search was interrupted; repeat the command to continue. Its trials are in {self.storage}.")
             return False
         return True
 
     def objective(self, trial: optuna.Trial) -> float:
         """
-        :param trial: to choose hyperparameters for
-        :return: last mean reward of the evaluation
+        Train with the hyperparameters of a trial.
+
+        :param trial: trial to sample hyperparameters for
+        :return: mean reward of the last evaluation
         """
         self.study = trial.study
         sign(trial)
@@ -422,7 +431,7 @@ class TeamExperimentManager(ExperimentManager):
             sampled = HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, arguments)
             model = ALGOS[self.algo](
                 env=env,
-                seed=None,  # as in rl_zoo3: each trial draws other numbers
+                seed=None,  # as in rl_zoo3, so that trials differ
                 verbose=self.verbose if self.verbose >= 2 else 0,
                 device=self.device,
                 **update(self._hyperparams, sampled),
@@ -459,14 +468,16 @@ class TeamExperimentManager(ExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
+        Save the model and remove checkpoints that are no longer needed.
+
         :param model: the trained model
         """
         super().save_trained_model(model)
-        if self.checkpoint is not None and model.num_timesteps >= model._total_timesteps:  # else it was interrupted
+        if self.checkpoint is not None and model.num_timesteps >= model._total_timesteps:  # not interrupted
             shutil.rmtree(self.checkpoint.folder, ignore_errors=True)
         if model.ep_info_buffer:
             rewards = [episode["r"] for episode in model.ep_info_buffer]
-            print(f"Mean reward: {safe_mean(rewards):.4g} in the last {len(rewards)} episodes of the training")
+            print(f"Mean reward: {safe_mean(rewards):.4g} in the last {len(rewards)} episodes of training")
         print(f"Model:       {self.save_path}/{self.env_name}.zip")
         print(f"Logs:        {self.save_path}")
         if self.tensorboard_log:
@@ -474,7 +485,7 @@ class TeamExperimentManager(ExperimentManager):
 
 
 class _Replaying:
-    """A wrapper of environments for ``make_vec_env``: the recipe's, and ``Replayable`` inside of it."""
+    """Wrapper class for ``make_vec_env`` that applies ``Replayable`` before the recipe's wrapper."""
 
     def __init__(self, outer: Callable[[gymnasium.Env], gymnasium.Env] | None):
         self.outer = outer
@@ -485,10 +496,10 @@ class _Replaying:
 
 
 class RegularTables(LogEveryNTimesteps):
-    """A table, and a point of each curve, every so many timesteps and at the end."""
+    """Logs a table and a point of each curve every ``n_steps`` timesteps and at the end."""
 
     def _on_training_start(self) -> None:
-        self.last_time_trigger = self.num_timesteps  # a continued training counts on
+        self.last_time_trigger = self.num_timesteps  # a continued training keeps its step count
 
     def _on_training_end(self) -> None:
         self.num_timesteps = self.model.num_timesteps
@@ -498,11 +509,12 @@ class RegularTables(LogEveryNTimesteps):
 
 def claim_folder(prefix: str, first: int, suffix: str = "") -> Path:
     """
-    Make a folder ``PREFIX_NUMBER`` that nobody else has, whoever starts at the same time.
+    Create a new folder ``PREFIX_NUMBER``, also if several processes do so at the same time.
 
     :param prefix: path without the number
-    :param first: the lowest number
-    :param suffix: added to the number
+    :param first: lowest number
+    :param suffix: text after the number
+    :return: path of the folder
     """
     Path(prefix).parent.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(first):
@@ -517,8 +529,8 @@ def claim_folder(prefix: str, first: int, suffix: str = "") -> Path:
 
 def as_yaml(recipe: dict[str, Any]) -> dict[str, Any]:
     """
-    :param recipe: that may hold classes of ``torch.nn``
-    :return: with text that ``parse_literal`` reads where YAML has no form for a value
+    :param recipe: a recipe, which may hold classes of ``torch.nn``
+    :return: the recipe, where values that YAML cannot hold are text for ``parse_literal``
     """
     plain = {}
     for key, value in recipe.items():
@@ -535,7 +547,7 @@ def _finished(study: optuna.Study) -> int:
 
 
 def _make_tables(url: str) -> None:
-    """Those of a study in a database. Workers that start together get in each other's way here, and only here."""
+    """Create the tables of a study in a database, with retries if several workers do so at the same time."""
     for attempt in range(20):
         try:
             optuna.storages.RDBStorage(url)
@@ -553,13 +565,15 @@ def _no_database(url: str, error: DBAPIError) -> ValueError:
 
 def update(hyperparams: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """
-    :param hyperparams: of a recipe
-    :param changes: of a trial
-    :return: both, the changes over the recipe, also among the arguments of the policy
+    Merge the changes of a trial over a recipe, including the arguments of the policy.
+
+    :param hyperparams: hyperparameters of a recipe
+    :param changes: hyperparameters of a trial
+    :return: the merged hyperparameters
     """
     changed = {**hyperparams, **changes}
     policy_kwargs = hyperparams.get("policy_kwargs") or {}
-    if isinstance(policy_kwargs, str):  # of a recipe as it is written
+    if isinstance(policy_kwargs, str):  # text of a recipe
         policy_kwargs = parse_literal(policy_kwargs)
     if "policy_kwargs" in changes:
         changed["policy_kwargs"] = {**policy_kwargs, **changes["policy_kwargs"]}
@@ -568,7 +582,7 @@ def update(hyperparams: dict[str, Any], changes: dict[str, Any]) -> dict[str, An
 
 def diverged(model: BaseAlgorithm) -> bool:
     """
-    :param model: after an error
-    :return: whether a network has a weight that is no number
+    :param model: a model after an error
+    :return: whether a weight of its networks is NaN or infinite
     """
     return any(not weight.isfinite().all() for weight in model.policy.parameters())

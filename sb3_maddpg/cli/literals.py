@@ -1,4 +1,4 @@
-"""Values on the command line and in recipes, read without running code."""
+"""Parsing of values on the command line and in recipes without running code."""
 
 import argparse
 import ast
@@ -14,7 +14,7 @@ from sb3_maddpg.utils import shown
 WORDS = {"true": True, "false": False, "null": None, "none": None}
 NOT_FINITE = ("nan", "inf", "infinity")
 SEQUENCES = {"list": list, "tuple": tuple}
-# What recipes of rl_zoo3 name: activation functions and optimizers
+# Modules of the classes that recipes of rl_zoo3 name: activation functions and optimizers
 CLASSES = {
     **{name: (torch.nn, torch.nn.Module) for name in ("nn", "th.nn", "torch.nn")},
     **{name: (torch.optim, torch.optim.Optimizer) for name in ("th.optim", "torch.optim")},
@@ -23,11 +23,12 @@ CLASSES = {
 
 def parse_literal(text: str) -> Any:
     """
-    Read a Python literal: numbers, text in quotes, lists, tuples and dicts, also written ``dict(a=1)``, with classes of
+    Parse a Python literal: numbers, quoted text, lists, tuples, dicts (also as ``dict(a=1)``), and classes of
     ``torch.nn`` and ``torch.optim``, such as ``nn.ReLU``. Nothing is evaluated.
 
     :param text: e.g. "dict(net_arch=[64, 64], activation_fn=nn.ReLU)"
-    :raises ValueError: anything else, also a number that is not finite
+    :return: the value
+    :raises ValueError: if the text is anything else, or contains a number that is not finite
     """
     try:
         tree = ast.parse(text.strip(), mode="eval")
@@ -38,11 +39,12 @@ def parse_literal(text: str) -> Any:
 
 def parse_value(text: str) -> Any:
     """
-    Read a value of the command line: a literal of Python (``parse_literal``), ``true``, ``false`` or ``null``, a list
-    or dict as YAML has it, ``{preset: dense}``, or else a word, ``state+memory``.
+    Parse a value of the command line: a Python literal (``parse_literal``), ``true``, ``false`` or ``null``, a YAML
+    list or dict such as ``{preset: dense}``, or a word such as ``state+memory``.
 
-    :param text: without the key
-    :raises ValueError: an expression that would have to be evaluated, or a number that is not finite
+    :param text: the value without its key
+    :return: the value
+    :raises ValueError: if the text is an expression that would have to be evaluated, or a number that is not finite
     """
     if text.lower() in WORDS:
         return WORDS[text.lower()]
@@ -60,14 +62,14 @@ def parse_value(text: str) -> Any:
 
 
 def _is_word(text: str) -> bool:
-    """Whether it is text that needs no quotes: neither brackets nor arithmetic."""
+    """:return: whether the text needs no quotes, because it has neither brackets nor arithmetic"""
     if set(text) & set("()[]{}"):
         return False
     try:
         tree = ast.parse(text, mode="eval")
     except SyntaxError:
         return True
-    # An overflowing number is one constant, arithmetic has nothing but constants
+    # Arithmetic has only constants, as has an overflowing number
     return any(isinstance(node, ast.Name) for node in ast.walk(tree))
 
 
@@ -96,7 +98,7 @@ def _value(node: ast.expr) -> Any:
                 return found
             raise ValueError(f"there is no class {name} in {package.__name__}")
     raise ValueError(
-        f"{ast.unparse(node)} is not evaluated: give numbers, text in quotes, lists, dicts or classes of torch.nn"
+        f"{ast.unparse(node)} is not evaluated: write numbers, quoted text, lists, dicts or classes of torch.nn"
     )
 
 
@@ -122,9 +124,10 @@ def _finite(value: Any) -> Any:
 
 def format_literal(value: Any) -> str:
     """
-    The text that ``parse_literal`` reads as the value.
+    Format a value as text for ``parse_literal``.
 
-    :param value: a literal, or one with classes of ``torch.nn``
+    :param value: a literal, which may contain classes of ``torch.nn``
+    :return: the text
     """
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key!r}: {format_literal(one)}" for key, one in value.items()) + "}"
@@ -138,8 +141,8 @@ def format_literal(value: Any) -> str:
 
 class StoreValues(argparse.Action):
     """
-    ``key:value key:value`` as a dict, for rl_zoo3's options. Unlike rl_zoo3's own it evaluates nothing, see
-    ``parse_value``.
+    Action that stores ``key:value key:value`` as a dict, for rl_zoo3's options. Unlike rl_zoo3's own action, it
+    evaluates nothing, see ``parse_value``.
     """
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:

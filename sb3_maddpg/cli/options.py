@@ -1,4 +1,4 @@
-"""What all commands share: their name, the options that each of them looks at, and what is checked for each of them."""
+"""Options and checks that all commands share."""
 
 import argparse
 import difflib
@@ -17,7 +17,7 @@ PROG = "sb3-maddpg"
 
 
 def common_options() -> argparse.ArgumentParser:
-    """The options that all commands look at; what they call reads the rest."""
+    """:return: a parser of the options that all commands share"""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo", default="maddpg")
     parser.add_argument("--env")
@@ -28,22 +28,22 @@ def common_options() -> argparse.ArgumentParser:
 def helps(words: Iterable[str]) -> bool:
     """
     :param words: arguments of a command
-    :return: whether they ask for its help
+    :return: whether they ask for help
     """
     return not {"-h", "--help"}.isdisjoint(words)
 
 
 def import_packages(names: Iterable[str]) -> None:
     """
-    Import what ``--gym-packages`` names.
+    Import the packages of ``--gym-packages``.
 
-    :param names: of packages or modules
-    :raises ValueError: no such name can be imported
-    :raises ImportError: the package is missing, with the nearest that is there, or what it needs
+    :param names: names of packages or modules
+    :raises ValueError: if a name is not the name of a module
+    :raises ImportError: if a package or one of its dependencies is missing
     """
     for name in names:
         if not all(part.isidentifier() for part in name.split(".")):
-            raise ValueError(f"--gym-packages {shown(name)}: give the names of packages, as after `import`.")
+            raise ValueError(f"--gym-packages {shown(name)}: write the names of packages as after `import`.")
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
@@ -58,10 +58,10 @@ def import_packages(names: Iterable[str]) -> None:
 
 def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.7) -> str:
     """
-    :param name: that is not known
-    :param known: the names that are
-    :param cutoff: how alike they must be, see ``difflib``
-    :return: the nearest as a question to end a message with, or nothing
+    :param name: an unknown name
+    :param known: the known names
+    :param cutoff: minimum similarity, see ``difflib``
+    :return: a question about the closest known name, to append to a message; empty if there is none
     """
     nearest = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
     return f" Did you mean '{nearest[0]}'?" if nearest else ""
@@ -69,29 +69,29 @@ def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.7) -> str:
 
 def modules_beside(name: str) -> set[str]:
     """
-    :param name: of a module that need not exist
-    :return: the modules of its package, or of the present folder and all that are installed
+    :param name: name of a module, which may not exist
+    :return: the modules of its package, or without a package, those of the current folder and all installed ones
     """
     package, dot, _ = name.rpartition(".")
     try:
         paths = list(importlib.import_module(package).__path__) if dot else [str(Path.cwd()), *sys.path]
-    except (ImportError, AttributeError):  # no package
+    except (ImportError, AttributeError):  # not a package
         return set()
     return {package + dot + module.name for module in pkgutil.iter_modules(paths)}
 
 
 def files_beside(path: str, pattern: str) -> list[str]:
     """
-    :param path: of a file that need not exist
-    :param pattern: of the names of files
-    :return: those in its folder
+    :param path: path of a file, which may not exist
+    :param pattern: glob pattern of file names
+    :return: the matching files in its folder
     """
     return [str(found) for found in Path(path).parent.glob(pattern)]
 
 
 @contextmanager
 def nearest_options() -> Iterator[None]:
-    """Let every parser, rl_zoo3's too, name the nearest option where one is unknown, and the nearest of its choices."""
+    """Make all parsers, including rl_zoo3's, suggest the closest option for an unknown one, and the closest choice."""
     error = argparse.ArgumentParser.error
 
     def with_hint(self: argparse.ArgumentParser, message: str) -> NoReturn:
@@ -111,10 +111,10 @@ def nearest_options() -> Iterator[None]:
 
 def check_writable(path: Path) -> None:
     """
-    Find out that a file cannot be written before the work whose result it shall hold; its folder is made.
+    Check that a file can be written before doing the work that it will hold. This creates its folder.
 
-    :param path: of the file
-    :raises OSError: it cannot be written
+    :param path: path of the file
+    :raises OSError: if the file cannot be written
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     exists = path.exists()

@@ -1,4 +1,4 @@
-"""What there is to name on the command line, for ``--help``: read from the registries, own entries among them."""
+"""Overview of algorithms, environments, models and recipes for ``--help``, read from the registries."""
 
 import importlib
 import shutil
@@ -19,7 +19,7 @@ ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg"
 
 
 def load_environments() -> None:
-    """Import what registers environments: the toy tasks, and the packages that say so by an entry point."""
+    """Import the modules that register environments: the toy tasks, and those that packages name by an entry point."""
     importlib.import_module("sb3_maddpg.team_tasks")
     for entry_point in entry_points(group="sb3_maddpg.environments"):
         entry_point.load()
@@ -27,7 +27,7 @@ def load_environments() -> None:
 
 def environments() -> list[str]:
     """
-    :return: the ids that are registered, without Gymnasium's and rl_zoo3's own
+    :return: the registered ids, except those of Gymnasium and rl_zoo3
     """
     load_environments()
     points = {env_id: spec.entry_point for env_id, spec in gymnasium.registry.items()}
@@ -39,7 +39,7 @@ def environments() -> list[str]:
 
 def packaged_recipes() -> dict[str, Path]:
     """
-    :return: the files of ``zoo_configs`` by their names
+    :return: the files of ``zoo_configs`` by name
     """
     folder = Path(str(files("sb3_maddpg.zoo_configs")))
     return {path.name: path for path in sorted(folder.glob("*.yml"))}
@@ -47,7 +47,7 @@ def packaged_recipes() -> dict[str, Path]:
 
 def overview() -> str:
     """
-    :return: algorithms, environments, pretrained models and recipes
+    :return: text that lists algorithms, environments, pretrained models and recipes
     """
     found = {
         "algorithms": [*ALGORITHMS, "rl_zoo3's (`train --help`)"],
@@ -69,4 +69,4 @@ def overview() -> str:
         )
         for name, some in found.items()
     ]
-    return "there are:\n" + "\n".join(lines)
+    return "available:\n" + "\n".join(lines)

@@ -1,7 +1,7 @@
 """
-Stable-Baselines3's own algorithms on PettingZoo's environments: one policy with shared parameters for all agents, each
-of which sees its own observation and learns from its own reward (PS-PPO and the like, Gupta et al. 2017; Terry et al.
-2020). SuperSuit lays the agents out as the environments of a vector environment.
+Stable-Baselines3's own algorithms in PettingZoo environments, with parameter sharing: all agents share one policy,
+which acts on each agent's own observation and learns from its own reward (PS-PPO etc., Gupta et al. 2017; Terry et al.
+2020). SuperSuit turns the agents into the environments of a vectorised environment.
 """
 
 import copy
@@ -25,38 +25,40 @@ from sb3_maddpg import MADDPG, parallel
 
 def shares_parameters(algorithm: type[BaseAlgorithm], env_id: str) -> bool:
     """
-    :param algorithm: to train with
+    :param algorithm: an algorithm
     :param env_id: Gymnasium id
-    :return: whether it trains one policy for all agents: an algorithm for single agents on a PettingZoo environment
+    :return: whether training shares one policy among all agents: a single-agent algorithm in a PettingZoo environment
     """
     return not issubclass(algorithm, MADDPG) and gymnasium.spec(env_id).entry_point == parallel.ENTRY_POINT
 
 
 class AgentsVecEnv(VecEnv):
     """
-    Every agent of every copy of a PettingZoo ``ParallelEnv`` as one environment of a vector environment, by SuperSuit.
-    A step of all copies counts as ``n_agents * n_envs`` timesteps.
+    Vectorised environment whose environments are the agents of all copies of a PettingZoo ``ParallelEnv``, based on
+    SuperSuit. A step of all copies counts as ``n_agents * n_envs`` timesteps.
 
-    SuperSuit's own wrapper for Stable-Baselines3 does not pass the seed on, marks no truncation, so that the value of
-    the last observation would not be bootstrapped, and takes no actions of another dtype than the space's.
+    It replaces SuperSuit's wrapper for Stable-Baselines3, which ignores the seed, does not report truncation, so that
+    values are not bootstrapped, and rejects actions of another dtype than the space's.
 
     :param env_id: id of a PettingZoo environment, see ``pettingzoo_ids.register``
     :param n_envs: number of copies
     :param env_kwargs: arguments of ``parallel.make_parallel_env``
-    :raises ValueError: agents that cannot share a policy
+    :raises ValueError: if the agents cannot share a policy
     """
 
     def __init__(self, env_id: str, n_envs: int, env_kwargs: dict[str, Any]):
         if env_kwargs.get("state"):
-            raise ValueError("state:True is for critics of MADDPG and MATD3: a shared policy sees its own agent only.")
+            raise ValueError(
+                "state:True is for critics of MADDPG and MATD3: a shared policy only sees its own agent's observation."
+            )
         self.spec = copy.deepcopy(gymnasium.spec(env_id))
         self.spec.kwargs.update(env_kwargs)
         env = parallel.make_parallel_env(**{key: one for key, one in self.spec.kwargs.items() if key != "state"})
         self.agents = _homogeneous_agents(env_id, env)
-        with warnings.catch_warnings():  # it looks for a Gymnasium environment
+        with warnings.catch_warnings():  # SuperSuit expects a Gymnasium environment
             warnings.filterwarnings("ignore", module="supersuit")
             self.envs = concat_vec_envs_v1(pettingzoo_env_to_vec_env_v1(EveryAgent(env)), n_envs)
-        env.close()  # the copies go on
+        env.close()  # only the copies are used
         self.actions: np.ndarray | None = None
         super().__init__(self.envs.num_envs, self.envs.observation_space, self.envs.action_space)
         self.metadata = self.envs.metadata
@@ -72,8 +74,8 @@ class AgentsVecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """
-        :param actions: of all agents, (n_envs * n_agents, ...); algorithms for Box also act in MultiBinary spaces by
-            floats, and SuperSuit takes none
+        :param actions: actions of all agents, (n_envs * n_agents, ...); converted to the dtype of the action space,
+            because some algorithms return floats for MultiBinary spaces
         """
         self.actions = np.asarray(actions).astype(self.action_space.dtype, copy=False)
 
@@ -90,8 +92,8 @@ class AgentsVecEnv(VecEnv):
 
     def render(self, mode: str | None = None) -> Any:
         """
-        :param mode: unused: PettingZoo's environments are told when they are made
-        :return: what the first copy renders
+        :param mode: unused, since PettingZoo's environments get their render mode on creation
+        :return: rendering of the first copy
         """
         return self.envs.render()
 
@@ -101,9 +103,9 @@ class AgentsVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """
-        :param attr_name: name
-        :param indices: of agents
-        :return: the attribute of the environment that each agent is in
+        :param attr_name: name of the attribute
+        :param indices: indices of agents
+        :return: the attribute of each agent's environment
         """
         if attr_name == "spec":
             return [self.spec for _ in self._get_indices(indices)]
@@ -111,25 +113,25 @@ class AgentsVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """
-        :param attr_name: name
-        :param value: for each of the environments
-        :param indices: of agents
+        :param attr_name: name of the attribute
+        :param value: value for each of the environments
+        :param indices: indices of agents
         """
         for env in self._distinct(indices):
             setattr(env, attr_name, value)
 
     def env_method(self, method_name: str, *method_args, indices: VecEnvIndices = None, **method_kwargs) -> list[Any]:
         """
-        :param method_name: called once in each environment
-        :param method_args: for the method
-        :param indices: of agents
-        :param method_kwargs: for the method
-        :return: what each environment returns
+        :param method_name: name of the method, which is called once in each environment
+        :param method_args: positional arguments of the method
+        :param indices: indices of agents
+        :param method_kwargs: keyword arguments of the method
+        :return: the result of each environment
         """
         return [getattr(env, method_name)(*method_args, **method_kwargs) for env in self._distinct(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Never: they are no environments of Gymnasium."""
+        """:return: False, since these are not Gymnasium environments"""
         return [False for _ in self._get_indices(indices)]
 
     def _env_of(self, agent: int) -> Any:
@@ -140,7 +142,7 @@ class AgentsVecEnv(VecEnv):
 
 
 def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
-    """The agents, which have to have equal spaces."""
+    """:return: the agents, after checking that their spaces are equal"""
     agents = env.possible_agents
     for kind, space_of, wrapper in (
         ("observation", env.observation_space, "pad_observations_v0"),
@@ -151,7 +153,7 @@ def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
             if space_of(agent) != first:
                 raise ValueError(
                     f"{env_id} has heterogeneous agents: the {kind} space of {agents[0]} is {first}, that of {agent} "
-                    f"{space_of(agent)}. One policy with shared parameters needs equal ones: add supersuit.{wrapper} "
+                    f"is {space_of(agent)}. A shared policy needs equal spaces: add supersuit.{wrapper} "
                     "to `wrappers` of env_kwargs, or train with --algo maddpg or matd3."
                 )
     return agents
@@ -159,9 +161,9 @@ def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
 
 class EveryAgent(BaseParallelWrapper):
     """
-    Shows agents that ended before the others zeros, and rewards them with nothing, until the episode ends. SuperSuit's
-    ``black_death_v3`` should do so, but in version 3.11 an episode goes on until all agents terminate and are truncated
-    in the same step.
+    Wrapper that keeps agents that ended before the others, with zero observations and rewards, until the episode ends.
+    SuperSuit's ``black_death_v3`` should do this, but in version 3.11 it only ends an episode if all agents are both
+    terminated and truncated in the same step.
 
     :param env: the environment
     """
@@ -172,8 +174,8 @@ class EveryAgent(BaseParallelWrapper):
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """
-        :param seed: for the environment
-        :param options: for the environment
+        :param seed: seed of the environment
+        :param options: options of the environment
         :return: observations and infos of all agents
         """
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -181,13 +183,13 @@ class EveryAgent(BaseParallelWrapper):
 
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
         """
-        :param actions: of all agents
-        :return: observations, rewards, terminations, truncations and infos of all agents; all end together
+        :param actions: actions of all agents
+        :return: observations, rewards, terminations, truncations and infos of all agents, which end together
         """
         given = {agent: actions[agent] for agent in self.env.agents}
         observations, rewards, terminations, truncations, infos = self.env.step(given)
         over = not self.env.agents
-        # Some environments go on telling of agents that have left
+        # Some environments keep reporting agents that have left
         truncated = {agent: over and agent in given and bool(truncations[agent]) for agent in self.agents}
         terminated = {agent: over and (not truncated[agent] or bool(terminations[agent])) for agent in self.agents}
         return (
@@ -208,8 +210,9 @@ class EveryAgent(BaseParallelWrapper):
 
 class SharedPolicy:
     """
-    A model of ``AgentsVecEnv`` as the policy of a whole team (``TeamEnv``): of observations (n_envs, n_agents, columns)
-    it makes joint actions, (n_envs, n_actions). For rl_zoo3's ``enjoy`` and ``record``, and for ``evaluate_policy``.
+    Adapter that lets a model trained in ``AgentsVecEnv`` act for a whole team (``TeamEnv``): it maps observations,
+    (n_envs, n_agents, columns), to joint actions, (n_envs, n_actions). Used by rl_zoo3's ``enjoy`` and ``record``, and
+    for ``evaluate_policy``.
 
     :param model: the trained model
     """
@@ -220,8 +223,8 @@ class SharedPolicy:
     @classmethod
     def loader(cls, load: Callable[..., BaseAlgorithm]) -> type:
         """
-        :param load: of the algorithm
-        :return: a stand-in for the algorithm whose ``load`` returns a ``SharedPolicy``
+        :param load: the algorithm's ``load``
+        :return: a replacement for the algorithm, whose ``load`` returns a ``SharedPolicy``
         """
 
         class Algorithm:
@@ -235,11 +238,11 @@ class SharedPolicy:
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[np.ndarray, None]:
         """
-        :param observation: of the team, (n_envs, n_agents, columns)
+        :param observation: observations of the team, (n_envs, n_agents, columns)
         :param state: unused
         :param episode_start: unused
-        :param deterministic: choose the most probable actions
-        :return: joint actions, (n_envs, n_actions), and no state
+        :param deterministic: whether to choose the most probable actions
+        :return: joint actions, (n_envs, n_actions), and None for the state
         """
         space = self.model.observation_space
         n_envs, n_agents = observation.shape[:2]

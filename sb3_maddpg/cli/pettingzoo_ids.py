@@ -1,4 +1,4 @@
-"""Modules with a function ``parallel_env``, as PettingZoo's are, under ids of Gymnasium."""
+"""Gymnasium ids for PettingZoo modules, which have a function ``parallel_env``."""
 
 import inspect
 import pkgutil
@@ -11,12 +11,12 @@ from sb3_maddpg.parallel import ENTRY_POINT, find_module, find_parallel_env
 
 def register(env_id: str) -> bool:
     """
-    Make a module with a function ``parallel_env`` known to Gymnasium: "mpe2/simple_spread_v3" stands for
-    ``mpe2.simple_spread_v3``, and "quad_swarm" or "quad_swarm/parallel_env" for a module that lies in no package.
+    Register a module with a function ``parallel_env`` in Gymnasium. The id "mpe2/simple_spread_v3" stands for
+    ``mpe2.simple_spread_v3``, and "quad_swarm" or "quad_swarm/parallel_env" for a top-level module.
 
     :param env_id: Gymnasium id
-    :return: whether Gymnasium knows the id now
-    :raises ValueError: a module that is there, but cannot be imported
+    :return: whether the id is registered now
+    :raises ValueError: if the module exists but cannot be imported
     """
     if env_id in gymnasium.registry:
         return True
@@ -25,15 +25,15 @@ def register(env_id: str) -> bool:
         return False
     if not callable(getattr(find_module(entry), "parallel_env", None)):
         return False
-    # Gymnasium's checker would warn of padding, whose bounds are both zero
+    # Gymnasium's checker would warn about padding, whose bounds are both zero
     gymnasium.register(env_id, entry_point=ENTRY_POINT, kwargs={"entry": entry}, disable_env_checker=True)
     return True
 
 
 def siblings(env_id: str) -> list[str]:
     """
-    :param env_id: an id like those of ``register``, of a module that may not exist
-    :return: ids of the versioned modules beside it
+    :param env_id: id of a module as in ``register``, which may not exist
+    :return: ids of the versioned modules in its package
     """
     package, _, _ = env_id.rpartition("/")
     if not package.isidentifier():
@@ -44,11 +44,11 @@ def siblings(env_id: str) -> list[str]:
 
 def arguments(entry: str) -> set[str] | None:
     """
-    Names of the arguments of ``make`` for a module. PettingZoo's modules take any in ``parallel_env`` and hand them
-    on to ``raw_env``, which is asked instead.
+    List the arguments of ``make`` for a module. ``parallel_env`` of PettingZoo's modules accepts any argument and
+    passes it on to ``raw_env``, whose signature is used instead.
 
     :param entry: see ``make``
-    :return: the names, or None if any is taken
+    :return: the names, or None if any name is accepted
     """
     for function in (find_parallel_env(entry), getattr(find_module(entry), "raw_env", None)):
         if callable(function):

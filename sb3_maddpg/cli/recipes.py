@@ -1,4 +1,4 @@
-"""What a training is asked for, checked before anything runs: options of the command line and keys of recipes."""
+"""Checks of command-line options and recipes before training starts."""
 
 import argparse
 import inspect
@@ -38,13 +38,13 @@ from sb3_maddpg.cli.overview import packaged_recipes
 from sb3_maddpg.utils import arguments_of, shown, suggest
 from sb3_maddpg.validation import Arguments, validated_as
 
-# Arguments of the algorithm that the command line gives.
+# Arguments of the algorithm that come from the command line
 COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
-# Arguments of the policy that the algorithm gives.
+# Arguments of the policy that the algorithm passes
 OF_ALGORITHM = {"observation_space", "action_space", "lr_schedule"}
 # Arguments that rl_zoo3 turns into schedules
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
-# More of an environment side by side than any machine can step
+# Maximum number of parallel environments
 MOST_COPIES = 10_000
 SIMPLE = (int, float, bool, str, type(None))
 
@@ -52,12 +52,13 @@ SIMPLE = (int, float, bool, str, type(None))
 def at_least(low: int, otherwise: int | None = None) -> AfterValidator:
     """
     :param low: the lowest value
-    :param otherwise: a value below that means something of its own
+    :param otherwise: a lower value that is also allowed, because it has a special meaning
+    :return: a validator
     """
 
     def check(value: int) -> int:
         if value < low and value != otherwise:
-            raise ValueError(f"give {low} or more" + ("" if otherwise is None else f", or {otherwise}"))
+            raise ValueError(f"choose {low} or more" + ("" if otherwise is None else f", or {otherwise}"))
         return value
 
     return AfterValidator(check)
@@ -66,23 +67,24 @@ def at_least(low: int, otherwise: int | None = None) -> AfterValidator:
 def at_most(high: int) -> AfterValidator:
     """
     :param high: the highest value
+    :return: a validator
     """
 
     def check(value: int) -> int:
         if value > high:
-            raise ValueError(f"give {high} or less")
+            raise ValueError(f"choose {high} or less")
         return value
 
     return AfterValidator(check)
 
 
 def _storage(storage: str | None) -> str | None:
-    """Optuna's: a journal, or a database."""
+    """Check a storage of Optuna, which is a journal file or a database."""
     if storage is not None and not storage.endswith(".log"):
         try:
             make_url(storage).get_dialect()
         except ArgumentError:
-            raise ValueError("give a file FILE.log, or the URL of a database such as sqlite:///FILE.db") from None
+            raise ValueError("name a file FILE.log, or the URL of a database such as sqlite:///FILE.db") from None
     return storage
 
 
@@ -91,7 +93,7 @@ OneOrDefault = Annotated[int, at_least(1, otherwise=-1)]
 
 
 class LengthOption(Arguments):
-    """How long ``enjoy``, ``record`` and ``bench`` go on."""
+    """Option for the length of ``enjoy``, ``record`` and ``bench``."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -99,7 +101,7 @@ class LengthOption(Arguments):
 
 
 class TrainingOptions(Arguments):
-    """The numbers among rl_zoo3's options of ``train``; -1 is the default, or none at all."""
+    """Numeric options of rl_zoo3's ``train``, and the storage. -1 means the default, or none."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -122,23 +124,23 @@ class TrainingOptions(Arguments):
 
 def check_options(args: argparse.Namespace, options: type[Arguments] = TrainingOptions) -> None:
     """
-    Refuse numbers that a command cannot be asked for.
+    Check options of the command line.
 
-    :param args: the options of the command line, by rl_zoo3's names
-    :param options: those to check
-    :raises ValueError: with the option, its value and what is allowed
+    :param args: options with rl_zoo3's names
+    :param options: class of the options to check
+    :raises ValueError: if an option is invalid; the message names the option, its value and what is allowed
     """
     validated_as(options, vars(args), lambda name: f"--{name.replace('_', '-')}")
 
 
 def _number(value: Any) -> Any:
-    """YAML reads 1e-3 as text, and so may the user's editor write it."""
+    """Convert text to a number, since YAML reads 1e-3 as text."""
     if not isinstance(value, str):
         return value
     try:
         return float(value)
     except ValueError:
-        raise ValueError("give a number") from None
+        raise ValueError("write a number") from None
 
 
 def _schedule(value: Any) -> Any:
@@ -150,7 +152,7 @@ def _schedule(value: Any) -> Any:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError("give a finite number, or lin_NUMBER for one that falls linearly to zero")
+        raise ValueError("write a finite number, or lin_NUMBER for one that decreases linearly to zero")
     return number if text == value else value
 
 
@@ -160,7 +162,7 @@ def _literal(value: Any) -> Any:
 
 def _noise_type(name: str) -> str:
     if not any(kind in name for kind in ("normal", "ornstein-uhlenbeck")):
-        raise ValueError("give normal or ornstein-uhlenbeck")
+        raise ValueError("choose normal or ornstein-uhlenbeck")
     return name
 
 
@@ -172,7 +174,7 @@ KeywordArguments = Annotated[dict[str, Any], BeforeValidator(_literal)]
 
 
 class ZooKeys(Arguments):
-    """Keys of a recipe that rl_zoo3 uses up itself; every other key is an argument of the algorithm."""
+    """Keys of a recipe that rl_zoo3 reads itself. All other keys are arguments of the algorithm."""
 
     model_config = ConfigDict(extra="allow", protected_namespaces=())
 
@@ -195,12 +197,12 @@ class ZooKeys(Arguments):
     @classmethod
     def _with_noise_type(cls, noise_std: float | None, info: ValidationInfo) -> float | None:
         if noise_std is None and info.data.get("noise_type") is not None:
-            raise ValueError("noise_type needs a standard deviation, give a number")
+            raise ValueError("noise_type needs a standard deviation, write a number")
         return noise_std
 
 
 class MonitorArguments(Arguments):
-    """Of Stable-Baselines3's ``Monitor``, which a recipe may choose."""
+    """Arguments of Stable-Baselines3's ``Monitor`` that a recipe may set."""
 
     filename: str | None = None
     allow_early_resets: bool = True
@@ -211,13 +213,13 @@ class MonitorArguments(Arguments):
 
 def read_recipe(path: str, algo: str, env_id: str) -> None:
     """
-    Refuse a YAML file that holds no recipe for the environment.
+    Check that a YAML file has a recipe for the environment.
 
-    :param path: of the file
+    :param path: path of the file
     :param algo: name of the algorithm
     :param env_id: Gymnasium id
-    :raises FileNotFoundError: there is no such file
-    :raises ValueError: it holds something else
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the file has no valid recipe for the environment
     """
     if not path.endswith((".yml", ".yaml")):  # a module, which Python reads
         if not all(part.isidentifier() for part in path.split(".")):
@@ -225,7 +227,7 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
         return
     if not Path(path).is_file():
         hint = did_you_mean(path, [*files_beside(path, "*.y*ml"), *packaged_recipes()])
-        raise FileNotFoundError(f"There is no recipe {path}: --conf-file names a YAML file.{hint}")
+        raise FileNotFoundError(f"There is no recipe {path}: --conf-file must name a YAML file.{hint}")
     try:
         recipes = yaml.safe_load(Path(path).read_text())
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
@@ -255,13 +257,13 @@ def _kind(value: Any) -> str:
 
 def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict[str, Any]:
     """
-    Refuse a recipe with keys that nothing reads, or values of another type than their keys take.
+    Check the keys and values of a recipe.
 
     :param algo: name of the algorithm
     :param hyperparams: the recipe, with the changes of the command line
-    :param source: where it comes from, for messages
-    :return: the recipe with numbers for their text and dicts for Python's ``dict(...)``
-    :raises ValueError: with key, value and what is allowed
+    :param source: origin of the recipe, for error messages
+    :return: the recipe, with text such as ``1e-3`` and ``dict(...)`` converted to numbers and dicts
+    :raises ValueError: if a key is unknown or a value is invalid; the message says what is allowed
     """
     check_keys(algo, hyperparams)
     fields = {key: hint for key, hint in _hints(ALGOS[algo]).items() if key in hyperparams}
@@ -283,11 +285,11 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
 
 
 def _hints(algorithm: type) -> dict[str, Any]:
-    """The arguments of an algorithm whose values a recipe can hold, with their types."""
+    """:return: the types of those arguments of an algorithm whose values a recipe can hold"""
     hints: dict[str, Any] = {}
     for base in algorithm.__mro__:
         if "__init__" in vars(base) and base is not object:
-            # Stable-Baselines3 names VecEnv in text that only its own module can resolve
+            # Stable-Baselines3's annotations contain VecEnv as text that only its own module can resolve
             hints = {**typing.get_type_hints(vars(base)["__init__"], localns={"VecEnv": VecEnv}), **hints}
     names = arguments_of(algorithm) - COMMAND_LINE
     return {name: _lenient(hint) for name, hint in hints.items() if name in names and _is_simple(hint)}
@@ -306,11 +308,11 @@ def _lenient(hint: Any) -> Any:
 
 def check_keys(algo: str, hyperparams: Mapping[str, Any]) -> None:
     """
-    Refuse a recipe with keys that nothing reads.
+    Check the keys of a recipe.
 
     :param algo: name of the algorithm
     :param hyperparams: the recipe
-    :raises ValueError: with the nearest known key
+    :raises ValueError: if a key is unknown; the message suggests the closest known one
     """
     known = set(ZooKeys.model_fields) | (arguments_of(ALGOS[algo]) - COMMAND_LINE)
     for key in hyperparams:
@@ -321,11 +323,11 @@ def check_keys(algo: str, hyperparams: Mapping[str, Any]) -> None:
 
 def check_policy_kwargs(algo: str, hyperparams: Mapping[str, Any]) -> None:
     """
-    Refuse arguments that the policy does not take.
+    Check the names of the policy's arguments.
 
     :param algo: name of the algorithm
     :param hyperparams: the recipe
-    :raises ValueError: with the nearest known argument
+    :raises ValueError: if an argument is unknown; the message suggests the closest known one
     """
     policy = policy_class(algo, hyperparams.get("policy", ""))
     policy_kwargs = hyperparams.get("policy_kwargs")
@@ -339,32 +341,32 @@ def check_policy_kwargs(algo: str, hyperparams: Mapping[str, Any]) -> None:
 def policy_class(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | None:
     """
     :param algo: name of the algorithm
-    :param name: what the recipe calls the policy
-    :return: the policy, or None for a dotted path, which rl_zoo3 imports later, and for what is no name
+    :param name: name of the policy in the recipe
+    :return: the policy class, or None for a dotted path, which rl_zoo3 imports later, or an invalid name
     """
     if isinstance(name, str):
         return ALGOS[algo].policy_aliases.get(name)
     return name if isinstance(name, type) else None
 
 
-_OF_WHICH = "Its package must be installed, or named by --gym-packages where it lies in the present folder."
+_OF_WHICH = "Install its package, or name it in --gym-packages if it is in the current folder."
 
 
 def _replay_buffer(name: str) -> type[ReplayBuffer]:
-    """The replay buffer that a recipe names by a dotted path, or as rl_zoo3's recipes do."""
+    """:return: the replay buffer class that a recipe names, by a dotted path or as in rl_zoo3's recipes"""
     if name == "HerReplayBuffer":
         return HerReplayBuffer
     try:
         return get_class_by_name(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Give the dotted path of a class, "
+            f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Use the dotted path of a class, "
             f"such as sb3_maddpg.PrioritizedTeamReplayBuffer. {_OF_WHICH}"
         ) from error
 
 
 def _names_of_classes(value: Any) -> list[str]:
-    """What rl_zoo3 imports: a name, the only key of a dict, or several of them."""
+    """:return: the names that rl_zoo3 imports: a name, the only key of a dict, or a list of both"""
     if isinstance(value, list):
         return [name for one in value for name in _names_of_classes(one)]
     return [value] if isinstance(value, str) else [str(name) for name in value or ()]
@@ -376,16 +378,16 @@ def _check_callable(key: str, name: str) -> None:
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"{key}: {name} in the recipe cannot be imported ({error}). {_OF_WHICH}") from error
     if not callable(found):
-        raise ValueError(f"{key}: {name} in the recipe is no class. Give the dotted path of one.")
+        raise ValueError(f"{key}: {name} in the recipe is not a class. Use the dotted path of one.")
 
 
 def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
     """
-    Refuse arguments that the environment does not take.
+    Check the names of the environment's arguments.
 
     :param env_id: Gymnasium id
-    :param env_kwargs: from the recipe and the command line
-    :raises ValueError: with the nearest known argument
+    :param env_kwargs: arguments from the recipe and the command line
+    :raises ValueError: if an argument is unknown; the message suggests the closest known one
     """
     known = _env_arguments(env_id)
     for key in env_kwargs:
@@ -394,7 +396,7 @@ def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
 
 
 def _env_arguments(env_id: str) -> set[str] | None:
-    """Names of the arguments an environment takes, or None if it takes any."""
+    """:return: names of the arguments of an environment, or None if it accepts any"""
     spec = gymnasium.spec(env_id)
     if spec.entry_point == parallel.ENTRY_POINT:
         return pettingzoo_ids.arguments(spec.kwargs["entry"])

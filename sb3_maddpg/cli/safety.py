@@ -1,4 +1,4 @@
-"""Keeps rl_zoo3 and Stable-Baselines3 from running what files hold, as long as a command of theirs runs."""
+"""Protection that keeps commands of rl_zoo3 and Stable-Baselines3 from running code in files."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from sb3_maddpg.normalization import SafeVecNormalize
 
 
 class RunLoader(yaml.SafeLoader):
-    """Reads the YAML of run folders: plain values, and the one Python type that rl_zoo3 writes."""
+    """YAML loader for run folders, which accepts plain values and the Python types that rl_zoo3 writes."""
 
     def get_single_data(self) -> Any:
         try:
             return super().get_single_data()
         except RecursionError:
-            raise ValueError(f"{self.name} is nested too deeply to be a run's.") from None
+            raise ValueError(f"{self.name} is nested too deeply to belong to a run.") from None
 
 
 def _ordered_dict(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> dict[Any, Any]:
-    """rl_zoo3 writes a list of pairs as the argument of OrderedDict."""
+    """Read an OrderedDict, which rl_zoo3 writes with a list of pairs as its argument."""
     (pairs,) = loader.construct_sequence(node, deep=True)
     return dict(pairs)
 
@@ -39,8 +39,8 @@ def _tuple(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> tuple[Any, ...]:
 
 def _refuse(loader: yaml.SafeLoader, node: yaml.Node) -> None:
     raise ValueError(
-        f"{node.start_mark.name} names what is no plain value ({node.tag}). To read it may run any code: if you trust "
-        "whoever wrote it, give --trust."
+        f"{node.start_mark.name} holds a value that is not plain ({node.tag}). Reading it may run any code: if you "
+        "trust its author, pass --trust."
     )
 
 
@@ -51,8 +51,10 @@ for _tag, _read in (("object/apply:collections.OrderedDict", _ordered_dict), ("t
 
 @contextmanager
 def no_code_from_files() -> Iterator[None]:
-    """rl_zoo3 reads YAML with a loader that calls functions, evaluates texts, and unpickles models, buffers and
-    statistics: with plain loaders in their places, unless the user trusts the files."""
+    """
+    Replace rl_zoo3's unsafe loaders by safe ones, unless the user trusts the files. The originals call functions named
+    in YAML, evaluate text, and unpickle models, replay buffers and statistics.
+    """
     load_model = base_class.load_from_zip_file
 
     def load_plain_model(path: Any, load_data: bool = True, custom_objects: Any = None, **kwargs: Any) -> Any:
@@ -79,7 +81,7 @@ def no_code_from_files() -> Iterator[None]:
 
 @contextmanager
 def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
-    """An attribute of a module, or what stands before a builtin of that name there."""
+    """Replace an attribute of a module, or shadow the builtin of that name in it."""
     before = getattr(module, name, None)
     setattr(module, name, value)
     try:

@@ -1,4 +1,4 @@
-"""Searches for hyperparameters that outlive their processes: what was tried is kept, and killed trials come back."""
+"""Hyperparameter searches that survive killed processes: finished trials are kept, and killed ones are repeated."""
 
 import hashlib
 import os
@@ -14,15 +14,15 @@ from optuna.trial import TrialState
 from sb3_maddpg.utils import process_runs
 
 STUDY = "search"
-_PROCESS = "process"  # the attribute of a trial that tells who works at it
+_PROCESS = "process"  # attribute of a trial that identifies the process running it
 
 
 def kept_search(folder: Path, env_name: str, settings: Any) -> Path:
     """
-    :param folder: of the algorithm's logs
-    :param env_name: the environment
-    :param settings: all that the search depends on; the same settings go on with the same search
-    :return: the file that keeps the trials of a search without ``--storage`` until it is done
+    :param folder: folder of the algorithm's logs
+    :param env_name: name of the environment
+    :param settings: everything that the search depends on; the same settings continue the same search
+    :return: path of the file that keeps the trials of a search without ``--storage`` until it is finished
     """
     digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:12]
     return folder / f"{env_name}_search_{digest}.log"
@@ -30,36 +30,36 @@ def kept_search(folder: Path, env_name: str, settings: Any) -> Path:
 
 def open_storage(storage: str) -> BaseStorage | str:
     """
-    :param storage: as ``--storage`` gives it
-    :return: what Optuna takes; a file that ends with .log holds a journal
+    :param storage: value of ``--storage``
+    :return: storage for Optuna; a file with the suffix .log is a journal
     """
     return JournalStorage(JournalFileBackend(as_absolute(storage))) if storage.endswith(".log") else storage
 
 
 def as_absolute(storage: str) -> str:
     """
-    :param storage: as ``--storage`` gives it
-    :return: the same, files by their whole path: by another, Optuna would never release the lock of a killed process
+    :param storage: value of ``--storage``
+    :return: the storage with an absolute path, without which Optuna would never release the lock of a killed process
     """
     return str(Path(storage).resolve()) if storage.endswith(".log") else storage
 
 
 def sign(trial: optuna.Trial) -> None:
     """
-    Tell who works at a trial, for ``bring_back``.
+    Mark a trial as run by this process, for ``bring_back``.
 
-    :param trial: that begins
+    :param trial: a trial that starts
     """
     trial.set_user_attr(_PROCESS, _me())
 
 
 def bring_back(study: optuna.Study) -> int:
     """
-    Fail the trials whose processes on this machine are gone, and queue their hyperparameters again. Those of other
-    machines are left alone: nobody can see from here whether they run.
+    Mark the trials of dead processes on this machine as failed and queue their hyperparameters again. Trials of other
+    machines are left alone, since it is unknown whether they are still running.
 
-    :param study: that may have been worked at by processes that were killed
-    :return: number of trials that come back
+    :param study: a study that may have trials of killed processes
+    :return: number of trials that will be repeated
     """
     count = 0
     for trial in study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
@@ -80,7 +80,7 @@ def _me() -> str:
 
 
 def _began(process: int) -> str:
-    """When a process began, as far as the system tells: its number may be given to another one."""
+    """:return: start time of a process, if available, since process ids are reused"""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):

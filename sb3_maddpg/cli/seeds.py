@@ -1,4 +1,4 @@
-"""``sb3-maddpg train --seeds 0-9``: one training for each seed, some at a time, each in a process of its own."""
+"""``sb3-maddpg train --seeds 0-9``: one training per seed, each in its own process, several at a time."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ from sb3_maddpg.checkpoints import newest
 from sb3_maddpg.cli.experiment import CHECKPOINTS, COMMAND_FILE
 from sb3_maddpg.utils import shown
 
-_SECONDS = 60.0  # that a training has to write its last checkpoint
+_SECONDS = 60.0  # time for a training to write its last checkpoint
 
 
 def parse_seeds(text: str) -> list[int]:
     """
+    Parse a list of seeds.
+
     :param text: numbers and ranges, such as ``0-4,7``
-    :return: the seeds, each once
-    :raises ValueError: something else
+    :return: the seeds without duplicates
+    :raises ValueError: if the text is anything else
     """
     seeds: list[int] = []
     for part in text.split(","):
@@ -39,19 +41,20 @@ def parse_seeds(text: str) -> list[int]:
 
 def train_seeds(argv: list[str], seeds: list[int], jobs: int, log_folder: str, every: int | None = None) -> int:
     """
-    Train once for each seed. A training that was killed is resumed, one that is finished is left alone.
+    Train once per seed. Killed trainings are resumed, and finished ones are skipped.
 
-    :param argv: of ``train``, without seed, log folder and checkpoints
+    :param argv: arguments of ``train``, without seed, log folder and checkpoints
     :param seeds: see ``parse_seeds``
-    :param jobs: trainings at a time
-    :param log_folder: of the runs; what each training prints goes to ``seed_K.log`` there
-    :param every: steps from one checkpoint to the next, None: by time
-    :return: the exit status: of the first training that failed, 0 if none did
+    :param jobs: number of trainings at a time
+    :param log_folder: folder of the runs; the output of each training goes to ``seed_K.log`` there
+    :param every: number of steps between checkpoints, None for checkpoints by time
+    :return: exit status of the first training that failed, 0 if none did
+    :raises ValueError: if arguments are invalid
     """
     if jobs < 1:
         raise ValueError(f"--jobs {jobs} must be at least 1.")
     if "--seed" in argv:
-        raise ValueError("--seeds and --seed: give one of them.")
+        raise ValueError("--seeds and --seed exclude each other: pass only one of them.")
     Path(log_folder).mkdir(parents=True, exist_ok=True)
     runs = _Trainings(argv, Path(log_folder), every)
     handlers = {}
@@ -76,7 +79,7 @@ def train_seeds(argv: list[str], seeds: list[int], jobs: int, log_folder: str, e
 
 
 class _Trainings:
-    """The processes of some trainings."""
+    """The processes of several trainings."""
 
     def __init__(self, argv: list[str], log_folder: Path, every: int | None):
         self.argv, self.log_folder, self.every = argv, log_folder, every
@@ -85,13 +88,13 @@ class _Trainings:
         self._lock = threading.Lock()
 
     def train(self, seed: int) -> int:
-        """Train, or go on, and wait for the end."""
+        """Start or resume a training and wait for it to end."""
         argv = [*self.argv, "--seed", str(seed), "--log-folder", str(self.log_folder)]
         every = [] if self.every is None else ["--checkpoint-every", str(self.every)]
-        words, what = ["train", *argv, *every], "begins"
+        words, what = ["train", *argv, *every], "starts"
         run = self._run_of(argv)
         if run is not None and newest(run / CHECKPOINTS) is not None:
-            words, what = ["train", "--resume", str(run)], f"goes on with {run}"
+            words, what = ["train", "--resume", str(run)], f"resumes {run}"
         elif run is not None and not (run / CHECKPOINTS).exists() and any(run.glob("*.zip")):
             print(f"seed {seed}: finished before, {run}", flush=True)
             return 0
@@ -113,7 +116,7 @@ class _Trainings:
         return abs(status)
 
     def stop(self) -> None:
-        """End all trainings, with a checkpoint each."""
+        """Stop all trainings, each with a checkpoint."""
         with self._lock:
             self._stopped = True
             for process in self._running:
@@ -127,7 +130,7 @@ class _Trainings:
                 process.kill()
 
     def _run_of(self, argv: list[str]) -> Path | None:
-        """The newest run that was begun by this command."""
+        """:return: the newest run that this command started, if there is one"""
         found = []
         for path in self.log_folder.glob(f"*/*/{COMMAND_FILE}"):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
@@ -141,7 +144,7 @@ def _as_exit(number: int, frame: object) -> None:
 
 
 def _end_with_parent() -> None:
-    """Have Linux end this process, with a checkpoint, when its parent is gone, however it went."""
+    """Make Linux end this process, which then writes a checkpoint, when its parent dies."""
     set_parent_death_signal = 1
     ctypes.CDLL(None, use_errno=True).prctl(set_parent_death_signal, signal.SIGTERM)
     if os.getppid() == 1:

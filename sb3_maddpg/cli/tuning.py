@@ -1,4 +1,4 @@
-"""What ``sb3-maddpg train -optimize`` searches: the hyperparameters of MADDPG and MATD3."""
+"""Search spaces of ``sb3-maddpg train -optimize`` for MADDPG, MATD3 and IDDPG."""
 
 import json
 from typing import Any
@@ -12,7 +12,7 @@ from sb3_maddpg.team import Team
 BATCH_SIZES = [256, 512, 1024, 2048]
 NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "large": [256, 256]}
 WITHOUT_TEMPERATURE = ("expected", "score")
-# Transitions between two updates: many in the original code, few where samples are dear
+# Number of transitions between updates: many in the original code, few where samples are expensive
 MOST_UPDATES, FEWEST_UPDATES = 4, 200
 
 
@@ -20,13 +20,13 @@ def sample_maddpg_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    Sampler for MADDPG hyperparameters: only those that matter to the team at hand.
+    Sample MADDPG's hyperparameters, as far as they matter to the team.
 
-    :param trial: of the study
-    :param n_actions: unused, but part of rl_zoo3's interface
+    :param trial: trial of a study
+    :param n_actions: unused, part of rl_zoo3's interface
     :param n_envs: number of environments
-    :param additional_args: as ``TeamExperimentManager`` gives them: ``env``, ``hyperparams`` (those of the
-        recipe) and ``policy_arguments`` (names of those the policy takes)
+    :param additional_args: arguments of ``TeamExperimentManager``: ``env``, ``hyperparams`` (of the recipe) and
+        ``policy_arguments`` (names of the policy's arguments)
     :return: arguments of the algorithm
     """
     _suggest(trial, n_envs, additional_args)
@@ -37,9 +37,9 @@ def sample_matd3_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    Sampler for MATD3 hyperparameters, see ``sample_maddpg_params``.
+    Sample MATD3's hyperparameters, see ``sample_maddpg_params``.
 
-    :param trial: of the study
+    :param trial: trial of a study
     :param n_actions: unused
     :param n_envs: number of environments
     :param additional_args: see ``sample_maddpg_params``
@@ -54,6 +54,8 @@ def sample_matd3_params(
 
 def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
+    Convert the parameters of a trial.
+
     :param sampled_params: parameters of a trial
     :return: arguments of the algorithm
     """
@@ -71,12 +73,16 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 
 def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) -> TeamActions:
-    """Suggest what both algorithms have. :return: how the team acts"""
+    """
+    Suggest the hyperparameters that all algorithms have.
+
+    :return: the team's actions
+    """
     env = additional_args["env"]
     team = Team.from_spaces(env.observation_space, env.action_space)
     actions = TeamActions(team.action_spaces)
     trial.suggest_float("learning_rate", 1e-4, 3e-2, log=True)
-    # A batch is drawn from the replay buffer, whose size is the recipe's
+    # A batch must not be larger than the replay buffer, whose size the recipe sets
     buffer_size = int(additional_args["hyperparams"].get("buffer_size", max(BATCH_SIZES)))
     sizes = [size for size in BATCH_SIZES if size <= buffer_size] or [buffer_size]
     trial.suggest_categorical("batch_size", sizes)
@@ -97,7 +103,7 @@ def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) 
         if estimator not in WITHOUT_TEMPERATURE:
             trial.suggest_float("temperature", 0.2, 2.0, log=True)
     if "share_actor" in additional_args["policy_arguments"] and (groups := _homogeneous_groups(team)):
-        # Optuna keeps no lists among its choices
+        # Optuna does not support lists as choices
         sharing = ["false", "true" if len(groups[0]) == team.n_agents else json.dumps(groups)]
         trial.suggest_categorical("share_actor", sharing)
         trial.suggest_categorical("share_critic", sharing)
@@ -105,7 +111,7 @@ def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) 
 
 
 def _homogeneous_groups(team: Team) -> list[list[int]]:
-    """:return: the agents that could share a network, with those they could share it with"""
+    """:return: groups of two or more agents that could share a network"""
     groups: list[list[int]] = []
     for agent in range(team.n_agents):
         for group in groups:

@@ -41,19 +41,19 @@ from sb3_maddpg.utils import suggest
 
 
 def register() -> None:
-    """Make the algorithms and every installed environment known to rl_zoo3, whose command line reads these dicts."""
+    """Register the algorithms and all installed environments in rl_zoo3."""
     ALGOS.update(ALGORITHMS)
     HYPERPARAMS_SAMPLER.update(dict.fromkeys(ALGORITHMS, sample_maddpg_params))
     HYPERPARAMS_SAMPLER["matd3"] = sample_matd3_params
     HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
-    for module in (rl_zoo3.train, rl_zoo3.enjoy, rl_zoo3.utils):  # record takes it from the last
+    for module in (rl_zoo3.train, rl_zoo3.enjoy, rl_zoo3.utils):  # record imports it from the last
         module.StoreDict = StoreValues  # type: ignore[attr-defined]
     load_environments()
 
 
 def _call(function: Callable[[], Any], command: str, argv: list[str]) -> None:
-    """rl_zoo3's commands read ``sys.argv`` and have no other way in."""
+    """Call a command of rl_zoo3, which reads its arguments from ``sys.argv``."""
     saved, sys.argv = sys.argv, [f"{PROG} {command}", *argv]
     try:
         with no_code_from_files():
@@ -66,7 +66,7 @@ def packaged_config(algo: str, env_id: str) -> str | None:
     """
     :param algo: name of the algorithm
     :param env_id: Gymnasium id
-    :return: path of the packaged recipe for the two, if there is one
+    :return: path of the packaged recipe for both, None if there is none
     """
     path = packaged_recipes().get(f"{algo}.yml")
     if path is not None and not {env_id, "default"}.isdisjoint(yaml.safe_load(path.read_text())):
@@ -75,7 +75,12 @@ def packaged_config(algo: str, env_id: str) -> str | None:
 
 
 def train(argv: list[str]) -> int:
-    """Train as rl_zoo3 does, by the packaged recipe unless another is given, with checkpoints."""
+    """
+    Train like rl_zoo3, but with checkpoints and, by default, with the packaged recipe.
+
+    :param argv: arguments of the command
+    :return: exit status
+    """
     name = "tune" if "-optimize" in argv else "train"
     resuming = _resuming(name)
     asked, argv = resuming.parse_known_args(argv)
@@ -83,10 +88,12 @@ def train(argv: list[str]) -> int:
         import_packages(common_options().parse_known_args(argv)[0].gym_packages)
         print(f"{overview()}\n\n{resuming.format_help()}\nrl_zoo3's options:\n")
     if asked.checkpoint_every is not None and asked.checkpoint_every < 0:
-        raise ValueError(f"--checkpoint-every {asked.checkpoint_every}: give a number of steps, or 0 for none.")
+        raise ValueError(
+            f"--checkpoint-every {asked.checkpoint_every}: pass a number of steps, or 0 for no checkpoints."
+        )
     if asked.seeds is not None:
         if asked.resume is not None:
-            raise ValueError("--resume goes on with one run; --seeds goes on with those of its command by itself.")
+            raise ValueError("--resume continues one run; --seeds resumes the runs of its command automatically.")
         return train_seeds(argv, parse_seeds(asked.seeds), asked.jobs, asked.log_folder, asked.checkpoint_every)
     if asked.resume is None:
         argv += ["--log-folder", asked.log_folder]
@@ -100,7 +107,7 @@ def train(argv: list[str]) -> int:
     known, rest = parser.parse_known_args(argv)
     if not helps(rest):
         _check(known)
-    # One thread unless asked otherwise: small networks gain nothing by a second and lose badly where it is not free.
+    # One thread by default: a second does not speed up small networks, and slows them down if the core is not idle
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
     if known.conf_file is not None and not Path(known.conf_file).is_file():
         packaged = packaged_recipes().get(known.conf_file)
@@ -119,40 +126,44 @@ def train(argv: list[str]) -> int:
 
 
 def _resuming(name: str) -> argparse.ArgumentParser:
-    """The options that rl_zoo3 does not have."""
+    """:return: a parser of the options that rl_zoo3 does not have"""
     parser = argparse.ArgumentParser(prog=f"{PROG} {name}", add_help=False, allow_abbrev=False, usage=argparse.SUPPRESS)
-    group = parser.add_argument_group("options beside rl_zoo3's")
-    group.add_argument("--checkpoint-every", type=int, metavar="STEPS", help="0: never (default: by time)")
-    group.add_argument("--resume", nargs="?", const="", metavar="RUN", help="go on with a run (default: the newest)")
-    group.add_argument("-f", "--log-folder", default="logs", metavar="DIR", help="of the runs (default %(default)s)")
-    group.add_argument("--seeds", metavar="0-9", help="a training for each seed")
-    group.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trainings at once (default %(default)s)")
+    group = parser.add_argument_group("options in addition to rl_zoo3's")
+    group.add_argument("--checkpoint-every", type=int, metavar="STEPS", help="0 for none (default: by time)")
+    group.add_argument("--resume", nargs="?", const="", metavar="RUN", help="resume a run (default: the newest)")
+    group.add_argument(
+        "-f", "--log-folder", default="logs", metavar="DIR", help="folder of the runs (default %(default)s)"
+    )
+    group.add_argument("--seeds", metavar="0-9", help="train once per seed")
+    group.add_argument(
+        "--jobs", type=int, default=os.cpu_count() or 1, help="number of parallel trainings (default %(default)s)"
+    )
     return parser
 
 
 def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, list[str]]:
-    """What ``--resume`` goes on with: a run's folder, unless given the newest with checkpoints, and its command."""
+    """:return: the checkpoints of the run that ``--resume`` names, by default the newest, and the run's command"""
     if argv:
-        raise ValueError(f"--resume goes on with the command of the run: leave out {' '.join(argv)}.")
+        raise ValueError(f"--resume uses the command of the run: leave out {' '.join(argv)}.")
     run = Path(asked.resume)
     if not asked.resume:
         runs = [path.parent for path in Path(asked.log_folder).glob(f"*/*/{CHECKPOINTS}")]
         if not runs:
-            raise ValueError(f"--resume: no run in {asked.log_folder} has checkpoints; name its folder.")
+            raise ValueError(f"--resume: no run in {asked.log_folder} has checkpoints; pass the folder of a run.")
         run = max(runs, key=lambda path: path.stat().st_mtime)
     try:
         command = json.loads((run / COMMAND_FILE).read_text())
         argv, every = [str(word) for word in command["argv"]], command["every"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{run} is no folder of a run with checkpoints ({error}).") from error
+        raise ValueError(f"{run} is not the folder of a run with checkpoints ({error}).") from error
     path = newest(run / CHECKPOINTS)
     if path is None:
-        raise ValueError(f"{run} has no checkpoint that is whole.")
+        raise ValueError(f"{run} has no complete checkpoint.")
     return Checkpoints(asked.checkpoint_every or every, command, run), [*argv, "-i", str(path / "model.zip")]
 
 
 def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
-    """Show a trained model in an environment with the arguments it was trained with."""
+    """Show a trained model in an environment with the arguments of its training."""
     parser = common_options()
     parser.add_argument("-f", "--folder", default="logs")
     parser.add_argument("--exp-id", type=int, default=0)
@@ -171,7 +182,7 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
             hyperparams, _ = get_saved_hyperparams(str(run / name))
         env_kwargs = {**hyperparams.get("env_kwargs", {}), **known.env_kwargs}
         rest += ["--env", known.env]
-        # rl_zoo3 reads these values as Python; its own merging forgets some of them
+        # rl_zoo3 reads these values as Python; its own merging drops some of them
         rest += ["--env-kwargs", *(f"{key}:{value!r}" for key, value in env_kwargs.items())] if env_kwargs else []
         if command == "enjoy" and "--no-render" not in rest:
             reason = "there is no display" if _is_headless() else f"{known.env} has no window to show"
@@ -196,16 +207,18 @@ def enjoy(argv: list[str]) -> int:
 
 def record(argv: list[str]) -> int:
     """Record a trained model on video."""
-    # A script without a function to call
+    # This module of rl_zoo3 is a script
     return _show("record", lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), argv)
 
 
 def _check(known: argparse.Namespace) -> None:
-    """Whether the algorithm and the environment are there; a PettingZoo module is made known to Gymnasium."""
+    """Check that the algorithm and the environment exist, and register a PettingZoo module in Gymnasium."""
     if known.algo not in ALGOS:
         raise ValueError(suggest("algorithm", known.algo, ALGOS))
     if known.env is None:
-        raise ValueError("--env is missing: give the id of a Gymnasium environment, or PACKAGE/MODULE of PettingZoo's.")
+        raise ValueError(
+            "--env is missing: pass the id of a Gymnasium environment, or PACKAGE/MODULE of a PettingZoo environment."
+        )
     import_packages(known.gym_packages)
     if pettingzoo_ids.register(known.env):
         return
@@ -214,7 +227,7 @@ def _check(known: argparse.Namespace) -> None:
     if slash and not any(name.startswith(f"{package}/") for name in ids):
         raise ValueError(
             f"Unknown environment '{known.env}': there is no module {known.env.replace('/', '.')} with a function "
-            "parallel_env, as PettingZoo's have. Is its package installed, or in this folder?"
+            "parallel_env, as PettingZoo's modules have. Is its package installed or in this folder?"
             f"{did_you_mean(package, modules_beside(package))}"
         )
     if difflib.get_close_matches(known.env, ids, n=1):
@@ -222,13 +235,13 @@ def _check(known: argparse.Namespace) -> None:
     nearest = ", ".join(difflib.get_close_matches(known.env, ids, n=3, cutoff=0))
     raise ValueError(
         f"Unknown environment '{known.env}'. The nearest ids are {nearest}. A PettingZoo environment is "
-        "PACKAGE/MODULE, or MODULE for a file in this folder, with a function parallel_env; --gym-packages imports "
-        "what registers others."
+        "PACKAGE/MODULE, or MODULE for a file in this folder, with a function parallel_env. --gym-packages imports "
+        "packages that register other environments."
     )
 
 
 def _is_headless() -> bool:
-    """Whether windows would be drawn where nobody sees them. SDL_VIDEODRIVER is for those who want just that."""
+    """:return: whether there is no display; setting SDL_VIDEODRIVER allows windows without one"""
     known = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     return sys.platform.startswith("linux") and not any(os.environ.get(name) for name in known)
 
@@ -236,7 +249,7 @@ def _is_headless() -> bool:
 def _has_window(env_id: str, env_kwargs: dict[str, Any]) -> bool:
     spec = gymnasium.spec(env_id)
     if spec.entry_point == parallel.ENTRY_POINT:
-        # Only the environment itself knows
+        # Only an instance of the environment knows its render modes
         env = parallel.make(**{**spec.kwargs, **env_kwargs})
         env.close()
         return "human" in env.metadata["render_modes"]
@@ -253,4 +266,4 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
 
 
 if __name__ == "__main__":
-    sys.exit(f"error: this module is no command: use `{PROG} train` or `python -m sb3_maddpg train`.")
+    sys.exit(f"error: this module is not a command: use `{PROG} train` or `python -m sb3_maddpg train`.")

@@ -1,10 +1,10 @@
-"""Which iterate of a training by the paper's settings to take: the last, the best in evaluation, or a mean of the last.
+"""Compare models from different times of a training with the paper's settings: last, best in evaluation, mean of last.
 
 ``python -m studies.swarm.checkpoints RUN [RUN ...] [--episodes N] [--jobs N] [--models FOLDER] [--json F]``. A RUN is a
-folder that ``sb3-maddpg train --save-freq`` made. From it come the last model, ``best_model.zip`` (highest return of
-the evaluations during the training), the checkpoint with the fewest collisions on the validation set, and the mean of
-the actors of the last checkpoints. All of them then fly other episodes. JSON: one row a run, choice and scenario with
-the keys of `summarise`, and run, choice, model.
+folder of ``sb3-maddpg train --save-freq``. It provides the last model, ``best_model.zip`` (highest return of the
+evaluations during training), the checkpoint with the fewest collisions on the validation set, and the mean of the
+actors of the last checkpoints. All of them then fly other episodes. JSON: one row per run, choice and scenario with the
+keys of `summarise`, and run, choice, model.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
 from studies.swarm.protocol import EARLIER, NAMES, VALIDATION, condition, fly_kept, progress
 
-# Checkpoints whose actors are averaged
+# Number of checkpoints whose actors are averaged
 LAST = 5
 
 
 class Flown(NamedTuple):
-    """A model in all scenarios.
+    """Results of a model in all scenarios.
 
-    :param path: of the model
-    :param rows: scenario -> figures, see `summarise`
+    :param path: path of the model
+    :param rows: scenario -> result, see `summarise`
     """
 
     path: str
@@ -40,14 +40,16 @@ class Flown(NamedTuple):
 
     @property
     def collisions(self) -> int:
-        """In all scenarios together."""
+        """Number of collisions in all scenarios."""
         return sum(row["collisions"] for row in self.rows.values())
 
 
 def fly(path: str, episodes: int, seed: int) -> Flown:
-    """Fly episodes of every scenario.
+    """Fly episodes of all scenarios.
 
-    :param seed: of which set
+    :param path: path of the model
+    :param episodes: number of episodes per scenario
+    :param seed: index of the set of held-out episodes
     """
     config = make_config("paper")
     flown = fly_kept([condition(path, name, config) for name in NAMES], episodes, seed)
@@ -55,13 +57,13 @@ def fly(path: str, episodes: int, seed: int) -> Flown:
 
 
 def checkpoints(run: Path) -> list[Path]:
-    """The checkpoints of a run, the oldest first."""
+    """Return the checkpoints of a run, oldest first."""
     steps = {path: re.fullmatch(r"rl_model_(\d+)_steps", path.stem) for path in run.glob("rl_model_*_steps.zip")}
     return sorted((path for path, found in steps.items() if found), key=lambda path: int(steps[path][1]))  # type: ignore[index]
 
 
 def average(paths: list[Path], target: Path) -> str:
-    """Write a model whose actors have the mean weights of several models; critics are those of the last."""
+    """Write a model whose actors have the mean weights of several models. Its critics are those of the last one."""
     models = [MADDPG.load(path, device="cpu") for path in paths]
     with th.no_grad():
         for weights in zip(*(model.actor.parameters() for model in models), strict=True):
@@ -71,13 +73,19 @@ def average(paths: list[Path], target: Path) -> str:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--choosing", type=int, default=250, help="episodes of a scenario to choose on (%(default)s)")
-    parser.add_argument("--episodes", type=int, default=2000, help="of each scenario afterwards (%(default)s)")
+    parser.add_argument(
+        "--choosing", type=int, default=250, help="episodes per scenario for the choice (default %(default)s)"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=2000, help="episodes per scenario for the test (default %(default)s)"
+    )
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for averaged models (%(default)s)")
+    parser.add_argument(
+        "--models", type=Path, default=Path("logs"), help="folder for averaged models (default %(default)s)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     choices: list[tuple[str, str, str]] = []

@@ -1,10 +1,10 @@
-"""A reference for docs/results.md: what a regression on forked simulators learns in the swarm.
+"""A reference for docs/results.md: an actor trained by regression on forked simulations.
 
-``python -m studies.swarm.counterfactual [--forks N] [--episodes N] [--seed S] [--models FOLDER] [--json F]``: every
-few steps swarms are copied once for each request that could be turned round, the copies fly on for a second and a
-half, and the actor of zoo_configs/quad_swarm_paper.yml learns by regression how much more its pair would have paid
-without the request. No critic learns: this is what its estimates are worth beside the simulator's. Then the actor flies
-with several prices of a request on episodes of the validation set. JSON: one row a scenario and price with the keys of
+``python -m studies.swarm.counterfactual [--forks N] [--episodes N] [--seed S] [--models FOLDER] [--json F]``. Every few
+steps, swarms are copied once for each possible request, which is toggled in the copy. The copies fly for a second and a
+half, and the actor of zoo_configs/quad_swarm_paper.yml learns by regression how much a request reduces its pair's cost.
+There is no critic, so the comparison shows how good critics' estimates are. Then the actor flies with several prices of
+a request on episodes of the validation set. JSON: one row per scenario and price with the keys of
 `quad_swarm.evaluation.evaluation.summarise`, and forks, steps (of a swarm), labels, seed, seconds, scenario, price.
 """
 
@@ -29,20 +29,20 @@ from studies.swarm.ppo import env_kwargs, validate
 from studies.swarm.protocol import condition
 
 PRICES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
-# Prices of the policy that flies while it learns are drawn between these, for each pair and step.
+# Range of the prices of the behaviour policy, drawn for each pair and step
 LOWEST, HIGHEST = 0.002, 0.4
-# Swarms, steps from fork to fork, for which a request is turned round, and for which the copies fly
+# Number of swarms, and numbers of steps: between forks, with the toggled request, and of the copies' flights
 SWARMS, APART, HELD, AHEAD = 32, 3, 3, 14
 DISCOUNT = 0.95
-# What an actor's logit is to a gain, and the largest gain: a collision would drown everything else
+# Ratio of an actor's logit to the gain, and maximum gain, so that collisions do not dominate
 SCALE, LARGEST = 4.0, 3.0
 
 
 class Labels(NamedTuple):
-    """What was learned from forks.
+    """Labels from forks.
 
-    :param obs: of single robots, (B, size)
-    :param gain: how much less its pair pays if a robot asks, for each of the others, (B, n - 1)
+    :param obs: observations of single robots, (B, size)
+    :param gain: reduction of the pair's cost by a request, for each of the others, (B, n - 1)
     """
 
     obs: np.ndarray
@@ -50,10 +50,10 @@ class Labels(NamedTuple):
 
 
 class Forks:
-    """Swarms that are copied and flown with one request turned round.
+    """Swarms that are copied and flown with one request toggled.
 
-    :param model: whose actor says the gain of each request
-    :param seed: of starts, goals and prices
+    :param model: model whose actor estimates the gain of each request
+    :param seed: seed of starts, goals and prices
     """
 
     def __init__(self, model: MADDPG, seed: int):
@@ -74,21 +74,21 @@ class Forks:
                 self.task.reset(c * SWARMS + k, np.random.default_rng(seed))
 
     def _act(self, task: RequestTask) -> np.ndarray:
-        """Requests by the actor, with the same prices in all copies, (copies, SWARMS, n, n - 1)."""
+        """Return the actor's requests, with the same prices in all copies, (copies, SWARMS, n, n - 1)."""
         prices = np.exp(self.rng.uniform(np.log(LOWEST), np.log(HIGHEST), (SWARMS, *self.pairs)))
         with th.no_grad():
             gain = self.model.actor.logits(th.as_tensor(task.observe())).numpy() / SCALE
         return gain.reshape(self.copies, SWARMS, *self.pairs) > prices
 
     def _step(self, task: RequestTask, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rewards by pair and who is over, both with a leading axis of copies."""
+        """Take a step and return the pairs' rewards and which episodes are over, both with a leading axis of copies."""
         self.steps += bits.shape[0] * SWARMS
         outcome = task.step(bits.reshape(-1, *self.pairs))
         over = (outcome.terminated | outcome.truncated).reshape(self.copies, SWARMS)
         return outcome.pair_rewards.reshape(self.copies, SWARMS, *self.pairs), over
 
     def fork(self) -> Labels:
-        """Fly on for a few steps, then fork."""
+        """Fly for a few steps, then fork."""
         for _ in range(APART):
             over = self._step(self.task, self._act(self.task))[1][0]
             self._begin(over)
@@ -113,7 +113,7 @@ class Forks:
 
 
 def train(forks: int, seed: int) -> tuple[MADDPG, Forks]:
-    """Regress the actor on what forks say; it decides which states are seen meanwhile."""
+    """Train the actor by regression on forks, whose states come from its own flights."""
     env = gymnasium.make("QuadSwarm-v0", **env_kwargs(0.0))
     policy_kwargs = {"net_arch": [64, 64], "pair_credit": True}
     model = MADDPG(
@@ -129,7 +129,7 @@ def train(forks: int, seed: int) -> tuple[MADDPG, Forks]:
         for _ in range(10):
             drawn = [known[source.rng.integers(len(known))] for _ in range(8)]
             obs, gain = (th.as_tensor(np.concatenate(both)) for both in zip(*drawn, strict=True))
-            # An actor decides for a whole team, but looks at each of its robots by itself.
+            # The actor expects observations of whole teams, although it treats each robot separately
             logits = model.actor.logits(obs.unflatten(0, (-1, n_robots))).flatten(0, 1)
             loss = F.mse_loss(logits, SCALE * gain)
             optimizer.zero_grad()
@@ -141,12 +141,14 @@ def train(forks: int, seed: int) -> tuple[MADDPG, Forks]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--forks", type=int, default=600, help=f"of {SWARMS} swarms each (%(default)s)")
-    parser.add_argument("--episodes", type=int, default=2000, help="of each scenario (%(default)s)")
+    parser.add_argument(
+        "--forks", type=int, default=600, help=f"number of forks of {SWARMS} swarms each (default %(default)s)"
+    )
+    parser.add_argument("--episodes", type=int, default=2000, help="episodes per scenario (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the model (%(default)s)")
+    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the model (default %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     args.models.mkdir(parents=True, exist_ok=True)

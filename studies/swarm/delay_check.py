@@ -1,10 +1,10 @@
-"""A delay check in the manner of RMADER (Kondo et al. 2023), as a baseline against late plans.
+"""A delay check like RMADER's (Kondo et al. 2023), as a baseline for late plans.
 
-A robot flies a committed plan, which ends at rest. Meanwhile it plans on from where it will be in a while, announces
-the candidate beside what it is committed to, and commits to it only if nothing that arrives until then comes near it.
-What others announced is never touched, so that two robots cannot both act on what the other has given up. Unlike
-there: plans of the same solver as elsewhere instead of splines, compared at the planner's stages; a linear feedback
-keeps the vehicle to its plan; robots and steps share one clock.
+A robot flies a committed plan, which ends at rest. Meanwhile it plans from its future position, announces the candidate
+together with its committed plan, and commits to the candidate only if no plan that arrives until then comes close to
+it. Plans must avoid everything that others announced, so that two robots cannot both rely on plans that the other has
+abandoned. Differences from RMADER: plans come from the same solver as elsewhere instead of splines and are compared at
+the planner's stages, linear feedback keeps the vehicle on its plan, and robots and steps share a clock.
 """
 
 from __future__ import annotations
@@ -28,33 +28,34 @@ from quad_swarm.world.swarm import StepReport, Swarm
 from studies.swarm.protocol import LINGER
 
 COMMITTED, CANDIDATE = 0, 1
-_CHUNK = 100  # episodes that are flown at once
+_CHUNK = 100  # episodes per batch
 
 
 class DelayCheckedSwarm(Swarm):
-    """Robots that broadcast what they are committed to and what they would like to fly next, and check it.
+    """Swarm whose robots broadcast committed and candidate plans and check the candidates.
 
     :param config: the world; answers are late by ``radio.delay`` steps, without jitter
     :param n_swarms: number of swarms E
-    :param clearance: least distance between a candidate and what others announced (m)
+    :param clearance: minimum distance between a candidate and the plans that others announced (m)
     :param solver: see `make_planner`
+    :raises ValueError: if there is jitter
     """
 
     def __init__(self, config: SwarmConfig, n_swarms: int, clearance: float, solver: str = "rti"):
         if config.radio.jitter:
-            raise ValueError(f"radio.jitter={config.radio.jitter}: the check waits for the longest delay, set it to 0.")
+            raise ValueError(f"radio.jitter={config.radio.jitter}: the check assumes a constant delay, set it to 0.")
         super().__init__(config, n_swarms, solver)
         n, horizon = config.n_robots, config.planner.horizon
-        # Each of the others counts twice, as committed and as it would like to fly
+        # Each of the others counts twice, with its committed and its candidate plan
         self.planner = make_planner(config.planner, config.quadrotor, 2 * n - 1, solver)
         self.clearance = clearance
-        self.wait = 1 + config.radio.delay  # steps until everybody knows of a candidate, and its robot of theirs
-        self._stages = 2 * horizon + self.wait  # of a plan that ends at rest, from now on
+        self.wait = 1 + config.radio.delay  # steps until all robots know each other's candidates
+        self._stages = 2 * horizon + self.wait  # number of stages of a plan that ends at rest, from now on
         self._feedback = _feedback(self.planner.model)
-        # From now on, (E, n, committed or candidate, ...): a plan, and braking to rest
+        # Plans and braking to rest, from now on, (E, n, committed or candidate, ...)
         self._x = np.zeros((n_swarms, n, 2, self._stages + 1, 9))
         self._inputs = np.zeros((n_swarms, n, 2, self._stages, N_INPUTS))
-        self._pending = np.zeros((n_swarms, n), dtype=np.int64)  # steps until a candidate is flown, 0: none
+        self._pending = np.zeros((n_swarms, n), dtype=np.int64)  # steps until a candidate is flown, 0 for none
         self._known = np.zeros((n_swarms, n, n - 1, 2, self._stages + 1, 3))
         self._sent: list[np.ndarray] = []
 
@@ -73,15 +74,16 @@ class DelayCheckedSwarm(Swarm):
         self._sent = [self._announced() for _ in range(self.wait)]
 
     def _announced(self) -> np.ndarray:
-        """What robots broadcast: positions from now on, by the steps' clock, (E, n, 2, stages + 1, 3)."""
+        """Return the positions that robots broadcast, from now on, by the steps' clock, (E, n, 2, stages + 1, 3)."""
         pos = self._x[..., POSITION]
         start = self.chance.start
         return pos if start is None else resampled(pos, -np.repeat(start[..., None], 2, 2) / self.config.substeps)
 
     def _receive(self, requests: np.ndarray) -> np.ndarray:
-        """Take in what arrives.
+        """Receive broadcasts.
 
-        :return: what each robot knows of the others, as of when its own input acts, (E, n, n - 1, 2, stages + 1, 3)
+        :return: each robot's knowledge of the others, from the time at which its input takes effect,
+            (E, n, n - 1, 2, stages + 1, 3)
         """
         self._sent = [advance(sent) for sent in self._sent]
         arriving, _ = self.chance.arrivals(requests, self.neighbours.others)
@@ -95,7 +97,7 @@ class DelayCheckedSwarm(Swarm):
         )
 
     def _comes_near(self, known: np.ndarray) -> np.ndarray:
-        """Whose candidate comes near something that is known of another, (E, n) bool."""
+        """Return whether each candidate comes close to a known plan of another robot, (E, n) bool."""
         own = self._x[:, :, None, None, CANDIDATE, :, POSITION]
         return length(own - known)[..., 1:].min(axis=(2, 3, 4)) < self.clearance
 
@@ -138,7 +140,7 @@ class DelayCheckedSwarm(Swarm):
         self._x[who, to], self._inputs[who, to] = self._x[who, what], self._inputs[who, what]
 
     def _plan(self, who: np.ndarray, known: np.ndarray) -> None:
-        """Let some robots plan on from where they will be after the wait, and keep what passes their own check."""
+        """Plan candidates of some robots from their positions after the wait, and keep those that pass the check."""
         if not who.any():
             return
         horizon, wait = self.config.planner.horizon, self.wait
@@ -159,7 +161,7 @@ class DelayCheckedSwarm(Swarm):
 
 
 def _feedback(model: QuadrotorModel) -> np.ndarray:
-    """Gain (4, 9) of a linear-quadratic regulator about hover."""
+    """Return the gain, (4, 9), of a linear-quadratic regulator at hover."""
     eye, zero = np.eye(9), np.zeros((9, 9))
     a = (model.step(1e-4 * eye, zero[:, :4]) / 1e-4).T
     b = (model.step(zero[:4], 1e-4 * np.eye(4)) / 1e-4).T
@@ -172,8 +174,11 @@ def _feedback(model: QuadrotorModel) -> np.ndarray:
 
 
 def fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequence[int]) -> Rows:
-    """Figures of episodes with the check, see `run_episodes`.
+    """Fly episodes with the check and return their statistics, see `run_episodes`.
 
+    :param config: the world
+    :param scenario: name of the scenario
+    :param clearance: see `DelayCheckedSwarm`
     :param episodes: seeds
     """
     chunks = [episodes[k : k + _CHUNK] for k in range(0, len(episodes), _CHUNK)]

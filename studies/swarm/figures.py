@@ -1,4 +1,4 @@
-"""The figures of the pages of results."""
+"""Figures of the results pages."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Rows = list[dict[str, Any]]
 
 
 def rate_of(row: dict[str, Any]) -> float:
-    """Share of the episodes with a collision."""
+    """Return the fraction of episodes with a collision."""
     return row["collisions"] / row["episodes"]
 
 
 @rc_context(STYLE)
 def draw_fronts(rules: Rows, sweep: Rows, tests: Rows, names: Sequence[str], path: Path) -> None:
-    """Requests against collisions: all rules that were tried, the learned policy at all thresholds, and the tested
-    policies; a column for each preset, a line for each scenario."""
+    """Draw requests against collisions of all rules tried, the learned policy at all thresholds, and the tested
+    policies, with a column per preset and a row per scenario."""
     presets = [preset for preset in PRESETS if any(row["preset"] == preset for row in rules)]
     figure = Figure(figsize=(8, 0.6 + 2.5 * len(names)), layout="constrained")
     panels = figure.subplots(len(names), len(presets), sharex="col", sharey="row", squeeze=False)
@@ -99,7 +99,7 @@ def _draw_front(axes: Axes, preset: str, rules: Rows, sweep: Rows, tests: Rows) 
 
 
 def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
-    """The first test episode of each scenario as a model flies it, and whom a rule would have asked on its way."""
+    """Fly the first test episode of each scenario with a model, and record the requests that a rule would have made."""
     config = make_config(preset)
     names = progress(NAMES, f"flights, {preset}", len(NAMES))
     return {name: fly(condition(model, name, config), EARLIER, other_rule=rule) for name in names}
@@ -107,7 +107,7 @@ def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:
 
 @rc_context(STYLE)
 def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
-    """The paper's Fig. 2: the flights of each preset from above, a column each."""
+    """Draw flights from above as in the paper's Fig. 2, with a column per preset."""
     figure = Figure(figsize=(4 * len(flown), 4 * len(NAMES)), layout="constrained")
     panels = figure.subplots(len(NAMES), len(flown), squeeze=False)
     for column, (preset, by_name) in zip(panels.T, flown.items(), strict=True):
@@ -120,7 +120,8 @@ def draw_trajectories(flown: dict[str, dict[str, Flight]], path: Path) -> None:
 
 @rc_context(STYLE)
 def draw_asking(rows: Rows, path: Path) -> None:
-    """How often policies ask at what they see: a line for each quantity, a column for each preset."""
+    """Draw how often policies make requests depending on what they observe, with a row per quantity and a column per
+    preset."""
     quantities = list(dict.fromkeys(row["quantity"] for row in rows))
     presets = list(dict.fromkeys(row["preset"] for row in rows))
     figure = Figure(figsize=(8, 0.4 + 2.0 * len(quantities)), layout="constrained")

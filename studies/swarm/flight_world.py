@@ -1,14 +1,16 @@
-"""What the disturbed worlds are like under rules that nobody tuned.
+"""Evaluate the disturbed worlds with untuned rules, and other physics with tuned policies.
 
 ``python -m studies.swarm.flight_world [PART ...]`` flies its parts.
 
-``world``: no and full communication in `flight` and `flight-hard`. ``delays``: full communication with answers one, two
-and three steps late, with and without the right of way. ``delay_check``: the same with the baseline of
-`studies.swarm.delay_check`. ``paper``: four robots with the paper's settings, trained in `flight`, over whole episodes
-as the paper counts. ``plants``: margins and models in foreign physics. All on a set of episodes that nothing was chosen
-on. JSON: one row for each condition with the keys of `summarise`, and part, scenario, policy and what was
-changed in the world. The rule and the model of ``plants`` are those that `studies.swarm.tune_flight` chose; what is
-known of that part is not flown again.
+- ``world``: no and full communication in `flight` and `flight-hard`.
+- ``delays``: full communication with answers that are one, two and three steps late, with and without the right of way.
+- ``delay_check``: the same with the baseline of `studies.swarm.delay_check`.
+- ``paper``: four robots with the paper's settings, trained in `flight`, over whole episodes as in the paper.
+- ``plants``: separations and models in other simulators, with the rule and the model that `studies.swarm.tune_flight`
+  chose. Conditions that the file already contains are not flown again.
+
+All parts use a set of episodes on which nothing was chosen. JSON: one row per condition with the keys of `summarise`,
+and part, scenario, policy and the changes to the world.
 """
 
 from __future__ import annotations
@@ -41,10 +43,10 @@ from studies.swarm.protocol import (
 )
 from studies.swarm.tune_flight import SWAPS
 
-# What the planner keeps in the part `plants`: contact is at 0.6 m
+# Separations of the planner in the part `plants`; contact is at 0.6 m
 SEPARATIONS = (0.6, 0.65, 0.7, 0.8)
 PARTS = {"world": 1000, "delays": 4000, "delay_check": 1000, "paper": 1000, "plants": 1000}
-# What the delay check keeps: of 0.62, 0.66 and 0.7 m that with the fewest collisions in validation episodes
+# Clearance of the delay check: the one of 0.62, 0.66 and 0.7 m with the fewest collisions in validation episodes
 CLEARANCE = 0.62
 DELAY_CHECK = f"full, delay check at {CLEARANCE} m"
 QUICK = 10
@@ -53,11 +55,11 @@ QUICK = 10
 class Job(NamedTuple):
     """A condition.
 
-    :param part: of this study
-    :param preset: the world
-    :param changed: what is changed in it
-    :param scenario: the scenario
-    :param policy: a rule
+    :param part: part of this study
+    :param preset: name of the world
+    :param changed: changes to the world
+    :param scenario: name of the scenario
+    :param policy: a rule or a model
     """
 
     part: str
@@ -68,7 +70,7 @@ class Job(NamedTuple):
 
 
 def jobs(part: str) -> Iterator[Job]:
-    """The conditions of a part."""
+    """Yield the conditions of a part."""
     if part == "world":
         for preset, name, policy in itertools.product(("flight", "flight-hard"), NAMES, ("none", "full")):
             yield Job(part, preset, {}, name, policy)
@@ -90,7 +92,7 @@ def jobs(part: str) -> Iterator[Job]:
 
 
 def fly(job: Job, episodes: int) -> dict[str, Any]:
-    """The row of a condition."""
+    """Fly a condition and return its row."""
     config = make_config(job.preset, job.changed)
     if job.policy == DELAY_CHECK:
         first = first_episode(WORLDS)
@@ -104,10 +106,10 @@ def fly(job: Job, episodes: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each condition")
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="parts to fly (default: all)")
+    parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=absolute_path, default=DATA / "flight_world.json", metavar="FILE")
     args = parser.parse_args()

@@ -1,10 +1,10 @@
 """Fly the sealed test set of `flight`: ``python -m studies.swarm.fly_flight [--n-robots ...] [--quick] [--json F]``.
 
-Full and no communication, the best rule with one setting, and all models with theirs, each in every scenario, and with
-four robots also the models that were trained with the paper's settings; what the file already holds is not flown again.
-Who flies is read from ``flight_tuning.json``, which `studies.swarm.tune_flight`
-writes: commit it first. JSON: one row for each condition with the keys of
-`summarise`, its episodes' outcomes as text (1: a collision) for paired comparisons, and scenario, policy, n_robots.
+Full and no communication, the best rule and all models, each with a single setting, fly in all scenarios. With four
+robots, the models that were trained with the paper's settings also fly. Conditions that the file already contains are
+not flown again. The policies come from ``flight_tuning.json``, which `studies.swarm.tune_flight` writes: commit it
+first. JSON: one row per condition with the keys of `summarise`, the outcomes of its episodes as text (1: a collision)
+for paired comparisons, and scenario, policy, n_robots.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from studies.swarm.protocol import (
 )
 from studies.swarm.tune_flight import FULL, OWN_SWAPS, PRESET
 
-# Episodes of each condition by the number of robots
+# Number of episodes per condition by the number of robots
 EPISODES = {8: 12000, 4: 4000, 12: 4000, 16: 4000}
 QUICK = 10
-# The models of the paper's settings, which fly with the number of robots that they were trained with alone
+# Recipe of the models with the paper's settings, which only fly with the number of robots of their training
 PAPERS = "faithful_flight"
 
 
@@ -51,17 +51,18 @@ class Job(NamedTuple):
 
 
 def tuned() -> Iterator[dict[str, Any]]:
-    """The rows of all settings that are safe, but for full communication."""
+    """Return the rows of all safe settings except full communication."""
     return (row for row in known_rows(DATA / "flight_tuning.json") if row["safe"] and row["family"] != FULL)
 
 
 def best_rule() -> str:
-    """The rule that is safe everywhere with the fewest requests in both swaps of eight robots."""
+    """Return the rule that is safe everywhere and makes the fewest requests in both swaps of eight robots."""
     return _cheapest("rule", lambda setting: not is_model(setting))
 
 
 def best_model() -> str:
-    """The model, with its threshold, of which the same is true: the one that is shipped."""
+    """Return the model with its threshold that is safe everywhere and makes the fewest requests in both swaps of eight
+    robots. This model is shipped."""
     return _cheapest("model", is_model)
 
 
@@ -76,13 +77,13 @@ def _cheapest(what: str, is_one: Callable[[str], bool]) -> str:
 
 
 def tuned_models() -> list[str]:
-    """The models with their thresholds; those that have none that is safe fly with their own."""
+    """Return the models with their tuned thresholds. Models without a safe threshold keep their own."""
     safe = {row["family"]: row["setting"] for row in tuned()}
     return [safe.get(path, path) for path in models("flight")]
 
 
 def jobs(sizes: list[int], quick: bool) -> list[Job]:
-    """All conditions, the most robots last."""
+    """Return all conditions, by increasing number of robots."""
     everywhere = ["full", "none", best_rule(), *tuned_models()]
     return [
         Job(n, name, policy, QUICK if quick else EPISODES[n])
@@ -93,7 +94,7 @@ def jobs(sizes: list[int], quick: bool) -> list[Job]:
 
 
 def fly(job: Job) -> dict[str, Any]:
-    """The row of a condition."""
+    """Fly a condition and return its row."""
     config = world(PRESET, job.n_robots)
     ((_, rows),) = fly_kept([condition(job.policy, job.scenario, config)], job.episodes, FLIGHT_TEST).items()
     outcomes = "".join("1" if row["collided"] else "0" for row in rows)
@@ -101,10 +102,10 @@ def fly(job: Job) -> dict[str, Any]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n-robots", nargs="+", type=int, default=list(EPISODES), choices=list(EPISODES))
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each condition")
+    parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=absolute_path, default=DATA / "flight.json", metavar="FILE")
     args = parser.parse_args()

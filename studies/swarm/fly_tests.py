@@ -1,9 +1,8 @@
-"""Fly everything that docs/results.md says, from the models and rules in studies/swarm/data.
+"""Fly all results of docs/results.md with the models and rules in studies/swarm/data.
 
 ``python -m studies.swarm.fly_tests [PART ...] [--quick] [--out FOLDER]`` flies episodes that neither training nor
-tuning have seen, and writes a file of rows for each part. Parts can be chosen by name, also presets, scenarios and
-teams; the other rows stay. ``--quick`` flies few episodes and checks only that everything runs. `studies.swarm.report`
-makes the page of them.
+tuning have seen, and writes a file of rows per part. Parts, presets, scenarios and teams can be selected; all other
+rows stay. ``--quick`` flies few episodes, only to check that everything runs. `studies.swarm.report` fills the pages.
 """
 
 from __future__ import annotations
@@ -46,18 +45,18 @@ from studies.swarm.protocol import (
     world,
 )
 
-# Episodes of each condition, and the set that they are taken from
+# Number of episodes per condition, and their set
 EPISODES = {"test": 12000, "teams": 4000, "counts": 1000, "quadrants": 4000}
 EPISODES |= {"sweep": 1000, "robustness": 1000, "unseen": 4000, "asking": 200, "interventions": 12000}
 SETS = {"test": TEST, "teams": TEST, "counts": TEST, "quadrants": TEST}
 QUICK = 20
-# A threshold with which there are collisions to look at
+# A threshold with enough collisions to analyse
 RECKLESS = 0.6
-# The rule that the paper compares with, and the simplest one that is better
+# The simplest rule that is better than the paper's
 CPA = "cpa:0.7:1.5"
-# What tells the conditions of a part from each other; one that is flown again replaces its rows
+# Keys that identify the conditions of a part; a condition that is flown again replaces its rows
 CONDITION = ("preset", "scenario", "condition", "n_robots")
-# Other sizes than those it was trained with
+# Numbers of robots other than in training
 TEAMS = (6, 12, 16)
 CONDITIONS: dict[str, dict[str, Any]] = {
     "as trained": {},
@@ -77,14 +76,14 @@ Intervention = Callable[[np.ndarray, int, int], np.ndarray]
 
 
 class Job(NamedTuple):
-    """Policies in a scenario, to be flown over the same episodes.
+    """Policies in a scenario that fly the same episodes.
 
-    :param keys: of every row
-    :param policies: for `compare` the first is full communication, the second the rule to beat
+    :param keys: common entries of all rows
+    :param policies: the policies; for `compare` the first is full communication, the second the rule to beat
     :param scenario: a name of `SCENARIOS` or `UNSEEN`
     :param config: the world
-    :param episodes: how many
-    :param seed: of which set
+    :param episodes: number of episodes
+    :param seed: index of the set of episodes
     """
 
     keys: dict[str, Any]
@@ -98,7 +97,7 @@ class Job(NamedTuple):
 def compare(job: Job) -> list[dict[str, Any]]:
     """Fly policies over the same episodes.
 
-    :return: a row for each policy, with its paired differences from full communication and from the rule
+    :return: a row per policy, with its paired differences from full communication and from the rule
     """
     policies = list(dict.fromkeys(job.policies))
     flown = fly_kept([condition(policy, job.scenario, job.config) for policy in policies], job.episodes, job.seed)
@@ -126,7 +125,7 @@ def compare(job: Job) -> list[dict[str, Any]]:
 def _jobs(
     part: str, episodes: int, presets: Sequence[str], policies: Callable[[str, str], list[str]], names: Sequence[str]
 ) -> list[Job]:
-    """A job for each preset and scenario; ``policies`` is called with both."""
+    """Create a job per preset and scenario; ``policies`` is a function of both."""
     return [
         Job({"preset": preset}, policies(preset, name), name, make_config(preset), episodes, SETS.get(part, EARLIER))
         for preset in presets
@@ -135,7 +134,7 @@ def _jobs(
 
 
 def test(episodes: int) -> list[Job]:
-    """The main tables."""
+    """Create the jobs of the main tables."""
 
     def policies(preset: str, name: str) -> list[str]:
         others = ["none", DBCP, CPA, *models(preset)]
@@ -147,7 +146,7 @@ def test(episodes: int) -> list[Job]:
 
 
 def counts(episodes: int) -> list[Job]:
-    """Requests over whole episodes of 100 steps, as the paper counts them."""
+    """Create jobs that count requests over whole episodes of 100 steps, as in the paper."""
 
     def policies(preset: str, name: str) -> list[str]:
         return ["full", DBCP, "none", *models("faithful"), *models(preset)]
@@ -156,7 +155,7 @@ def counts(episodes: int) -> list[Job]:
 
 
 def compare_whole_episodes(job: Job) -> list[dict[str, Any]]:
-    """`compare` without an early end: all episodes fly all their steps."""
+    """Do the same as `compare`, but fly all episodes to their time limit."""
     conditions = [replace(condition(policy, job.scenario, job.config), linger=None) for policy in job.policies]
     flown = fly_kept(conditions, job.episodes, job.seed)
     return [
@@ -166,7 +165,7 @@ def compare_whole_episodes(job: Job) -> list[dict[str, Any]]:
 
 
 def quadrants(episodes: int) -> list[Job]:
-    """The asymmetric swap as the paper describes it, one robot anywhere in each quadrant."""
+    """Create jobs of the asymmetric swap as in the paper, with one robot anywhere in each quadrant."""
 
     def policies(preset: str, name: str) -> list[str]:
         return ["full", best_rules(preset)[name], "none", DBCP, *models(preset), *models("faithful")]
@@ -177,7 +176,7 @@ def quadrants(episodes: int) -> list[Job]:
 
 
 def sweep(episodes: int) -> list[Job]:
-    """The sweep of the threshold, first seeds only."""
+    """Create jobs that sweep the threshold of the first seeds."""
     deltas = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 
     def policies(preset: str, name: str) -> list[str]:
@@ -187,7 +186,7 @@ def sweep(episodes: int) -> list[Job]:
 
 
 def robustness(episodes: int) -> list[Job]:
-    """Disturbed worlds, first seeds only."""
+    """Create jobs in disturbed worlds with the first seeds."""
     return [
         Job(
             {"preset": preset, "condition": name_of_world},
@@ -204,7 +203,7 @@ def robustness(episodes: int) -> list[Job]:
 
 
 def half_swap(n_robots: int, space: ScenarioSpace, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A mixture within one episode: half of the robots as in `symmetric_swap`, the others on ways of their own."""
+    """Mixture of scenarios in an episode: half of the robots fly `symmetric_swap`, the others `random`."""
     half = n_robots // 2
     while True:
         swapping, own = (
@@ -216,7 +215,7 @@ def half_swap(n_robots: int, space: ScenarioSpace, rng: np.random.Generator) -> 
 
 
 def two_streams(n_robots: int, space: ScenarioSpace, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Two rows of robots cross at a right angle, abreast and at one height, starts and goals slightly moved."""
+    """Two rows of robots that fly abreast at one height and cross at a right angle, with slight displacements."""
     half, along = n_robots // 2, space.sector_radius[1]
     abreast = [
         (k - (m - 1) / 2) * (space.spacing + 2 * space.circle_jitter) for m in (half, n_robots - half) for k in range(m)
@@ -230,7 +229,7 @@ def two_streams(n_robots: int, space: ScenarioSpace, rng: np.random.Generator) -
 
 
 def apart(points: np.ndarray) -> float:
-    """Distance of the closest two of some points (m)."""
+    """Return the distance of the two closest points (m)."""
     return float((np.linalg.norm(points[:, None] - points, axis=-1) + np.diag(np.full(len(points), np.inf))).min())
 
 
@@ -238,7 +237,7 @@ UNSEEN: dict[str, Scenario] = {"half_swap": half_swap, "two_streams": two_stream
 
 
 def unseen(episodes: int) -> list[Job]:
-    """Scenarios that nothing was trained or tuned in: the rules of both swaps, and the first seeds."""
+    """Create jobs in scenarios without any training or tuning, with the rules of both swaps and the first seeds."""
 
     def policies(preset: str, name: str) -> list[str]:
         rules = [best_rules(preset)[swap] for swap in ("symmetric_swap", "asymmetric_swap")]
@@ -248,13 +247,13 @@ def unseen(episodes: int) -> list[Job]:
 
 
 def compare_unseen(job: Job) -> list[dict[str, Any]]:
-    """`compare` in a process that knows the scenarios of `UNSEEN`."""
+    """Do the same as `compare`, after registering the scenarios of `UNSEEN` in this process."""
     SCENARIOS.update(UNSEEN)
     return compare(job)
 
 
 def teams(episodes: int) -> list[Job]:
-    """Other sizes of the team: all models with the thresholds tuned for it."""
+    """Create jobs with other numbers of robots, in which all models have thresholds tuned for that number."""
     return [
         Job(
             {"preset": "dense", "n_robots": n},
@@ -271,7 +270,7 @@ def teams(episodes: int) -> list[Job]:
 
 
 def asking(episodes: int) -> list[Job]:
-    """Whom policies ask: pairs and steps counted by what the robots saw."""
+    """Create jobs that count requests by what the robots observe."""
 
     def policies(preset: str, name: str) -> list[str]:
         return [best_rules(preset)[name], *models(preset)[:1]]
@@ -280,12 +279,12 @@ def asking(episodes: int) -> list[Job]:
 
 
 def ask(job: Job) -> list[dict[str, Any]]:
-    """For some quantities how often policies ask at each of their values."""
+    """Count how often policies make requests at each value of several quantities."""
     return [row for policy in job.policies for row in requests_by_quantity(job, policy)]
 
 
 def requests_by_quantity(job: Job, policy: str) -> list[dict[str, Any]]:
-    """The rows of one policy."""
+    """Return the rows of one policy."""
     seen: dict[str, list[np.ndarray]] = {}
     asked = []
     for number in range(job.episodes):
@@ -318,7 +317,7 @@ def requests_by_quantity(job: Job, policy: str) -> list[dict[str, Any]]:
 
 
 def interventions(episodes: int) -> list[Job]:
-    """What would have helped: first seeds with a threshold that is too high."""
+    """Create jobs that test which requests avoid collisions, with first seeds and too high a threshold."""
 
     def policies(preset: str, name: str) -> list[str]:
         return [f"{path}@{RECKLESS}" for path in models(preset)[:1]]
@@ -327,7 +326,7 @@ def interventions(episodes: int) -> list[Job]:
 
 
 def intervene(job: Job) -> list[dict[str, Any]]:
-    """Fly again what ended in a collision, and let more be asked in the last steps before it."""
+    """Repeat episodes that ended in a collision with additional requests in the last steps before it."""
     (policy,) = job.policies
     one = condition(policy, job.scenario, job.config)
     rows = fly_kept([one], job.episodes, job.seed)[one]
@@ -348,10 +347,15 @@ def replay(
     pair: tuple[int, int] = (0, 0),
     when: range = range(0),
 ) -> tuple[bool, int, tuple[int, int]]:
-    """Fly an episode, in some steps with more requests, up to a collision or the time limit.
+    """Fly an episode to a collision or the time limit, with additional requests in some steps.
 
-    :param more: from who asks whom, (n, n) bool, and the pair to who is to ask whom
-    :return: whether it ended in a collision, after how many steps, and which two robots were the closest then
+    :param one: policy, scenario and world
+    :param seed: index of the set of episodes
+    :param number: index of the episode in the set
+    :param more: function of the requests, (n, n) bool, and of the pair that returns the requests to make
+    :param pair: the two robots that collide
+    :param when: steps with additional requests
+    :return: whether the episode ended in a collision, the number of steps, and the two closest robots at the end
     """
     n = one.config.n_robots
     rows, others = np.arange(n)[:, None], other_indices(n)
@@ -375,19 +379,19 @@ def replay(
 
 
 def each_other(asked: np.ndarray, i: int, j: int) -> np.ndarray:
-    """The two that are about to collide ask each other."""
+    """Let the two robots that are about to collide request each other's plans."""
     asked[[i, j], [j, i]] = True
     return asked
 
 
 def everybody(asked: np.ndarray, i: int, j: int) -> np.ndarray:
-    """The two ask everybody."""
+    """Let the two robots request all plans."""
     asked[[i, j]] = True
     return asked
 
 
 def both(asked: np.ndarray, i: int, j: int) -> np.ndarray:
-    """All others ask the two."""
+    """Let all other robots request the plans of the two."""
     third = np.setdiff1d(np.arange(len(asked)), (i, j))
     asked[third[:, None], [i, j]] = True
     return asked
@@ -414,15 +418,19 @@ PARTS: dict[str, tuple[Callable[[int], list[Job]], Callable[[Job], list[dict[str
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="what to fly; everything unless given")
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="parts to fly (default: all)")
     parser.add_argument("--preset", nargs="+", default=PRESETS_TESTED, choices=PRESETS_TESTED)
     parser.add_argument("--scenario", nargs="+", default=NAMES, choices=NAMES)
-    parser.add_argument("--n-robots", nargs="+", type=int, default=TEAMS, choices=TEAMS, help="of the part teams")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} episodes of each condition")
+    parser.add_argument(
+        "--n-robots", nargs="+", type=int, default=TEAMS, choices=TEAMS, help="numbers of robots in the part teams"
+    )
+    parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--out", type=absolute_path, default=DATA, help="folder of the JSON files (%(default)s)")
+    parser.add_argument(
+        "--out", type=absolute_path, default=DATA, help="folder of the JSON files (default %(default)s)"
+    )
     args = parser.parse_args(argv)
     os.chdir(ROOT)
     with workers(args) as pool:

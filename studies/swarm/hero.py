@@ -1,8 +1,8 @@
-"""The animation that the README opens with: ``python -m studies.swarm.hero --policy none full MODEL.zip [--out DIR]``.
+"""Render the README's animation: ``python -m studies.swarm.hero --policy none full MODEL.zip [--out DIR]``.
 
-All policies fly the same held-out episode; the page of `sb3-maddpg replay` draws every frame in a headless Chromium, by
-its function ``renderFrame(seconds)``, so that frames do not depend on how fast the machine is. Writes
-``hero-light.webp`` and ``hero-dark.webp``. Needs Playwright (extra `dev`) and a Chromium; software rendering will do.
+All policies fly the same held-out episode. The page of `sb3-maddpg replay` draws each frame in a headless Chromium with
+its function ``renderFrame(seconds)``, so frames do not depend on the machine's speed. This writes ``hero-light.webp``
+and ``hero-dark.webp``. It needs Playwright (extra `dev`) and Chromium; software rendering suffices.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from quad_swarm.figures.replay import replay_page
 from studies.swarm.protocol import ROOT
 
 THEMES = ("light", "dark")
-# s that the last frame stays
+# Duration of the last frame (s)
 HOLD = 2.5
 # WebGL without a graphics card
 SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -34,12 +34,12 @@ SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-
 
 @contextmanager
 def opened(page: str) -> Iterator[Any]:
-    """A page in a headless Chromium, in its mode for scripts.
+    """Open a page in a headless Chromium, in its mode for scripts.
 
     :param page: HTML
-    :return: what evaluates JavaScript in it: a Playwright page
+    :return: a Playwright page, which evaluates JavaScript
     """
-    from playwright.sync_api import sync_playwright  # needed only here
+    from playwright.sync_api import sync_playwright  # only needed here
 
     with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
         path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -55,16 +55,16 @@ def opened(page: str) -> Iterator[Any]:
 def frames(
     tab: Any, size: tuple[int, int], theme: str, fps: int, speed: float, until: float | None
 ) -> Iterator[Image.Image]:
-    """The frames of an animation.
+    """Yield the frames of an animation.
 
     :param tab: see `opened`
     :param size: width and height (pixels)
     :param theme: light or dark
-    :param fps: frames in a second
-    :param speed: seconds of the flight in a second
-    :param until: which part of the flight (s); None: until shortly after the last arrival
+    :param fps: frames per second
+    :param speed: seconds of the flight per second
+    :param until: end of the animation in the flight (s), by default shortly after the last arrival
     """
-    # Drawn twice as large and scaled down: thin lines stay smooth
+    # Draw at twice the size and scale down to keep thin lines smooth
     duration = tab.evaluate("prepare", {"width": size[0], "height": size[1], "ratio": 2, "theme": theme})
     count = round((duration if until is None else until) / speed * fps) + 1
     for k in tqdm(range(count), desc=theme, leave=False):
@@ -74,7 +74,7 @@ def frames(
 
 
 def save(path: Path, pictures: list[Image.Image], fps: int, quality: int) -> None:
-    """Write an animation, WebP or GIF, that plays for ever and holds at its end."""
+    """Write an animation, WebP or GIF, that loops forever and pauses at its end."""
     durations = [1000 // fps] * (len(pictures) - 1) + [round(1000 * HOLD)]
     if path.suffix == ".gif":
         palette = pictures[len(pictures) // 2].quantize(255, dither=Image.Dither.NONE)
@@ -89,15 +89,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_policy_arguments(parser)
     parser.add_argument("--scenario", default="symmetric_swap")
-    parser.add_argument("--episode", type=int, default=0, help="which episode of the set (default 0)")
+    parser.add_argument("--episode", type=int, default=0, help="index of the episode in the set (default 0)")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images", help="folder (default docs/images)")
-    parser.add_argument("--name", default="hero", help="of the files (default hero)")
+    parser.add_argument("--name", default="hero", help="name of the files (default hero)")
     parser.add_argument("--format", nargs="+", choices=("webp", "gif"), default=["webp"])
     parser.add_argument("--size", type=int, nargs=2, default=(1080, 460), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--fps", type=int, default=20)
-    parser.add_argument("--speed", type=float, default=0.5, help="of the flight (default 0.5: half as fast as real)")
-    parser.add_argument("--seconds", type=float, help="of the flight that are shown (default: until all arrived)")
-    parser.add_argument("--quality", type=int, default=70, help="of the WebP (default 70)")
+    parser.add_argument("--speed", type=float, default=0.5, help="speed of the flight (default 0.5: half of real time)")
+    parser.add_argument("--seconds", type=float, help="seconds of the flight to show (default: until all have arrived)")
+    parser.add_argument("--quality", type=int, default=70, help="quality of the WebP (default 70)")
     args = parser.parse_args()
     conditions = make_conditions(args, [args.scenario])
     for theme in THEMES:

@@ -1,7 +1,7 @@
-"""Draw how training went: ``python -m studies.swarm.learning_curve RUN [RUN ...] --out curve.png``.
+"""Draw learning curves: ``python -m studies.swarm.learning_curve RUN [RUN ...] --out curve.png``.
 
-A RUN is a folder that `sb3-maddpg train` made, with its `evaluations.npz`; several seeds of one recipe
-give a mean and the range between the worst and the best.
+A RUN is a folder of `sb3-maddpg train` with its `evaluations.npz`. For several seeds of a recipe, the figure shows the
+mean and the range.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of a training run")
-    parser.add_argument("--out", type=Path, required=True, help="picture to write")
+    parser.add_argument("--out", type=Path, required=True, help="image file to write")
     args = parser.parse_args()
     logs = [np.load(run / "evaluations.npz") for run in args.runs]
     length = min(len(log["timesteps"]) for log in logs)

@@ -1,10 +1,10 @@
-"""A reference for docs/results.md: what PPO learns in the swarm, with one network for all robots.
+"""A reference for docs/results.md: PPO with one network for all robots.
 
 ``python -m studies.swarm.ppo [--price P ...] [--steps N] [--episodes N] [--seed S] [--models FOLDER] [--json F]``
-trains Stable-Baselines3's PPO with every robot as an environment of its own, with the observations, scenarios and
-rewards of zoo_configs/quad_swarm_paper.yml, credit by robot and a price for each request. Then it flies each policy
-with several thresholds of the probability to ask, on episodes of the validation set. JSON: one row a price, scenario
-and threshold with the keys of `summarise`, and price, steps, seed, seconds, scenario, threshold.
+trains Stable-Baselines3's PPO with each robot as its own environment, with the observations, scenarios and rewards of
+zoo_configs/quad_swarm_paper.yml, individual rewards and a price per request. Then each policy flies with several
+thresholds of its request probability on episodes of the validation set. JSON: one row per price, scenario and threshold
+with the keys of `summarise`, and price, steps, seed, seconds, scenario, threshold.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 0.7)
 
 
 def env_kwargs(price: float) -> dict[str, Any]:
-    """The world of the recipe, without what only its critics see, and with a price for each request."""
+    """Return the recipe's arguments of the environment, without the critic's observations and with a request price."""
     kwargs = yaml.safe_load(RECIPE.read_text())["QuadSwarm-v0"]["env_kwargs"]
     kwargs["observation"] = kwargs["observation"].removesuffix("+critic")
     kwargs["reward"]["request"] = price
@@ -44,7 +44,7 @@ def env_kwargs(price: float) -> dict[str, Any]:
 
 
 class Robots(VecEnvWrapper):
-    """Every robot of every team as an environment; its reward is the sum of what it pays for each of the others."""
+    """Wrapper that makes each robot of each team an environment, whose reward is the sum of its pairs' rewards."""
 
     def __init__(self, teams: GymnasiumVecEnv):
         n, size = teams.observation_space.shape  # type: ignore[misc]
@@ -54,15 +54,15 @@ class Robots(VecEnvWrapper):
         self.num_envs = self.teams * n
 
     def reset(self) -> np.ndarray:
-        """As in Stable-Baselines3."""
+        """See Stable-Baselines3."""
         return np.asarray(self.venv.reset()).reshape(self.num_envs, -1)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """As in Stable-Baselines3."""
+        """See Stable-Baselines3."""
         self.venv.step_async(actions.reshape(self.teams, -1).astype(np.int8))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """As in Stable-Baselines3."""
+        """See Stable-Baselines3."""
         obs, _, dones, infos = self.venv.step_wait()
         rewards = np.stack([info["pair_rewards"].sum(axis=-1) for info in infos])
         mine: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -76,9 +76,9 @@ class Robots(VecEnvWrapper):
 
 
 class SharedPPO:
-    """A trained PPO that decides for every robot of a team by itself, as the evaluation flies models.
+    """Adapter that lets a trained PPO model act for each robot of a team, for the evaluation.
 
-    :param model: trained with one robot's observations and requests
+    :param model: model trained with single robots' observations and requests
     """
 
     def __init__(self, model: PPO):
@@ -90,15 +90,19 @@ class SharedPPO:
 
     @classmethod
     def load(cls, path: str, device: str = "auto") -> SharedPPO:
-        """As in Stable-Baselines3."""
+        """See Stable-Baselines3."""
         return cls(PPO.load(path, device=device))
 
     def set_threshold(self, threshold: float) -> None:
-        """:param threshold: of the probability with which the policy would ask"""
+        """
+        Set the threshold of requests.
+
+        :param threshold: threshold of the request probability
+        """
         self.threshold = threshold
 
     def predict(self, observation: np.ndarray, deterministic: bool = True) -> tuple[np.ndarray, None]:
-        """:return: bits of all robots, (E, n (n - 1)), and no state"""
+        """:return: bits of all robots, (E, n (n - 1)), and None for the state"""
         with th.no_grad():
             rows = th.as_tensor(observation.reshape(-1, observation.shape[-1]))
             probabilities = self.policy.get_distribution(rows).distribution.probs  # type: ignore[union-attr]
@@ -106,7 +110,7 @@ class SharedPPO:
 
 
 def train(price: float, steps: int, seed: int) -> PPO:
-    """Train for so many steps of the swarm."""
+    """Train for a number of steps of the swarm."""
     env = Robots(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", 32, **env_kwargs(price))))
     model = PPO(
         "MlpPolicy",
@@ -126,12 +130,13 @@ def train(price: float, steps: int, seed: int) -> PPO:
 def validate(
     conditions: dict[float, Condition], what: str, episodes: int, keys: dict[str, Any]
 ) -> list[dict[str, Any]]:
-    """Fly a scenario of the validation set with several values of something.
+    """Fly a scenario of the validation set with several values of a parameter.
 
-    :param conditions: what flies with each value
-    :param what: name of the values
-    :param keys: of every row
-    :return: a row for each value
+    :param conditions: value -> condition
+    :param what: name of the parameter
+    :param episodes: number of episodes
+    :param keys: common entries of all rows
+    :return: a row per value
     """
     flown = fly_kept(list(conditions.values()), episodes, VALIDATION)
     rows = []
@@ -144,13 +149,15 @@ def validate(
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--price", type=float, nargs="+", default=[0.02, 0.1], help="of a request (%(default)s)")
-    parser.add_argument("--steps", type=int, default=400_000, help="of the swarm (%(default)s)")
-    parser.add_argument("--episodes", type=int, default=2000, help="of each scenario (%(default)s)")
+    parser.add_argument(
+        "--price", type=float, nargs="+", default=[0.02, 0.1], help="price of a request (default %(default)s)"
+    )
+    parser.add_argument("--steps", type=int, default=400_000, help="steps of the swarm (default %(default)s)")
+    parser.add_argument("--episodes", type=int, default=2000, help="episodes per scenario (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the models (%(default)s)")
+    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the models (default %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     args.models.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""Put tables and figures into the pages of results: ``python -m studies.swarm.report [--data FOLDER]``.
+"""Write tables and figures into the results pages: ``python -m studies.swarm.report [--data FOLDER]``.
 
-The tables stand between ``<!-- NAME -->`` and ``<!-- end -->``; what stands around them is written by hand. The data
-come from the other modules of this study.
+Tables are between ``<!-- NAME -->`` and ``<!-- end -->``; the text around them is handwritten. The data come from the
+other modules of this study.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Rows = list[dict[str, Any]]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Format a table in Markdown."""
     body = list(rows)
     if not body:
         return "Not flown yet."
@@ -41,7 +41,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def label(policy: str) -> str:
-    """How a policy is called in tables."""
+    """Return the name of a policy in tables."""
     if not is_model(policy):
         return f"`{policy}`".replace("|", "\\|")
     path, _, threshold = policy.partition("@")
@@ -49,13 +49,13 @@ def label(policy: str) -> str:
 
 
 def rate(row: dict[str, Any]) -> str:
-    """Collisions with their interval."""
+    """Format collisions with their interval."""
     low, high = 100 * row["collision_low"], 100 * row["collision_high"]
     return f"{row['collisions']}/{row['episodes']} [{low:.2f}, {high:.2f}] %"
 
 
 def versus(row: dict[str, Any], rival: str) -> str:
-    """Paired difference of the collision rates."""
+    """Format the paired difference of collision rates."""
     against = row[f"against_{rival}"]
     if against["rival"] == row["policy"]:
         return "-"
@@ -64,13 +64,13 @@ def versus(row: dict[str, Any], rival: str) -> str:
 
 
 def depths(row: dict[str, Any], where: str = "") -> str:
-    """Collisions deeper than the tolerance of 1 mm, than 1 cm and than 3 cm."""
+    """Format the numbers of collisions deeper than the tolerance of 1 mm, than 1 cm and than 3 cm."""
     counts = (row[f"collisions{where}"], row.get(f"collisions{where}_1cm"), row.get(f"collisions{where}_3cm"))
     return " / ".join("?" if count is None else str(count) for count in counts)
 
 
 def main_table(rows: Rows, preset: str) -> str:
-    """All policies of a preset in all scenarios."""
+    """Format all policies of a preset in all scenarios."""
     chosen = [row for row in rows if row["preset"] == preset and "ablation" not in row["policy"]]
     chosen.sort(key=lambda row: NAMES.index(row["scenario"]))
     head = ["scenario", "policy", "collisions, 95 %", "> 1 mm / 1 cm / 3 cm", "the same, also between steps"]
@@ -89,7 +89,8 @@ def main_table(rows: Rows, preset: str) -> str:
 
 
 def worse_table(rows: Rows) -> str:
-    """Where a learned policy within the margin of full communication is significantly worse than it all the same."""
+    """Format the cases in which a learned policy is significantly worse than full communication, though within the
+    margin."""
     lines = []
     for row in rows:
         against = row["against_full"]
@@ -110,7 +111,7 @@ def worse_table(rows: Rows) -> str:
 
 
 def faithful_table(rows: Rows) -> str:
-    """The paper's settings, seed by seed: collisions, how many of them are deeper than 1 cm, and requests."""
+    """Format the paper's settings by seed: collisions, those deeper than 1 cm, and requests."""
     chosen = [row for row in rows if row["preset"] == "paper" and "faithful" in row["policy"]]
     policies = list(dict.fromkeys(row["policy"] for row in chosen))
     lines = []
@@ -126,7 +127,8 @@ def faithful_table(rows: Rows) -> str:
 
 
 def overview_table(rows: Rows) -> str:
-    """Four robots in short: collisions, in brackets those deeper than 1 cm, and requests, seeds as ranges."""
+    """Format an overview of four robots: collisions, in brackets those deeper than 1 cm, and requests, with seeds as
+    ranges."""
     chosen = [row for row in rows if row["preset"] == "paper"]
     groups = {f"`{name}`": [name] for name in ("none", "full", "distance:4", "cpa:0.7:1.5")}
     for what, recipe in {"the paper's settings": "faithful", "`quad_swarm_paper.yml`": "paper"}.items():
@@ -139,7 +141,7 @@ def overview_table(rows: Rows) -> str:
 
 
 def overview(rows: Rows) -> str:
-    """Some rows of one scenario in short."""
+    """Format an overview of rows of one scenario."""
     if not rows:
         return "-"
     rates, deeper, shares = (
@@ -154,7 +156,7 @@ def overview(rows: Rows) -> str:
 
 
 def counts_table(rows: Rows) -> str:
-    """The paper's own comparison: requests in whole episodes, against everybody asking everybody and 4-DBCP."""
+    """Format the paper's comparison: requests in whole episodes, compared with full communication and 4-DBCP."""
     lines = []
     for name in NAMES:
         here = {row["policy"]: row for row in rows if row["scenario"] == name}
@@ -182,17 +184,17 @@ def counts_table(rows: Rows) -> str:
 
 
 def by_requests(rows: Rows) -> Rows:
-    """The rows, most requests first."""
+    """Sort rows by decreasing number of requests."""
     return sorted(rows, key=lambda row: -row["requests_flown"])
 
 
 def spread(values: Sequence[str]) -> str:
-    """The first and the last of some values."""
+    """Format the first and the last of some values."""
     return values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
 
 
 def checkpoints_table(rows: Rows) -> str:
-    """Which iterate of a training by the paper's settings to take."""
+    """Format the comparison of models from different times of a training with the paper's settings."""
     lines = []
     for kind, choice in dict.fromkeys((row["run"].partition("_")[0], row["choice"]) for row in rows):
         line = ["constant" if kind == "faithful" else "falls to 0", choice]
@@ -210,12 +212,12 @@ def checkpoints_table(rows: Rows) -> str:
 
 
 def pooled(rows: Rows) -> float:
-    """Requests of all rows together, of all that were possible."""
+    """Return the requests of all rows as a fraction of the possible requests."""
     return sum(row["requests"] for row in rows) / max(sum(row["possible_requests"] for row in rows), 1)
 
 
 def targets(rows: Rows) -> str:
-    """What was asked for and what came out, for every seed."""
+    """Format the targets and the results of each seed."""
     lines = []
     for preset in ("paper", "dense"):
         learned = [row for row in rows if row["preset"] == preset and f"/{preset}_seed" in row["policy"]]
@@ -237,13 +239,13 @@ def targets(rows: Rows) -> str:
 
 
 def share_of_rule(rows: Rows, row: dict[str, Any]) -> float:
-    """Share of the requests of the rule that a policy is compared with."""
+    """Return the request share of the rule that a policy is compared with."""
     key = (row["preset"], row["scenario"], row["against_rule"]["rival"])
     return next(r["request_share"] for r in rows if (r["preset"], r["scenario"], r["policy"]) == key)
 
 
 def family_table(rules: Rows, preset: str) -> str:
-    """The cheapest safe rule of each family, in validation."""
+    """Format the safe rule of each family with the fewest requests on the validation set."""
     names = list(dict.fromkeys(row["family"] for row in rules if row["preset"] == preset))
     lines = []
     for family in names:
@@ -259,7 +261,7 @@ def family_table(rules: Rows, preset: str) -> str:
 
 
 def wide_table(rows: Rows, first: str, preset: str) -> str:
-    """Collisions and requests of every policy, scenarios side by side."""
+    """Format collisions and requests of all policies, with a column per scenario."""
     chosen = [row for row in rows if row["preset"] == preset]
     kinds = dict.fromkeys((row[first], kind_of(row)) for row in chosen)
     lines = []
@@ -273,8 +275,8 @@ def wide_table(rows: Rows, first: str, preset: str) -> str:
 
 
 def teams_table(rows: Rows) -> str:
-    """Every number of robots: collisions and requests, in bold where at most half a point less safe than asking
-    everybody, and the share of the best rule's requests; models also with their threshold for the cell."""
+    """Format each number of robots: collisions and requests, in bold if at most half a percentage point less safe than
+    full communication, the ratio to the best rule's requests, and the models' thresholds."""
     lines = []
     for n in dict.fromkeys(row["n_robots"] for row in rows):
         cells: dict[str, dict[str, str]] = {}
@@ -298,7 +300,7 @@ def teams_table(rows: Rows) -> str:
 
 
 def unseen_table(rows: Rows) -> str:
-    """Policies in scenarios that nothing was trained or tuned in."""
+    """Format policies in scenarios without any training or tuning."""
     lines = []
     for row in rows:
         line = [row["preset"], row["scenario"].replace("_", " "), label(row["policy"]), rate(row), versus(row, "full")]
@@ -307,7 +309,7 @@ def unseen_table(rows: Rows) -> str:
 
 
 def worlds_table(rows: Rows, part: str) -> str:
-    """Rules that nobody tuned in the disturbed worlds: contact at any time, and what was changed in them."""
+    """Format a part of `studies.swarm.flight_world`: contact at any time, with the changes to the worlds."""
     chosen = [row for row in rows if row["part"] == part]
     alike = not any(row["changed"] for row in chosen)
     lines = []
@@ -330,13 +332,13 @@ def worlds_table(rows: Rows, part: str) -> str:
 
 
 def against(row: dict[str, Any], rival: dict[str, Any]) -> Comparison:
-    """Who collides in which of the same episodes."""
+    """Compare the outcomes of the same episodes."""
     pairs = [[{"collided": letter == "1"} for letter in one["outcomes"]] for one in (row, rival)]
     return Comparison.of(*pairs)
 
 
 def flight_groups(rows: Rows) -> Iterator[tuple[int, str, dict[str, dict[str, Any]]]]:
-    """Of the sealed flights of `flight`: number of robots, scenario, and the rows by policy."""
+    """Group the sealed flights of `flight`: yield the number of robots, the scenario, and the rows by policy."""
     for n_robots in sorted({row["n_robots"] for row in rows}):
         for name in NAMES:
             here = {r["policy"]: r for r in rows if (r["n_robots"], r["scenario"]) == (n_robots, name)}
@@ -345,12 +347,12 @@ def flight_groups(rows: Rows) -> Iterator[tuple[int, str, dict[str, dict[str, An
 
 
 def rule_of(here: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
-    """The row of the tuned rule, if it was flown."""
+    """Return the row of the tuned rule, if it was flown."""
     return next((row for policy, row in here.items() if not is_model(policy) and policy not in ("none", "full")), None)
 
 
 def flight_table(rows: Rows) -> str:
-    """All policies in `flight`, in teams of all sizes."""
+    """Format all policies in `flight`, in teams of all sizes."""
     lines = []
     for n_robots, name, here in flight_groups(rows):
         rule = rule_of(here)
@@ -368,7 +370,7 @@ def flight_table(rows: Rows) -> str:
 
 
 def flight_targets(rows: Rows) -> str:
-    """In how many scenarios each policy is as safe as full communication in `flight`, and its requests."""
+    """Format in how many scenarios of `flight` each policy is as safe as full communication, and its requests."""
     lines: dict[tuple[int, str], list[Any]] = {}
     for n_robots, name, here in flight_groups(rows):
         rule = rule_of(here)
@@ -388,9 +390,11 @@ def flight_targets(rows: Rows) -> str:
 
 
 def headline_table(rows: Rows, best: str) -> str:
-    """The sealed flights of `flight` in five rows: eight robots, but for the paper's settings; seeds as ranges.
+    """Format the sealed flights of `flight` in five rows: eight robots, except for the paper's settings; seeds as
+    ranges.
 
-    :param best: the rule
+    :param rows: rows of the sealed flights
+    :param best: the tuned rule
     """
     eight, four = ([row for row in rows if row["n_robots"] == n] for n in (8, 4))
     rule = f"best of {sum(map(len, families().values()))} hand-made rules ({label(best)})"
@@ -416,7 +420,7 @@ def headline_table(rows: Rows, best: str) -> str:
 
 
 def seeds_rate(rows: Rows) -> str:
-    """Collisions of some seeds in the same episodes, and the widest interval of any of them."""
+    """Format the collisions of several seeds in the same episodes, with the envelope of their intervals."""
     if not rows:
         return "-"
     counts = spread([str(count) for count in sorted(row["collisions"] for row in rows)])
@@ -425,14 +429,14 @@ def seeds_rate(rows: Rows) -> str:
 
 
 def changes(changed: Any, path: str = "") -> str:
-    """Nested fields as they are written on the command line."""
+    """Format nested fields as on the command line."""
     if isinstance(changed, dict):
         return ", ".join(changes(value, f"{path}.{name}" if path else name) for name, value in changed.items()) or "-"
     return f"{path}={changed:g}" if isinstance(changed, (int, float)) else f"{path}={changed}"
 
 
 def reference_table(rows: Rows, *names: str) -> str:
-    """Collisions and requests of another learner by what it was flown with."""
+    """Format collisions and requests of another learner by its parameters."""
     lines = []
     for values in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
         here = {row["scenario"]: row for row in rows if tuple(row[name] for name in names) == values}
@@ -442,7 +446,7 @@ def reference_table(rows: Rows, *names: str) -> str:
 
 
 def training_table(rows: Rows) -> str:
-    """How long trainings take, and what of."""
+    """Format the duration of trainings and the shares of their parts."""
     parts = ("planner", "learner", "acting", "rest")
     lines = []
     for row in rows:
@@ -453,12 +457,12 @@ def training_table(rows: Rows) -> str:
 
 
 def kind_of(row: dict[str, Any]) -> str:
-    """A policy by its part in a comparison."""
+    """Return the role of a policy in a comparison."""
     return label(row["policy"]) if is_model(row["policy"]) or row["policy"] in ("full", "none") else "best rule"
 
 
 def step_by_step(flight: Flight) -> str:
-    """A flight as a table: who asks whom, what it sees of it, and whom the rule would have asked."""
+    """Format a flight as a table: requests with what the robots observe, and the requests of the rule."""
     others = other_indices(flight.n_robots)
     approach, time = flight.closest_approach
     last: dict[tuple[int, int], int] = {}
@@ -478,7 +482,7 @@ def step_by_step(flight: Flight) -> str:
 
 
 def interventions_table(rows: Rows) -> str:
-    """What would have avoided the collisions of a policy that asks too little."""
+    """Format which additional requests avoid the collisions of a policy with too few requests."""
     steps = list(dict.fromkeys(row["last_steps"] for row in rows))
     lines = []
     for preset, who in dict.fromkeys((row["preset"], row["who"]) for row in rows):
@@ -489,7 +493,7 @@ def interventions_table(rows: Rows) -> str:
 
 
 def fill(page: str, blocks: dict[str, str]) -> str:
-    """A page with every place ``<!-- NAME --> ... <!-- end -->`` filled anew."""
+    """Fill all places ``<!-- NAME --> ... <!-- end -->`` of a page."""
 
     def block(place: re.Match[str]) -> str:
         return f"<!-- {place[1]} -->\n\n{blocks[place[1]]}\n\n<!-- end -->"
@@ -498,11 +502,15 @@ def fill(page: str, blocks: dict[str, str]) -> str:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=absolute_path, default=DATA, help="folder of the JSON files (%(default)s)")
+    parser.add_argument(
+        "--data", type=absolute_path, default=DATA, help="folder of the JSON files (default %(default)s)"
+    )
     parser.add_argument("--pages", type=absolute_path, default=ROOT, help="folder of the pages (default %(default)s)")
-    parser.add_argument("--images", type=absolute_path, default=IMAGES, help="folder of the figures (%(default)s)")
+    parser.add_argument(
+        "--images", type=absolute_path, default=IMAGES, help="folder of the figures (default %(default)s)"
+    )
     args = parser.parse_args()
     os.chdir(ROOT)
     names = "rules test sweep robustness unseen teams asking interventions ppo counterfactual training counts quadrants"

@@ -1,8 +1,8 @@
-"""How long a training of a swarm's recipe takes, and where the time goes.
+"""Measure how long training with the swarm's recipes takes, and where the time goes.
 
-``python -m studies.swarm.training_time [--recipe RECIPE.yml ...] [--steps N] [--threads N] [--json F]``. Planner: its
-batch calls, on one core. Learner: updates. Acting: the policy while exploring. Rest: the swarm around its planner,
-observations, infos, the replay buffer and logging. JSON: one row a recipe with recipe, threads, steps, updates,
+``python -m studies.swarm.training_time [--recipe RECIPE.yml ...] [--steps N] [--threads N] [--json F]``. Planner: batch
+calls on one core. Learner: updates. Acting: the policy during exploration. Rest: the swarm except its planner,
+observations, infos, the replay buffer and logging. JSON: one row per recipe with recipe, threads, steps, updates,
 episodes, seconds, and the share of each part.
 """
 
@@ -26,7 +26,7 @@ from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 
 def measure(recipe: str, steps: int | None) -> dict[str, Any]:
-    """Train once."""
+    """Train once and measure the times."""
     hyperparams = yaml.safe_load(Path(recipe).read_text())["QuadSwarm-v0"]
     for key in ("vec_env", "eval_env_kwargs", "callback"):
         hyperparams.pop(key, None)
@@ -54,12 +54,12 @@ def measure(recipe: str, steps: int | None) -> dict[str, Any]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = ["zoo_configs/quad_swarm_paper.yml", "zoo_configs/quad_swarm_dense.yml", "zoo_configs/maddpg.yml"]
     parser.add_argument("--recipe", nargs="+", default=default)
-    parser.add_argument("--steps", type=int, help="the recipe's unless given")
-    parser.add_argument("--threads", type=int, default=1, help="of PyTorch (%(default)s)")
+    parser.add_argument("--steps", type=int, help="steps (default: the recipe's)")
+    parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch (default %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     th.set_num_threads(args.threads)

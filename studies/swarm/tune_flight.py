@@ -1,14 +1,17 @@
-"""Tune rules and models in the world of `flight` with one setting for all scenarios and sizes, on the validation set.
+"""Tune rules and models in `flight` with one setting for all scenarios and numbers of robots, on the validation set.
 
-``python -m studies.swarm.tune_flight rules|thresholds [MODEL.zip ...] [--quick] [--json F]``. A rule, or a threshold of
-a model, is safe if it is as safe as full communication, to within `SAFETY_MARGIN`, in every scenario and with every
-number of robots. All rules fly a few episodes of both swaps with eight robots, which tell their requests there; of
-those that fly these alike, one is kept. Then they are tried from the cheapest on, in stages of more and more episodes,
-until one is safe; what can no longer turn out to be safe is not flown on. To find that out soon, each first flies those
-of the hardest cell's episodes in which others have collided (rows with ``selected``). A model's thresholds are tried
-from the highest on. JSON: one row for each setting, number of robots and scenario with the keys of `summarise`
-over the episodes that it flew, and family, setting, safe (None: only its requests are known). What the table has is
-not flown again.
+``python -m studies.swarm.tune_flight rules|thresholds [MODEL.zip ...] [--quick] [--json F]``. A setting, which is a
+rule or a threshold of a model, is safe if it is as safe as full communication up to `SAFETY_MARGIN` in each cell, which
+is a scenario with a number of robots.
+
+All rules first fly a few episodes of both swaps with eight robots to measure their requests. Of rules with identical
+flights, only one is kept. The rules are then tried by increasing number of requests, in stages of more and more
+episodes, until one is safe. A rule that can no longer be safe is dropped. To find this out early, each rule first flies
+those episodes of the hardest cell in which most other rules collided (rows with ``selected``). The thresholds of a
+model are tried in decreasing order.
+
+JSON: one row per setting, number of robots and scenario with the keys of `summarise` over the episodes flown, and
+family, setting, safe (None if only the requests are known). Results that the file already contains are reused.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ Flown = dict[Cell, Rows]
 
 
 class Setting(NamedTuple):
-    """A rule of a family, or a model with a threshold, whose family is the model."""
+    """A rule with its family, or a model with a threshold, whose family is the model."""
 
     family: str
     name: str
@@ -53,9 +56,9 @@ class Setting(NamedTuple):
 
 PRESET = "flight"
 SWAPS = ("symmetric_swap", "asymmetric_swap")
-# Episodes that decide, by the number of robots, and the cells in which all are tuned, where most goes wrong first:
-# hardly anything does in the random scenarios of other teams than the preset's. No more robots than in training: with
-# sixteen neither a rule that asks for less than a tenth of the plans nor a model is safe (docs/flight.md).
+# Number of episodes for a decision by the number of robots, and the cells, hardest first. The random scenarios of teams
+# other than the preset's are left out, since hardly any collisions occur in them. Teams are no larger than in training:
+# with sixteen robots, neither a model nor a rule that requests less than a tenth of the plans is safe (docs/flight.md).
 SIZES = {12: 2000, 8: 4000, 4: 2000}
 CELLS: list[Cell] = [
     *itertools.product(SIZES, SWAPS),
@@ -63,15 +66,16 @@ CELLS: list[Cell] = [
 ]
 OWN_SWAPS = [cell for cell in CELLS if cell[0] == 8 and cell[1] in SWAPS]
 STAGES = (25, 50, 100, 250, 500, 1000, 2000, 4000)
-# Episodes of one cell after the other, the hardest and the others; more only of those that none of them ruled out
+# Number of episodes to fly first in the hardest cell and in each of the other cells
 FIRST, FIRST_OTHERS = 2000, 100
-# Episodes of the hardest cell in which most others have collided, which are flown before all, so many at a time
+# Number of episodes of the hardest cell, those with the most collisions so far, to fly before all others, and the size
+# of their batches
 HARDEST, AT_ONCE = 240, 60
 THRESHOLDS = (0.9, 0.85, *(round(0.8 - 0.025 * k, 3) for k in range(23)), 0.2, 0.15, 0.1, 0.05, 0.02)
 
 
 def families() -> dict[str, list[str]]:
-    """The rules of each family; lengths in separations."""
+    """Return the rules of each family, with lengths in separations."""
     product = itertools.product
     cpas = [f"cpa:{d}s:{t}" for d, t in product((1.0, 1.05, 1.1, 1.15, 1.2, 1.3), (1, 1.5, 2, 3))]
     far = [f"cpa:{d}s:{t}" for d, t in product((1.0, 1.1, 1.2), (1.5, 2, 3))]
@@ -101,7 +105,7 @@ def families() -> dict[str, list[str]]:
 
 
 def fly(policy: str, cell: Cell, episodes: int, known: Rows | None = None) -> Rows:
-    """A policy's figures of the first episodes, of which some are known."""
+    """Return a policy's statistics in the first episodes, some of which may be known."""
     rows, (n_robots, name) = list(known or []), cell
     if episodes > len(rows):
         rows += fly_validation([policy], PRESET, name, episodes, n_robots, skip=len(rows))[policy]
@@ -109,17 +113,17 @@ def fly(policy: str, cell: Cell, episodes: int, known: Rows | None = None) -> Ro
 
 
 def last(cell: Cell, stages: Sequence[int]) -> int:
-    """Episodes that decide in a cell."""
+    """Return the number of episodes for a decision in a cell."""
     return min(SIZES[cell[0]], stages[-1])
 
 
 class Trial(NamedTuple):
-    """What came of trying a setting.
+    """Result of trying a setting.
 
-    :param flown: its figures; if others' collisions ruled it out, in those episodes alone
-    :param safe: whether it is as safe as full communication; so few episodes as in a quick run prove nothing
-    :param collided: episodes of the hardest cell in which it collided
-    :param selected: whether the episodes are those in which others collided
+    :param flown: statistics of the episodes flown
+    :param safe: whether the setting is as safe as full communication; a quick run has too few episodes to prove this
+    :param collided: episodes of the hardest cell in which the setting collided
+    :param selected: whether only selected episodes were flown, in which other settings collided
     """
 
     flown: Flown
@@ -129,10 +133,12 @@ class Trial(NamedTuple):
 
 
 def try_out(policy: str, full: Flown, stages: Sequence[int], hard: Sequence[int] = ()) -> Trial:
-    """Fly a policy in more and more episodes as long as it may be as safe as full communication in every cell.
+    """Fly a policy in more and more episodes as long as it may be as safe as full communication in all cells.
 
-    :param full: figures of full communication, of as many episodes as decide
-    :param hard: episodes of the hardest cell to fly before all
+    :param policy: the policy
+    :param full: statistics of full communication, of all episodes for a decision
+    :param stages: numbers of episodes of the stages
+    :param hard: episodes of the hardest cell to fly before all others
     """
     cell = CELLS[0]
     if hard:
@@ -166,18 +172,18 @@ def _by_stages(policy: str, full: Flown, stages: Sequence[int]) -> tuple[Flown, 
 
 
 def may_be_safe(flown: Rows, full: Rows, deciding: int) -> bool:
-    """Whether a policy would be as safe as full communication if it did not collide any more.
+    """Return whether a policy would be as safe as full communication without any further collision.
 
-    :param flown: its figures of the first episodes
-    :param full: those of full communication, of all
-    :param deciding: how many decide
+    :param flown: the policy's statistics in the first episodes
+    :param full: statistics of full communication in all episodes
+    :param deciding: number of episodes for a decision
     """
     no_more: Rows = [{"collided": False}] * deciding
     return Comparison.of([*flown, *no_more][:deciding], [*full, *no_more][:deciding]).as_safe(SAFETY_MARGIN)
 
 
 def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected: bool = False) -> list[dict[str, Any]]:
-    """The rows of a setting."""
+    """Return the rows of a setting."""
     keys: dict[str, Any] = {"preset": PRESET, "family": family, "setting": setting, "safe": safe}
     keys |= {"selected": True} if selected else {}
     return [
@@ -188,7 +194,7 @@ def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected
 
 
 def fly_full(pool: Executor, path: Path, stages: Sequence[int]) -> Flown:
-    """Who collides under full communication in the episodes that decide; what the table has is not flown again."""
+    """Return the collisions with full communication in all episodes for a decision. Known results are reused."""
     known = {(row["n_robots"], row["scenario"]): row["outcomes"] for row in read_rows(path) if row["family"] == FULL}
     missing = [cell for cell in CELLS if len(known.get(cell, "")) < last(cell, stages)]
     work = pool.map(fly, [FULL] * len(missing), missing, [last(cell, stages) for cell in missing])
@@ -200,7 +206,8 @@ def fly_full(pool: Executor, path: Path, stages: Sequence[int]) -> Flown:
 
 
 def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool) -> list[Setting]:
-    """The rules, those with the fewest requests in both swaps of eight robots first; one of those that fly alike."""
+    """Return the rules by increasing number of requests in both swaps of eight robots, without rules with identical
+    flights."""
     rules = [Setting(family, rule) for family, rules in families().items() for rule in rules[:: 12 if quick else 1]]
     known: dict[str, list[dict[str, Any]]] = {}
     for row in read_rows(path):
@@ -222,10 +229,14 @@ def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool) 
 def tune(
     pool: Executor, jobs: int, ladders: list[list[Setting]], full: Flown, stages: Sequence[int], path: Path
 ) -> None:
-    """Try the settings of each ladder from the first on until one is safe, and put them into the table; what it has
-    decided is not tried again.
+    """Try the settings of each ladder in order until one is safe, and write their rows. Known results are reused.
 
-    :param jobs: how many are tried at once, of one ladder if there is only one
+    :param pool: executor of the trials
+    :param jobs: number of settings to try at a time
+    :param ladders: ordered settings
+    :param full: see `fly_full`
+    :param stages: numbers of episodes of the stages
+    :param path: file of the table
     """
     decided = {row["setting"]: row["safe"] for row in read_rows(path) if row["safe"] is not None}
     running: dict[Future[Trial], Setting] = {}
@@ -260,7 +271,7 @@ def tune(
 
 
 def verdict(trial: Trial, full: Flown) -> str:
-    """Where a setting turned out not to be safe."""
+    """Describe in which cell a setting turned out not to be safe."""
     flown = trial.flown
     if trial.safe:
         return "safe"
@@ -273,16 +284,16 @@ def verdict(trial: Trial, full: Flown) -> str:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("rules", "thresholds"))
     parser.add_argument("models", nargs="*", metavar="MODEL.zip")
-    parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="fly few episodes, to check that everything runs")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, default=DATA / "flight_tuning.json", metavar="FILE")
     args = parser.parse_args()
     if args.what == "thresholds" and not args.models:
-        parser.error("name the models whose thresholds are to be tuned")
+        parser.error("pass the models whose thresholds should be tuned")
     stages = QUICK_STAGES if args.quick else STAGES
     with workers(args) as pool:
         full = fly_full(pool, args.json, stages)

@@ -1,11 +1,11 @@
-"""Tune every family of hand-made rules as hard as a learner: the cheapest of each that is as safe as asking everybody.
+"""Tune all families of hand-made rules: find the rule with the fewest requests that is as safe as full communication.
 
-``python -m studies.swarm.tune_rules [--quick] [--preset ...] [--n-robots ...] [--family ...] [--json F]``, on the
-validation set. In each scenario all rules of a family fly a few episodes, which tell their requests. Then they are
-tried from the cheapest on, in stages of more and more episodes, until one is as safe as full communication
-(`Standard`). One that collides clearly more often in an earlier stage is out. JSON: one row for each rule and scenario
-with the keys of `summarise` over the episodes that it flew, and preset, scenario, family, rule, with ``--n-robots``
-also n_robots, and safe: True or False, or None for those dearer than the one that was found.
+``python -m studies.swarm.tune_rules [--quick] [--preset ...] [--n-robots ...] [--family ...] [--json F]`` uses the
+validation set. In each scenario, all rules of a family first fly a few episodes to measure their requests. They are
+then tried by increasing number of requests, in stages of more and more episodes, until one is as safe as full
+communication (`Standard`). Rules that collide clearly more often in an early stage are dropped. JSON: one row per rule
+and scenario with the keys of `summarise` over the episodes flown, and preset, scenario, family, rule, with
+``--n-robots`` also n_robots, and safe (True, False, or None for rules with more requests than the one found).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
 
 
 def families() -> dict[str, list[str]]:
-    """The rules of each family."""
+    """Return the rules of each family."""
     cpa = [f"cpa:{d:g}:{t:g}" for d, t in itertools.product((0.6, *DISTANCES, 2.0), LOOK_AHEADS)]
     some = [f"cpa:{d:g}:{t:g}" for d, t in itertools.product(DISTANCES[:-1], (1.5, 2.0, 3.0))]
     return {
@@ -68,7 +68,7 @@ def families() -> dict[str, list[str]]:
 
 
 def fine_families() -> dict[str, list[str]]:
-    """The families that came out best, around what came out best, in steps as fine as those of models' thresholds."""
+    """Return fine grids around the best rules of the best families, as fine as those of models' thresholds."""
     product = itertools.product
     near = [f"cpa:{cpa}" for cpa in ("0.6:1.5", "0.62:1.25", "0.62:1.5", "0.62:2", "0.65:1.5", "0.65:2")]
     far = ["cpa:0.8:3", "cpa:0.95:3", "cpa:1.05:2.5", "cpa:1.05:3"]
@@ -92,7 +92,7 @@ def fine_families() -> dict[str, list[str]]:
 
 
 def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], quick: bool) -> list[dict[str, Any]]:
-    """The rows of some families in one scenario."""
+    """Tune several families in one scenario and return their rows."""
     stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
     config = world(preset, n_robots)
     full: Rows = []
@@ -118,13 +118,15 @@ def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], qui
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", nargs="+", default=PRESETS_TESTED, choices=list(PRESETS))
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
-    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
+    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="default: the preset's")
     parser.add_argument("--family", nargs="+", default=list(families()), choices=list(families()))
-    parser.add_argument("--quick", action="store_true", help="few episodes and rules, to see that it runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="fly few episodes and rules, to check that everything runs"
+    )
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()

@@ -1,13 +1,13 @@
-"""Choose the thresholds of trained models: the highest with which each is as safe as asking everybody.
+"""Tune the thresholds of trained models: find the highest with which a model is as safe as full communication.
 
-``python -m studies.swarm.tune_thresholds [MODEL.zip ...] [--scenario ...] [--n-robots ...] [--json F] [--write]``, on
-the validation set, on which rules are tuned too, in the world in which each was trained. In each scenario thresholds
-are tried from the highest on, in stages of more and more episodes, until the model is as safe as full communication
-(`Standard`) and not at the edge of it (`has_reserve`): who takes the first that passes takes one that was lucky in
-these episodes. With ``--n-robots`` other thresholds are tried (`TEAM_THRESHOLDS`). With ``--write`` the smallest of
-them, with which a model is safe everywhere, is written into its file. JSON: one row a model, scenario and threshold
-with the keys of `summarise` over the episodes that it flew, and model, threshold, preset, scenario, safe; rows of other
-models, scenarios and teams stay, and count for a model's threshold.
+``python -m studies.swarm.tune_thresholds [MODEL.zip ...] [--scenario ...] [--n-robots ...] [--json F] [--write]`` uses
+the validation set, like the tuning of rules, and the world of each model's training. In each scenario, thresholds are
+tried in decreasing order, in stages of more and more episodes, until the model is as safe as full communication
+(`Standard`) with a reserve (`has_reserve`), since the first threshold that passes would benefit from luck in these
+episodes. With ``--n-robots``, other thresholds are tried (`TEAM_THRESHOLDS`). ``--write`` writes the smallest of these
+thresholds, with which the model is safe everywhere, into its file. JSON: one row per model, scenario and threshold with
+the keys of `summarise` over the episodes flown, and model, threshold, preset, scenario, safe. Rows of other models,
+scenarios and teams stay, and count for a model's threshold.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 from studies.swarm.protocol import OF_PRESET, OF_TEAM, in_stages, models, progress, read_rows, replace_rows, world
 
-# The recipes whose threshold is free and whose team is the preset's; that of the faithful one is the paper's, one half.
+# Recipes whose threshold is free and whose team is the preset's. The faithful recipe has the paper's threshold of 0.5.
 TUNED = ("paper", "dense", "ablation*")
-# What is as safe, and of its margin how many more episodes than full communication's may end in a collision: 16 of
-# 12,000 in a preset, two thirds of what the margin allows; of teams, on fewer episodes, 5 of 4,000, less than half
+# Criterion of safety, and the fraction of its margin by which the collision rate may exceed that of full communication:
+# 16 of 12,000 episodes in a preset, two thirds of what passes the criterion, and 5 of 4,000 in teams, less than half
 STANDARDS = {"preset": (OF_PRESET, 4 / 9), "team": (OF_TEAM._replace(enough=4000), 1 / 4)}
 THRESHOLDS = [0.99, 0.98, 0.965, 0.95, 0.925, 0.9, 0.875, 0.85, 0.825, 0.8, 0.775, 0.75, 0.725, 0.7]
 THRESHOLDS += [0.675, 0.65, 0.625, 0.6, 0.575, 0.55, 0.525, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1]
-# In teams of another size: fewer below 0.8, and lower ones for crowds larger than any in training
+# For other numbers of robots: fewer thresholds below 0.8, and lower ones for teams larger than in training
 TEAM_THRESHOLDS = [*THRESHOLDS[:10], *THRESHOLDS[10::2], 0.1, 0.05, 0.02, 0.01, 0.005]
 
 
 @functools.cache
 def full(preset: str, scenario: str, n: int | None) -> Rows:
-    """Figures of full communication as far as they have been flown, for `in_stages` to append to."""
+    """Return the statistics of full communication flown so far, to which `in_stages` appends."""
     return []
 
 
 def has_reserve(comparison: Comparison, margin: float, share: float) -> bool:
-    """Whether a threshold is not only as safe as full communication, but not at the edge of it: how many more episodes
-    end in a collision than with that is at most a share of the margin."""
+    """Return whether a threshold is safe with a reserve: its excess of collisions over full communication is at most a
+    fraction of the margin."""
     return comparison.only_first - comparison.only_second <= share * margin * comparison.episodes
 
 
 def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
-    """The rows of a model in one scenario."""
+    """Tune a model in one scenario and return its rows."""
     rival = full(preset, scenario, n)
     config = world(preset, n)
     standard, share = STANDARDS["preset" if n is None else "team"]
@@ -68,7 +68,7 @@ def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> l
 
 
 def preset_of(path: str) -> str:
-    """The world in which a model was trained."""
+    """Return the preset of a model's training."""
     spec = MADDPG.load(path, device="cpu").env_spec
     if spec is None:
         raise ValueError(f"{path} does not say in which world it was trained.")
@@ -76,7 +76,7 @@ def preset_of(path: str) -> str:
 
 
 def set_threshold(path: str, table: list[dict[str, Any]]) -> None:
-    """Write the smallest threshold that was needed in any of its cells into a model's file."""
+    """Write the smallest threshold of all scenarios and numbers of robots into a model's file."""
     last = {(row["scenario"], row["n_robots"]): row["threshold"] for row in table if row["model"] == path}
     model = MADDPG.load(path, device="cpu")
     model.set_threshold(min(last.values()))
@@ -84,12 +84,12 @@ def set_threshold(path: str, table: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", metavar="MODEL.zip", help="all that swarm_results flies unless given")
+    parser.add_argument("models", nargs="*", metavar="MODEL.zip", help="default: all models with a free threshold")
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS)[::-1], choices=list(SCENARIOS))
-    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="the preset's unless given")
-    parser.add_argument("--quick", action="store_true", help="few episodes, to see that it runs")
+    parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="default: the preset's")
+    parser.add_argument("--quick", action="store_true", help="fly few episodes, to check that everything runs")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--write", action="store_true", help="write each model's threshold into its file")

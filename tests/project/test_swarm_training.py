@@ -90,7 +90,7 @@ def test_recipes_can_step_many_swarms_in_one_call(algo, tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"vec_env": "ray"}, "only 'gymnasium' is known"),
-        ({"vec_env": "gymnasium", "frame_stack": 2}, "does not go with frame_stack"),
+        ({"vec_env": "gymnasium", "frame_stack": 2}, "cannot be combined with frame_stack"),
         ({"env_kwargs": {"presett": "paper"}}, "Unknown argument of QuadSwarm-v0 'presett': did you mean 'preset'?"),
         ({"env_kwargs": {"preset": "papier"}}, "Did you mean 'paper'"),
         ({"callback": [{"sb3_maddpg.callbacks.CurriculumCallback": {"window": 0}}]}, "window=0"),

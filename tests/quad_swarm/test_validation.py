@@ -36,7 +36,7 @@ def function(number: PositiveInt, text: str | Mapping[str, float] = "", **others
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: Inner((2, 1)), r"pair=(2, 1): it must be lowest first, highest second."),
+        (lambda: Inner((2, 1)), r"pair=(2, 1): it must be the lowest value first, then the highest."),
         (lambda: Inner(count=0), "count=0: it must be greater than 0."),
         (lambda: Inner(cuont=0), "Unknown Inner parameter 'cuont'; known: count, pair. Did you mean 'count'?"),
         (lambda: Outer(Inner(count=2), True), "flag=True goes with inner.count=1 alone."),

@@ -28,7 +28,7 @@ CONTENTS = ["", "parameters: 3", "drag_x: 0.1", "parameters: {drag: 0.1}", "para
 def test_files_that_hold_something_else_are_refused(content, tmp_path):
     path = tmp_path / "vehicle.yml"
     path.write_text(content)
-    with pytest.raises(ValueError, match=r"no vehicle file|drag"):
+    with pytest.raises(ValueError, match=r"not a vehicle file|drag"):
         load_vehicle(str(path))
 
 

@@ -213,14 +213,14 @@ def test_what_does_not_fit_is_refused():
             mask = spaces.Box(0, 1, (3,), np.int8)
             return spaces.Dict({"observation": spaces.Box(-1, 1, (2,)), "action_mask": mask})
 
-    with pytest.raises(ValueError, match=r"'one' has an action mask of 3 numbers; its space Discrete\(4\) takes one"):
+    with pytest.raises(ValueError, match=r"'one' has an action mask of 3 numbers, but its space Discrete\(4\) needs 4"):
         MADDPG("MlpPolicy", Short(("one",)))
-    with pytest.raises(ValueError, match="takes none: it has continuous actions"):
+    with pytest.raises(ValueError, match="is continuous and takes no mask"):
         MADDPG("MlpPolicy", Short(("smooth",)))
     with pytest.raises(ValueError, match=r"info_mask=True: .* is continuous"):
         TeamEnv(Masked(("smooth",)), info_mask=True)
     env = DummyVecEnv([lambda: TeamEnv(Masked(("one",)))])
-    with pytest.raises(ValueError, match=r"moves the numbers of action masks.*norm_obs=False"):
+    with pytest.raises(ValueError, match=r"shifts the action masks.*norm_obs=False"):
         MADDPG("MlpPolicy", VecNormalize(env))
     MADDPG("MlpPolicy", VecNormalize(DummyVecEnv([lambda: TeamEnv(Masked(("one",)))]), norm_obs=False))
 
@@ -255,7 +255,7 @@ def test_a_game_with_turns_is_played_by_its_rules(capfd):
 def test_turns_are_for_discrete_actions_and_real_turns():
     from mpe2 import simple_spread_v3
 
-    with pytest.raises(ValueError, match="takes turns only in form: take its parallel_env"):
+    with pytest.raises(ValueError, match=r"is parallelizable, .*: use its parallel_env"):
         TurnBased(simple_spread_v3.env())
     env = tictactoe_v3.env()
     env.action_space = lambda agent: spaces.MultiBinary(9)

@@ -182,14 +182,14 @@ def test_agents_have_the_names_of_the_environment():
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        (np.zeros(3), r"An observation of binary_2 has length 4, not shape \(3,\)"),
-        (np.zeros((2, 5)), r"not shape \(2, 5\)"),
-        (np.zeros((1, 2, 4)), r"not shape \(1, 2, 4\)"),
-        (np.array(0.0), r"not shape \(\)"),
+        (np.zeros(3), r"An observation of binary_2 has shape \(4,\), not \(3,\)"),
+        (np.zeros((2, 5)), r"not \(2, 5\)"),
+        (np.zeros((1, 2, 4)), r"not \(1, 2, 4\)"),
+        (np.array(0.0), r"not \(\)"),
         (np.array([0, 0, np.nan, 0]), "observation of binary_2 holds NaN or infinity"),
         (np.array([[0, 0, np.inf, 0]]), "observation of binary_2 holds NaN or infinity"),
-        (10**400, "observation of binary_2 is no array of numbers: 10"),
-        (np.array(["1", "0", "1", "0"]), "observation of binary_2 is no array of numbers"),
+        (10**400, "observation of binary_2 is not an array of numbers: 10"),
+        (np.array(["1", "0", "1", "0"]), "observation of binary_2 is not an array of numbers"),
     ],
 )
 def test_an_observation_that_does_not_fit_is_refused(observation, message):
@@ -213,5 +213,5 @@ def test_a_policy_that_is_not_finite_is_not_exported(tmp_path):
 def test_warns_where_an_agent_would_miss_the_statistics_of_observations():
     env = VecNormalize(DummyVecEnv([lambda: TeamEnv(Toy("binary"))]))
     model = MADDPG("MlpPolicy", env, **SMALL)
-    with pytest.warns(UserWarning, match="normalised by VecNormalize.*no part of the agent's policy"):
+    with pytest.warns(UserWarning, match="VecNormalize.*normalises.*not part of the agent's policy"):
         model.agent_policy(0)

@@ -103,7 +103,7 @@ def test_optimize_memory_usage_gives_the_next_observation_without_storing_it():
 
 
 def test_optimize_memory_usage_has_sb3s_condition():
-    with pytest.raises(ValueError, match="give handle_timeout_termination=False"):
+    with pytest.raises(ValueError, match="set handle_timeout_termination=False"):
         buffer(optimize_memory_usage=True)
     kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
     model = MADDPG("MlpPolicy", OwnBit(), **kwargs, buffer_size=100, learning_starts=20, train_freq=10, batch_size=16)
@@ -253,7 +253,7 @@ def test_rewards_are_normalised_before_they_are_summed():
 def test_rewards_of_a_pair_end_with_it(n_steps):
     memory = buffer(n_steps=n_steps, gamma=0.5, n_pairs=2, pairs_end=True)
     ended = np.zeros((3, N, 2), dtype=bool)
-    ended[1, 0, 0] = ended[0, 1, 1] = True  # which pairs end with which step
+    ended[1, 0, 0] = ended[0, 1, 1] = True  # ends of pairs by step
     infos = [{"pair_rewards": np.full((N, 2), 1.0), "pair_terminated": each} for each in ended]
     episodes(memory, *infos)
     sample = memory.samples_at(np.array([0]), np.array([0]))
@@ -316,7 +316,7 @@ def test_missing_keys_are_filled_in_environment_by_environment():
         ({}, {"agent_rewards": np.zeros(2)}, r"info\['agent_rewards'\] has shape \(2,\).*3 agents"),
         ({}, {"agent_terminated": np.zeros(2)}, r"info\['agent_terminated'\] has shape \(2,\).*3 agents"),
         ({}, {"agent_rewards": {"agent_0": 1.0}}, r"has shape \(\), but there are 3 agents"),
-        ({}, {"agent_rewards": [0.0, np.nan, 0.0]}, r"'agent_rewards'\] of agent 1 \(agent_1\) is nan.*bound it"),
+        ({}, {"agent_rewards": [0.0, np.nan, 0.0]}, r"'agent_rewards'\] of agent 1 \(agent_1\) is nan.*clip the value"),
         ({}, {"reward": np.inf}, "The team's reward is inf"),
         ({"n_pairs": 2}, {}, r"'pair_rewards'\] is missing.*\(3, 2\).*leave n_pairs"),
         ({"n_pairs": 2}, {"pair_rewards": np.zeros((3, 3))}, r"shape \(3, 3\).*n_pairs=2.*\(3, 2\)"),

@@ -200,7 +200,7 @@ def test_a_damaged_checkpoint_is_passed_over(damage, tmp_path):
         path.unlink()
     else:
         path.write_bytes(content[: len(content) // 2] if damage == "truncated" else content)
-    with pytest.warns(UserWarning, match="is passed over: .*"):
+    with pytest.warns(UserWarning, match="is skipped: .*"):
         before = newest(tmp_path)
     assert before is not None
     assert before < last
@@ -214,7 +214,7 @@ def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(checkpoints, "fault", full)
-    with pytest.warns(UserWarning, match="No space for a checkpoint at step .*: the last one stays"):
+    with pytest.warns(UserWarning, match="No space left for a checkpoint at step .*: the previous one stays"):
         model = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
     assert digest(model) == expected, "the training goes on"
     assert not list(tmp_path.glob("*.unfinished"))
@@ -230,7 +230,7 @@ def test_what_tells_no_state_goes_on_with_new_episodes_and_says_so(tmp_path):
         assert callback.inexact
         model.env.close()
         resumed, callback = resume(tmp_path, env())
-        with pytest.warns(UserWarning, match="goes on with new episodes, and not exactly as it would have"):
+        with pytest.warns(UserWarning, match="continues with new episodes and will not be bit-identical"):
             resumed.learn(100, callback=[callback], reset_num_timesteps=False)
         resumed.env.close()
         shutil.rmtree(tmp_path)
@@ -239,17 +239,19 @@ def test_what_tells_no_state_goes_on_with_new_episodes_and_says_so(tmp_path):
 def test_another_machine_is_named(tmp_path, monkeypatch):
     make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
     monkeypatch.setattr(checkpoints, "fingerprint", lambda: {"torch": "3.0"})
-    with pytest.warns(UserWarning, match=r"not bit for bit as it would have: torch:? .* then, 3\.0 now"):
+    with pytest.warns(UserWarning, match=r"will not be bit-identical: torch:? .* before, 3\.0 now"):
         resume(tmp_path, Replayable(OwnBit()))
 
 
 def test_other_callbacks_and_other_environments_are_refused(tmp_path):
     make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
     model, callback = resume(tmp_path, Replayable(OwnBit()))
-    with pytest.raises(ValueError, match=r"The run had the callbacks .* these are .*CurriculumCallback.*: resume with"):
+    with pytest.raises(
+        ValueError, match=r"The run had the callbacks .* now they are .*CurriculumCallback.*: resume with"
+    ):
         model.learn(100, [callback, CurriculumCallback()], reset_num_timesteps=False)
     model, callback = resume(tmp_path, OwnBit())
-    with pytest.raises(ValueError, match="The state is of a Replayable, this is a OwnBit"):
+    with pytest.raises(ValueError, match="The state belongs to a Replayable, but this is a OwnBit"):
         model.learn(100, [callback], reset_num_timesteps=False)
     assert resume(tmp_path / "nothing", OwnBit()) is None
     for wrong in ({"every": 0}, {"every": 5, "keep": 0}):

@@ -178,13 +178,13 @@ def test_the_default_is_stable_baselines3s_network():
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="agents that see images of one size"):
+    with pytest.raises(ValueError, match="agents that observe images of the same size"):
         MADDPG("CnnPolicy", TeamEnv(Toy("mixed")), **ARGUMENTS)
-    with pytest.raises(ValueError, match="NatureCNN cannot be made"):
+    with pytest.raises(ValueError, match="NatureCNN cannot be created"):
         MADDPG("CnnPolicy", BrightSide(), **ARGUMENTS)  # too small for its filters
     with pytest.raises(ValueError, match="BaseFeaturesExtractor"):
         made(features_extractor_class=th.nn.Linear)
-    with pytest.raises(ValueError, match="has 12 numbers, the agents observe"):
+    with pytest.raises(ValueError, match="has 12 numbers, but the agents observe"):
         made(image_space=spaces.Box(0, 255, (2, 6, 1), np.uint8))
     with pytest.raises(ValueError, match="features_extractor_kwargs"):
         made(features_extractor_kwargs={"width": 3})

@@ -67,7 +67,10 @@ class Wrong(team_tasks.OwnBit):
         (Wrong(agent_rewards=[0.0, np.nan, 0.0]), "'agent_rewards'.* of agent agent_1 in step 1 is not finite"),
         (Wrong(agent_reward=[0.0] * 3), "Unknown entry 'agent_reward': did you mean 'agent_rewards'"),
         (Wrong(agent_active=[0.5, 1, 1]), "must hold True or False for each agent"),
-        (Wrong(agent_terminated=[True, False, False], agent_active=[True] * 3), "agent_0 acts in step 2, although it"),
+        (
+            Wrong(agent_terminated=[True, False, False], agent_active=[True] * 3),
+            "agent_0 is active in step 2, although it",
+        ),
         (Wrong(pair_rewards=np.zeros(3)[None]), "each of its neighbours"),
         (Wrong(pair_terminated=np.zeros(3, bool)[None]), "each of its neighbours"),
         (Wrong(pair_terminated=np.full((3, 2), 0.5)), "must hold True or False"),
@@ -80,9 +83,9 @@ class Wrong(team_tasks.OwnBit):
         (Wrong({"observation_layout": {"own": [0]}}), "needs `own` and `neighbours`"),
         (
             Wrong({"observation_layout": {"own": [0], "neighbours": [[0]], "who_columns": [1]}}),
-            "neighbours of agent agent_0 in step 1, .* another agent's number",
+            "neighbours of agent agent_0 in step 1, .* another agent's index plus 1",
         ),
-        (Wrong({"action_space": spaces.MultiBinary(10)}), "10 numbers cannot be shared out evenly"),
+        (Wrong({"action_space": spaces.MultiBinary(10)}), "10 numbers cannot be divided evenly"),
         (
             Wrong({"draw": unseeded}),
             "different observations",

@@ -65,7 +65,7 @@ def test_a_replayable_environment_draws_episodes_from_its_seed():
 @pytest.mark.parametrize("make", [lambda: DummyVecEnv([OwnBit]), lambda: SubprocVecEnv([OwnBit], start_method="fork")])
 def test_says_what_tells_no_state(make):
     env = make()
-    with pytest.raises(NoStateError, match=r"OwnBit has no state_dict\(\)|SubprocVecEnv keeps its environments"):
+    with pytest.raises(NoStateError, match=r"OwnBit has no state_dict\(\)|SubprocVecEnv runs its environments"):
         vec_env_state(env)
     env.close()
 
@@ -73,7 +73,7 @@ def test_says_what_tells_no_state(make):
 def test_a_state_of_other_wrappers_is_refused():
     env = vectorized()
     env.reset()
-    with pytest.raises(ValueError, match="The state is of a VecMonitor, this is a DummyVecEnv"):
+    with pytest.raises(ValueError, match="The state belongs to a VecMonitor, but this is a DummyVecEnv"):
         load_vec_env_state(env.venv, vec_env_state(env))
 
 

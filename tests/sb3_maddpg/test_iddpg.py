@@ -67,7 +67,7 @@ def test_alternatives_have_the_values_of_the_action_replaced(factors, n_critics,
 
 
 def test_one_value_for_the_team_is_refused():
-    with pytest.raises(ValueError, match="share_critic='team': independent critics value each agent"):
+    with pytest.raises(ValueError, match="share_critic='team' requires a centralised critic"):
         IDDPG("MlpPolicy", Neighbours(), policy_kwargs={"share_critic": "team"})
 
 

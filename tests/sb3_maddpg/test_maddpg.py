@@ -185,7 +185,7 @@ def test_tasks_are_proper_environments():
         ({"exploration_noise": (0.1, 0.2, 0.3)}, "or two of them"),
         ({"temperature": 0.0}, r"temperature=0\.0 must be positive"),
         ({"n_steps": 0}, "n_steps=0 must be a number of steps of at least 1"),
-        ({"tau": "fast"}, "tau='fast' must be a number between 0 and 1"),
+        ({"tau": "fast"}, "tau='fast' must be a number above 0 and up to 1"),
         ({"gamma": 1.5}, "gamma=1.5 must be a number between 0 and 1"),
         ({"policy_delay": 0}, "policy_delay=0 must be at least 1"),
     ],
@@ -198,7 +198,7 @@ def test_a_bad_argument_is_refused(kwargs, message):
 def test_a_cost_of_another_shape_is_refused():
     env = OwnBit()
     env.action_cost = np.ones((3, 2))
-    with pytest.raises(ValueError, match=r"action_cost of shape \(3, 2\) does not fit \(n_agents, width\) = \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"shape \(3, 2\) cannot be broadcast to \(n_agents, width\) = \(3, 3\)"):
         MADDPG("MlpPolicy", env, use_action_cost=True)
 
 
@@ -222,7 +222,7 @@ class Misshapen(gymnasium.Env):
         (spaces.Discrete(4), spaces.MultiBinary(6), r"not Discrete\(4\)"),
         (spaces.Box(-1, 1, (4, 3)), spaces.MultiBinary(6), "6 numbers.*4 agents"),
         (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary((2, 3)), r"MultiBinary\(\(2, 3\)\).*Flatten"),
-        (spaces.Box(-1, 1, (2, 3)), spaces.Discrete(4), r"A team action is flat.*not Discrete\(4\)"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.Discrete(4), r"A team action is a flat.*not Discrete\(4\)"),
     ],
 )
 def test_spaces_that_are_no_team_are_refused(observation_space, action_space, message):
@@ -258,12 +258,12 @@ def test_a_value_out_of_range_is_refused_in_one_line(name, value):
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"buffer_size": 100, "batch_size": 101}, r"batch_size=101 is larger than buffer_size=100.*Lower the one"),
-        ({"buffer_size": 100, "batch_size": 10, "n_steps": 101}, "n_steps=101 is more than buffer_size=100 keeps"),
+        ({"buffer_size": 100, "batch_size": 101}, r"batch_size=101 is larger than buffer_size=100.*Lower batch_size"),
+        ({"buffer_size": 100, "batch_size": 10, "n_steps": 101}, "n_steps=101 is more than buffer_size=100 stores"),
         ({"policy_kwargs": {"net_arhc": [8]}}, "Unknown argument in policy_kwargs 'net_arhc': did you mean 'net_arch'"),
         ({"policy_kwargs": {"net_arch": [0]}}, r"net_arch=\[0\] must be a list of widths"),
         ({"policy_kwargs": {"net_arch": {"pi": [8]}}}, r"net_arch=.* must be a list of widths"),
-        ({"policy_kwargs": {"random_thresholds": NAN}}, "random_thresholds=nan must be a share above 0"),
+        ({"policy_kwargs": {"random_thresholds": NAN}}, "random_thresholds=nan must be a fraction above 0"),
     ],
 )
 def test_arguments_that_do_not_fit_are_refused(kwargs, message):
@@ -326,11 +326,11 @@ def test_parameters_that_are_not_finite_stop_the_training():
 
 def test_absent_neighbours_and_normalised_observations_exclude_each_other():
     env = VecNormalize(DummyVecEnv([Neighbours]))
-    with pytest.raises(ValueError, match=r"VecNormalize\(norm_obs=True\) moves the zeros .* Set norm_obs=False"):
+    with pytest.raises(ValueError, match=r"VecNormalize\(norm_obs=True\) shifts the zeros .* Set norm_obs=False"):
         MADDPG("PairPolicy", env, **SMALL)
     model = MADDPG("PairPolicy", VecNormalize(DummyVecEnv([Neighbours]), norm_obs=False), **SMALL)
     before = model.get_env()
-    with pytest.raises(ValueError, match="moves the zeros"):
+    with pytest.raises(ValueError, match="shifts the zeros"):
         model.set_env(env)
     assert model.get_env() is before
     env = Neighbours()
@@ -351,7 +351,7 @@ def test_a_model_for_a_team_of_another_size_has_its_networks_and_arguments():
     prioritized = MADDPG("PairPolicy", Neighbours(3), **SMALL, **buffer)
     assert prioritized.resized(Neighbours(5)).replay_buffer.alpha == 0.5
     assert type(prioritized.resized(Neighbours(5), replay_buffer_class=None).replay_buffer) is TeamReplayBuffer
-    with pytest.raises(ValueError, match="fits one size of team"):
+    with pytest.raises(ValueError, match="fits a single team size"):
         learned().resized(OwnBit())
 
 
@@ -394,8 +394,8 @@ def test_a_short_training_logs_its_episodes_once():
     [
         ({"policy": "x"}, "Unknown policy 'x'"),
         ({"policy": 5}, "policy=5 is neither"),
-        ({"env": None}, "env=None: give an environment"),
-        ({"env": object}, "is no environment"),
+        ({"env": None}, "env=None: pass an environment"),
+        ({"env": object}, "is not an environment"),
         ({"device": "None"}, "device='None' must be"),
         ({"device": 1.5}, "device=1.5 must be"),
         ({"seed": 0.5}, "seed=0.5 must be"),
@@ -407,27 +407,27 @@ def test_a_short_training_logs_its_episodes_once():
         ({"replay_buffer_kwargs": {1: 2}}, "replay_buffer_kwargs={1: 2} must be a dict"),
         ({"replay_buffer_kwargs": {"alpha": 1}}, "Unknown argument in replay_buffer_kwargs 'alpha'"),
         ({"replay_buffer_kwargs": {"optimize_memory_usage": True}}, "Unknown argument in replay_buffer_kwargs"),
-        ({"replay_buffer_kwargs": {"n_steps": 3}}, "'n_steps'. is the algorithm's own"),
-        ({"replay_buffer_class": 2}, "replay_buffer_class=2 is no class"),
+        ({"replay_buffer_kwargs": {"n_steps": 3}}, "'n_steps'. is an argument of the algorithm"),
+        ({"replay_buffer_class": 2}, "replay_buffer_class=2 is not a class"),
         ({"estimator": {}}, "Unknown estimator '{}'"),
         ({"policy_kwargs": {"activation_fn": 0.5}}, "activation_fn=0.5 must be a class of torch.nn"),
         ({"policy_kwargs": {"optimizer_class": int}}, "optimizer_class=<class 'int'> must be a class of torch.optim"),
         ({"policy_kwargs": {"optimizer_kwargs": 5}}, "optimizer_kwargs=5 must be a dict"),
-        ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "do not fit Adam: .*'x'"),
-        ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or lists of agents"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "cannot be passed to Adam: .*'x'"),
+        ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or a list of lists of agents"),
         (
             {"policy_kwargs": {"share_critic": "all"}},
             "share_critic='all' must be True, False or .*may also be \"team\"",
         ),
         ({"policy_kwargs": {"agent_names": 5}}, "agent_names=5 must be a list of names"),
         ({"policy_kwargs": {"n_critics": 10**400}}, r"n_critics=10* \.\.\. 0* is too large: it must be less than"),
-        ({"policy_kwargs": {"n_critics": 10**9}}, "the networks need too much memory"),
-        ({"policy_kwargs": {"net_arch": [10**7, 10**7]}}, "the networks need too much memory"),
-        ({"buffer_size": 10**18}, "buffer_size=1000000000000000000 or the networks need too much memory"),
+        ({"policy_kwargs": {"n_critics": 10**9}}, "the networks need more memory"),
+        ({"policy_kwargs": {"net_arch": [10**7, 10**7]}}, "the networks need more memory"),
+        ({"buffer_size": 10**18}, "buffer_size=1000000000000000000 or the networks need more memory"),
         ({"buffer_size": 10**400}, r"buffer_size=10* \.\.\. 0* is too large: it must be less than 2\*\*63"),
         ({"train_freq": 10**400}, r"train_freq=10* \.\.\. 0* is too large"),
         ({"gradient_steps": 10**5000}, "gradient_steps=<int> is too large"),
-        ({"optimize_memory_usage": True}, "optimize_memory_usage=True forgets"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage=True drops"),
         ({"replay_buffer_kwargs": {"handle_timeout_termination": 5}}, "handle_timeout_termination=5 must be"),
     ],
 )

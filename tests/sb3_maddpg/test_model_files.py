@@ -28,7 +28,7 @@ def assert_equal_state(a: dict, b: dict) -> None:
 def test_what_is_no_archive_is_refused(tmp_path):
     path = tmp_path / "model.zip"
     path.write_bytes(b"no archive")
-    with pytest.raises(ValueError, match="is no zip file"):
+    with pytest.raises(ValueError, match="models are zip files"):
         MADDPG.load(path)
 
 

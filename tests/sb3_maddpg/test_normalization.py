@@ -58,7 +58,7 @@ def test_statistics_of_parts_of_observations_come_back(tmp_path):
 def test_pickles_need_trust(tmp_path):
     path = tmp_path / "stats.pkl"
     VecNormalize(DummyVecEnv([OwnBit])).save(str(path))
-    with pytest.raises(ValueError, match=r"stats\.pkl holds no statistics .*`trust=True`"):
+    with pytest.raises(ValueError, match=r"stats\.pkl does not hold statistics .*`trust=True`"):
         SafeVecNormalize.load(str(path), DummyVecEnv([OwnBit]))
     assert isinstance(SafeVecNormalize.load(str(path), DummyVecEnv([OwnBit]), trust=True), VecNormalize)
 
@@ -70,7 +70,7 @@ def test_pickles_need_trust(tmp_path):
         ({"settings": {}}, "damaged"),
         ({"settings": {"$": "class", "name": "os.system"}}, "Unknown class"),
         ({"obs_rms": 5}, "damaged"),
-        ({"ret_rms": {"mean": 0.0, "var": 1.0, "count": 1.0}}, r"has the shape|damaged"),
+        ({"ret_rms": {"mean": 0.0, "var": 1.0, "count": 1.0}}, r"has shape|damaged"),
         ({"ret_rms": {"mean": np.zeros(()), "var": np.full((), -1.0), "count": 1.0}}, "negative variance"),
         ({"ret_rms": {"mean": np.full((), np.nan), "var": np.ones(()), "count": 1.0}}, "NaN"),
         ({"ret_rms": {"mean": np.zeros(()), "var": np.ones(()), "count": 0.0}}, "negative variance"),

@@ -181,8 +181,8 @@ def forgotten(env, observations, rewards, terminations, truncations, infos):
     ("spoil", "message"),
     [
         (renamed, "'x' in `agents` of script, but possible_agents has only a, b"),
-        (revived, "'a' came back to life in the middle of an episode"),
-        (forgotten, "'a' left script without an end"),
+        (revived, "'a' returned in the middle of an episode"),
+        (forgotten, "'a' left script without termination"),
         (lambda env, observations, *_: observations.pop("b"), "no observation for agent 'b'"),
         (lambda env, observations, *_: observations.update(a=np.zeros(2)), r"agent 'a' has shape \(2,\), but"),
         (lambda env, observations, *_: env.time == 2 and observations.pop("a"), "no observation for agent 'a'"),
@@ -231,7 +231,7 @@ def test_a_terminated_agent_need_not_see_its_end():
     ("env", "message"),
     [
         (simple_spread_v3.env(), "aec_to_parallel"),
-        (gymnasium.make("CartPole-v1"), "no PettingZoo ParallelEnv"),
+        (gymnasium.make("CartPole-v1"), "not a PettingZoo ParallelEnv"),
         (Broken(possible_agents=[]), "possible_agents"),
         (Broken(possible_agents=["a", "b", "a"]), "a name twice"),
         (Broken(action_space=lambda agent: spaces.Text(3)), "'a' has the action space Text"),
@@ -257,7 +257,7 @@ def test_a_state_that_is_not_there_is_refused():
     with pytest.raises(ValueError, match=r"state_space but no state\(\)"):
         env.reset()
     env = TeamEnv(Broken(state_space=spaces.Box(0, 1, (3,)), state=lambda: np.zeros(4)), state=True)
-    with pytest.raises(ValueError, match="has 4 numbers, its state_space 3"):
+    with pytest.raises(ValueError, match="has 4 numbers, but its state_space has 3"):
         env.reset()
 
 
@@ -300,8 +300,8 @@ def test_values_that_mean_nothing_are_refused(spoil, message):
     [
         (None, r"step\(\) of script returned None: it must return \(observations, rewards"),
         (({}, {}, {}, {}), r"it must return \(observations, rewards"),
-        ((None, {}, {}, {}, {}), "gave None as observations in step 1"),
-        (({}, [1.0], {}, {}, {}), r"gave \[1.0\] as rewards in step 1"),
+        ((None, {}, {}, {}, {}), "returned None as observations in step 1"),
+        (({}, [1.0], {}, {}, {}), r"returned \[1.0\] as rewards in step 1"),
     ],
 )
 def test_a_step_must_return_five_dicts(returned, message):

@@ -197,8 +197,8 @@ def test_groups_by_name_and_number():
         ([[0, 6]], "There is no agent 6.*0 to 5"),
         ([["mixed_0", 1], [0]], "share_actor.* names an agent twice"),
         ([[2, 2]], "names an agent twice"),
-        ("team", "share_actor='team' must be True, False or lists"),
-        (True, "mixed_0 and mixed_1 have different spaces.*Give lists of homogeneous agents, or False"),
+        ("team", "share_actor='team' must be True, False or a list of lists"),
+        (True, "mixed_0 and mixed_1 have different spaces.*Pass lists of homogeneous agents, or False"),
         ([["mixed_0", "mixed_4"]], "mixed_0 and mixed_4 have different spaces"),
     ],
 )
@@ -257,7 +257,7 @@ def test_a_threshold_outside_the_scores_is_refused(threshold):
 @pytest.mark.parametrize("kind", ["datetime64[s]", "timedelta64[s]", "U4", "S4", "complex64"])
 def test_an_observation_of_other_things_than_numbers_is_refused(kind):
     for observation in (np.zeros((N, D), kind), 10**400, "x", {}, [[0.0], [0.0, 1.0]]):
-        with pytest.raises(ValueError, match=r"observation=.* is no array of numbers of shape \(4, 5\)"):
+        with pytest.raises(ValueError, match=r"observation=.* is not an array of numbers of shape \(4, 5\)"):
             policy().predict(observation)
 
 

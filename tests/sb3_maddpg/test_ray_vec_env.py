@@ -130,7 +130,7 @@ def broken():
 
 
 def test_a_shard_that_cannot_be_made_is_told():
-    with pytest.raises(ValueError, match=r"processes died at describe\(\) of a shard.*cannot be made"):
+    with pytest.raises(ValueError, match=r"processes died during describe\(\) of a shard.*cannot be made"):
         RayVecEnv([broken])
     with pytest.raises(ValueError, match="0 shards"):
         RayVecEnv([])

@@ -149,7 +149,7 @@ def test_neighbours_that_are_named_in_columns_may_stand_anywhere(layout, space):
     expected = fixed.critic.of_pairs(obs, actions)[0].unflatten(-1, (N, M)).gather(2, order)
     got = named.critic.of_pairs(moved, moved_actions)[0].unflatten(-1, (N, M))
     assert th.allclose(got, expected, atol=1e-6)
-    # Absent neighbours are worth nothing, whatever anybody does
+    # The value of an absent neighbour is zero for all actions
     moved[:, 0, [*place[1], 10 + 1]] = 0.0
     assert not named.critic.of_pairs(moved, moved_actions)[0].unflatten(-1, (N, M))[:, 0, 1].any()
 
@@ -157,9 +157,9 @@ def test_neighbours_that_are_named_in_columns_may_stand_anywhere(layout, space):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"complete": True}, "leave out `who` and `complete`"),
-        ({"who": [others(agent) for agent in range(N)]}, "leave out `who`"),
-        ({"who_columns": [10, 11]}, "every neighbour needs as many columns"),
+        ({"complete": True}, "cannot be combined with .* complete=True"),
+        ({"who": [others(agent) for agent in range(N)]}, "cannot be combined with `who`"),
+        ({"who_columns": [10, 11]}, "every neighbour needs the same number of columns"),
         ({"who_columns": [10, 11, 12, 99]}, "each from 0 to 13"),
     ],
 )
@@ -181,9 +181,9 @@ def test_what_a_neighbour_does_counts_only_while_it_sees_the_agent():
     obs, actions = batch(built, 10 + M)
     actions.requires_grad_()
     obs[..., 10:] = 0.0
-    obs[:, 0, 10:12] = th.tensor([3.0, 2.0])  # agent 0 sees 2 and 1, of which 1 sees it in its last place
+    obs[:, 0, 10:12] = th.tensor([3.0, 2.0])  # agent 0 perceives 2 and 1; it is the last neighbour of 1
     obs[:, 1, 10 + M - 1] = 1.0
-    obs[:, 0, [4, 5, 8, 9]] = 0.0  # nobody has its other places
+    obs[:, 0, [4, 5, 8, 9]] = 0.0  # its other positions are empty
     (gradient,) = th.autograd.grad(built.critic.of_pairs(obs, actions)[0, :, :M].sum(), actions)
     acting = (gradient.abs().sum(dim=0) > 0).unflatten(-1, (M, -1)).any(dim=-1)
     assert acting[0].tolist() == [True, True, False, False]
@@ -226,14 +226,14 @@ def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
 @pytest.mark.parametrize(
     ("layout", "message"),
     [
-        (None, "PairPolicy has to know .*`observation_layout`"),
+        (None, "PairPolicy needs to know .*`observation_layout`"),
         ({"own": [0]}, r"has entries \['own'\], but needs `own` and `neighbours`"),
-        ({**LAYOUT, "owns": [0]}, "`action_mask` and `complete` only"),
+        ({**LAYOUT, "owns": [0]}, "`action_mask` and `complete`\\."),
         ({**LAYOUT, "own": [10]}, "each from 0 to 9"),
-        ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "as many columns as the next"),
-        ({**LAYOUT, "neighbours": []}, "as many columns as the next"),
+        ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "the same number of columns"),
+        ({**LAYOUT, "neighbours": []}, "the same number of columns"),
         ({**LAYOUT, "neighbours": [[2], [3]]}, r"2 neighbours, but the 5 agents have \[4, 4, 4, 4, 4\]"),
-        ({**LAYOUT, "who": [[0, 1, 2, 3]] * 5}, "must name others, by numbers from 0 to 4"),
+        ({**LAYOUT, "who": [[0, 1, 2, 3]] * 5}, "must name other agents, by indices from 0 to 4"),
     ],
 )
 def test_a_layout_that_does_not_fit_is_refused(layout, message):
@@ -254,9 +254,9 @@ def test_only_binary_actions_on_neighbours_are_masked(space):
 
 def test_spaces_that_do_not_fit_are_refused():
     for space in (spaces.MultiBinary(N * 3), spaces.MultiDiscrete([3, 3, 3, 2] * N)):
-        with pytest.raises(ValueError, match=r"act on 4 neighbours, but .* does not fall into as many equal parts"):
+        with pytest.raises(ValueError, match=r"act on 4 neighbours, but .* cannot be split into as many equal parts"):
             policy(space)
-    with pytest.raises(ValueError, match=r"net_arch=\[\]: PairPolicy needs a hidden layer"):
+    with pytest.raises(ValueError, match=r"net_arch=\[\]: PairPolicy needs at least one hidden layer"):
         policy(net_arch=[])
     with pytest.raises(ValueError, match="agent_0 and agent_4 have different spaces: use MlpPolicy"):
         policy(spaces.MultiDiscrete([3] * 4 * (N - 1) + [2] * 4))

@@ -120,7 +120,7 @@ def test_what_holds_for_every_neighbour_is_learned_from_all_of_them(n_choices, p
 
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_the_value_of_a_pair_ends_with_it(n_steps):
-    """Training where neighbours change: the target of a pair takes nothing from who has its place later."""
+    """If neighbours change, the target of a pair does not depend on a later neighbour in the same position."""
     world = {"neighbourhood": {"max_others": 2, "range": 2.0}}
     kwargs = {"n_robots": 6, "preset": "dense", "scenario": "random_swap", "reward": {"near_miss": 1.0}}
     env = gymnasium.make("QuadSwarm-v0", observation="state+critic", world=world, **kwargs)

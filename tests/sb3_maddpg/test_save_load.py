@@ -218,14 +218,14 @@ def test_a_replay_buffer_that_does_not_fit_is_refused_where_it_is_loaded(tmp_pat
     model = learned()
     present = model.replay_buffer
     for name, message in (
-        ("two", r"transitions of 2 environment\(s\) side by side, the model needs transitions of 1 .*: resume with"),
-        ("other", r"observations of .*\(2, 2\).*, the model needs observations of .*\(3, 3\)"),
-        ("td3", "no replay buffer that this version writes. .* `trust=True`"),
+        ("two", r"transitions of 2 parallel environment\(s\), but the model needs transitions of 1 .*: resume with"),
+        ("other", r"observations of .*\(2, 2\).*, but the model needs observations of .*\(3, 3\)"),
+        ("td3", "not a replay buffer that this version writes. .* `trust=True`"),
     ):
         with pytest.raises(ValueError, match=message):
             model.load_replay_buffer(tmp_path / f"{name}.pkl")
         assert model.replay_buffer is present
-    with pytest.raises(ValueError, match="holds a ReplayBuffer, which knows no agents"):
+    with pytest.raises(ValueError, match="holds a ReplayBuffer, but the model needs a TeamReplayBuffer"):
         model.load_replay_buffer(tmp_path / "td3", trust=True)
 
 
@@ -297,7 +297,7 @@ def test_a_truncated_replay_buffer_is_refused(tmp_path):
     content = (tmp_path / "buffer.pkl").read_bytes()
     (tmp_path / "buffer.pkl").write_bytes(content[: len(content) // 2])
     present = model.replay_buffer
-    with pytest.raises(ValueError, match=r"buffer\.pkl is no replay buffer that this version writes"):
+    with pytest.raises(ValueError, match=r"buffer\.pkl is not a replay buffer that this version writes"):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is present
 
@@ -317,7 +317,7 @@ def test_a_lean_file_acts_the_same_and_trains_on_from_what_it_has(tmp_path, lean
     assert_equal_state(loaded.critic.state_dict(), loaded.critic_target.state_dict())
     same = all(map(th.equal, model.critic.parameters(), loaded.critic.parameters()))
     assert same == (lean == "critic")
-    with pytest.warns(UserWarning, match="saved without .*optimizers' state, which begin anew"):
+    with pytest.warns(UserWarning, match="saved without .*optimizers' state, which are initialised afresh"):
         loaded.learn(60)
     assert loaded.lean is None
     other = MADDPG("MlpPolicy", OwnBit(), **{**SMALL, "seed": 5})
@@ -328,7 +328,7 @@ def test_a_lean_file_acts_the_same_and_trains_on_from_what_it_has(tmp_path, lean
 def test_lean_is_one_of_two_and_needs_the_actor(tmp_path):
     model = learned()
     for wrong in ({"lean": "actors"}, {"lean": "actor", "pickle": True}, {"lean": True}):
-        with pytest.raises(ValueError, match="lean is one of"):
+        with pytest.raises(ValueError, match="lean must be one of"):
             model.save(tmp_path / "model", **wrong)
     model.save(tmp_path / "model", lean="actor")
     with zipfile.ZipFile(tmp_path / "model.zip") as old, zipfile.ZipFile(tmp_path / "other.zip", "w") as new:

@@ -28,9 +28,9 @@ def test_a_path_that_cannot_be_written_is_refused_before_any_work(tmp_path):
     (tmp_path / "folder.zip").mkdir()
     (tmp_path / "file").write_text("")
     for path, message in (
-        (tmp_path / "folder", "This is a folder: name a file in it: '.*folder.zip'"),
-        ("", "This is a folder: name a file in it: '.*zip'"),
-        ("..", "This is a folder: name a file in it: '.*zip'"),
+        (tmp_path / "folder", "This is a folder: pass the path of a file: '.*folder.zip'"),
+        ("", "This is a folder: pass the path of a file: '.*zip'"),
+        ("..", "This is a folder: pass the path of a file: '.*zip'"),
         (tmp_path / "file" / "model", "Cannot write here .*choose another folder: '.*file/model.zip'"),
     ):
         worked = False

@@ -144,7 +144,7 @@ def test_actions_that_are_not_finite_are_refused():
 
 
 def test_what_is_no_vector_environment_is_refused():
-    with pytest.raises(ValueError, match=r"no Gymnasium VectorEnv: .*make_vec"):
+    with pytest.raises(ValueError, match=r"not a Gymnasium VectorEnv: .*make_vec"):
         GymnasiumVecEnv(gymnasium.make("CartPole-v1"))
 
 

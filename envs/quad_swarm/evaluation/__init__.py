@@ -1,4 +1,4 @@
-"""Policies flown over held-out episodes, and what their figures allow to say."""
+"""Evaluation of policies over held-out episodes, and statistical inference from the results."""
 
 from quad_swarm.evaluation.evaluation import evaluate, fly_all, summarise
 from quad_swarm.evaluation.flight import Condition, Flight, fly, run_episodes

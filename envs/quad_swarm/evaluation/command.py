@@ -33,12 +33,12 @@ EXAMPLES = "  sb3-maddpg evaluate --policy none full cpa:0.7:1.5 pretrained:quad
 
 
 class Column(NamedTuple):
-    """Of the table."""
+    """A column of the table."""
 
     title: str
     text: Callable[[Mapping[str, Any]], str]
     wide: bool = True
-    """Whether it is left out of a table that is not `wide`"""
+    """Whether only the wide table has this column"""
 
 
 COLUMNS = [
@@ -66,10 +66,10 @@ SHORTEST_NAME = 12
 
 
 def table_texts(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> list[list[str]]:
-    """The titles, then the cells of each row, as they are printed; models by the shortest names that differ.
+    """Return the titles and the cells of each row as text, with the shortest unambiguous names of models.
 
-    :param rows: of `evaluate`
-    :param wide: all columns instead of the most important ones
+    :param rows: rows of `evaluate`
+    :param wide: whether to include all columns instead of the most important ones
     """
     columns = [column for column in COLUMNS if wide or not column.wide]
     names = short_names(row["policy"] for row in rows)
@@ -78,9 +78,9 @@ def table_texts(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> list[l
 
 
 def format_table(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> str:
-    """The rows as a table to print. Unless it is `wide` it fits 100 columns of text; longer names are wrapped.
+    """Format rows as a table. Unless it is wide, it fits into 100 columns of text by wrapping long names.
 
-    :param rows: of `evaluate`
+    :param rows: rows of `evaluate`
     :param wide: see `table_texts`
     """
     texts = table_texts(rows, wide)
@@ -97,14 +97,14 @@ def format_table(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> str:
 
 
 def _wrapped(texts: list[str], most: int) -> list[list[str]]:
-    """A line of the table, and further ones for what is left of the policy's name."""
+    """Return a line of the table, and additional lines for the rest of the policy's name."""
     scenario, name, *cells = texts
     lines = [[scenario, name[:most], *cells]]
     return lines + [["", name[k : k + most], *("" for _ in cells)] for k in range(most, len(name), most)]
 
 
 def _latex(texts: Sequence[Sequence[str]]) -> str:
-    """The texts of a table as LaTeX, for the package booktabs."""
+    """Format the texts of a table as LaTeX for the package booktabs."""
     escape = str.maketrans({
         **{c: f"\\{c}" for c in "&%$#_{}"},
         **{"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"},
@@ -124,7 +124,7 @@ def _latex(texts: Sequence[Sequence[str]]) -> str:
 
 
 def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
-    """``["noise.wind=1", "memory=0.3"]`` -> ``{"noise": {"wind": 1}, "memory": 0.3}``."""
+    """Convert ``["noise.wind=1", "memory=0.3"]`` to ``{"noise": {"wind": 1}, "memory": 0.3}``."""
     world: dict[str, Any] = {}
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
@@ -135,13 +135,13 @@ def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
         for parent in parents:
             place = place.setdefault(parent, {})
             if not isinstance(place, dict):
-                raise ValueError(f"--world {assignment!r}: {parent!r} was given a plain value before.")
+                raise ValueError(f"--world {assignment!r}: {parent!r} already has a plain value.")
         if leaf in place:
             raise ValueError(f"--world {assignment!r}: {name!r} is given twice.")
         try:
             place[leaf] = yaml.safe_load(value)
         except yaml.YAMLError:
-            raise ValueError(f"--world {assignment!r}: {value!r} is no valid YAML; quote text.") from None
+            raise ValueError(f"--world {assignment!r}: {value!r} is not valid YAML; quote text.") from None
     return world
 
 
@@ -150,14 +150,15 @@ def _rules_usage() -> str:
 
 
 def paper_policies() -> list[str]:
-    """Those of the paper's table: no and full communication, by distance, and a learned one."""
+    """Return the policies of the paper's table: no and full communication, by distance, and a learned policy."""
     return ["none", "full", "distance:4", str(files("quad_swarm.models") / "quad-swarm-paper" / "model.zip")]
 
 
 def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True) -> None:
-    """The options of every command that flies policies in a world.
+    """Add the options of commands that fly policies in a world.
 
-    :param required: whether --policy must be given
+    :param parser: parser to add to
+    :param required: whether --policy is required
     """
     parser.add_argument(
         "--policy",
@@ -167,9 +168,9 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
         help=f"a rule ({_rules_usage()}), rules joined by & (both) and | (either), a model's zip, MODEL.zip@THRESHOLD, "
         "latest:LOGDIR or pretrained:NAME",
     )
-    parser.add_argument("--seed", type=int, default=0, help="which set of held-out episodes (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="index of the set of held-out episodes (default 0)")
     parser.add_argument(
-        "--preset", help=f"{', '.join(PRESETS)} (default: the one in which the models were trained, paper for rules)"
+        "--preset", help=f"{', '.join(PRESETS)} (default: the preset of the models' training, paper for rules)"
     )
     parser.add_argument("--n-robots", type=int, default=None, help="number of robots (default: the preset's)")
     parser.add_argument("--max-steps", type=int, help="time limit in steps (default: the preset's)")
@@ -178,8 +179,10 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
         "--world", nargs="+", default=[], metavar="NAME=VALUE", help=f"fields of the preset, e.g. noise.wind=1: {names}"
     )
     simulated = ", ".join(simulated_vehicles())
-    parser.add_argument("--plant", help=f"what is flown: {MODEL} (default), or a simulator's vehicle ({simulated})")
-    parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="imported first: own scenarios and rules")
+    parser.add_argument("--plant", help=f"simulated vehicle: {MODEL} (default), or one of a simulator ({simulated})")
+    parser.add_argument(
+        "--gym-packages", nargs="+", metavar="MODULE", help="modules to import first, for custom scenarios and rules"
+    )
     parser.add_argument(
         "--algo",
         default="sb3_maddpg:MADDPG",
@@ -191,10 +194,11 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
 
 
 def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[Condition]:
-    """The policies of a command line in some scenarios. Sets ``args.preset`` where it was not given.
+    """Create the conditions of a command line: its policies in some scenarios. Sets ``args.preset`` if it is missing.
 
-    :param args: with what `add_policy_arguments` added
-    :raises ValueError: unknown scenario, preset or field, or a world in which the robots do not fit
+    :param args: parsed options of `add_policy_arguments`
+    :param scenarios: names of the scenarios
+    :raises ValueError: if a scenario, preset or field is unknown, or the robots do not fit into the world
     """
     for name in scenarios:
         if name not in SCENARIOS:
@@ -204,9 +208,9 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
     config = make_config(args.preset, _parse_world(args.world), n_robots=args.n_robots, plant=args.plant)
     for policy, trained in models.items():
         if (preset := trained.get("preset", args.preset)) != args.preset:
-            print(f"note: {short_name(policy)} was trained in {preset!r}, this is {args.preset!r}", file=sys.stderr)
+            print(f"note: {short_name(policy)} was trained in {preset!r}, but this is {args.preset!r}", file=sys.stderr)
     for name in scenarios:
-        ScenarioSampler(name, config.n_robots, config.space)  # raises where the robots do not fit
+        ScenarioSampler(name, config.n_robots, config.space)  # raises if the robots do not fit
     return [
         Condition(policy, name, config, args.max_steps, args.algo, args.solver)
         for name in dict.fromkeys(scenarios)
@@ -217,14 +221,14 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
 def _preset_of(models: Mapping[str, Mapping[str, Any]]) -> str:
     presets = {str(trained["preset"]) for trained in models.values() if "preset" in trained}
     if len(presets) > 1:
-        raise ValueError(f"The models were trained in {', '.join(sorted(presets))}: choose one of these by --preset.")
+        raise ValueError(f"The models were trained in {', '.join(sorted(presets))}: choose one of these with --preset.")
     return presets.pop() if presets else "paper"
 
 
 def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace) -> int:
-    """Run a command; what the user can mend is told in one line.
+    """Run a command and print errors that the user can fix as one line.
 
-    :return: the exit status
+    :return: exit status
     """
     try:
         command(args)
@@ -239,8 +243,8 @@ def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace)
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-maddpg evaluate",
-        description="Fly the same held-out episodes with several policies and compare them. Without options: the "
-        "paper's table, four policies in all scenarios.",
+        description="Fly the same held-out episodes with several policies and compare them. Without options, this "
+        "prints the paper's table: four policies in all scenarios.",
         epilog=f"example:\n{EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -248,38 +252,41 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scenario", nargs="+", default=["all"], metavar="NAME", help=f"all, or some of {', '.join(SCENARIOS)}"
     )
-    parser.add_argument("--episodes", type=int, default=200, help="episodes of each policy and scenario (default 200)")
+    parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
     add_worker_arguments(parser, jobs=1)
-    parser.add_argument("--wide", action="store_true", help="print all columns, in lines of any length")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object a policy and scenario")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the same figures as comma-separated values")
-    parser.add_argument("--latex", type=Path, metavar="FILE", help="write the printed table for LaTeX with booktabs")
+    parser.add_argument("--wide", action="store_true", help="print all columns, in long lines")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per policy and scenario")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the same results as comma-separated values")
+    parser.add_argument("--latex", type=Path, metavar="FILE", help="write the printed table as LaTeX with booktabs")
     parser.add_argument(
-        "--plot", type=Path, metavar="DIR", help="draw collisions, requests and flights into this folder"
+        "--plot", type=Path, metavar="DIR", help="write figures of collisions, requests and flights to this folder"
     )
     return parser
 
 
 def add_worker_arguments(parser: argparse.ArgumentParser, jobs: int) -> None:
-    """The options that say who flies: ``--jobs``, ``--engine``, ``--address`` and ``--mixed``, see `workers`.
+    """Add the options that choose the processes: ``--jobs``, ``--engine``, ``--address`` and ``--mixed``.
 
     :param jobs: default number of processes
     """
     parser.add_argument(
-        "--jobs", type=int, default=jobs, help="processes; the result does not depend on it (default %(default)s)"
+        "--jobs",
+        type=int,
+        default=jobs,
+        help="number of processes; results do not depend on it (default %(default)s)",
     )
     parser.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where processes run (default local)")
-    parser.add_argument("--address", help="of a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
-    parser.add_argument("--mixed", action="store_true", help="take results of machines unlike this one")
+    parser.add_argument("--address", help="a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
+    parser.add_argument("--mixed", action="store_true", help="accept results of machines that differ from this one")
 
 
 def workers(args: argparse.Namespace) -> Executor:
-    """What the options of `add_worker_arguments` name, see `make_executor`."""
+    """Create the executor that the options of ``add_worker_arguments`` choose, see ``make_pool``."""
     return make_pool(args.jobs, args.engine, args.address, args.mixed)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return run(_compare, _parser().parse_args(argv))
 
 
@@ -298,7 +305,7 @@ def _compare(args: argparse.Namespace) -> None:
         with workers(args) if elsewhere else nullcontext() as executor:
             rows = evaluate(conditions, args.episodes, args.seed, args.jobs, default_folder(), executor)
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
+        print("interrupted; repeat the command to continue", file=sys.stderr)
         raise
     solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name
     common = {"preset": args.preset, "preset_version": PRESET_VERSION, "seed": args.seed, "solver": solver}
@@ -316,7 +323,7 @@ def _compare(args: argparse.Namespace) -> None:
     for path in filter(None, (args.json, args.csv, args.latex)):
         print(f"wrote {path}")
     if args.plot:
-        from quad_swarm.figures.plots import draw_all  # matplotlib is needed only here
+        from quad_swarm.figures.plots import draw_all  # matplotlib is only needed here
 
         for path in draw_all(rows, conditions, args.seed, args.plot):
             print(f"drew {path}")

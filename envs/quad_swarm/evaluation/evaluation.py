@@ -1,4 +1,4 @@
-"""Policies compared over the same held-out episodes, on several processes if there are many."""
+"""Comparison of policies over the same held-out episodes, optionally in several processes."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from quad_swarm.tasks import Journal, make_executor
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
-# Fixed, so that neither the batches nor the results depend on the number of processes.
+# Episodes per piece; fixed, so that batches and results do not depend on the number of processes
 _CHUNK = 250
-# Depths of a collision that are counted apart (m): much of what is deeper than the tolerance of 1 mm is a graze
+# Depths of collisions that are counted separately (m), since many collisions beyond the tolerance of 1 mm are grazes
 DEPTHS = {"1cm": 0.01, "3cm": 0.03}
 
-# Of the smallest separation of an episode at any time
+# Quantiles of the smallest separation in an episode at any time
 QUANTILES = (0.001, 0.01, 0.05, 0.25, 0.5)
 
 Rows = list[dict[str, float]]
 
 
 def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[str, Any]:
-    """The figures of a condition from those of its episodes.
+    """Summarise the statistics of episodes.
 
-    :param rows: see `run_episodes`
+    :param rows: statistics of each episode, see `run_episodes`
     :param config: the world
-    :return: number of episodes and of those with a collision, with its 95 % interval, ``collisions_at_steps``,
-        ``collisions_1cm`` and ``collisions_3cm`` (deeper than that, at steps), the same ``_continuous`` (at or between
-        steps); requests until arrival or collision, absolute, by step and as a share of those that were possible, the
-        most in one step, bytes that a robot sends in a second (requests and answers), mean age of the plans that were
-        believed (s), requests in all steps flown; arrivals, and mean steps and path (m) until then; smallest separation
-        and quantiles of each episode's smallest at any time (m); plans without a successful solve, and the planner's
-        time for a plan (us)
+    :return: number of episodes, number of episodes with a collision and the 95 % interval of the rate;
+        ``collisions_at_steps``, ``collisions_1cm`` and ``collisions_3cm`` (deeper than that) at steps, and the same
+        with ``_continuous`` at any time; requests until arrival or collision: in total, per step, as a fraction of the
+        possible requests, and the maximum in a step; bytes that a robot sends per second (requests and answers); mean
+        age of believed plans (s); requests in all steps flown; number of arrivals, and mean steps and path length (m)
+        until arrival; smallest separation, and quantiles over episodes of the smallest separation at any time (m);
+        number of plans without a successful solve, and time of the planner per plan (us)
     """
     n, dt = config.n_robots, config.planner.dt
     figures = {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -99,15 +99,15 @@ def evaluate(
     journal: Path | None = None,
     executor: Executor | None = None,
 ) -> list[dict[str, Any]]:
-    """Fly ``episodes`` episodes of every condition.
+    """Evaluate conditions over the same held-out episodes.
 
-    :param conditions: policies in scenarios; one that is named twice is flown once
-    :param episodes: number of episodes of each condition
-    :param seed: which set of held-out episodes; every condition flies the same
-    :param jobs: processes; one that dies costs the piece it was flying alone
-    :param journal: folder in which finished pieces are kept until all are, see `Journal`; None keeps none
-    :param executor: what flies the pieces, such as a `Cluster`; None: ``jobs`` processes of this machine
-    :return: one row a condition, see `summarise` and, where full communication is among the policies, `lost_against`
+    :param conditions: policies in scenarios; duplicates are flown once
+    :param episodes: number of episodes per condition
+    :param seed: index of the set of held-out episodes
+    :param jobs: number of processes
+    :param journal: folder that keeps finished pieces until all are finished, see `Journal`; None keeps none
+    :param executor: executor that flies the pieces, such as a `Cluster`; by default ``jobs`` processes of this machine
+    :return: one row per condition, see `summarise` and, if full communication is among the policies, `lost_against`
     """
     flown = fly_all(conditions, episodes, seed, jobs, journal=journal, executor=executor)
     table = []
@@ -121,9 +121,12 @@ def evaluate(
 
 
 def lost_against(full: Rows, rows: Rows, config: SwarmConfig) -> dict[str, float | None]:
-    """What a policy loses against full communication, over the episodes in which the robots arrive with both.
+    """Compute what a policy loses compared with full communication, over the episodes in which both arrive.
 
-    :return: ``time_lost`` (s) and ``path_lost`` (m), means; None without such episodes
+    :param full: statistics of episodes with full communication
+    :param rows: statistics of the same episodes with the policy
+    :param config: the world
+    :return: mean ``time_lost`` (s) and ``path_lost`` (m), None without such episodes
     """
     both = [(a, b) for a, b in zip(full, rows, strict=True) if a["arrived"] and b["arrived"]]
     if not both:
@@ -141,14 +144,16 @@ def fly_all(
     journal: Path | None = None,
     executor: Executor | None = None,
 ) -> dict[Condition, Rows]:
-    """`evaluate`, episode by episode: the figures of each, see `EpisodeStatistics`.
+    """Fly held-out episodes and return the statistics of each episode, see `EpisodeStatistics`. The other arguments are
+    those of `evaluate`.
 
-    :param skip: leave out that many of the ``episodes``, which have been flown before
+    :param skip: number of the first ``episodes`` to leave out, which have been flown before
+    :raises ValueError: if there are no episodes or processes, or a policy is invalid
     """
     if episodes <= skip or jobs < 1:
         raise ValueError(f"episodes={episodes} must be at least {skip + 1}, jobs={jobs} at least 1.")
     for condition in conditions:
-        make_policy(condition.policy, condition.config, condition.algo)  # say what is wrong before anything is flown
+        make_policy(condition.policy, condition.config, condition.algo)  # fail before anything is flown
     first = first_episode(seed)
     chunks = [range(first + k, first + min(k + _CHUNK, episodes)) for k in range(skip, episodes, _CHUNK)]
     flown: dict[Condition, Rows] = {condition: [] for condition in conditions}
@@ -161,12 +166,12 @@ def fly_all(
 def _run_all(
     work: Sequence[tuple[Condition, range]], jobs: int, journal: Journal, executor: Executor | None
 ) -> list[Rows]:
-    """The figures of each piece of work, in its order; what the journal holds of it is not flown again."""
+    """Return the statistics of each piece of work, in order. Pieces in the journal are not flown again."""
     keys = [_key(*piece) for piece in work]
     done: dict[int, Rows] = {k: rows for k, key in enumerate(keys) if (rows := journal.fetch(key)) is not None}
     left = [k for k in range(len(work)) if k not in done]
     if done:
-        print(f"{len(done)} of {len(work)} pieces were flown before this run.", file=sys.stderr)
+        print(f"{len(done)} of {len(work)} pieces were finished before this run.", file=sys.stderr)
     progress = tqdm(
         total=len(work), initial=len(done), unit="piece", desc="evaluate", disable=not sys.stderr.isatty(), leave=False
     )
@@ -182,7 +187,7 @@ def _run_all(
 def _fly(
     work: Sequence[tuple[Condition, range]], left: Sequence[int], jobs: int, executor: Executor | None
 ) -> Iterator[tuple[int, Rows]]:
-    """Number and figures of pieces of work as they come."""
+    """Yield the index and the statistics of each piece of work when it is finished."""
     if executor is None and (jobs == 1 or len(left) < 2):
         for k in left:
             yield k, run_episodes(*work[k])
@@ -194,7 +199,7 @@ def _fly(
 
 
 def _key(condition: Condition, episodes: range) -> str:
-    """What a piece of work is a function of: a policy may be a file, which may change."""
+    """Return the key of a piece of work, which includes the content of a model's file."""
     packages, files = {"quad_swarm", *_user_modules()}, []
     if is_model(condition.policy):
         packages.add(condition.algo.partition(":")[0])
@@ -203,11 +208,12 @@ def _key(condition: Condition, episodes: range) -> str:
 
 
 def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixed: bool = False) -> Executor:
-    """Processes that fly episodes; they know what a user added to the scenarios and rules once its modules are
-    imported there too.
+    """Create an executor that flies episodes. Its processes import the modules of custom scenarios and rules.
 
-    :param jobs: how many
-    :param engine: see `make_executor`, as for the others
+    :param jobs: number of processes
+    :param engine: see `make_executor`
+    :param address: see `make_executor`
+    :param mixed: see `make_executor`
     """
     return make_executor(engine, jobs, _user_modules(), address, mixed)
 

@@ -1,4 +1,4 @@
-"""Episodes flown by a policy: one of them step by step, or many at once for their figures."""
+"""Episodes flown by a policy: a single one step by step, or a batch for statistics."""
 
 from __future__ import annotations
 
@@ -21,22 +21,23 @@ from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
-# Held-out episodes begin here; training seeds count from 0.
+# First seed of held-out episodes; training seeds count from 0
 _FIRST_SEED = 10**9
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One policy in one scenario and world.
+    """A policy in a scenario and a world.
 
-    :param policy: rule or path of a model's zip, as given on the command line
+    :param policy: a rule or the path of a model's zip, as on the command line
     :param scenario: a name of `SCENARIOS`
     :param config: the world
-    :param max_steps: time limit (steps); None: the world's
+    :param max_steps: time limit (steps), by default the world's
     :param algo: ``module:Class`` that loads models
     :param solver: see `make_planner`
-    :param linger: steps that are flown on after all robots have reached their goals; None: until the time limit
-    :raises ValueError: no step, or a negative number
+    :param linger: number of steps to fly after all robots have reached their goals; None for flying until the time
+        limit
+    :raises ValueError: if ``max_steps`` is less than 1, or ``linger`` is negative
     """
 
     policy: str
@@ -51,29 +52,29 @@ class Condition:
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
         if self.linger is not None and self.linger < 0:
-            raise ValueError(f"linger={self.linger} is a number of steps, or None to fly until the time limit.")
+            raise ValueError(f"linger={self.linger} must be a number of steps, or None to fly until the time limit.")
 
 
 def first_episode(seed: int) -> int:
-    """Seed of the first held-out episode of set ``seed``; the others follow it.
+    """Return the seed of the first episode of a set of held-out episodes. The other episodes have consecutive seeds.
 
-    :raises ValueError: the set is negative, where training's seeds are
+    :param seed: index of the set
+    :raises ValueError: if the index is negative, which could select seeds of training
     """
     if seed < 0:
-        raise ValueError(f"seed={seed}: sets of held-out episodes are counted from 0.")
+        raise ValueError(f"seed={seed}: sets of held-out episodes count from 0.")
     return _FIRST_SEED + seed * 10**6
 
 
 def begin(
     condition: Condition, episodes: Sequence[int], model: Any = None
 ) -> tuple[RequestPolicy, RequestTask, list[np.random.Generator]]:
-    """A policy, its episodes at their start, and the generators of rules that draw.
-
-    A collision ends what is counted of an episode, but not its flight, which shows how deep the collision gets.
+    """Start episodes. Collisions do not end them, which shows how deep collisions are, but end their statistics.
 
     :param condition: policy, scenario and world
     :param episodes: seeds, see `first_episode`; ``env.reset(seed=...)`` of `QuadSwarm-v0` draws the same episodes
-    :param model: flies instead of the condition's policy
+    :param model: model that flies instead of the condition's policy
+    :return: the policy, the task, and random number generators for random rules
     """
     config = condition.config
     if model is None:
@@ -96,11 +97,12 @@ def begin(
 class Step(NamedTuple):
     """One step of a batch of episodes.
 
-    :param episodes: which of the episodes are still flying, (E,)
-    :param requests: who got whose plan, (E, n, n - 1) bool, whoever perceives whom
-    :param announced: which of these plans came unasked, (E, n, n - 1) bool
-    :param outcome: what came of it
-    :param over: which of them end with this step, (E,) bool
+    :param episodes: indices of the running episodes, (E,)
+    :param requests: whose plan each robot got, (E, n, n - 1) bool, with all others in ascending order even if the
+        neighbourhood is limited
+    :param announced: which of these plans were announced without a request, (E, n, n - 1) bool
+    :param outcome: outcome of the step
+    :param over: which episodes end with this step, (E,) bool
     """
 
     episodes: np.ndarray
@@ -113,8 +115,11 @@ class Step(NamedTuple):
 def fly_steps(
     policy: RequestPolicy, task: RequestTask, rngs: Sequence[np.random.Generator], linger: int | None = None
 ) -> Iterator[Step]:
-    """Fly all episodes of a task to their ends. One that is over leaves the batch after its last step was yielded.
+    """Fly all episodes of a task and yield their steps. Finished episodes leave the batch after their last step.
 
+    :param policy: see `begin`
+    :param task: see `begin`
+    :param rngs: see `begin`
     :param linger: see `Condition`
     """
     episodes = np.arange(task.swarm.n_swarms)
@@ -138,11 +143,11 @@ def fly_steps(
 
 
 def run_episodes(condition: Condition, episodes: Sequence[int]) -> list[dict[str, float]]:
-    """Fly some episodes of a condition, all at once.
+    """Fly a batch of episodes of a condition.
 
     :param condition: policy, scenario and world
     :param episodes: seeds, see `begin`
-    :return: for each episode its figures, see `EpisodeStatistics`
+    :return: statistics of each episode, see `EpisodeStatistics`
     """
     policy, task, rngs = begin(condition, episodes)
     rows: dict[int, dict[str, float]] = {}
@@ -153,18 +158,18 @@ def run_episodes(condition: Condition, episodes: Sequence[int]) -> list[dict[str
 
 @dataclass(frozen=True)
 class Flight:
-    """One episode step by step: T steps of n robots.
+    """Recording of an episode of T steps and n robots.
 
     :param config: the world
     :param state: states, (T + 1, n, 9)
-    :param plans: planned states as of each step, stages 0..N, (T + 1, n, N + 1, 9)
+    :param plans: planned states at stages 0..N, (T + 1, n, N + 1, 9)
     :param goal: goals, (n, 3), world frame (m)
-    :param requests: who got whose plan in each step, (T, n, n - 1) bool
-    :param announced: which of these plans came unasked, (T, n, n - 1) bool
-    :param other_requests: whom a second rule would have asked in each step, which was not executed, (T, n, n - 1) bool;
-        like the above of all others in ascending order, whoever perceives whom
-    :param min_separation: smallest distance between two robots at the start and in each step: at any time of it where
-        the world's collisions are continuous, else after it, (T + 1,) (m)
+    :param requests: whose plan each robot got in each step, (T, n, n - 1) bool, with all others in ascending order even
+        if the neighbourhood is limited
+    :param announced: which of these plans were announced without a request, (T, n, n - 1) bool
+    :param other_requests: requests of a second rule in each step, which were not executed, (T, n, n - 1) bool
+    :param min_separation: smallest distance between two robots at the start and in each step, (T + 1,) (m): at any time
+        of the step if the world's collisions are continuous, otherwise after the step
     """
 
     config: SwarmConfig
@@ -188,54 +193,54 @@ class Flight:
 
     @cached_property
     def relative_pos(self) -> np.ndarray:
-        """Position of each of the others seen from each robot, (T + 1, n, n - 1, 3) (m)."""
+        """Positions of the others relative to each robot, (T + 1, n, n - 1, 3) (m)."""
         return self.pos[:, other_indices(self.n_robots)] - self.pos[:, :, None]
 
     @cached_property
     def relative_vel(self) -> np.ndarray:
-        """Velocity of each of the others seen from each robot, (T + 1, n, n - 1, 3) (m/s)."""
+        """Velocities of the others relative to each robot, (T + 1, n, n - 1, 3) (m/s)."""
         vel = self.state[..., VELOCITY]
         return vel[:, other_indices(self.n_robots)] - vel[:, :, None]
 
     @cached_property
     def separation(self) -> np.ndarray:
-        """Distance of each robot to each of the others, (T + 1, n, n - 1) (m)."""
+        """Distances of each robot to the others, (T + 1, n, n - 1) (m)."""
         return length(self.relative_pos)
 
     @cached_property
     def closest_approach(self) -> tuple[np.ndarray, np.ndarray]:
-        """If all kept their velocities from each step on: the closest distance (m) and the time until then (s), not
-        limited; both (T + 1, n, n - 1)."""
+        """Distance (m) and time (s) of the closest approach at constant velocities from each step on, without a time
+        limit, both (T + 1, n, n - 1)."""
         closing = -(self.relative_pos * self.relative_vel).sum(axis=-1)
         time = np.maximum(closing / np.maximum((self.relative_vel**2).sum(axis=-1), 1e-12), 0.0)
         return length(self.relative_pos + time[..., None] * self.relative_vel), time
 
     @cached_property
     def arrival(self) -> int | None:
-        """The first step after which all robots are at their goals at once; None if they never are."""
+        """First step after which all robots are at their goals at the same time, None if they never are."""
         at_goal = (length(self.pos[1:] - self.goal) <= self.config.goal_radius).all(axis=1)
         return int(at_goal.argmax()) + 1 if at_goal.any() else None
 
     @cached_property
     def collision(self) -> int | None:
-        """The first step with, or after which there is, a collision, as the world counts them; None without any."""
+        """First step with a collision as the world counts them, None without a collision."""
         colliding = self.min_separation[1:] < 2 * self.config.radius - self.config.collision_tolerance
         return int(colliding.argmax()) + 1 if colliding.any() else None
 
     def closest_pair(self, step: int) -> tuple[int, int]:
-        """The two robots that are closest to each other after a step."""
+        """Return the two robots that are closest to each other after a step."""
         i, m = np.unravel_index(self.separation[step].argmin(), self.separation.shape[1:])
         return int(i), int(other_indices(self.n_robots)[i, m])
 
 
 def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "none", model: Any = None) -> Flight:
-    """Fly a held-out episode of a set, step by step.
+    """Fly and record a held-out episode.
 
     :param condition: policy, scenario and world
-    :param seed: which set
-    :param number: which episode of it
-    :param other_rule: a rule whose requests are recorded in every step too, but not executed
-    :param model: flies instead of the condition's policy
+    :param seed: index of the set of held-out episodes
+    :param number: index of the episode in the set
+    :param other_rule: a rule whose requests are also recorded, but not executed
+    :param model: model that flies instead of the condition's policy
     """
     episode = first_episode(seed) + number
     policy, task, rngs = begin(condition, [episode], model)

@@ -1,7 +1,7 @@
-"""Policies as they are named on a command line: rules, and models by the path of their zip.
+"""Policies by their names on the command line: rules, and models by the path of their zip.
 
-A rule is one of `RULES`, see `quad_swarm.task.rules`. A model is loaded by the class that ``algo`` names;
-``MODEL.zip@0.3`` acts with the threshold 0.3 instead of its own.
+For rules see `quad_swarm.task.rules`. The class ``algo`` loads models. ``MODEL.zip@0.3`` sets the model's threshold to
+0.3.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import SwarmConfig
 
-# From the present state of E swarms, and a generator for each, to bits of each robot for each of the others, (E, n,
-# n - 1, 1 or 2) bool, see `requests_of`
+# Maps the current state of E swarms, and a random number generator for each, to actions, (E, n, n - 1, 1 or 2) bool,
+# see `requests_of`
 RequestPolicy = Callable[[RequestTask, list[np.random.Generator]], np.ndarray]
 
-# Arguments of the environment that shape what a model observes: they are the model's, all others the evaluation's.
+# Arguments of the environment that define a model's observation. They come from the model, all others do not.
 OBSERVATION_ARGUMENTS = ("observation", "scale_observation")
 
 
 def is_model(policy: str) -> bool:
-    """Whether a policy's text names a model's file instead of a rule."""
+    """Return whether a policy is a model's file instead of a rule."""
     return policy.partition("@")[0].endswith(".zip") or os.sep in policy
 
 
 def short_name(policy: str) -> str:
-    """A rule as it is written, a model by its file's name, or its folder's where many files are called model.zip."""
+    """Return a short name: a rule as it is, a model's file name, or its folder's name if the file is model.zip."""
     if not is_model(policy):
         return policy
     path, at, threshold = policy.partition("@")
@@ -46,7 +46,7 @@ def short_name(policy: str) -> str:
 
 
 def short_names(policies: Iterable[str]) -> dict[str, str]:
-    """Policies by `short_name`, or by as much of the ends of their paths as tells them apart."""
+    """Return unique names of policies: `short_name`, or as many of the last parts of their paths as necessary."""
     policies = set(policies)
     names = {policy: short_name(policy) for policy in policies}
     for parts in range(1, max((policy.count(os.sep) for policy in policies), default=0) + 2):
@@ -57,20 +57,20 @@ def short_names(policies: Iterable[str]) -> dict[str, str]:
 
 
 def load_model(policy: str, algo: str) -> Any:
-    """A trained model; read again only if its file has changed.
+    """Load a trained model, from a cache if its file has not changed.
 
-    :param policy: its zip, with a threshold where that is not to be its own: ``MODEL.zip@0.3``
-    :param algo: ``module:Class`` with a ``load(path, device=...)`` as in Stable-Baselines3, and a ``set_threshold`` if
-        one is given
-    :raises FileNotFoundError: no such file
-    :raises ValueError: the class does not exist or cannot read the file, the threshold is no number, or a weight of the
-        model is NaN or infinite
+    :param policy: path of the model's zip, optionally with a threshold as in ``MODEL.zip@0.3``
+    :param algo: ``module:Class`` with a ``load(path, device=...)`` as in Stable-Baselines3, and with ``set_threshold``
+        if there is a threshold
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if the class does not exist or cannot read the file, the threshold is not a number, or a weight
+        of the model is NaN or infinite
     """
     path = policy.partition("@")[0]
     if not Path(path).is_file():
         near = difflib.get_close_matches(path, map(str, Path(path).parent.glob("*.zip")), n=1, cutoff=0.7)
         hint = f" Did you mean {near[0]!r}?" if near else ""
-        raise FileNotFoundError(f"No model at {path!r}: train one first, or give the zip's full path.{hint}")
+        raise FileNotFoundError(f"No model at {path!r}: train one first, or pass the zip's full path.{hint}")
     stat = Path(path).stat()
     return _load(policy, algo, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
 
@@ -82,7 +82,7 @@ def _load(policy: str, algo: str, stamp: tuple[int, ...]) -> Any:
     try:
         loader = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"--algo {algo!r} is no importable module:Class ({error}).") from error
+        raise ValueError(f"--algo {algo!r} is not an importable module:Class ({error}).") from error
     try:
         model = loader.load(path, device="cpu")
     except Exception as error:  # whatever the loader raises for a damaged or foreign file
@@ -99,7 +99,7 @@ def _load(policy: str, algo: str, stamp: tuple[int, ...]) -> Any:
 
 
 def _check_weights(model: Any, path: str) -> None:
-    """A comparison with NaN is False: a model of NaN would fly as one that never asks."""
+    """Check that weights are finite. Comparisons with NaN are False, so a model of NaN would never make requests."""
     for name, weight in getattr(getattr(model, "policy", None), "named_parameters", list)():
         if not np.isfinite(weight.detach().cpu().numpy()).all():
             raise ValueError(f"{path}: the weight {name} is not finite. Its training diverged; use an earlier model.")
@@ -109,34 +109,36 @@ def _number(text: str, policy: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"{policy}: the threshold {text!r} is no number; write MODEL.zip@0.3.") from None
+        raise ValueError(f"{policy}: the threshold {text!r} is not a number; write MODEL.zip@0.3.") from None
 
 
 def make_policy(policy: str, config: SwarmConfig, algo: str) -> tuple[RequestPolicy, Observation]:
-    """A policy by its name, and the observation that it needs.
+    """Create a policy and its observation by name.
 
     :param policy: a rule or a model's zip
     :param config: the world
     :param algo: see `load_model`
-    :raises ValueError: unknown rule, or a model that was trained for another number of robots or another space
+    :raises ValueError: if the rule is unknown, or the model was trained for another number of robots or another space
     """
     if is_model(policy):
         return policy_of(load_model(policy, algo), policy, config)
     try:
         rule = parse_rule(policy)
     except ValueError as error:
-        hint = "A model is given by the path of its .zip"
+        hint = "Pass a model as the path of its .zip"
         if policy.startswith(("pretrained:", "latest:")):
-            hint += "; `sb3-maddpg evaluate` knows latest:LOGDIR and pretrained:NAME too"
+            hint += "; only `sb3-maddpg evaluate` also accepts latest:LOGDIR and pretrained:NAME"
         raise ValueError(f"{error} {hint}.") from None
     return (lambda task, rngs: rule(View(task.swarm, rngs))[..., None]), PaperObservation(config)
 
 
 def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:
-    """A model as a policy, and the observation that it needs.
+    """Create a policy and its observation from a model.
 
-    :param name: what messages call it
-    :raises ValueError: it was trained for another number of robots or another space
+    :param model: the model
+    :param name: name of the model, for error messages
+    :param config: the world
+    :raises ValueError: if the model was trained for another number of robots or another space
     """
     arguments = {k: v for k, v in trained_in(model).items() if k in OBSERVATION_ARGUMENTS}
     n, m = config.n_robots, config.n_others
@@ -149,11 +151,11 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
         if not fits_any_number:
             robots = f"{trained[0]} robots" if len(trained) == 2 else "another environment"
             raise ValueError(
-                f"{name} was trained for {robots} (observation {trained}); "
+                f"{name} was trained for {robots} (observation {trained}), but "
                 f"this world has {n} robots (observation {expected}). "
-                "Choose the preset or --n-robots that it was trained with."
+                "Choose the preset or --n-robots of its training."
             )
-        # A policy that looks at its neighbours one by one fits any number of them
+        # Relational policies fit any number of robots
         predictor = model.policy_for(
             spaces.Box(-np.inf, np.inf, expected, np.float32),
             spaces.MultiBinary(n * m * n_bits),
@@ -168,5 +170,5 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
 
 
 def trained_in(model: Any) -> dict[str, Any]:
-    """Arguments of the environment that a model was trained in, as far as its file tells."""
+    """Return the arguments of the environment that a model was trained in, as far as its file contains them."""
     return (getattr(model, "env_spec", None) or {}).get("kwargs", {})

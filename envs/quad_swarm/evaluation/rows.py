@@ -1,4 +1,4 @@
-"""Tables of rows in files: one JSON object a line, or comma-separated values."""
+"""Files of rows: one JSON object per line, or comma-separated values."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import Any
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file; none if it does not exist."""
+    """Read the rows of a file, none if it does not exist."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write the rows; the file appears whole or not at all."""
+    """Write rows to a file, atomically."""
     write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write the rows as comma-separated values below their names; what is no plain value as JSON, None as nothing."""
+    """Write rows as comma-separated values with a header. Nested values are written as JSON, None as empty text."""
     text = io.StringIO()
     writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
     writer.writeheader()
@@ -33,7 +33,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that appears whole or not at all; its folder is made."""
+    """Write text to a file, atomically. Missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(
         "w", encoding="utf-8", newline="", dir=path.parent, prefix=path.name, suffix=".part", delete=False
@@ -49,13 +49,14 @@ def write_text(path: Path, text: str) -> None:
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Find out before the work that a file cannot be written after it; its folder is made.
+    """Check that a file can be written before doing the work that it will hold. This creates its folder.
 
-    :param option: of the command line that names the file, for the message
-    :raises ValueError: it is a folder, or its folder cannot be made or written to
+    :param path: path of the file
+    :param option: option of the command line that names the file, for error messages
+    :raises ValueError: if the path is a folder, or its folder cannot be created or written to
     """
     if path.is_dir():
-        raise ValueError(f"{option} {path} is a folder: name a file in it.")
+        raise ValueError(f"{option} {path} is a folder: pass the path of a file.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):

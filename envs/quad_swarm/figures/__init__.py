@@ -1,1 +1,1 @@
-"""Pictures of flights and tables: plots, animation, the page that replays an episode, TensorBoard's dashboard."""
+"""Figures of flights and evaluations: plots, animations, the replay page and TensorBoard's dashboard."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-# After Okabe and Ito's, which colour-blind people can tell apart; darker, for a contrast of 3:1 and more on white.
+# Based on Okabe and Ito's palette for colour-blind readers, but darker for a contrast of at least 3:1 on white
 COLOURS = ("#0072B2", "#C77700", "#008866", "#C2609A", "#3399D4", "#B84A00", "#8F8200", "#757575")
-# What is learned, what it is compared with, and text beside the data
+# Colours of learned policies, of rules to compare with, and of text
 LEARNED, RULES, INK = "#B84A00", "#757575", "#333333"
 
-# For figures of 7.5 inches and more, which a page shows at about 100 pixels an inch
+# For figures of at least 7.5 inches, which a page shows at about 100 pixels per inch
 STYLE: Any = {
     "font.size": 9.0,
     "axes.titlesize": 10.0,
@@ -32,5 +32,5 @@ STYLE: Any = {
 
 
 def colour_of(index: int) -> str:
-    """The colour of the robot or policy with this index; colours repeat after eight."""
+    """Return the colour of the robot or policy with this index. Colours repeat after eight."""
     return COLOURS[index % len(COLOURS)]

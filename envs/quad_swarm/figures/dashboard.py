@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a training beside its curves: a layout, who asks whom, and how the swarm flies."""
+"""TensorBoard's dashboard of a training: a layout of curves, a heat map of requests, and figures of flights."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def _line(tag: str) -> list[Any]:
     return ["Multiline", [tag]]
 
 
-# Of TensorBoard's page "Custom scalars": title -> chart -> kind and tags. One tag a chart, for the tags of a run have
-# one colour there. What is flat as long as all goes well comes last.
+# Layout of TensorBoard's tab "Custom scalars": title -> chart -> kind and tags. Each chart has one tag, because all
+# tags of a run have the same colour. Curves that are flat as long as all goes well come last.
 LAYOUT: dict[str, dict[str, list[Any]]] = {
     "Safety": {
         "training: episodes with a collision": _line("swarm/collision_rate"),
@@ -49,18 +49,18 @@ LAYOUT: dict[str, dict[str, list[Any]]] = {
         "training: planner failures": _line("planner/failure_rate"),
     },
 }
-# Episodes behind the heat map, a set of their own
+# Number of episodes for the heat map, and their own set of held-out episodes
 EPISODES, SET = 32, 9
 _OF_THE_WORLD = ("preset", "world", "n_robots", "memory", "planner", "noise", "radio", "space")
 
 
 def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]:
-    """Fly some held-out episodes with a model.
+    """Fly held-out episodes with a model and draw figures for TensorBoard.
 
-    :param model: with ``predict`` and ``env_spec``, see `evaluation.policy_of`
-    :param env_kwargs: arguments of `QuadSwarmEnv`, of which only the world's count
-    :return: for TensorBoard, by tag: a flight of each scenario, who asks whom in the symmetric swap, and figures of
-        the same episodes
+    :param model: a model with ``predict`` and ``env_spec``, see `evaluation.policies.policy_of`
+    :param env_kwargs: arguments of `QuadSwarmEnv`, of which only those of the world are used
+    :return: by tag, figures of a flight in each scenario, a heat map of requests in the symmetric swap, and request
+        share and collision rate of the same episodes
     """
     config = make_config(**({"preset": "paper"} | {k: v for k, v in env_kwargs.items() if k in _OF_THE_WORLD}))
     conditions = [Condition("model", name, config, linger=5) for name in SCENARIOS]
@@ -76,10 +76,11 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
 
 
 def requests_by_pair(condition: Condition, model: Any) -> tuple[np.ndarray, int, int, int]:
-    """Who asks whom, until a collision or the arrival of all.
+    """Count requests until a collision or the arrival of all robots.
 
     :param condition: scenario and world
-    :return: how often robot i asked robot j, (n, n); how many requests were possible; the number of steps; the number
+    :param model: the model that flies
+    :return: number of requests of robot i to robot j, (n, n), number of possible requests, number of steps, and number
         of episodes with a collision
     """
     policy, task, rngs = begin(condition, [first_episode(SET) + k for k in range(EPISODES)], model)
@@ -99,10 +100,10 @@ def requests_by_pair(condition: Condition, model: Any) -> tuple[np.ndarray, int,
 
 
 def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:
-    """A heat map.
+    """Draw a heat map of requests.
 
-    :param share: how often robot i asks robot j, of all steps, (n, n)
-    :param scenario: for the title
+    :param share: fraction of steps in which robot i requests robot j's plan, (n, n)
+    :param scenario: name of the scenario, for the title
     """
     n = len(share)
     figure = Figure(figsize=(4.2, 3.6), layout="constrained")

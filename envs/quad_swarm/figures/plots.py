@@ -22,11 +22,13 @@ from quad_swarm.geometry import length
 
 
 def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition], seed: int, folder: Path) -> list[Path]:
-    """Draw every figure as PNG and as PDF into ``folder``, and a flight as an animation; returns their paths.
+    """Draw all figures as PNG and PDF files, and a flight as an animation.
 
-    :param rows: what `evaluate` returned
-    :param conditions: what it was given; the last policy's flights are drawn
-    :param seed: the same seed
+    :param rows: result of `evaluate`
+    :param conditions: arguments of `evaluate`; the flights of the last policy are drawn
+    :param seed: seed of `evaluate`
+    :param folder: folder of the files
+    :return: paths of the files
     """
     folder.mkdir(parents=True, exist_ok=True)
     last = [one for one in conditions if one.policy == conditions[-1].policy]
@@ -49,7 +51,7 @@ def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition],
 
 @rc_context(STYLE)
 def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Share of episodes with a collision, with 95 % Wilson intervals."""
+    """Draw the fraction of episodes with a collision, with 95 % Wilson intervals."""
     figure = Figure(figsize=(8, 3.5), layout="constrained")
     axes = figure.subplots()
     _bars(axes, rows, lambda r: r["collisions"] / r["episodes"], lambda r: (r["collision_low"], r["collision_high"]))
@@ -59,7 +61,7 @@ def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 @rc_context(STYLE)
 def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Share of the possible requests that were made."""
+    """Draw the fraction of the possible requests that were made."""
     figure = Figure(figsize=(8, 3.5), layout="constrained")
     axes = figure.subplots()
     _bars(axes, rows, lambda r: r["request_share"], None)
@@ -69,8 +71,8 @@ def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 @rc_context(STYLE)
 def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Requests against collisions, a panel for each scenario. A line joins the policies that none is better than in
-    both (the Pareto front); bars are 95 % Wilson intervals."""
+    """Draw requests against collisions, with a panel per scenario. A line connects the Pareto front; bars are 95 %
+    Wilson intervals."""
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
     figure = Figure(figsize=(3.4 * len(scenarios), 3.6), layout="constrained")
@@ -119,8 +121,10 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
 
 @rc_context(STYLE)
 def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight], size: float = 3.6) -> Figure:
-    """A flight of a policy in each scenario, from above: where robots asked, and where they did not (Fig. 2).
+    """Draw a flight of a policy in each scenario from above, with the places of requests (Fig. 2).
 
+    :param conditions: conditions of the flights
+    :param flights: the flights
     :param size: width and height of each flight's panel (inches)
     """
     columns = min(len(conditions), 2)
@@ -137,7 +141,7 @@ def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight], siz
 
 
 def animate(condition: Condition, flight: Flight, path: Path) -> None:
-    """The flight as an animated GIF in real time, until shortly after all have arrived."""
+    """Write a flight as an animated GIF in real time, until shortly after all robots have arrived."""
     renderer = Renderer(flight.config)
     steps = len(flight.requests) if flight.arrival is None else min(flight.arrival + 9, len(flight.requests))
     frames = []
@@ -153,7 +157,8 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
 
 
 def draw_flight(axes: Axes, flight: Flight) -> None:
-    """A flight from above, in the colours of the robots: a dot where a robot asks, an arrow half-way."""
+    """Draw a flight from above in the colours of the robots, with dots where a robot makes requests and an arrow
+    halfway along each path."""
     asks = flight.requests.sum(axis=2) > 0
     for i, goal in enumerate(flight.goal):
         path, colour = flight.state[:, i, :2], colour_of(i)
@@ -173,11 +178,11 @@ def draw_flight(axes: Axes, flight: Flight) -> None:
 
 
 def explain_flights(figure: Figure, axes: Axes, policy: str = "") -> None:
-    """A legend of what `draw_flight` draws.
+    """Add a legend of `draw_flight` at the bottom of a figure.
 
-    :param figure: to whose foot it goes
+    :param figure: the figure
     :param axes: any of its panels
-    :param policy: who flew
+    :param policy: name of the policy
     """
     marks: dict[str, dict[str, Any]] = {
         "start": {"marker": "o", "markersize": 7, "markerfacecolor": "white"},

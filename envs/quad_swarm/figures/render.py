@@ -1,5 +1,5 @@
-"""Pictures of the swarm, drawn with pygame, off-screen or in a window: robots, goals, trails, plans, who asks whom;
-rings around robots that are within a tenth of touching (amber), or collide (red)."""
+"""Rendering of a swarm with pygame, off-screen or in a window: robots, goals, trails, plans and requests, with rings
+around robots that almost touch (amber; up to a tenth above contact) or collide (red)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _TRAIL_STEPS = 40
 
 
 class Renderer:
-    """Draws one swarm.
+    """Renderer of a swarm.
 
     :param config: the world
-    :param size: width and height of the picture (pixels)
+    :param size: width and height of the image (pixels)
     """
 
     def __init__(self, config: SwarmConfig, size: tuple[int, int] = (640, 480)):
@@ -39,7 +39,7 @@ class Renderer:
         self._clock = pygame.time.Clock()
 
     def reset(self) -> None:
-        """A new episode: forget the trails and look anew."""
+        """Start a new episode: clear the trails and reset the camera."""
         self._trail.clear()
         self._camera = None
 
@@ -51,9 +51,9 @@ class Renderer:
         :param state: states, (n, 9)
         :param goal: goals, (n, 3), world frame (m)
         :param plans: planned states, (n, N + 1, 9)
-        :param requests: who asked whom, (n, n - 1) bool
+        :param requests: whose plans each robot requested, (n, n - 1) bool
         :param lines: text to show in the corner
-        :return: the picture, (height, width, 3) uint8
+        :return: the image, (height, width, 3) uint8
         """
         pos = state[:, POSITION]
         if self._camera is None:
@@ -76,9 +76,9 @@ class Renderer:
         return pixels.reshape(self.size[1], self.size[0], 3).copy()
 
     def show(self, fps: float) -> None:
-        """Show what was drawn last in a window, not faster than ``fps`` pictures a second.
+        """Show the last image in a window, with at most ``fps`` images per second.
 
-        :raises gymnasium.error.Error: there is no window to be had
+        :raises gymnasium.error.Error: if no window can be opened
         """
         if self._window is None:
             self._window = _open_window(self.size)
@@ -102,7 +102,7 @@ class Renderer:
                 self._polyline(ends, _GRID, 1)
 
     def _draw_requests(self, pos: np.ndarray, requests: np.ndarray) -> None:
-        """Arrows from the robot that asks towards the one it asks."""
+        """Draw arrows from robots to those whose plans they request."""
         for i, k in zip(*np.nonzero(requests), strict=True):
             start, end = self._project(pos[[i, self._others[i, k]]])
             length = np.hypot(*(end - start))
@@ -110,7 +110,7 @@ class Renderer:
                 continue
             along = (end - start) / length
             across = np.array([-along[1], along[0]])
-            # Beside the line between the two, so that a request and its answerer's own do not cover each other.
+            # Beside the line between the two, so that mutual requests do not overlap
             start, end = start + 12 * along + 3 * across, end - 14 * along + 3 * across
             pygame.draw.aaline(self._surface, _REQUEST, start, end)
             pygame.draw.polygon(
@@ -166,14 +166,14 @@ def _open_window(size: tuple[int, int]) -> pygame.Surface:
     except pygame.error as error:
         raise gymnasium.error.Error(
             f"render_mode='human' cannot open a window ({error}). render_mode='rgb_array' needs no display; on the "
-            "command line take `enjoy --no-render`, `record` for a video or `replay` for a page."
+            "command line use `enjoy --no-render`, `record` for a video or `replay` for a web page."
         ) from error
     pygame.display.set_caption("QuadSwarm")
     return window
 
 
 class _Camera:
-    """A pinhole camera that looks from above at the middle of some points, far enough away to see them all."""
+    """Pinhole camera that looks from above at the centre of some points, from far enough away to see all of them."""
 
     def __init__(self, points: np.ndarray, size: tuple[int, int], azimuth: float = -1.1, elevation: float = 0.65):
         low, high = points.min(axis=0), points.max(axis=0)
@@ -189,17 +189,17 @@ class _Camera:
         self._middle = np.array(size) / 2
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """Distance along the line of sight, (K,) (m)."""
+        """Return the distances along the line of sight, (K,) (m)."""
         return (points - self._eye) @ self._axes[2]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Points (K, 3), world frame (m), on the picture, (K, 2) (pixels)."""
+        """Project points, (K, 3), world frame (m), to the image, (K, 2) (pixels)."""
         camera = (points - self._eye) @ self._axes.T
         return self._middle + self._focal * camera[:, :2] / camera[:, 2:]
 
 
 def _rotation(phi: float, theta: float, psi: float) -> np.ndarray:
-    """Rotation matrix of roll, pitch and yaw (rad)."""
+    """Return the rotation matrix of roll, pitch and yaw (rad)."""
     (cf, sf), (ct, st), (cp, sp) = ((np.cos(a), np.sin(a)) for a in (phi, theta, psi))
     return np.array(
         [
@@ -211,5 +211,5 @@ def _rotation(phi: float, theta: float, psi: float) -> np.ndarray:
 
 
 def _blend(colour: str, amount: float) -> pygame.Color:
-    """The colour, lighter by ``amount`` in [0, 1]."""
+    """Lighten a colour by ``amount`` in [0, 1]."""
     return pygame.Color(colour).lerp(pygame.Color("white"), amount)

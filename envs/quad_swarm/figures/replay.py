@@ -1,9 +1,9 @@
-"""``sb3-maddpg replay``: a page that replays an episode.
+"""``sb3-maddpg replay``: a web page that replays an episode.
 
-One HTML file that needs no other: a view in three dimensions, a time slider, and for each policy who asked whom, how
-close the robots came and how often they asked. All policies fly the same held-out episode.
+The page is a single HTML file with a three-dimensional view, a time slider, and the requests, the smallest separation
+and the number of requests of each policy. All policies fly the same held-out episode.
 
-The page is ``replay.html``, built from the sources in ``page/`` (``make page``); here it only gets its data.
+``replay.html`` is built from the sources in ``page/`` (``make page``). This module inserts the data.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.scenarios import SCENARIOS
 
-# Steps shown after all robots have arrived
+# Number of steps to show after all robots have arrived
 _LINGER = 10
-# Digits behind the point of a metre and a radian: finer than a pixel; plans are drawn less exactly
+# Decimals of metres and radians, which are finer than a pixel; plans need fewer
 _DIGITS, _PLAN_DIGITS = 3, 2
-# Every which stage of a plan is drawn
+# Every such stage of a plan is drawn
 _PLAN_STRIDE = 2
 
 # Shown by `sb3-maddpg --help`
@@ -40,13 +40,13 @@ EXAMPLES = "  sb3-maddpg replay --policy full pretrained:quad-swarm-paper --scen
 
 
 def replay_page(conditions: Sequence[Condition], seed: int = 0, episode: int = 0, preset: str = "") -> str:
-    """Fly an episode with some policies and make its page.
+    """Fly an episode with several policies and create its web page.
 
-    :param conditions: policies in one scenario and world
-    :param seed: which set of held-out episodes
-    :param episode: which episode of it
-    :param preset: what the page calls the world
-    :return: HTML
+    :param conditions: policies in the same scenario and world
+    :param seed: index of the set of held-out episodes
+    :param episode: index of the episode in the set
+    :param preset: name of the world on the page
+    :return: the page as HTML
     """
     config = conditions[0].config
     data = {
@@ -68,13 +68,13 @@ def replay_page(conditions: Sequence[Condition], seed: int = 0, episode: int = 0
 
 
 def _describe(policy: str, flight: Flight) -> dict[str, Any]:
-    """What the page needs of a flight, until shortly after the arrival of all robots: T steps of n robots.
+    """Return the page's data of a flight until shortly after the arrival of all robots: T steps of n robots.
 
-    positions, attitudes (roll, pitch, yaw): (T + 1, n, 3) (m, rad); plans, those made in each step, which begin where
-    the robots were then: (T, n, K, 3) (m); goals: (n, 3) (m); requests: for each step who gets whose plan, as (robot,
-    the other), or (robot, the other, 1) if the plan came unasked; separation, as the world counts it: (T + 1,) (m);
-    arrival, collision: the first steps after which all had arrived, and two collided, or None; colliding: (step, robot,
-    robot) for every pair that collides in a step.
+    positions, attitudes (roll, pitch, yaw): (T + 1, n, 3) (m, rad); plans made in each step, from the robots' positions
+    at that time: (T, n, K, 3) (m); goals: (n, 3) (m); requests: for each step the pairs (robot, the other) of robots
+    that get a plan, or (robot, the other, 1) if the plan was announced; separation, as the world counts it: (T + 1,)
+    (m); arrival, collision: first steps after which all robots had arrived, and two collided, or None; colliding:
+    (step, robot, robot) for each pair that collides in a step.
     """
     end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _LINGER, len(flight.requests))
     others = other_indices(flight.n_robots)
@@ -96,13 +96,13 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
 
 
 def _pairs(requests: np.ndarray, announced: np.ndarray, others: np.ndarray) -> list[list[int]]:
-    """The requests of a step as the page knows them."""
+    """Return the requests of a step in the page's format."""
     pairs = [[int(a), int(others[a, k]), int(announced[a, k])] for a, k in np.argwhere(requests)]
     return [pair if pair[2] else pair[:2] for pair in pairs]
 
 
 def _plain_name(policy: str) -> tuple[str, str]:
-    """What the page calls a policy, and what it adds in small letters."""
+    """Return the name of a policy on the page, and its subtitle."""
     if policy == "none":
         return "No communication", "nobody asks"
     if policy == "full":
@@ -111,10 +111,11 @@ def _plain_name(policy: str) -> tuple[str, str]:
 
 
 def _colliding(flight: Flight) -> list[list[int]]:
-    """For every step, from 1, the pairs of robots that collide in it: (step, robot, robot).
+    """Return the pairs of robots that collide in each step, counting from 1: (step, robot, robot).
 
-    What counts is `Flight.min_separation`. Where collisions are continuous it knows the sub-steps and a flight does
-    not, so distances on the straight line from step to step are shifted until the closest pair has it.
+    `Flight.min_separation` decides. With continuous collisions it takes sub-steps into account, which a flight does not
+    record. Therefore, distances on the straight line between steps are shifted so that the closest pair has this
+    distance.
     """
     before, after = flight.relative_pos[:-1], flight.relative_pos[1:]
     if flight.config.continuous_collisions:
@@ -130,23 +131,23 @@ def _colliding(flight: Flight) -> list[list[int]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="sb3-maddpg replay",
-        description="Fly one held-out episode with some policies and write a page that replays it.",
+        description="Fly a held-out episode with several policies and write a web page that replays it.",
         epilog=f"example:\n{EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_policy_arguments(parser)
     parser.add_argument("--scenario", default="symmetric_swap", help=f"one of {', '.join(SCENARIOS)} (%(default)s)")
-    parser.add_argument("--episode", type=int, default=0, help="which episode of the set (default 0)")
-    parser.add_argument("--out", type=Path, default=Path("replay.html"), help="the page (default %(default)s)")
+    parser.add_argument("--episode", type=int, default=0, help="index of the episode in the set (default 0)")
+    parser.add_argument("--out", type=Path, default=Path("replay.html"), help="file of the page (default %(default)s)")
     return run(_write, parser.parse_args(argv))
 
 
 def _write(args: argparse.Namespace) -> None:
     if args.episode < 0:
-        raise ValueError(f"--episode {args.episode}: episodes are counted from 0.")
+        raise ValueError(f"--episode {args.episode}: episodes count from 0.")
     check_writable(args.out, "--out")
     conditions = make_conditions(args, [args.scenario])
     page = replay_page(conditions, args.seed, args.episode, args.preset)

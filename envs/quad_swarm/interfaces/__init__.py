@@ -1,1 +1,1 @@
-"""The task as Gymnasium and PettingZoo environments."""
+"""Gymnasium and PettingZoo environments of the task."""

@@ -19,65 +19,67 @@ from quad_swarm.world.neighbours import spread
 
 
 class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
-    """Quadrotors that fly to their goals and may ask each other for their plans.
+    """Quadrotors that fly to their goals and may request each other's plans.
 
     ## Description
-    At every step each robot chooses whom to ask. It gets the plans it asked for, predicts the other robots with a
-    constant velocity, solves a nonlinear model predictive control problem with separation constraints, and flies its
-    first input (Serra-Gomez et al., IROS 2020).
+    At each step, every robot chooses which robots to ask for their plans. It receives the requested plans, predicts the
+    other robots with earlier plans or constant velocities, solves a nonlinear model predictive control problem with
+    separation constraints, and applies the first input of the solution (Serra-Gomez et al., IROS 2020).
 
     ## Action Space
-    `MultiBinary(n * (n - 1))`: robot 0's bits for robots 1..n-1, robot 1's bits for robots 0, 2..n-1, and so on; 1
-    asks. With `announcements` two bits for each of them, side by side: to ask it, and to send it the own plan. With
-    `world={"neighbourhood": {"max_others": m}}` there are bits for m others only, who change, see `world.neighbours`.
+    `MultiBinary(n * (n - 1))`: robot 0's bits for robots 1..n-1, robot 1's bits for robots 0, 2..n-1, and so on. 1
+    requests the robot's plan. With `announcements`, there are two consecutive bits for each of the others: to request
+    its plan, and to send it the robot's own plan. With `world={"neighbourhood": {"max_others": m}}`, there are bits for
+    only m of the others, which change during an episode, see `world.neighbours`.
 
     ## Observation Space
-    `Box(n, 6n)`, one row a robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the
-    others (3(n-1), m), their relative velocities (3(n-1), m/s); others in ascending order. ``observation`` chooses
-    another one, see `observation.GROUPS`.
+    `Box(n, 6n)`, one row per robot: own velocity (3, m/s), goal relative to the robot (3, m), relative positions of the
+    others (3(n-1), m), relative velocities of the others (3(n-1), m/s), with the others in ascending order.
+    ``observation`` selects another observation, see `observation.GROUPS`.
 
     ## Rewards
-    The team's: +1.3 in each step in which all robots are at their goals, -150 for a collision, -0.1 for each request.
+    The team reward is +1.3 for each step in which all robots are at their goals, -150 for a collision, and -0.1 for
+    each request.
 
     ## Starting State
-    At rest; starts and goals as the scenario draws them. `reset(options={"starts": ..., "goals": ...})` sets them, both
-    (n, 3), m.
+    Robots start at rest. The scenario draws starts and goals; `reset(options={"starts": ..., "goals": ...})` sets them,
+    both (n, 3), m.
 
     ## Episode End
-    Terminated by a collision, with `end_at_arrival` also by the arrival of all; truncated after `max_steps`.
+    A collision terminates the episode, and with `end_at_arrival` so does the arrival of all robots. The episode is
+    truncated after `max_steps`.
 
     ## Info
-    `reward_terms`, `pair_rewards` (n, n - 1: the part of the reward that belongs to a robot and one of the others),
+    `reward_terms`, `pair_rewards` (n, n - 1; the part of a robot's reward that belongs to one of the others),
     `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
-    `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and at the end `is_success`
-    and `metrics`. Where the neighbourhood is limited, `neighbours` (n, m) says who had each place of the action and of
-    the entries for each of the others, -1: nobody, and `pair_terminated` (n, m) which of them somebody
-    else has now, or nobody.
+    `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and `metrics`. In the last
+    step of an episode also `is_success` and further `metrics`. With a limited neighbourhood also `neighbours` (n, m),
+    the index of the robot in each slot of the action and of the entries about others, -1 for an empty slot, and
+    `pair_terminated` (n, m), whether another robot, or none, is in the slot after the step.
 
     ## Arguments
-    :param preset: "paper" or "dense" (`presets.PRESETS`)
-    :param scenario: a name of `scenarios.SCENARIOS`, "mixed" or "curriculum", or names with weights
-    :param n_robots: number of robots; None: the preset's
-    :param max_steps: time limit (steps); None: the preset's
+    :param preset: a name of `presets.PRESETS`, such as "paper" or "dense"
+    :param scenario: a name of `scenarios.SCENARIOS`, "mixed" or "curriculum", or a mapping of names to weights
+    :param n_robots: number of robots, by default the preset's
+    :param max_steps: time limit (steps), by default the preset's
     :param observation: "paper", or names of `observation.GROUPS` joined by "+", for example "state+memory+plan"
-    :param scale_observation: of the paper's: divide distances by 4 m and velocities by 4 m/s
-    :param continuous_collisions: whether a collision is contact at any time of a step, or at the steps alone; None: as
-        in the preset
+    :param scale_observation: for the paper's observation: divide distances by 4 m and velocities by 4 m/s
+    :param continuous_collisions: whether contact at any time of a step is a collision, or only contact at the steps; by
+        default as in the preset
     :param end_at_arrival: end episodes as soon as all robots are at their goals
-    :param memory: how far off (m) an earlier plan may be and still be believed, see `Beliefs`; 0: off; None: the
-        preset's
+    :param memory: maximum error (m) up to which an earlier plan is still believed, see `Beliefs`; 0 for no memory; by
+        default the preset's
     :param reward: values of `RewardConfig` to replace
     :param planner: values of `PlannerConfig` to replace
     :param noise: values of `ProcessNoise` to replace
     :param radio: values of `Radio` to replace
     :param space: values of `ScenarioSpace` to replace
-    :param world: any fields of `SwarmConfig` to replace, nested ones by mappings, for example ``{"radius": 0.12,
-        "quadrotor": {"drag_x": 0.3}}``; what has an argument of its own may be given here or there
+    :param world: fields of `SwarmConfig` to replace, nested ones as mappings, for example ``{"radius": 0.12,
+        "quadrotor": {"drag_x": 0.3}}``; fields that are also arguments may be passed either way, but not both
     :param solver: "auto" or a name of `planner.SOLVERS`
-    :param announcements: robots may also send their plans unasked: two bits for each of the others, the first to ask it
-        for its plan, the second to send it the own one
+    :param announcements: whether robots may also send their plans without a request, see the action space
     :param render_mode: None, "rgb_array", or "human" for a window that shows every step in real time
-    :raises ValueError: a wrong value; the message names it and the remedy
+    :raises ValueError: if a value is invalid; the message names it and the remedy
 
     ## Version History
     * v0: initial release, presets of version 1
@@ -142,16 +144,16 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; see the class for ``options``.
+        """Start an episode; see the class for ``options``.
 
-        :raises ValueError: a wrong seed or option
+        :raises ValueError: if the seed or an option is invalid
         """
         super().reset(seed=checked_seed(seed))
         options = checked_options(options)
         if unknown := set(options).difference(self.reset_options):
             raise unknown_name("reset option", unknown.pop(), self.reset_options)
         if len(options) == 1:
-            raise ValueError(f"reset options name only {next(iter(options))!r}; give both 'starts' and 'goals'.")
+            raise ValueError(f"reset options name only {next(iter(options))!r}; pass both 'starts' and 'goals'.")
         if options:
             self.task.place(0, "custom", options["starts"], options["goals"], self.np_random)
         else:
@@ -165,11 +167,11 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         return self.task.observe()[0], {"scenario": self.task.scenario[0]}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Let every robot ask, plan and fly for one step.
+        """Let all robots make requests, plan and fly for one step.
 
-        :param action: bits, (n(n - 1),), with announcements twice as many
-        :raises ValueError: the action has another shape or other entries; a solver's failure never raises
-        :raises gymnasium.error.ResetNeeded: before the first reset
+        :param action: bits, (n(n - 1),), twice as many with announcements
+        :raises ValueError: if the action has another shape or other entries than bits; solver failures never raise
+        :raises gymnasium.error.ResetNeeded: if ``reset`` has not been called yet
         """
         if not self._is_reset:
             raise need_reset()
@@ -188,7 +190,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
 
     def state_dict(self) -> dict[str, Any]:
-        """All of the present state, plain numbers and arrays, see `load_state_dict`."""
+        """Return the complete state as plain values and arrays, see `load_state_dict`."""
         return {
             "task": self.task.state_dict(),
             "requests": self._requests.copy(),
@@ -197,9 +199,9 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what `state_dict` of an environment with the same arguments gave, bit for bit.
+        """Restore a state from `state_dict` of an environment with the same arguments, bit for bit.
 
-        :raises ValueError: the state of another environment
+        :raises ValueError: if the state belongs to another environment
         """
         self.task.load_state_dict(state["task"])
         self._requests = like(self._requests, state["requests"], "requests")
@@ -207,15 +209,15 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         self.np_random = generator_of(state["generator"])
 
     def render(self) -> Any:
-        """The present step as an image, (480, 640, 3) uint8; in the mode "human" it is shown in a window instead.
+        """Render the current step as an image, (480, 640, 3) uint8, or in a window with render mode "human".
 
-        :raises ValueError: the environment was made without a mode
-        :raises gymnasium.error.Error: no window can be opened
+        :raises ValueError: if the environment has no render mode
+        :raises gymnasium.error.Error: if no window can be opened
         """
         if self.render_mode is None:
-            raise ValueError("No render_mode: make the environment with render_mode='rgb_array'.")
+            raise ValueError("No render_mode: create the environment with render_mode='rgb_array'.")
         if self._renderer is None:
-            from quad_swarm.figures.render import Renderer  # pygame is needed only here
+            from quad_swarm.figures.render import Renderer  # pygame is only needed here
 
             self._renderer = Renderer(self.config)
         swarm, statistics = self.task.swarm, self.task.statistics
@@ -240,7 +242,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
 
 
 def info_of(batch: dict[str, Any], swarm: int) -> dict[str, Any]:
-    """One swarm's part of a batched `info`, in plain Python numbers and fresh arrays."""
+    """Return one swarm's part of a batched `info`, as plain Python numbers and copies of arrays."""
     return {
         name: info_of(value, swarm)
         if isinstance(value, dict)

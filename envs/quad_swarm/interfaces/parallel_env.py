@@ -1,4 +1,4 @@
-"""The PettingZoo interface: the same swarm with one agent for each robot."""
+"""The PettingZoo interface: the same swarm with one agent per robot."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_o
 
 
 class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
-    """`QuadSwarmEnv` as a PettingZoo environment: same seed and same bits give the same episode.
+    """`QuadSwarmEnv` as a PettingZoo environment. The same seed and the same actions give the same episode.
 
-    Agents are called "robot_0", "robot_1", ...; each observes its row, acts with `MultiBinary(n - 1)` and gets the
-    team's reward.
+    The agents are "robot_0", "robot_1", ... Each agent observes its row, acts with `MultiBinary(n - 1)` and gets the
+    team reward.
 
     :param render_mode: None, "rgb_array" or "human"
     :param kwargs: arguments of `QuadSwarmEnv`
-    :raises ValueError: a wrong value; the message names it and the remedy
+    :raises ValueError: if a value is invalid; the message names it and the remedy
     """
 
     metadata = {"name": "quad_swarm_v0", "render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
@@ -41,17 +41,17 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         self._is_reset = False
 
     def observation_space(self, agent: str) -> spaces.Space:
-        """Observation space of one robot, (6n,)."""
+        """Return the observation space of a robot, (6n,) for the paper's observation."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space:
-        """Action space of one robot, n - 1 bits, with announcements twice as many."""
+        """Return the action space of a robot: n - 1 bits, twice as many with announcements."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
-        """See `QuadSwarmEnv.reset`; unknown options are ignored, as PettingZoo's API test demands."""
+        """See `QuadSwarmEnv.reset`. Unknown options are ignored, as PettingZoo's API test requires."""
         known = {name: value for name, value in checked_options(options).items() if name in QuadSwarmEnv.reset_options}
         observation, info = self.team.reset(seed=seed, options=known)
         self._is_reset = True
@@ -68,18 +68,18 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         self.agents, self._is_reset = list(state["agents"]), bool(state["is_reset"])
 
     def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
-        """See `QuadSwarmEnv.step`; once the episode is over there are no agents left, and all five are empty.
+        """See `QuadSwarmEnv.step`. After the end of the episode, there are no agents and all returned dicts are empty.
 
-        :param actions: bits of each agent, (n - 1,), with announcements twice as many
-        :raises ValueError: an agent's action is missing or has another shape or other entries
-        :raises gymnasium.error.ResetNeeded: before the first reset
+        :param actions: bits of each agent, (n - 1,), twice as many with announcements
+        :raises ValueError: if an agent's action is missing, or has another shape or other entries than bits
+        :raises gymnasium.error.ResetNeeded: if ``reset`` has not been called yet
         """
         if not self._is_reset:
             raise need_reset()
         if not self.agents:
             return {}, {}, {}, {}, {}
         if not isinstance(actions, Mapping):
-            raise ValueError(f"actions={shown(actions)}: step() takes a mapping from each robot's name to its action.")
+            raise ValueError(f"actions={shown(actions)}: step() takes a mapping from agent names to actions.")
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise ValueError(f"No action for {', '.join(missing)}; every robot must act in every step.")
         m, n_bits = self.config.n_others, self.task.n_bits
@@ -99,7 +99,7 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """All observations, one robot after the other, (n * size,); in `state_space`."""
+        """Return the observations of all robots, (n * size,), in `state_space`."""
         return self.team.task.observe()[0].ravel()
 
     def render(self) -> Any:

@@ -1,4 +1,4 @@
-"""What the three interfaces have in common: what learners read of them, and how seeds and actions are checked."""
+"""Common parts of the three interfaces: attributes for learners, and checks of seeds, options and actions."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from quad_swarm.world.presets import SwarmConfig
 
 
 class TaskAttributes:
-    """The attributes of a team environment that learners and callbacks read, taken from ``task``."""
+    """Mixin with the attributes of a team environment that learners and callbacks read."""
 
     task: RequestTask
 
     @property
     def config(self) -> SwarmConfig:
-        """The world."""
+        """Configuration of the world."""
         return self.task.swarm.config
 
     @property
@@ -31,42 +31,42 @@ class TaskAttributes:
 
     @property
     def agent_names(self) -> tuple[str, ...]:
-        """The robots' names, "robot_0", "robot_1", ..."""
+        """Names of the robots, "robot_0", "robot_1", ..."""
         return self.task.agent_names
 
     @property
     def observation_layout(self) -> dict[str, Any]:
-        """Which columns of an observation are about the robot itself and which about each of the others."""
+        """Meaning of an observation's columns, see `sb3_maddpg.relational.ObservationLayout`."""
         return self.task.observation_layout
 
     @property
     def action_cost(self) -> float:
-        """What a request costs."""
+        """Cost of a request."""
         return self.task.action_cost
 
-    # The curriculum: a training callback sets the level, the environment itself never does.
+    # A callback sets the curriculum's level, the environment itself never does.
     @property
     def n_curriculum_levels(self) -> int:
-        """Number of curriculum levels; 1 where the scenario has none."""
+        """Number of curriculum levels, 1 without a curriculum."""
         return self.task.sampler.n_levels
 
     @property
     def curriculum_level(self) -> int:
-        """The present level, from 0."""
+        """Current curriculum level, from 0."""
         return self.task.sampler.level
 
     def set_curriculum_level(self, level: int) -> None:
-        """Draw later episodes from the first ``level + 1`` scenarios.
+        """Draw the next episodes from the first ``level + 1`` scenarios.
 
-        :raises ValueError: no such level
+        :raises ValueError: if there is no such level
         """
         self.task.sampler.set_level(level)
 
 
 def checked_seed(seed: Any) -> int | None:
-    """A seed as Gymnasium takes it, which refuses NumPy's integers.
+    """Convert a seed to the type that Gymnasium needs, which does not accept NumPy's integers.
 
-    :raises ValueError: it is no integer of at least 0
+    :raises ValueError: if the seed is not a non-negative integer
     """
     if seed is None:
         return None
@@ -75,45 +75,47 @@ def checked_seed(seed: Any) -> int | None:
     except TypeError:
         number = -1
     if number < 0:
-        raise ValueError(f"seed={shown(seed)}: a seed is an integer of at least 0, or None.")
+        raise ValueError(f"seed={shown(seed)}: a seed must be a non-negative integer or None.")
     return number
 
 
 def checked_options(options: Any) -> dict[str, Any]:
-    """Options of ``reset``; none are an empty mapping.
+    """Check the options of ``reset``; None becomes an empty dict.
 
-    :raises ValueError: it is no mapping of names
+    :raises ValueError: if the options are not a mapping with names as keys
     """
     if options is None:
         return {}
     if not isinstance(options, Mapping) or not all(isinstance(name, str) for name in options):
-        raise ValueError(f"options={shown(options)}: the options of reset() are a mapping by their names, or None.")
+        raise ValueError(
+            f"options={shown(options)}: the options of reset() must be a mapping from names to values, or None."
+        )
     return dict(options)
 
 
 def need_reset() -> gym.error.ResetNeeded:
-    """The error of a step before the first reset."""
+    """Create the error for a step before the first reset."""
     return gym.error.ResetNeeded("step() was called before reset(): reset the environment first.")
 
 
 def checked_bits(
     actions: Any, shape: tuple[int, ...], n_others: int, n_bits: int = 1, whose: str = "The action"
 ) -> np.ndarray:
-    """Actions as bits of each robot for each of the others, (..., n_others, n_bits) bool with one row for each robot
-    that acts.
+    """Check actions and reshape them to bits of each acting robot for each of the others.
 
     :param actions: bits
-    :param shape: of the action space, whose last axis holds whole robots' bits
-    :param n_others: number of others of a robot
-    :param n_bits: of each robot for each of the others
-    :param whose: whose action it is, for messages
-    :raises ValueError: another shape, or anything but zeros and ones
+    :param shape: shape of the action space, whose last axis holds the bits of one or more robots
+    :param n_others: number of others per robot
+    :param n_bits: number of bits of each robot for each of the others
+    :param whose: whose action it is, for error messages
+    :return: the bits, (..., robots, n_others, n_bits) bool
+    :raises ValueError: if the shape differs, or there are other entries than 0 and 1
     """
     bits = np.asarray(actions)
     if bits.shape != shape:
         raise ValueError(
             f"{whose} has shape {bits.shape}; the action space has {shape}: "
-            f"{n_bits * n_others} bits for each robot, {n_bits} for each of the others."
+            f"{n_bits * n_others} bits per robot, {n_bits} for each of the others."
         )
     asked = bits == 1
     if not (asked | (bits == 0)).all():

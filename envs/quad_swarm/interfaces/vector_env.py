@@ -1,4 +1,4 @@
-"""Many swarms in one Gymnasium vector environment: all robots of all swarms go through one planner call."""
+"""The Gymnasium vector interface: many swarms in one environment, with a single planner call for all robots."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from quad_swarm.validation import checked_arguments
 
 
 class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """`QuadSwarmEnv`, E times: ``gymnasium.make_vec("QuadSwarm-v0", num_envs=256)``.
+    """Vector environment of E copies of `QuadSwarmEnv`: ``gymnasium.make_vec("QuadSwarm-v0", num_envs=256)``.
 
-    Each swarm flies step for step as it would alone. Episodes that end begin anew in the same step
-    (`AutoresetMode.SAME_STEP`): the last observation is in ``infos["final_obs"]`` and the last step's info in
-    ``infos["final_info"]``, valid where ``infos["_final_obs"]``.
+    Each swarm flies exactly as it would alone. When an episode ends, its environment resets in the same step
+    (`AutoresetMode.SAME_STEP`): the final observation is in ``infos["final_obs"]`` and the final info in
+    ``infos["final_info"]``, both valid where ``infos["_final_obs"]`` is True.
 
     :param num_envs: number of swarms E, at most 100 000
+    :param render_mode: must be None, since the vector environment cannot render
     :param kwargs: arguments of `QuadSwarmEnv`
-    :raises ValueError: a wrong value; the message names it and the remedy
+    :raises ValueError: if a value is invalid; the message names it and the remedy
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's convention
@@ -50,11 +51,11 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode in every swarm.
+        """Start an episode in every swarm.
 
-        :param seed: of swarm 0, the others count on from it; or one of each swarm
-        :param options: none are known
-        :raises ValueError: a wrong seed or option
+        :param seed: seed of swarm 0, from which the seeds of the others count up, or a list with one seed per swarm
+        :param options: must be empty
+        :raises ValueError: if a seed is invalid, or there are options
         """
         if options := checked_options(options):
             raise ValueError(f"Unknown reset options {sorted(options)}: the vector environment has none.")
@@ -74,11 +75,11 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         return self.task.observe(), self._with_masks({"scenario": np.array(self.task.scenario)})
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of every swarm; see `QuadSwarmEnv.step`.
+        """Take one step in every swarm; see `QuadSwarmEnv.step`.
 
-        :param actions: bits, (E, n(n - 1)), with announcements twice as many
-        :raises ValueError: the actions have another shape or other entries
-        :raises gymnasium.error.ResetNeeded: before the first reset
+        :param actions: bits, (E, n(n - 1)), twice as many with announcements
+        :raises ValueError: if the actions have another shape or other entries than bits
+        :raises gymnasium.error.ResetNeeded: if ``reset`` has not been called yet
         """
         if not self._rngs:
             raise need_reset()
@@ -99,21 +100,23 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         return observations, outcome.reward, outcome.terminated, outcome.truncated, infos
 
     def state_dict(self) -> dict[str, Any]:
-        """All of the present state, plain numbers and arrays, see `load_state_dict`."""
+        """Return the complete state as plain values and arrays, see `load_state_dict`."""
         return {"task": self.task.state_dict(), "generators": [generator_state(rng) for rng in self._rngs]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what `state_dict` of an environment with the same arguments gave, bit for bit.
+        """Restore a state from `state_dict` of an environment with the same arguments, bit for bit.
 
-        :raises ValueError: the state of another environment
+        :raises ValueError: if the state belongs to another environment
         """
         if len(state["generators"]) not in (0, self.num_envs):
-            raise ValueError(f"The state is of {len(state['generators'])} swarms, these are {self.num_envs}.")
+            raise ValueError(
+                f"The state has {len(state['generators'])} swarms, but this environment has {self.num_envs}."
+            )
         self.task.load_state_dict(state["task"])
         self._rngs = [generator_of(one) for one in state["generators"]]
 
     def render(self) -> Any:
-        """Refused: the vector environment draws nothing.
+        """Raise an error, since the vector environment cannot render.
 
         :raises ValueError: always
         """
@@ -124,11 +127,11 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
 
 
 def _draws_nothing(asked: str) -> ValueError:
-    return ValueError(f"{asked}: the vector environment draws nothing; use QuadSwarmEnv.")
+    return ValueError(f"{asked}: the vector environment cannot render; use QuadSwarmEnv.")
 
 
 def _masked(info: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Gymnasium's form of batched infos: beside every entry the mask of the environments that it is valid for."""
+    """Convert infos to Gymnasium's batched form, where each entry has a mask of the environments it is valid for."""
     masked: dict[str, Any] = {}
     for name, value in info.items():
         masked[name] = _masked(value, mask) if isinstance(value, Mapping) else value

@@ -1,4 +1,4 @@
-"""Compiled code: the compiler and its cache, and what is computed for every pair of robots in every step."""
+"""Compiled code: the compiler and its cache, and the computations for every pair of robots in every step."""
 
 from quad_swarm.native.build import BuildError
 

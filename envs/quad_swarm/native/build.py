@@ -1,4 +1,4 @@
-"""Compiles C++ once for each text and machine and keeps the result in the user's cache."""
+"""Compilation of C++, cached per source and machine in the user's cache."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 _SUFFIX = ".dll" if sys.platform == "win32" else ".so"
-# Fused multiplications stand in the source and NaN must stay NaN: nothing here may let the compiler rearrange numbers.
+# The source contains explicit fused multiply-adds, and NaN must stay NaN: no flag may allow the compiler to reorder
+# floating-point operations.
 _FLAGS = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-fvisibility=hidden")
 _SHARED = ("-shared",) if sys.platform == "win32" else ("-shared", "-fPIC")
-_TIMEOUT = 300  # seconds; a compiler that takes longer hangs
+_TIMEOUT = 300  # seconds, after which the compiler is assumed to hang
 
 
 class BuildError(RuntimeError):
-    """Nothing can be compiled here; the message says why and what helps."""
+    """Raised if code cannot be compiled or loaded; the message names the cause and the remedy."""
 
 
 def cache_directory() -> Path:
-    """Where compiled libraries are kept: ``QUAD_SWARM_CACHE``, or the user's cache directory."""
+    """Return the directory of compiled libraries: ``QUAD_SWARM_CACHE``, or one in the user's cache directory."""
     if chosen := os.environ.get("QUAD_SWARM_CACHE"):
         return Path(chosen)
     if sys.platform == "win32":
@@ -40,35 +41,36 @@ def cache_directory() -> Path:
 
 
 def compiler() -> list[str]:
-    """The command of the C++ compiler: ``CXX``, or the first that is found.
+    """Return the command of the C++ compiler: ``CXX``, or the first compiler found.
 
-    :raises BuildError: there is none
+    :raises BuildError: if there is none
     """
     if chosen := os.environ.get("CXX"):
         try:
             command = shlex.split(chosen)
-        except ValueError:  # an unclosed quotation
+        except ValueError:  # an unclosed quote
             command = []
         if not command or shutil.which(command[0]) is None:
-            raise BuildError(f"no C++ compiler: CXX={chosen!r} is no command; unset CXX or name one")
+            raise BuildError(f"no C++ compiler: CXX={chosen!r} is not a command; unset CXX or set it to one")
         return command
     for name in ("c++", "g++", "clang++"):
         if shutil.which(name):
             return [name]
-    raise BuildError("no C++ compiler: install g++ or clang++, or name one in CXX")
+    raise BuildError("no C++ compiler: install g++ or clang++, or set CXX")
 
 
 def build(name: str, main: str, sources: Mapping[str, str], defines: Sequence[str] = ()) -> Path:
-    """The shared library of some sources, compiled unless the cache has it whole.
+    """Compile sources to a shared library, unless it is in the cache.
 
-    Beside each library stands its checksum: a damaged one is compiled again. Without a compiler that works, a library
-    that any compiler made of the same sources on such a machine will do.
+    Each library has a checksum, and damaged libraries are compiled again. Without a working compiler, a cached library
+    that another compiler built from the same sources on the same kind of machine is used.
 
-    :param name: how the library's file begins
-    :param main: the file that is compiled; it includes the others
-    :param sources: texts by the names of their files
+    :param name: prefix of the library's file name
+    :param main: file to compile, which includes the others
+    :param sources: text of each file by its name
     :param defines: macros, ``NAME=VALUE``
-    :raises BuildError: no compiler, or it fails, or the cache cannot be written
+    :return: path of the library
+    :raises BuildError: if there is no compiler, it fails, or the cache cannot be written
     """
     options = [*_FLAGS, _native_flag(), *(f"-D{define}" for define in defines)]
     directory = cache_directory()
@@ -86,7 +88,7 @@ def build(name: str, main: str, sources: Mapping[str, str], defines: Sequence[st
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         _remove_leftovers(directory)
-        # In the cache's own file system, so that the finished library appears there in one step.
+        # In the cache's file system, so that the finished library can be moved there atomically
         with tempfile.TemporaryDirectory(dir=directory, prefix="building-", ignore_cleanup_errors=True) as folder:
             for file, text in sources.items():
                 Path(folder, file).write_text(text, encoding="utf-8")
@@ -94,24 +96,25 @@ def build(name: str, main: str, sources: Mapping[str, str], defines: Sequence[st
             _run([*command, *_SHARED, str(Path(folder, main)), "-o", str(result)])
             checksum = Path(folder, _checksum_file(library).name)
             checksum.write_text(hashlib.sha256(result.read_bytes()).hexdigest(), encoding="utf-8")
-            # On Windows a library in use cannot be replaced: then another process was faster, and made the same.
+            # On Windows, a library in use cannot be replaced, but then another process has built the same one
             with contextlib.suppress(PermissionError):
                 os.replace(result, library)
                 os.replace(checksum, _checksum_file(library))
     except OSError as error:
         raise BuildError(
-            f"cannot write to the cache {directory} ({error.strerror or error}), or what lies there is another user's; "
-            "name a writable directory in QUAD_SWARM_CACHE"
+            f"cannot write to the cache {directory} ({error.strerror or error}), or its files belong to another user; "
+            "set QUAD_SWARM_CACHE to a writable directory"
         ) from error
     return library
 
 
 @functools.lru_cache(maxsize=64)
 def load(path: str, *functions: str) -> ctypes.CDLL:
-    """A compiled library.
+    """Load a compiled library.
 
-    :param functions: what it must hold
-    :raises BuildError: the system does not load it
+    :param path: path of the library
+    :param functions: functions that it must contain
+    :raises BuildError: if the library cannot be loaded
     """
     try:
         library = ctypes.CDLL(path)
@@ -119,8 +122,8 @@ def load(path: str, *functions: str) -> ctypes.CDLL:
             getattr(library, name).restype = None
     except (OSError, AttributeError) as error:
         raise BuildError(
-            f"cannot load {path} ({error}); delete that file to have it compiled again, or name a directory from which "
-            "libraries may be loaded in QUAD_SWARM_CACHE"
+            f"cannot load {path} ({error}); delete the file to compile it again, or set QUAD_SWARM_CACHE to a "
+            "directory from which libraries may be loaded"
         ) from error
     return library
 
@@ -141,8 +144,8 @@ def _checksum_file(library: Path) -> Path:
 
 
 def _is_whole(library: Path) -> bool:
-    """Whether the library is there, has the checksum with which it was made, and was put there by this user or the
-    system's: it is code that will run."""
+    """Return whether the library exists, has the right checksum, and belongs to this user or to the superuser, since
+    its code will be run."""
     try:
         if hasattr(os, "getuid") and library.stat().st_uid not in (os.getuid(), 0):
             return False
@@ -153,7 +156,7 @@ def _is_whole(library: Path) -> bool:
 
 
 def _remove_leftovers(directory: Path) -> None:
-    """Remove the folders of builds that were killed: those older than any compiler may run."""
+    """Remove the folders of killed builds, which are older than any compiler may run."""
     for folder in directory.glob("building-*"):
         with contextlib.suppress(OSError):
             if time.time() - folder.stat().st_mtime > 2 * _TIMEOUT:
@@ -162,19 +165,19 @@ def _remove_leftovers(directory: Path) -> None:
 
 @functools.cache
 def _machine() -> str:
-    """What a compiled library is tied to, as far as can be told without a compiler: the system and the processor."""
+    """Describe the system and the processor that a compiled library is tied to, without using a compiler."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             lines = [line for line in file if line.startswith(("flags", "Features", "CPU part"))]
         processor = "".join(sorted(set(lines)))
-    except OSError:  # no Linux: libraries serve this very machine alone
+    except OSError:  # not Linux: libraries are for this machine only
         processor = f"{platform.processor()} {platform.node()}"
     return f"{sys.platform} {platform.machine()} {' '.join(platform.libc_ver())} {processor}"
 
 
 @functools.lru_cache(maxsize=8)
 def _target(command: tuple[str, ...]) -> str:
-    """Every macro that the compiler predefines: its version and the processor's features, which the key must name."""
+    """Return all macros that the compiler predefines, which include its version and the processor's features."""
     return _run([*command, "-dM", "-E", "-x", "c++", os.devnull])
 
 
@@ -182,9 +185,9 @@ def _run(command: list[str]) -> str:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise BuildError(f"the C++ compiler {command[0]!r} does not run ({error}); name another in CXX") from error
+        raise BuildError(f"the C++ compiler {command[0]!r} does not run ({error}); set CXX to another one") from error
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
         first = next((line for line in lines if "error" in line), lines[0])
-        raise BuildError(f"the C++ compiler {command[0]!r} fails ({first.strip()}); name another in CXX")
+        raise BuildError(f"the C++ compiler {command[0]!r} fails ({first.strip()}); set CXX to another one")
     return done.stdout

@@ -1,5 +1,5 @@
-"""CasADi functions of many rows at once, in compiled code. CasADi's own interpreter gives the same numbers to the last
-bit, and takes seven times as long."""
+"""Compiled CasADi functions of batches of rows. CasADi's own interpreter gives bit-identical results but takes seven
+times as long."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ extern "C" __attribute__((visibility("default"))) void {name}_rows(
 
 
 class RowFunction:
-    """A CasADi function with one dense output, compiled to be called on rows.
+    """A CasADi function with one dense output, compiled for batches of rows.
 
     :param function: the function
-    :raises BuildError: it cannot be compiled here
+    :raises BuildError: if it cannot be compiled
     """
 
     def __init__(self, function: ca.Function):
@@ -55,11 +55,11 @@ class RowFunction:
         self._call.argtypes = [ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
 
     def __call__(self, count: int, values: Sequence[np.ndarray | None]) -> np.ndarray:
-        """The function of each row.
+        """Evaluate the function for each row.
 
         :param count: number of rows
-        :param values: for each argument its rows, (count, its length) in any shape; None for zeros
-        :return: (count, length of the output)
+        :param values: the rows of each argument, (count, its length) in any shape; None for zeros
+        :return: the outputs, (count, length of the output)
         """
         arrays = [None if value is None else np.ascontiguousarray(value, dtype=float) for value in values]
         for array, length in zip(arrays, self._lengths, strict=True):

@@ -1,7 +1,7 @@
-// What is computed for every pair of robots in every step. pairs.py says what, and does the same in NumPy to the last
-// bit: no operation here may change its order.
+// Computations for every pair of robots in every step. pairs.py documents them. Its NumPy versions give bit-identical
+// results, so the order of operations must not change.
 //
-// All arrays are contiguous. A trajectory is a row of 3 N numbers, stage by stage; pairs are ordered by the robot, then
+// All arrays are contiguous. A trajectory is a row of 3 N numbers, stage by stage. Pairs are ordered by the robot, then
 // by the other.
 #include <algorithm>
 #include <cmath>
@@ -30,8 +30,8 @@ inline double squared_distance(const double* a, const double* b) {
   return dot(difference, difference);
 }
 
-// The least squared distance of two robots while they move in straight lines from each position to the next, each
-// `stride` numbers after the one before.
+// Return the smallest squared distance of two robots that move in straight lines between consecutive positions, which
+// are `stride` numbers apart.
 double closest(const double* a, const double* b, Integer n_parts, Integer stride) {
   double least = std::numeric_limits<double>::infinity();
   double start[3], end[3];
@@ -50,7 +50,7 @@ double closest(const double* a, const double* b, Integer n_parts, Integer stride
   return least;
 }
 
-// A constant velocity at some times, each of which stands three times.
+// Positions at constant velocity. Each time is repeated three times.
 inline void steady(const double* pos, const double* vel, const std::vector<double>& times, double* to) {
   for (std::size_t k = 0; k < times.size(); k += 3)
     for (int i = 0; i < 3; i++) to[k + i] = vel[i] * times[k + i] + pos[i];

@@ -1,7 +1,7 @@
-"""What is computed for every pair of robots in every step: by compiled code where there is a compiler, else by NumPy.
+"""Computations for every pair of robots in every step, in compiled code if there is a compiler, otherwise in NumPy.
 
-Both give the same numbers to the last bit. ``pairs`` below stands for any leading axes that end with the robots and
-their others; N are the stages of a plan.
+Both give bit-identical results. ``pairs`` stands for any leading axes that end with the robots and their others; N is
+the number of stages of a plan.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FUNCTIONS = {
 
 @functools.cache
 def compiled() -> ctypes.CDLL | None:
-    """The compiled functions; None where they cannot be compiled, of which the planner warns."""
+    """Return the compiled functions, None if they cannot be compiled, of which the planner warns."""
     try:
         text = (Path(__file__).parent / _SOURCE).read_text(encoding="utf-8")
         library = load(str(build("pairs", _SOURCE, {_SOURCE: text})), *_FUNCTIONS)
@@ -45,14 +45,14 @@ def compiled() -> ctypes.CDLL | None:
 def remember(
     remembered: np.ndarray, age: np.ndarray, pos: np.ndarray, memory: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Plans received earlier, one step later.
+    """Advance remembered plans by a step.
 
     :param remembered: positions from the last step on, (pairs, N + 1, 3) (m)
-    :param age: steps since they were made, N or more: there is none, (pairs) int64
-    :param pos: where the others are seen now, (pairs, 3) (m)
-    :param memory: how far off a plan may be that is still believed (m)
-    :return: positions from now on, the last piece going on in a straight line; ages; how far off they are (m); and
-        which are believed, bool
+    :param age: steps since the plans were made, N or more without a plan, (pairs) int64
+    :param pos: observed current positions of the others, (pairs, 3) (m)
+    :param memory: maximum error of plans that are still believed (m)
+    :return: positions from now on, whose last segment continues in a straight line, ages, errors (m), and which plans
+        are believed, bool
     """
     n_stages = remembered.shape[-2] - 1
     if (library := compiled()) is None:
@@ -76,14 +76,14 @@ def believe(
     dt: float,
     stages: Sequence[int] | None = None,
 ) -> np.ndarray:
-    """Trajectories that are believed: remembered ones, else those of constant velocities.
+    """Compute believed trajectories: remembered ones, or otherwise constant velocities.
 
-    :param pos: positions now, (pairs, 3) (m)
-    :param vel: velocities now, (pairs, 3) (m/s)
+    :param pos: current positions, (pairs, 3) (m)
+    :param vel: current velocities, (pairs, 3) (m/s)
     :param remembered: remembered positions from now on, (pairs, N + 1, 3) (m)
-    :param remembers: which of those are believed, (pairs) bool
+    :param remembers: which remembered trajectories are believed, (pairs) bool
     :param dt: length of a stage (s)
-    :param stages: which of the next N steps, from 0 on; None: all
+    :param stages: indices among the next N steps, counting from 0; None for all
     :return: positions, (pairs, stages, 3) (m)
     """
     chosen = np.arange(remembered.shape[-2] - 1) if stages is None else np.array(stages, dtype=np.int64)
@@ -107,12 +107,13 @@ def approach(
     remembers: np.ndarray,
     dt: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How close the robots' plans come to what they believe, see there for the other arguments.
+    """Compute the distances between the robots' plans and believed trajectories. The other arguments are those of
+    `believe`.
 
     :param own: positions of the robots, (E, n, 3) (m)
-    :param plan: their positions at the next N steps relative to that, (E, n, N, 3) (m)
-    :return: the least distance (m), the first stage at which it is reached, from 0 on, and the distance at the last
-        stage (m), (E, n, n - 1) each
+    :param plan: planned positions at the next N steps relative to ``own``, (E, n, N, 3) (m)
+    :return: the smallest distance (m), the first stage at which it is reached, counting from 0, and the distance at the
+        last stage (m), each (E, n, n - 1)
     """
     n_stages = plan.shape[-2]
     if (library := compiled()) is None:
@@ -129,10 +130,11 @@ def approach(
 
 
 def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
-    """See trajectories at later times, in place: linear in between, and the last piece goes on in a straight line.
+    """Resample trajectories at later times, in place, by linear interpolation. The last segment continues in a straight
+    line.
 
-    :param trajectories: what each robot believes of the others, contiguous, (E, n, n - 1, N, 3) (m)
-    :param later: by how much later, as a share of a step, (E, n) in [0, 1)
+    :param trajectories: believed trajectories of each robot's others, contiguous, (E, n, n - 1, N, 3) (m)
+    :param later: time shift as a fraction of a step, (E, n) in [0, 1)
     """
     if (library := compiled()) is None:
         pieces = np.diff(trajectories, axis=-2)
@@ -148,16 +150,16 @@ def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
 def keep_right(
     x: np.ndarray, others: np.ndarray, known: np.ndarray, width: float, dt: float, fade: float, slow: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Others that have grown to one side, see `quad_swarm.planner.right_of_way`.
+    """Enlarge other robots on one side, see `quad_swarm.planner.right_of_way`.
 
     :param x: states of B robots, (B, 9)
     :param others: positions of their others, (B, m, N, 3) (m)
     :param known: which others' plans are known, (B, m) bool
-    :param width: by how much they grow (m)
+    :param width: distance by which the others are enlarged (m)
     :param dt: length of a stage (s)
-    :param fade: time before the closest approach from which on they grow less and less (s)
-    :param slow: closing speed below which they grow less (m/s)
-    :return: where they seem to be then (m), and how much more clearance they need (m), (B, m, N)
+    :param fade: time before the closest approach from which the effect fades (s)
+    :param slow: closing speed below which the effect is reduced (m/s)
+    :return: shifted positions of the others, (B, m, N, 3) (m), and additional clearances, (B, m, N) (m)
     """
     if (library := compiled()) is not None:
         others = np.array(others, dtype=float, order="C")
@@ -180,16 +182,18 @@ def keep_right(
 def neighbours(
     pos: np.ndarray, vel: np.ndarray, others: np.ndarray, present: np.ndarray, limit: float, look_ahead: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Who is near each robot; one that was before keeps its place, see `quad_swarm.world.neighbours`.
+    """Update the neighbours of each robot. A robot that remains a neighbour keeps its slot, see
+    `quad_swarm.world.neighbours`.
 
     :param pos: positions, (E, n, 3) (m)
     :param vel: velocities, (E, n, 3) (m/s)
-    :param others: who had each place, (E, n, m) int64; empty ones have the robot's own number
-    :param present: which places were taken, (E, n, m) bool
-    :param limit: how far a neighbour may be away (m); infinity: any distance
-    :param look_ahead: how far ahead to look for the least distance, which decides who is nearest, with the present
-        velocities (s); 0: the present distance decides
-    :return: the same now, and the place of the robot at each of its neighbours, -1 without any, (E, n, m)
+    :param others: index of the robot that was in each slot, the robot's own index in empty slots, (E, n, m) int64
+    :param present: whether each slot was taken, (E, n, m) bool
+    :param limit: maximum distance of a neighbour (m), infinity for any distance
+    :param look_ahead: time over which the smallest distance at constant velocities decides which robots are nearest
+        (s); 0 for the current distance
+    :return: the new ``others`` and ``present``, and the slot of the robot at each of its neighbours, -1 without one,
+        (E, n, m)
     """
     if (library := compiled()) is not None:
         others, present = np.array(others, order="C"), np.array(present, order="C")
@@ -209,9 +213,9 @@ def neighbours(
 
     stays = present & np.take_along_axis(near, others, axis=-1)
     swarms, robots, places = np.nonzero(stays)
-    near[swarms, robots, others[swarms, robots, places]] = False  # who is left over has just come
+    near[swarms, robots, others[swarms, robots, places]] = False  # the remaining ones are new
     others = np.where(stays, others, numbers[:, None])
-    free = np.argsort(stays, axis=-1, kind="stable")  # the free places first
+    free = np.argsort(stays, axis=-1, kind="stable")  # free slots first
     swarms, robots, come = np.nonzero(near)
     places = free[swarms, robots, (near.cumsum(axis=-1) - 1)[swarms, robots, come]]
     others[swarms, robots, places] = come
@@ -225,13 +229,13 @@ def neighbours(
 
 
 def separations(positions: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """How far robots are apart after a step and how close they come in it, moving in straight lines from each of its
-    parts to the next.
+    """Compute the distances between robots after a step and the smallest distances during it, with straight motion
+    between sub-steps.
 
-    :param positions: before the step and after each of its parts, (S + 1, E, n, 3) (m)
-    :param others: which others to tell apart, (E, n, m); a robot's own number: none
-    :return: the least of all pairs after the step and in it, (E,) each (m), and those of each robot and its ``others``,
-        (E, n, m) each (m), infinity where there is none
+    :param positions: positions before the step and after each of the S sub-steps, (S + 1, E, n, 3) (m)
+    :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m)
+    :return: smallest distance of all pairs after and during the step, (E,) each (m), and distance of each robot to each
+        of its ``others`` after and during the step, (E, n, m) each (m), infinity for none
     """
     if (library := compiled()) is not None:
         positions, others = np.ascontiguousarray(positions), np.ascontiguousarray(others)
@@ -263,7 +267,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def advance(trajectory: np.ndarray) -> np.ndarray:
-    """A trajectory (..., K, 3) seen one step later; its last piece goes on in a straight line."""
+    """Advance trajectories (..., K, 3) by a step; the last segment continues in a straight line."""
     end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
     return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
 

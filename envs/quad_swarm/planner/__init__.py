@@ -1,4 +1,4 @@
-"""Planning: the optimal control problem of one robot, solvers for batches of it, and the fallback chain below them."""
+"""Planning: the optimal control problem of a robot, solvers for batches of problems, and the fallback chain."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ SOLVERS: dict[str, type[FatropSolver] | type[RtiSolver]] = {"rti": RtiSolver, "f
 
 
 def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: int, solver: str = "auto") -> Planner:
-    """The planner of a swarm.
+    """Create the planner of a swarm.
 
     :param config: horizon, limits and weights
     :param quadrotor: physical parameters
     :param n_robots: number of robots in a swarm
-    :param solver: one of `SOLVERS`, or "auto": "rti" where it can be compiled, else "fatrop" with a warning
-    :raises ValueError: unknown solver
-    :raises RuntimeError: "rti" is asked for and cannot be compiled here
+    :param solver: one of `SOLVERS`, or "auto" for "rti" if it can be compiled, otherwise "fatrop" with a warning
+    :raises ValueError: if the solver is unknown
+    :raises RuntimeError: if the solver is "rti" and cannot be compiled
     """
     if solver != "auto" and solver not in SOLVERS:
         raise unknown_name("solver", solver, ["auto", *SOLVERS])
@@ -42,7 +42,7 @@ def _make_solver(problem: OptimalControlProblem, solver: str) -> Solver:
     except BuildError as error:
         if solver == "rti":
             raise BuildError(f"solver='rti' cannot run: {error}; solver='fatrop' needs no compiler.") from error
-        _warn_once(f"quad_swarm plans with fatrop, hundreds of times slower than rti: {error}.")
+        _warn_once(f"quad_swarm plans with fatrop, which is hundreds of times slower than rti: {error}.")
         return FatropSolver(problem)
     return rti
 

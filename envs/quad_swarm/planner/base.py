@@ -1,4 +1,4 @@
-"""What every solver is given and gives back, and the fallback chain that always ends in a plan that can be flown."""
+"""The interface of solvers, and the planner with its fallback chain, which always yields a flyable plan."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from quad_swarm.quadrotor import N_INPUTS, QuadrotorModel
 
 
 class Solution(NamedTuple):
-    """What a solver found for a batch of B problems.
+    """Solutions of a batch of B problems.
 
-    :param x: states at stages 0..N, (B, N + 1, 9); stage 0 is the present state
+    :param x: states at stages 0..N, (B, N + 1, 9); stage 0 is the current state
     :param u: inputs at stages 0..N-1, (B, N, 4)
-    :param success: whether each problem was solved to the solver's own tolerance, (B,) bool; x and u are finite then
-    :param iterations: iterations spent on each problem, (B,) int
+    :param success: whether each problem was solved to the solver's tolerance, (B,) bool; x and u are finite then
+    :param iterations: number of iterations for each problem, (B,) int
     """
 
     x: np.ndarray
@@ -29,12 +29,12 @@ class Solution(NamedTuple):
 
 
 class Solver(Protocol):
-    """Solves batches of problems; it reports failure as data. Should it raise all the same, all its problems failed."""
+    """Solver of batches of problems. It reports failures as data; if it raises, all its problems count as failed."""
 
     name: str
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
-        """Solve every problem of the batch.
+        """Solve a batch of problems.
 
         :param problems: the batch
         :param x_guess: initial guess of the states at stages 0..N, (B, N + 1, 9)
@@ -44,10 +44,10 @@ class Solver(Protocol):
 
 
 class PlanStatus(IntEnum):
-    """How a plan came about: the level of the fallback chain that gave it.
+    """Level of the fallback chain that a plan comes from.
 
-    SOLVED: by the solver, from the last plan as a guess. RETRIED: by the solver, from a guess that forgets the last
-    plan. SHIFTED: the last plan, flown on. BRAKING: braking to hover.
+    SOLVED: the solver, with the last plan as initial guess. RETRIED: the solver, with a cold initial guess. SHIFTED:
+    the continuation of the last plan. BRAKING: braking to hover.
     """
 
     SOLVED = 0
@@ -63,7 +63,7 @@ class Plans(NamedTuple):
     :param u: inputs at stages 0..N-1, (B, N, 4)
     :param age: steps since each plan came from the solver, (B,) int
     :param status: `PlanStatus` of each plan, (B,) int
-    :param iterations: solver iterations spent, (B,) int
+    :param iterations: number of solver iterations, (B,) int
     """
 
     x: np.ndarray
@@ -74,7 +74,7 @@ class Plans(NamedTuple):
 
     @classmethod
     def hover(cls, x: np.ndarray, horizon: int) -> Plans:
-        """The plan of a robot at rest before its first solve: stay where it is."""
+        """Return the plans of robots at rest before their first solve, which is to stay in place."""
         count = x.shape[0]
         return cls(
             x=np.repeat(x[:, None], horizon + 1, axis=1),
@@ -86,12 +86,13 @@ class Plans(NamedTuple):
 
 
 class Planner:
-    """Warm-started solves with a fallback chain: solve, retry cold, fly the last plan on, brake (Sec. III-B).
+    """Planner with warm-started solves and a fallback chain: solve, retry cold, continue the last plan, brake
+    (Sec. III-B).
 
-    The level is chosen for each robot by itself; a failure of one never touches another's plan.
+    The level is chosen independently for each robot, so a failure never affects another robot's plan.
 
     :param solver: the solver
-    :param model: discrete dynamics, for the levels that need no solver
+    :param model: discrete dynamics, for the levels without a solver
     :param config: horizon and limits
     """
 
@@ -101,10 +102,11 @@ class Planner:
         self.config = config
 
     def plan(self, problems: Problems, previous: Plans) -> Plans:
-        """Plans for a batch of B problems; a solver's failure never raises.
+        """Solve a batch of B problems; solver failures never raise.
 
         :param problems: the batch
-        :param previous: the plans of the same robots one step ago
+        :param previous: plans of the same robots in the previous step
+        :return: the new plans
         """
         x_guess, u_guess = shift(previous.x), shift(previous.u)
         problems = self._nearest_others(problems, x_guess)
@@ -116,7 +118,7 @@ class Planner:
 
         failed = np.flatnonzero(~success)
         if failed.size:
-            # Cold: the present state held, no input.
+            # Cold initial guess: constant state and no input
             cold = Plans.hover(problems.x[failed], self.config.horizon)
             retry = self._solve(problems.part(failed), cold.x, cold.u)
             iterations[failed] += retry.iterations
@@ -133,7 +135,7 @@ class Planner:
         return Plans(x, u, age, status, iterations)
 
     def _solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
-        """What the solver finds. Plans that are not finite failed, and all of a solver that raises did."""
+        """Call the solver. Plans that are not finite count as failed, as do all plans if the solver raises."""
         try:
             solution = self.solver.solve(problems, x_guess, u_guess)
         except Exception as error:
@@ -147,7 +149,7 @@ class Planner:
         return solution._replace(success=solution.success & finite)
 
     def _nearest_others(self, problems: Problems, x_guess: np.ndarray) -> Problems:
-        """The same problems with only the ``max_neighbours`` others that come nearest over the horizon."""
+        """Reduce problems to the ``max_neighbours`` others that come closest over the horizon."""
         kept = self.config.max_neighbours
         if kept is None or kept >= problems.others.shape[1]:
             return problems
@@ -161,11 +163,11 @@ class Planner:
         )
 
     def braking_inputs(self, x: np.ndarray) -> np.ndarray:
-        """Inputs that bring robots to hover without a solver, from their states alone: (B, 9) -> (B, N, 4).
+        """Compute inputs that bring robots to hover from their states without a solver, (B, 9) -> (B, N, 4).
 
-        The commanded tilt opposes the velocity and saturates at its limit; the climb rate is commanded to zero.
+        The commanded tilt opposes the velocity and saturates at its limit. The commanded climb rate is zero.
         """
-        # Tilt a = v / (g * 0.5 s) stops the linearised robot in about half a second without ringing.
+        # Tilt a = v / (g * 0.5 s) stops the linearised robot in about half a second without overshoot
         gain = 1.0 / (self.model.params.gravity * 0.5)
         limit = self.config.max_tilt
         u = np.zeros((x.shape[0], self.config.horizon, N_INPUTS))
@@ -178,5 +180,5 @@ class Planner:
 
 
 def shift(trajectory: np.ndarray) -> np.ndarray:
-    """A trajectory (B, K, ...) one step later, its last entry repeated."""
+    """Shift trajectories (B, K, ...) by one step, repeating the last entry."""
     return np.concatenate([trajectory[:, 1:], trajectory[:, -1:]], axis=1)

@@ -1,4 +1,4 @@
-"""The converged nonlinear program, solved with fatrop (structure-exploiting interior point, in CasADi's wheel)."""
+"""Solver that iterates to convergence with fatrop (a structure-exploiting interior-point method in CasADi's wheel)."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from quad_swarm.planner.base import Solution
 from quad_swarm.planner.problem import OptimalControlProblem, Problems
 from quad_swarm.quadrotor import N_INPUTS, N_STATES
 
-_LARGEST_EXPONENT = 300.0  # of the repulsion: its square is still far from the overflow of a double
+_LARGEST_EXPONENT = 300.0  # of the repulsion, whose square is still far from overflow
 
-_LARGEST_NUMBER = 1e5  # m, m/s or rad: what is given beyond that fails without a solve
+_LARGEST_NUMBER = 1e5  # m, m/s or rad: problems with larger numbers fail without a solve
 
 
 class FatropSolver:
-    """Reference solver: every problem of a batch to convergence, one after the other.
+    """Reference solver, which solves the problems of a batch to convergence, one after the other.
 
     :param problem: the problem
     :param tolerance: fatrop's convergence tolerance
-    :param max_iterations: iterations after which a problem counts as failed (never a time limit: results must repeat)
+    :param max_iterations: number of iterations after which a problem counts as failed. There is no time limit, so that
+        results are reproducible
     """
 
     name = "fatrop"
@@ -64,7 +65,7 @@ class FatropSolver:
                 continue
             try:
                 solution = solver(x0=variables, p=parameters, **program.bounds)
-            except RuntimeError:  # fatrop gave up on the numbers; the fallback chain takes over
+            except RuntimeError:  # fatrop failed numerically; the fallback chain takes over
                 continue
             stats = solver.stats()
             success[b], iterations[b] = stats["success"], stats["iter_count"]
@@ -75,11 +76,11 @@ class FatropSolver:
         return Solution(x, u, success, iterations)
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"_program": None, "_solver": None}  # rebuilt in the process that needs it
+        return self.__dict__ | {"_program": None, "_solver": None}  # rebuilt on demand in another process
 
 
 def _is_sane(numbers: np.ndarray) -> bool:
-    """Whether the numbers are finite and small enough for fatrop, which may loop for ever on what overflows."""
+    """Return whether numbers are finite and small enough for fatrop, which may loop forever on overflow."""
     return bool((np.abs(numbers) <= _LARGEST_NUMBER).all())
 
 
@@ -87,10 +88,10 @@ class Program(NamedTuple):
     """The problem as a nonlinear program.
 
     :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance), cost ``f``, constraints ``g``
-    :param bounds: of variables and constraints
+    :param bounds: bounds of variables and constraints
     :param structure: fatrop's description of the stages
-    :param x_index: where the states at stages 1..N stand among the variables, (N, nx)
-    :param u_index: where the inputs stand, (N, nu)
+    :param x_index: indices of the states at stages 1..N in the variables, (N, nx)
+    :param u_index: indices of the inputs in the variables, (N, nu)
     """
 
     nlp: dict[str, ca.SX]
@@ -101,7 +102,8 @@ class Program(NamedTuple):
 
 
 def transcribe(problem: OptimalControlProblem) -> Program:
-    """Multiple shooting in fatrop's stage order: x_0 is a parameter, slacks are further inputs of their stage."""
+    """Transcribe the problem by multiple shooting in fatrop's stage order. x_0 is a parameter, and slacks are inputs of
+    their stage."""
     config, nx, nu, n_others = problem.config, problem.nx, problem.nu, problem.n_others
     horizon = config.horizon
     x0, goal = ca.SX.sym("x0", nx), ca.SX.sym("goal", 3)
@@ -126,8 +128,8 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             x_index.append(np.arange(offset, offset + nx))
             offset += nx
             distances = problem.distances(states[k], others[:, [j * horizon + k - 1 for j in range(n_others)]])
-            # Far away the repulsion is zero long before its exponential overflows, whose derivatives would be NaN:
-            # given one, fatrop regularises its Hessian for ever.
+            # At large distances, the repulsion is zero long before its exponential overflows. The overflow would make
+            # derivatives NaN, with which fatrop regularises its Hessian forever.
             cost += sum((problem.repulsion_cost(ca.fmin(d, farthest)) for d in distances), start=ca.SX(0))
             cost += config.violation_weight * (
                 ca.sumsqr(slack) + ca.sumsqr(ca.fmax(problem.box_violations(states[k]), 0))

@@ -1,4 +1,4 @@
-"""The optimal control problem of one robot (eq. 2), written down once for every solver, and batches of it."""
+"""The optimal control problem of a robot (eq. 2) for all solvers, and batches of problems."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic_core import PydanticCustomError
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams, rk4_step
 from quad_swarm.validation import Length, PositiveLength, checked
 
-# Outside these, squares leave the range of numbers, and a solver may never come to an end.
+# Below this, squares underflow, and a solver may not terminate
 _TINIEST = 1e-6
 _Rate = Annotated[float, Field(ge=_TINIEST, le=1e4)]
 
@@ -28,30 +28,31 @@ def _not_tiny(rate: float) -> float:
 @checked
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Horizon, limits and weights of the problem. Form of the cost and most weights: tud-amr/mrca-mav (docs/method.md).
+    """Horizon, limits and weights of the problem. The form of the cost and most weights come from tud-amr/mrca-mav
+    (docs/method.md).
 
     :param horizon: number of stages N (-)
     :param dt: length of a stage and of a simulation step (s)
-    :param separation: distance to keep between the centres of two robots (m); the paper's constraint is 2r, which
-        `make_config` keeps to when the radius changes
+    :param separation: minimum distance between the centres of two robots (m), 2r in the paper; `make_config` adapts it
+        when the radius changes
     :param max_tilt: limit of the commanded roll and pitch (rad)
     :param max_climb_rate: limit of the commanded climb rate (m/s)
-    :param max_yaw_rate: limit of the commanded yaw rate (rad/s); 0 holds the yaw and takes it out of the problem
-    :param max_speed: limit of the velocity along x and along y, soft (m/s)
-    :param max_vertical_speed: limit of the velocity along z, soft (m/s)
-    :param workspace_low: lower corner of the workspace, soft (m)
-    :param workspace_high: upper corner of the workspace, soft (m)
-    :param goal_weight: weight of the terminal squared distance to the goal over max(1, squared distance at present)
-    :param input_weight: weight of the squared inputs, each over its limit
+    :param max_yaw_rate: limit of the commanded yaw rate (rad/s); 0 fixes the yaw and removes it from the problem
+    :param max_speed: soft limit of the velocity along x and along y (m/s)
+    :param max_vertical_speed: soft limit of the velocity along z (m/s)
+    :param workspace_low: lower corner of the workspace, a soft limit (m)
+    :param workspace_high: upper corner of the workspace, a soft limit (m)
+    :param goal_weight: weight of the terminal squared distance to the goal, divided by max(1, current squared distance)
+    :param input_weight: weight of the squared inputs, each divided by its limit
     :param repulsion_weight: weight of the smooth repulsion from each other robot
-    :param repulsion_buffer: distance at which half of the repulsion acts, in separations (-)
+    :param repulsion_buffer: distance at which the repulsion is at half of its maximum, in separations (-)
     :param repulsion_steepness: steepness of the repulsion, per separation (-)
-    :param right_of_way: by so much farther a robot keeps from another one, whose plan it knows, on the side on which it
-        should not pass, see `quad_swarm.planner.right_of_way` (m); 0 leaves the side to the optimum, as in the paper
-    :param violation_weight: weight of the squared violation of a soft constraint (1/m^2)
-    :param max_neighbours: consider only so many others, those whose believed trajectories come nearest to the robot's
-        last plan; None considers all
-    :raises ValueError: a value that is not finite or out of its range, or an empty workspace
+    :param right_of_way: additional distance to robots with known plans on the side on which they should not be passed,
+        see `quad_swarm.planner.right_of_way` (m); 0 for no preferred side, as in the paper
+    :param violation_weight: weight of the squared violation of soft constraints (1/m^2)
+    :param max_neighbours: maximum number of others to consider, those whose believed trajectories come closest to the
+        robot's last plan; None for all
+    :raises ValueError: if a value is not finite or out of range, or the workspace is empty
     """
 
     horizon: Annotated[int, Field(ge=2, le=1000)] = 10
@@ -84,11 +85,12 @@ class PlannerConfig:
 class Problems(NamedTuple):
     """A batch of B optimal control problems.
 
-    :param x: present states, (B, 9)
+    :param x: current states, (B, 9)
     :param goal: goals, (B, 3), world frame (m)
     :param others: believed positions of the n - 1 others at stages 1..N, (B, n - 1, N, 3) (m)
-    :param clearance: distance to keep from them beyond the separation, (B, n - 1, N) (m); None keeps none
-    :param announced: whose believed positions are those of a plan, (B, n - 1) bool, see `right_of_way`; None: nobody's
+    :param clearance: minimum distance to the others beyond the separation, (B, n - 1, N) (m); None for 0
+    :param announced: whether the believed positions come from a plan, (B, n - 1) bool, see `right_of_way`; None for
+        False
     """
 
     x: np.ndarray
@@ -98,7 +100,7 @@ class Problems(NamedTuple):
     announced: np.ndarray | None = None
 
     def part(self, which: Any) -> Problems:
-        """Some of the problems (anything that indexes an array)."""
+        """Return some of the problems, selected by anything that indexes an array."""
         return Problems(
             self.x[which],
             self.goal[which],
@@ -109,9 +111,9 @@ class Problems(NamedTuple):
 
 
 class OptimalControlProblem:
-    """Symbolic building blocks of eq. (2); a solver assembles them in the order that it needs.
+    """Symbolic building blocks of eq. (2), which solvers assemble.
 
-    With the yaw held (``max_yaw_rate = 0``) the decision variables are the first 8 states and the first 3 inputs.
+    With fixed yaw (``max_yaw_rate = 0``), the decision variables are the first 8 states and the first 3 inputs.
 
     :param config: horizon, limits and weights
     :param quadrotor: physical parameters
@@ -129,39 +131,40 @@ class OptimalControlProblem:
         self.max_input = ca.DM(limits[: self.nu])
 
     def dynamics(self, x: ca.SX, u: ca.SX) -> ca.SX:
-        """Next state, (nx,), in still air (eq. 1)."""
+        """Return the next state, (nx,), in still air (eq. 1)."""
         x_full = ca.vertcat(x, ca.SX.zeros(N_STATES - self.nx))
         u_full = ca.vertcat(u, ca.SX.zeros(N_INPUTS - self.nu))
         return ca.cse(rk4_step(x_full, u_full, ca.SX.zeros(2), self.quadrotor, self.config.dt))[: self.nx]
 
     def input_cost(self, u: ca.SX) -> ca.SX:
-        """Cost of the inputs of one stage, each over its limit."""
+        """Return the cost of the inputs of one stage, each divided by its limit."""
         return self.config.input_weight * ca.sumsqr(u / self.max_input)
 
     def goal_cost(self, x: ca.SX, x0: ca.SX, goal: ca.SX) -> ca.SX:
-        """Terminal cost: squared distance to the goal over the present one, so that far goals do not dominate."""
+        """Return the terminal cost: the squared distance to the goal, divided by the current one, so that distant goals
+        do not dominate."""
         cost = self.config.goal_weight * ca.sumsqr(goal - x[:3]) / ca.fmax(ca.sumsqr(goal - x0[:3]), 1.0)
         if self.nx == N_STATES:
-            cost += self.config.goal_weight * x[8] ** 2  # the task asks for no heading: fly with yaw zero
+            cost += self.config.goal_weight * x[8] ** 2  # the task prescribes no heading, so fly with yaw zero
         return cost
 
     def distances(self, x: ca.SX, others: ca.SX) -> list[ca.SX]:
-        """Distance (m) to each other robot's believed position; ``others`` is (3, n_others)."""
-        # The small constant keeps the gradient finite where two centres coincide.
+        """Return the distances (m) to the believed positions of other robots; ``others`` is (3, n_others)."""
+        # The small constant keeps the gradient finite if two centres coincide
         return [ca.sqrt(ca.sumsqr(x[:3] - others[:, j]) + 1e-6) for j in range(self.n_others)]
 
     def repulsion_residual(self, distance: ca.SX) -> ca.SX:
-        """Square root of the repulsion from one other robot, for methods that linearise it (Gauss-Newton)."""
+        """Return the square root of the repulsion from another robot, for methods that linearise it (Gauss-Newton)."""
         c = self.config
         steepness = c.repulsion_steepness * (distance / c.separation - c.repulsion_buffer)
         return math.sqrt(c.repulsion_weight) / (1 + ca.exp(steepness))
 
     def repulsion_cost(self, distance: ca.SX) -> ca.SX:
-        """Smooth repulsion from one other robot; it conditions the problem where the bare constraint leaves it flat."""
+        """Return the smooth repulsion from another robot, which improves the conditioning of the problem."""
         return self.repulsion_residual(distance) ** 2
 
     def box_violations(self, x: ca.SX) -> ca.SX:
-        """Amounts by which a state leaves the workspace (m) and the speed limits (m/s); violated where positive."""
+        """Return the amounts by which a state violates the workspace (m) and the speed limits (m/s) if positive."""
         c = self.config
         speed = ca.DM([c.max_speed, c.max_speed, c.max_vertical_speed])
         return ca.vertcat(

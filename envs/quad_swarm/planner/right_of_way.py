@@ -1,7 +1,7 @@
-"""Passing on the right: a convention that settles who passes whom on which side, where plans arrive late.
+"""Right of way: a convention about the side on which robots pass each other when plans arrive late.
 
-Two robots that approach each other head-on and know only each other's old plans may both dodge to the same side, again
-and again. The rules of the air have an answer: each alters its heading to the right (ICAO Annex 2, 3.2.2.2).
+Two robots that approach head-on and only know each other's outdated plans may repeatedly evade to the same side. The
+rules of the air resolve this: both alter their heading to the right (ICAO Annex 2, 3.2.2.2).
 """
 
 from __future__ import annotations
@@ -9,20 +9,20 @@ from __future__ import annotations
 from quad_swarm.native import pairs
 from quad_swarm.planner.problem import Problems
 
-_FADE = 1.0  # s before the closest approach, from which on less and less is asked for: then the sides are settled
-_SLOW = 0.5  # m/s of closing speed, below which less is asked for: then there is no head-on
+_FADE = 1.0  # time before the closest approach from which the effect fades, since the sides are settled then (s)
+_SLOW = 0.5  # closing speed below which the effect is reduced, since the approach is not head-on then (m/s)
 
 
 def keep_right(problems: Problems, distance: float, dt: float) -> Problems:
-    """The same problems with every other robot whose plan is known grown by ``distance`` on the side on which it should
-    not be passed.
+    """Enlarge all other robots with known plans by ``distance`` on the side on which they should not be passed.
 
-    Its believed positions move by that distance to the left, as seen along the relative motion, and the clearance grows
-    as much: on the right everything stays as it was.
+    Their believed positions move by this distance to the left, as seen along the relative motion, and the clearance
+    grows by the same amount. Nothing changes on the right.
 
     :param problems: a batch of B problems
-    :param distance: how much to grow the others (m)
+    :param distance: distance by which to enlarge the others (m)
     :param dt: length of a stage (s)
+    :return: the changed problems
     """
     known = problems.announced
     if known is None or not known.any():

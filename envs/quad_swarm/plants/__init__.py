@@ -1,4 +1,4 @@
-"""What is flown: our own model, or a simulator of other people. The planner knows the model alone."""
+"""Plants, which simulate the vehicles: our own model or another simulator. The planner only knows the model."""
 
 from __future__ import annotations
 

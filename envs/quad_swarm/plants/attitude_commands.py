@@ -1,4 +1,4 @@
-"""What simulators of other people take: an attitude and a thrust. Our robots command a climb rate."""
+"""Conversion of our robots' commands, with a climb rate, to those of other simulators: an attitude and a thrust."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 GRAVITY = 9.81  # m/s^2
 _CLIMB_GAIN = 3.0  # 1/s
-_MOST = 1.8  # of the weight
+_MOST = 1.8  # maximum thrust as a multiple of the weight
 
 
 def thrust(state: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Thrust by mass of a proportional loop on the climb rate, (...) (m/s^2).
+    """Compute the thrust per mass of a proportional controller of the climb rate, (...) (m/s^2).
 
     :param state: states, (..., 9)
     :param u: inputs, (..., 4)
@@ -21,8 +21,10 @@ def thrust(state: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def yaw(state: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-    """Yaw to be held: the robot's own, turned by what its rate makes of it in a sub-step, (...) (rad).
+    """Compute the commanded yaw: the current yaw plus its change in a sub-step, (...) (rad).
 
+    :param state: states, (..., 9)
+    :param u: inputs, (..., 4)
     :param dt: length of the sub-step (s)
     """
     return state[..., 8] + u[..., 3] * dt

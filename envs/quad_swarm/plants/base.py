@@ -1,4 +1,4 @@
-"""The interface of a plant: states in, commands in, states out, for E swarms of n robots at once."""
+"""The interface of plants, which map states and commands to the next states of E swarms of n robots."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from quad_swarm.errors import unknown_name
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
 MODEL = "model"
-# Simulators and the vehicles that each of them knows, the first one by default
+# Simulators and their vehicles, the first of which is the default
 SIMULATORS: dict[str, tuple[str, ...]] = {
     "crazyflow": ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
     "rotorpy": ("crazyflie", "crazyfliebrushless", "hummingbird"),
@@ -18,35 +18,35 @@ SIMULATORS: dict[str, tuple[str, ...]] = {
 
 
 def simulated_vehicles() -> list[str]:
-    """All vehicles of `SIMULATORS`, as ``plant`` takes them."""
+    """Return all vehicles of `SIMULATORS` as values of ``plant``."""
     return [f"{simulator}:{vehicle}" for simulator, vehicles in SIMULATORS.items() for vehicle in vehicles]
 
 
 class Plant(Protocol):
-    """Robots that fly. State (9) and input (4) are those of `quad_swarm.quadrotor`."""
+    """Simulation of robots. State (9) and input (4) are those of `quad_swarm.quadrotor`."""
 
     def place(self, swarm: int, state: np.ndarray) -> None:
-        """Put one swarm's robots into states, (n, 9), with everything else at rest."""
+        """Set the states of one swarm's robots, (n, 9), with everything else at rest."""
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
 
     def fork(self) -> Plant:
-        """A copy that flies on by itself."""
+        """Return an independent copy."""
 
     def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray, factors: np.ndarray | None) -> np.ndarray:
-        """States after a sub-step.
+        """Compute the states after a sub-step.
 
-        :param state: present states, (E, n, 9): those that the last call returned, moved by noise at most
-        :param u: inputs that are held, (E, n, 4)
+        :param state: current states, (E, n, 9), which are those of the last call, possibly with added noise
+        :param u: constant inputs, (E, n, 4)
         :param air: velocity of the air at each robot, (E, n, 2) (m/s)
-        :param factors: of each vehicle's parameters, see `QuadrotorModel.step`; only our own model has them
+        :param factors: factors of each vehicle's parameters, see `QuadrotorModel.step`; for our own model only
         """
         ...
 
 
 class ModelPlant:
-    """The planner's model itself.
+    """Plant that uses the planner's own model.
 
     :param model: the dynamics over a sub-step
     """
@@ -55,7 +55,7 @@ class ModelPlant:
         self._model = model
 
     def place(self, swarm: int, state: np.ndarray) -> None:
-        """See `Plant`; the state is all there is."""
+        """See `Plant`. The model has no hidden state."""
 
     def keep(self, swarms: np.ndarray) -> None:
         """See `Plant`."""
@@ -70,9 +70,9 @@ class ModelPlant:
 
 
 def parse_plant(name: str) -> tuple[str, str]:
-    """Simulator and vehicle of a plant's name, such as "model", "crazyflow" or "crazyflow:cf21B_500".
+    """Parse the name of a plant, such as "model", "crazyflow" or "crazyflow:cf21B_500", into simulator and vehicle.
 
-    :raises ValueError: unknown simulator or vehicle
+    :raises ValueError: if the simulator or the vehicle is unknown
     """
     simulator, _, vehicle = name.partition(":")
     if simulator == MODEL and not vehicle:
@@ -85,15 +85,15 @@ def parse_plant(name: str) -> tuple[str, str]:
 
 
 def make_plant(name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int) -> Plant:
-    """What is flown.
+    """Create a plant.
 
     :param name: see `parse_plant`
-    :param params: of our own model; of a simulator's vehicle only the drag, by which wind pushes it
+    :param params: parameters of our own model; other simulators only use the drag, for the force of the wind
     :param dt: length of a sub-step (s)
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
-    :raises ValueError: unknown plant, or a simulator that cannot take sub-steps of this length
-    :raises ImportError: the simulator is not installed
+    :raises ValueError: if the plant is unknown, or the simulator does not support sub-steps of this length
+    :raises ImportError: if the simulator is not installed
     """
     simulator, vehicle = parse_plant(name)
     if simulator == MODEL:

@@ -1,6 +1,7 @@
-"""Crazyflow (Schuck, Rath et al., arXiv:2606.01478): identified Crazyflie and Holybro vehicles, 500 Hz, vectorised.
+"""Adapter of Crazyflow (Schuck, Rath et al., arXiv:2606.01478): identified Crazyflie and Holybro vehicles at 500 Hz,
+vectorised.
 
-Its vehicles take attitudes and a thrust.
+The vehicles are commanded by attitude and thrust.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from copy import copy
 import numpy as np
 
 with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-    warnings.simplefilter("ignore")  # of optional parts that are not needed here
+    warnings.simplefilter("ignore")  # they concern optional parts that are not needed
     logging.getLogger("jax").setLevel(logging.ERROR)
     # Crazyflow first: it has to be imported before SciPy
     from crazyflow.control import Control
@@ -29,29 +30,29 @@ from quad_swarm.plants.attitude_commands import GRAVITY, thrust, yaw
 from quad_swarm.quadrotor import ATTITUDE, POSITION, VELOCITY
 
 _FREQUENCY = 500  # Hz
-# Above the simulator's floor, which it would rest on: our workspace has none
+# High above the simulator's floor, since our workspace has no floor
 _ALTITUDE = 100.0
 
 
 class CrazyflowPlant:
-    """A `Plant`, but for the factors that only our own model has.
+    """`Plant` without the factors of vehicle parameters, which only our own model has.
 
-    Swarms that were dropped stay in the simulation, so that nothing is compiled anew.
+    Dropped swarms stay in the simulation to avoid a recompilation.
 
-    :param vehicle: a drone of crazyflow; Holybro's has second-order attitude dynamics, the others first principles
-    :param drag: along x and y, which says how wind pushes the vehicle (1/s)
+    :param vehicle: a drone of Crazyflow; Holybro's has second-order attitude dynamics, the others use first principles
+    :param drag: drag coefficients along x and y, for the force of the wind (1/s)
     :param dt: length of a sub-step (s), a multiple of 2 ms
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
-    :raises ValueError: the sub-step is no multiple of 2 ms
+    :raises ValueError: if the sub-step is not a multiple of 2 ms
     """
 
     def __init__(self, vehicle: str, drag: tuple[float, float], dt: float, n_swarms: int, n_robots: int):
         self._n_steps = round(dt * _FREQUENCY)
         if self._n_steps < 1 or abs(self._n_steps / _FREQUENCY - dt) > 1e-9:
-            raise ValueError(f"crazyflow moves in steps of {1000 / _FREQUENCY:.0f} ms: a sub-step of {dt} s is none.")
+            raise ValueError(f"crazyflow needs sub-steps that are multiples of {1000 / _FREQUENCY:.0f} ms, not {dt} s.")
         dynamics = Dynamics.so_rpy if vehicle == "hb_x500" else Dynamics.first_principles
-        mujoco.set_mju_user_warning(lambda message: None)  # how it copies a drone is not the user's concern
+        mujoco.set_mju_user_warning(lambda message: None)  # they concern the copying of drones
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self._sim = Sim(
@@ -65,7 +66,7 @@ class CrazyflowPlant:
             )
         drone = self._sim.data.params
         self._mass = _number(drone.mass)
-        # Force of the rotors by the thrust that is commanded, which identified dynamics scale: offset (N) and slope
+        # Offset (N) and slope of the rotors' force as a function of the commanded thrust
         self._thrust = (0.0, 1.0)
         if dynamics == Dynamics.so_rpy:
             self._thrust = (_number(drone.acc_coef), _number(drone.cmd_f_coef))
@@ -89,7 +90,7 @@ class CrazyflowPlant:
         )
 
     def _hover_rotors(self) -> float:
-        """Speed of a rotor that carries its share of the weight; 0 where the dynamics know none."""
+        """Return the speed of a rotor at hover, 0 if the dynamics do not model rotors."""
         coefficients = getattr(self._sim.data.params, "rpm2thrust", None)
         if coefficients is None:
             return 0.0
@@ -101,7 +102,7 @@ class CrazyflowPlant:
         self._kept = self._kept[swarms]
 
     def fork(self) -> CrazyflowPlant:
-        """See `Plant`; JAX's arrays never change."""
+        """See `Plant`. A shallow copy suffices, because JAX's arrays are immutable."""
         return copy(self)
 
     def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray) -> np.ndarray:

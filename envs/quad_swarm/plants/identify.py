@@ -1,7 +1,7 @@
-"""Identify a vehicle: step responses of a plant, and the planner's model that comes closest to them.
+"""Identify a vehicle: fit the planner's model to step responses of a plant.
 
-``sb3-maddpg identify --plant crazyflow:cf21B_500 --out crazyflie.yml`` prints the parameters with what they leave over,
-and writes a vehicle file that worlds take as ``vehicle``.
+``sb3-maddpg identify --plant crazyflow:cf21B_500 --out crazyflie.yml`` prints the parameters and the residuals, and
+writes a vehicle file, which worlds accept as ``quadrotor``.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ EXAMPLES = "  sb3-maddpg identify --plant crazyflow:cf21B_500 --out crazyflie.ym
 
 DT = 0.01  # s
 SECONDS = 3.0
-HELD = 2.0  # s, after which an input goes back to zero
+HELD = 2.0  # duration of an input before it returns to zero (s)
 TILTS = (-0.3, -0.15, 0.15, 0.3)  # rad
 CLIMBS = (-1.0, -0.5, 0.5, 1.0)  # m/s
-# Usual sizes of what is fitted, by which errors are weighed: attitudes of 0.1 rad count as much as speeds of 1 m/s
+# Scales that weight the errors: attitudes of 0.1 rad count as much as velocities of 1 m/s
 _SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1])
 
 
 class Identification(NamedTuple):
-    """What was found.
+    """Result of an identification.
 
-    :param params: of the model
-    :param attitude_rms: what the model leaves over of roll and pitch, root mean square (deg)
-    :param attitude_max: the largest error (deg)
-    :param velocity_rms: the same of the velocities (m/s)
-    :param velocity_max: the largest error (m/s)
+    :param params: parameters of the model
+    :param attitude_rms: root mean square error of roll and pitch (deg)
+    :param attitude_max: largest error of roll and pitch (deg)
+    :param velocity_rms: root mean square error of the velocities (m/s)
+    :param velocity_max: largest error of the velocities (m/s)
     """
 
     params: QuadrotorParams
@@ -45,7 +45,7 @@ class Identification(NamedTuple):
 
 
 def experiment() -> np.ndarray:
-    """Inputs of the step responses, one robot each: roll, pitch and climb rate, (T, robots, 4)."""
+    """Return the inputs of the step responses in roll, pitch and climb rate, one robot each, (T, robots, 4)."""
     steps = [(axis, size) for axis, sizes in enumerate((TILTS, TILTS, CLIMBS)) for size in sizes]
     u = np.zeros((round(SECONDS / DT), len(steps), 4))
     for robot, (axis, size) in enumerate(steps):
@@ -54,17 +54,17 @@ def experiment() -> np.ndarray:
 
 
 def identify(plant: str) -> Identification:
-    """Fit the planner's model to step responses of a plant, roll, pitch and climb rate for both signs and two sizes.
+    """Fit the planner's model to step responses of a plant in roll, pitch and climb rate.
 
     :param plant: see `parse_plant`
-    :raises ValueError: unknown plant
-    :raises ImportError: the extra ``plants`` is not installed
+    :raises ValueError: if the plant is unknown
+    :raises ImportError: if the extra ``plants`` is not installed
     """
     try:
-        from scipy.optimize import least_squares  # here, so that the help needs no extra
+        from scipy.optimize import least_squares  # imported here, so that the help needs no extra
     except ImportError as missing:
         raise ImportError(
-            f"To identify a vehicle takes more: pip install 'sb3-maddpg[plants]' ({missing})."
+            f"Identification needs more packages: pip install 'sb3-maddpg[plants]' ({missing})."
         ) from missing
     u = experiment()
     count = u.shape[1]
@@ -105,7 +105,7 @@ def identify(plant: str) -> Identification:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The command line."""
+    """Run the command line and return the exit status."""
     parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
     parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
     parser.add_argument("--out", type=Path, metavar="FILE", help="vehicle file to write, YAML")
@@ -115,8 +115,8 @@ def main(argv: list[str] | None = None) -> int:
     for name in VEHICLE_PARAMETERS:
         print(f"{name:22}{getattr(found.params, name):22.4f}{getattr(QuadrotorParams(), name):10.4f}")
     print(
-        f"left over: roll and pitch {found.attitude_rms:.2f} deg rms, {found.attitude_max:.2f} at most; "
-        f"velocity {found.velocity_rms:.3f} m/s rms, {found.velocity_max:.3f} at most"
+        f"residuals: roll and pitch {found.attitude_rms:.2f} deg rms, {found.attitude_max:.2f} deg max; "
+        f"velocity {found.velocity_rms:.3f} m/s rms, {found.velocity_max:.3f} m/s max"
     )
     if args.out:
         values = {name: round(getattr(found.params, name), 4) for name in VEHICLE_PARAMETERS}

@@ -1,4 +1,4 @@
-"""A simulator in a process of its own: its threads, its memory and what it asks of other libraries stay there."""
+"""Simulators in separate processes, which isolates their threads, memory and library requirements."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from quad_swarm.quadrotor import QuadrotorParams
 
 
 class _Server:
-    """The process, started at the first call. It ends with this one, however that ends."""
+    """Process of a simulator. It ends with this process, however that ends."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -26,10 +26,11 @@ class _Server:
         there.close()
 
     def call(self, *message: Any) -> Any:
-        """What the process answers.
+        """Send a message to the process and return its answer.
 
-        :raises ValueError: and `ImportError`, as the process did
-        :raises RuntimeError: the process died
+        :raises ValueError: if the process raised it
+        :raises ImportError: if the process raised it
+        :raises RuntimeError: if the process died
         """
         with self._lock:
             try:
@@ -37,7 +38,7 @@ class _Server:
                 answer = self._connection.recv()
             except (EOFError, OSError) as error:
                 code = self.process.wait()
-                raise RuntimeError(f"The simulator's process ended with {code}; its messages stand above.") from error
+                raise RuntimeError(f"The simulator's process exited with {code}; see its messages above.") from error
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -47,7 +48,8 @@ _servers: dict[tuple[int, str], _Server] = {}
 
 
 def _server(simulator: str) -> _Server:
-    """This process' server for a simulator: they do not bear each other's libraries. A fork starts its own."""
+    """Return this process's server for a simulator. Each simulator has its own server, because their libraries
+    conflict, and a forked process starts its own servers."""
     key = os.getpid(), simulator
     server = _servers.get(key)
     if server is None or server.process.poll() is not None:
@@ -56,7 +58,7 @@ def _server(simulator: str) -> _Server:
 
 
 class RemotePlant:
-    """See `Plant`: one that another process flies.
+    """`Plant` in another process.
 
     :param simulator: one of `SIMULATORS`
     :param vehicle: one of its vehicles
@@ -64,8 +66,8 @@ class RemotePlant:
     :param dt: length of a sub-step (s)
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
-    :raises ValueError: what the simulator refuses
-    :raises ImportError: it is not installed
+    :raises ValueError: if the simulator rejects an argument
+    :raises ImportError: if the simulator is not installed
     """
 
     def __init__(self, simulator: str, vehicle: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int):
@@ -95,5 +97,5 @@ class RemotePlant:
         if hasattr(self, "_number") and self._server.process.poll() is None:
             try:
                 self._server.call("drop", self._number)
-            except (RuntimeError, AttributeError, TypeError):  # at the end of the interpreter
+            except (RuntimeError, AttributeError, TypeError):  # at interpreter shutdown
                 return

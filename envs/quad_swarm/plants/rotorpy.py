@@ -1,6 +1,6 @@
-"""RotorPy (Folk, Paulos and Kumar, arXiv:2306.04485): motors that lag, rotors with drag and inflow in the wind.
+"""Adapter of RotorPy (Folk, Paulos and Kumar, arXiv:2306.04485), which models motor lag, rotor drag and inflow in wind.
 
-Its vehicles take attitudes and a thrust here, and hold them by their own attitude loop.
+The vehicles are commanded by attitude and thrust, which RotorPy's own attitude controller tracks.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from scipy.spatial.transform import Rotation
 from quad_swarm.plants.attitude_commands import GRAVITY, thrust, yaw
 from quad_swarm.quadrotor import ATTITUDE, POSITION, VELOCITY
 
-_PERIOD = 0.005  # s, of the attitude loop, at most
+_PERIOD = 0.005  # maximum period of the attitude controller (s)
 _CPU = th.device("cpu")
 
 
 class RotorpyPlant:
-    """A `Plant`, but for the factors that only our own model has. The wind acts on each rotor.
+    """`Plant` without the factors of vehicle parameters, which only our own model has. Wind acts on each rotor.
 
-    :param vehicle: one whose parameters come with RotorPy
-    :param drag: not used, the vehicle has aerodynamics of its own
+    :param vehicle: a vehicle whose parameters come with RotorPy
+    :param drag: unused, since RotorPy has its own aerodynamics
     :param dt: length of a sub-step (s)
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
     """
 
     def __init__(self, vehicle: str, drag: tuple[float, float], dt: float, n_swarms: int, n_robots: int):
-        th.set_num_threads(1)  # small matrices, over which threads only wait for each other
+        th.set_num_threads(1)  # more threads do not speed up small matrices
         params = importlib.import_module(f"rotorpy.vehicles.{vehicle}_params").quad_params
         self._n_steps = math.ceil(dt / _PERIOD - 1e-9)
         self._dt = dt
@@ -56,7 +56,7 @@ class RotorpyPlant:
         self._rotor_speeds[swarm] = self._hover
 
     def keep(self, swarms: np.ndarray) -> None:
-        """See `Plant`. All of a kind, the first of RotorPy's vehicles fly on."""
+        """See `Plant`. RotorPy's vehicles are identical, so the first ones continue."""
         self._body_rates, self._rotor_speeds = self._body_rates[swarms], self._rotor_speeds[swarms]
 
     def fork(self) -> RotorpyPlant:
@@ -95,7 +95,7 @@ class RotorpyPlant:
         return np.concatenate([after["x"], after["v"], angles], axis=-1).reshape(state.shape)
 
     def _all(self, values: np.ndarray, rest: list[float] | float = 0.0) -> th.Tensor:
-        """What is given for the vehicles that fly, and a default for the others."""
+        """Return values for all vehicles: those given for the first ones, and a default for the others."""
         everything = np.empty((self._vehicles.num_drones, values.shape[1]))
         everything[:] = rest
         everything[: len(values)] = values

@@ -12,7 +12,7 @@ from quad_swarm.plants.base import SIMULATORS
 
 
 def make(simulator: str, vehicle: str, *arguments: Any) -> Any:
-    """A plant in this process."""
+    """Create a plant in this process."""
     if simulator not in SIMULATORS:
         raise ValueError(f"No adapter for the simulator {simulator!r}.")
     try:
@@ -25,7 +25,7 @@ def make(simulator: str, vehicle: str, *arguments: Any) -> Any:
 
 
 def serve(connection: Connection) -> None:
-    """Answer calls until the other side is gone."""
+    """Answer calls until the other side closes the connection."""
     plants: dict[int, Any] = {}
     numbers = itertools.count()
     while True:

@@ -1,1 +1,1 @@
-"""The decision task on top of the world: observations, rules, reward, the end and the figures of an episode."""
+"""The decision task on top of the world: observations, rules, reward, termination and statistics of episodes."""

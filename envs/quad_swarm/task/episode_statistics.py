@@ -1,4 +1,4 @@
-"""What happened in an episode, counted once for the environments' `info`, the logs and the evaluation."""
+"""Statistics of episodes for the environments' `info`, the logs and the evaluation."""
 
 from __future__ import annotations
 
@@ -17,38 +17,39 @@ _NO_PLAN = int(BeliefSource.CONSTANT_VELOCITY)
 
 
 def exchange_bytes(config: SwarmConfig) -> int:
-    """Size of a request and its answer."""
+    """Return the size of a request and its answer in bytes."""
     return REQUEST_BYTES + plan_bytes(config.planner.horizon)
 
 
 class EpisodeStatistics:
-    """Figures of the running episodes of E swarms, as arrays of length E.
+    """Statistics of the running episodes of E swarms, as arrays of length E.
+
+    Requests and path length count until all robots are at their goals at the same time, until a collision, or until the
+    time limit, whichever comes first. Separations cover all steps flown; if an episode continues after a collision,
+    they show how deep the collision is.
 
     :param n_swarms: number of swarms E
     :param config: the world
 
-    Requests and path count from the start until all robots are at their goals at once, a collision, or the time limit,
-    whichever comes first. Separations are taken over all steps flown: where an episode goes on after a collision they
-    say how deep it got.
-
-    :ivar steps: steps flown
-    :ivar steps_counted: steps in which requests and path counted
-    :ivar requests: requests made in them
-    :ivar possible_requests: how many could have been made in them: of each robot to each that it perceives
-    :ivar peak_requests: most requests in one of them
-    :ivar plans_used: plans of others that were believed in them, and
-    :ivar plan_ages: the sum of their ages when they were (steps)
-    :ivar requests_flown: requests made in all steps flown
+    :ivar steps: number of steps flown
+    :ivar steps_counted: number of steps that count for requests and path length
+    :ivar requests: number of requests in the steps counted
+    :ivar possible_requests: number of possible requests in the steps counted: one of each robot to each perceived robot
+        per step
+    :ivar peak_requests: maximum number of requests in a step counted
+    :ivar plans_used: number of other robots' plans believed, summed over the steps counted
+    :ivar plan_ages: sum of the ages of these plans (steps)
+    :ivar requests_flown: number of requests in all steps flown
     :ivar path_length: distance flown in the steps counted, mean over the robots (m)
-    :ivar reached: all robots were at their goals at once
-    :ivar arrived: the same, before any collision
-    :ivar collided: two robots collided, by the collisions that end episodes
-    :ivar collided_at_steps: a collision seen at a step
-    :ivar collided_continuous: a collision seen at or between steps
+    :ivar reached: whether all robots were at their goals at the same time
+    :ivar arrived: whether they were so before any collision
+    :ivar collided: whether two robots collided, in the sense that ends episodes
+    :ivar collided_at_steps: whether two robots collided at a step
+    :ivar collided_continuous: whether two robots collided at or between steps
     :ivar min_separation: smallest distance between two robots at a step (m)
-    :ivar min_separation_continuous: the same at or between steps (m)
-    :ivar planner_failures: plans without a successful solve (status SHIFTED or BRAKING)
-    :ivar solve_seconds: wall-clock time of the planner, this swarm's share of each batch call (s)
+    :ivar min_separation_continuous: smallest distance between two robots at or between steps (m)
+    :ivar planner_failures: number of plans without a successful solve (status SHIFTED or BRAKING)
+    :ivar solve_seconds: wall-clock time of the planner, as this swarm's share of each batch call (s)
     """
 
     _START = {  # noqa: RUF012 - never changed
@@ -97,7 +98,7 @@ class EpisodeStatistics:
             setattr(self, name, np.full(n_swarms, value))
 
     def reset(self, swarm: int) -> None:
-        """Begin a new episode in one swarm."""
+        """Start a new episode in one swarm."""
         for name, value in self._START.items():
             getattr(self, name)[swarm] = value
 
@@ -107,26 +108,26 @@ class EpisodeStatistics:
             setattr(self, name, getattr(self, name)[swarms])
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """All figures by name."""
+        """Return all statistics by name."""
         return {name: getattr(self, name).copy() for name in self._START}
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from what `state_dict` gave."""
+        """Restore a state from `state_dict`."""
         for name in self._START:
             setattr(self, name, like(getattr(self, name), state[name], name))
 
     def add(self, report: StepReport, n_requests: np.ndarray, collided: np.ndarray) -> None:
-        """Count one step.
+        """Add one step.
 
-        :param report: what happened in it
-        :param n_requests: requests made in it, (E,)
-        :param collided: whether two robots collided in it, by the collisions that end episodes, (E,) bool
+        :param report: report of the step
+        :param n_requests: number of requests in the step, (E,)
+        :param collided: whether two robots collided in the step, in the sense that ends episodes, (E,) bool
         """
         counted = ~(self.reached | self.collided)
         self.steps += 1
         self.steps_counted += counted
         self.requests += counted * n_requests
-        # The same in every swarm where nobody is missed
+        # `others` has no leading axis of swarms unless the neighbourhood is limited
         self.possible_requests += counted * (report.others >= 0).sum(axis=(-2, -1))
         self.peak_requests = np.maximum(self.peak_requests, counted * n_requests)
         used = report.belief_source.reshape(len(counted), -1) != _NO_PLAN
@@ -147,15 +148,15 @@ class EpisodeStatistics:
 
     @property
     def success(self) -> np.ndarray:
-        """All robots arrived and none collided, not even afterwards."""
+        """Whether all robots arrived and none collided, not even afterwards, (E,) bool."""
         return self.arrived & ~self.collided
 
     def row(self, swarm: int) -> dict[str, float]:
-        """One swarm's figures by name."""
+        """Return one swarm's statistics by name."""
         return {name: getattr(self, name)[swarm].item() for name in self._START}
 
     def metrics(self) -> dict[str, np.ndarray]:
-        """Figures of the episodes so far, each (E,), by the names under which they are logged."""
+        """Return metrics of the episodes so far by the names under which they are logged, each (E,)."""
         n, dt = self.config.n_robots, self.config.planner.dt
         plans = self.steps * n
         return {

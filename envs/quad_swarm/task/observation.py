@@ -1,7 +1,7 @@
-"""What robots observe, as arrays over E swarms, and what each column is about.
+"""Observations of robots, as arrays over E swarms, and the meaning of their columns.
 
-The paper's observation is a flat list of relative states. The other one describes every pair (robot, other) by groups
-of features in a frame that is turned towards the other, and holds nothing that the robot does not know by itself.
+The paper's observation is a flat list of relative states. The pair observation describes each pair (robot, other) by
+groups of features in a frame that points to the other. Except for the critic's, it only uses what the robot knows.
 """
 
 from __future__ import annotations
@@ -19,44 +19,41 @@ from quad_swarm.task.view import View
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import Swarm
 
-# About the largest speed (m/s) and the usual distance (m): divide observations to unit size.
+# Approximate maximum speed (m/s) and typical distance (m), which scale observations to unit size
 _VELOCITY_SCALE = 4.0
 _POSITION_SCALE = 4.0
 
 
 class Observation(Protocol):
-    """How a swarm looks to its robots.
+    """Function that computes the observations of a swarm's robots.
 
-    :ivar size: length of one robot's observation
+    :ivar size: length of a robot's observation
     """
 
     size: int
 
     @property
     def layout(self) -> dict[str, Any]:
-        """Which columns are about the robot itself and which about each of the others: `own`, `neighbours`,
-        `acts_on_neighbours`, `critic`, those about each of the others that no robot knows when it decides, and
-        `action_mask`, whom it may ask, `complete` unless neighbours may be absent, and `who_columns`, who the others
-        are, where that changes."""
+        """Meaning of the columns, see `sb3_maddpg.relational.ObservationLayout`."""
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
-        """What every robot observes, (E, n, size) float32."""
+        """Return the observations of all robots, (E, n, size) float32."""
 
 
 class PaperObservation:
-    """z_i = [v_i, p_ig, {p_ij}, {v_ij}] (Sec. IV-B): own velocity, goal relative to the robot, then all relative
-    positions of the others, then all their relative velocities, others in ascending order; length 6n.
+    """The paper's observation z_i = [v_i, p_ig, {p_ij}, {v_ij}] (Sec. IV-B): own velocity, goal relative to the robot,
+    relative positions of all others, and relative velocities of all others, in ascending order; length 6n.
 
-    Where the neighbourhood is limited to m others there are m of them, an empty place is all zero, and their numbers
-    follow as in `PairObservation`; length 7 m + 6.
+    If the neighbourhood is limited to m others, there are m positions and velocities, zero in an empty slot, and the
+    numbers of the others follow as in `PairObservation`; length 7m + 6.
 
     :param config: the world
-    :param scaled: divide distances by 4 m and velocities by 4 m/s
+    :param scaled: whether to divide distances by 4 m and velocities by 4 m/s
     """
 
     def __init__(self, config: SwarmConfig, scaled: bool = False):
         self.config = config
-        self._numbers = 6 * (config.n_others + 1)  # where the numbers of the others begin, if there are any
+        self._numbers = 6 * (config.n_others + 1)  # first column of the others' numbers, if there are any
         self.size = self._numbers + (config.n_others if config.is_limited else 0)
         distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
         others = 3 * config.n_others
@@ -85,16 +82,16 @@ class PaperObservation:
 
 
 def _numbered(first: int, end: int) -> dict[str, Any]:
-    """What a layout says of the columns with the numbers of others: also that nobody acts on an empty place."""
+    """Return the layout entries of the columns with the others' numbers, which also mask actions on empty slots."""
     return {"who_columns": list(range(first, end)), "action_mask": list(range(first, end))}
 
 
 class PairView:
-    """A view with vectors turned so that x points horizontally to the other robot and z up, and mirrored so that the
-    other moves to the left: what is to be learned about a pair does not depend on either.
+    """View in the frame of each pair: x points horizontally to the other robot, z points up, and the frame is mirrored
+    so that the other robot moves to the left. Features of a pair thus do not depend on rotations and reflections.
 
-    :param view: what the robots know
-    :param swarm: everything, for what only critics see
+    :param view: the knowledge of the robots
+    :param swarm: the swarm, for features that only critics see
     :param config: the world
     """
 
@@ -109,26 +106,26 @@ class PairView:
         self.side = np.where(self.cos * view.vel[..., 1] < self.sin * view.vel[..., 0], -1.0, 1.0)
 
     def turn(self, vectors: np.ndarray) -> np.ndarray:
-        """Vectors along the world's axes, (E, n, n - 1, ..., 3), seen from the pair's frame."""
+        """Transform vectors along the world's axes, (E, n, n - 1, ..., 3), to the pair's frame."""
         more = (1,) * (vectors.ndim - self.cos.ndim - 1)
         cos, sin, side = (a.reshape(a.shape + more) for a in (self.cos, self.sin, self.side))
         x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
         return np.stack([cos * x + sin * y, side * (cos * y - sin * x), z], axis=-1)
 
     def closeness(self, distance: np.ndarray) -> np.ndarray:
-        """A distance at several magnifications around contact, (..., 3)."""
+        """Return a distance at several scales around contact, (..., 3)."""
         return np.tanh((distance - self.contact)[..., None] / _MAGNIFICATIONS)
 
 
 _MAGNIFICATIONS = np.array([0.05, 0.2, 1.0])
-# Usual speed (m/s), which brings velocities in pairs' features to unit size.
+# Typical speed (m/s), which scales velocities in pair features to unit size
 _SPEED = 1.5
-# Stages of a trajectory that are looked at, out of 1..N, as fractions of N.
+# Stages of a trajectory that become features, as fractions of the horizon N
 _STAGES = (0.2, 0.5, 1.0)
-# Of what the planner keeps: plans that come no nearer than this are hardly changed by each other. 1.1 is enough for
-# eight robots; in a crowd of sixteen it leaves twice as many collisions.
+# Distance of plans in separations, beyond which they hardly affect each other. 1.1 is enough for eight robots, but
+# leaves twice as many collisions among sixteen.
 _CONFLICT = 1.8
-# Who would come nearer than this many separations within so many seconds
+# An encounter comes closer than this many separations within this many seconds
 _ENCOUNTER, _LOOK_AHEAD = 1.2, 3.0
 
 
@@ -141,7 +138,7 @@ def _flat(array: np.ndarray, keep: int) -> np.ndarray:
 
 
 def _own(view: View) -> np.ndarray:
-    """Own velocity and goal, in a frame whose x points horizontally to the goal: (E, n, 6)."""
+    """Return own velocity and goal in a frame whose x axis points horizontally to the goal, (E, n, 6)."""
     goal, vel = view.goal, view.own_vel
     flat = np.hypot(goal[..., 0], goal[..., 1])
     cos, sin = (goal[..., k] / np.maximum(flat, 1e-6) for k in (0, 1))
@@ -158,7 +155,7 @@ def _own(view: View) -> np.ndarray:
 
 
 def _state(pair: PairView) -> np.ndarray:
-    """Positions, velocities and the own goal."""
+    """Return features of positions, velocities and the robot's own goal."""
     view = pair.view
     distance = length(view.pos)
     own_vel, goal = (np.broadcast_to(a[:, :, None], view.pos.shape) for a in (view.own_vel, view.goal))
@@ -174,24 +171,24 @@ def _state(pair: PairView) -> np.ndarray:
 
 
 def _approach(pair: PairView) -> np.ndarray:
-    """When and how close the two would come with constant velocities."""
+    """Return features of the time and distance of closest approach at constant velocities."""
     distance, time = pair.view.approach(4.0)
     times = np.stack([time / 4.0, np.exp(-time / 0.3), np.exp(-time)], axis=-1)
     return np.concatenate([pair.closeness(distance), times], axis=-1)
 
 
 def _side(pair: PairView) -> np.ndarray:
-    """On which side the other would pass with constant velocities, which the mirrored frame hides: it matters where the
-    planner keeps to a right of way."""
+    """Return features of the side on which the other would pass at constant velocities, which the mirrored frame hides.
+    The side matters if the planner has a right of way."""
     pos, vel = pair.view.pos, pair.view.vel
     speed = np.hypot(vel[..., 0], vel[..., 1])
-    # Positive: the other is to the left of where the robot goes relative to it, as it should be.
+    # Positive if the other passes on the left of the robot's relative path, as the right of way requires
     miss = (vel[..., 1] * pos[..., 0] - vel[..., 0] * pos[..., 1]) / np.maximum(speed, 1e-6)
     return np.stack([pair.side, np.tanh(miss / 0.2), np.tanh(miss)], axis=-1)
 
 
 def _memory(pair: PairView) -> np.ndarray:
-    """The plan received last: its age, how far off it is, and where it departs from a constant velocity."""
+    """Return features of the newest received plan: its age, its error, and its deviation from a constant velocity."""
     view = pair.view
     remembers = view.prediction.remembers.astype(float)
     age = np.minimum(view.age / pair.horizon, 1.0)
@@ -204,7 +201,7 @@ def _memory(pair: PairView) -> np.ndarray:
 
 
 def _plan(pair: PairView) -> np.ndarray:
-    """The own plan against what is expected of the other."""
+    """Return features of the robot's own plan relative to the predicted motion of the other."""
     view = pair.view
     approach, stages = view.plan_approach, _stages(pair.horizon)
     times = pair.dt * (np.array(stages[1:]) + 1)
@@ -220,7 +217,7 @@ def _plan(pair: PairView) -> np.ndarray:
 
 
 def _told(pair: PairView) -> np.ndarray:
-    """What the other knows of this robot: whether it still believes a plan that it was told, and how far it is off."""
+    """Return features of the other's knowledge of this robot: whether it believes a plan, and that plan's error."""
     view, stages = pair.view, _stages(pair.horizon)
     told = view.presumed(stages)
     off = view.plan[:, :, None, stages] - (told.believed - view.own_pos[:, :, None, None])
@@ -235,8 +232,8 @@ def _told(pair: PairView) -> np.ndarray:
 
 
 def _mask(pair: PairView) -> np.ndarray:
-    """Whom there is any use in telling or asking: who comes near the own plan as far as is known, or would soon come
-    near if both kept their velocities."""
+    """Return the action mask: whether the other's predicted motion comes close to the robot's own plan, or the two
+    would soon meet at constant velocities. Otherwise, communication is of no use."""
     view = pair.view
     in_the_way = view.plan_approach.least < _CONFLICT * view.separation
     ahead = view.approach(_LOOK_AHEAD)[0] < _ENCOUNTER * view.separation
@@ -244,7 +241,7 @@ def _mask(pair: PairView) -> np.ndarray:
 
 
 def _critic(pair: PairView) -> np.ndarray:
-    """What no robot knows: how wrong the two are about each other, and how close their plans are."""
+    """Return features that no robot knows: the prediction errors of both robots, and the distance of their plans."""
     view, stages = pair.view, _stages(pair.horizon)
     prediction, plans = view.prediction, view.of_others(view.absolute_plans)
     certain = replace(prediction, remembered=plans, remembers=np.ones(view.age.shape, bool))
@@ -253,7 +250,7 @@ def _critic(pair: PairView) -> np.ndarray:
     parts = (
         np.clip(2 * _flat(pair.turn(surprise), 3), -2, 2),
         np.tanh(size / 0.1),
-        np.tanh(view.of_the_other(size) / 0.1),  # the other's view of this robot
+        np.tanh(view.of_the_other(size) / 0.1),  # swaps the two robots of a pair
         pair.closeness(certain.approach(view.own_pos, view.plan).least),
         pair.closeness(view.plan_approach.least),
         view.of_the_other(prediction.remembers)[..., None],
@@ -261,7 +258,7 @@ def _critic(pair: PairView) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
-# Name -> features of every pair, (E, n, n - 1, any number).
+# Name -> features of all pairs, (E, n, n - 1, any length)
 GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
     "state": _state,
     "approach": _approach,
@@ -275,15 +272,16 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
 
 
 class PairObservation:
-    """A row of a robot: six numbers of its own, then for each of the others the features of some groups.
+    """Pair observation: six numbers about the robot itself, then groups of features about each of the others.
 
-    Where the neighbourhood is limited, an empty place is all zero, and at the end stand the numbers of the others, from
-    1 on, 0: nobody. Critics need them to find the other's own part; robots only act on those that are there.
+    If the neighbourhood is limited, the features of an empty slot are zero, and the last columns are the numbers of the
+    others, counted from 1, with 0 for an empty slot. Critics use these numbers to look up the others' own columns. For
+    robots, they are only the action mask.
 
     :param config: the world
-    :param groups: names of `GROUPS`; "critic" holds what only critics may read
-    :param critics: whether there are any; otherwise their columns are zeros
-    :raises ValueError: unknown group
+    :param groups: names of `GROUPS`; only critics may read the group "critic"
+    :param critics: whether to fill the critic's columns, which are zeros otherwise
+    :raises ValueError: if a group is unknown
     """
 
     def __init__(self, config: SwarmConfig, groups: list[str], critics: bool = True):
@@ -294,7 +292,7 @@ class PairObservation:
         self.groups = [name for name in GROUPS if name in groups]
         sizes = [GROUPS[name](self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
         self._seen = sum(sizes) - (sizes[-1] if self.groups[-1] == "critic" else 0)
-        self._numbers = 6 + config.n_others * sum(sizes)  # where the numbers of the others begin, if there are any
+        self._numbers = 6 + config.n_others * sum(sizes)  # first column of the others' numbers, if there are any
         self.size = self._numbers + (config.n_others if config.is_limited else 0)
         self._blank = 0 if critics else sum(sizes) - self._seen
 
@@ -308,7 +306,7 @@ class PairObservation:
         layout = {"own": list(range(6)), "neighbours": seen.tolist(), "acts_on_neighbours": True}
         layout |= _numbered(self._numbers, self.size) if self.config.is_limited else {"complete": True}
         if "mask" in self.groups:
-            layout["action_mask"] = seen[:, -1].tolist()  # the last group that robots see
+            layout["action_mask"] = seen[:, -1].tolist()  # the mask is the last group that robots see
         return layout | ({"critic": hidden.tolist()} if hidden.size else {})
 
     def __call__(self, swarm: Swarm) -> np.ndarray:
@@ -332,19 +330,19 @@ class PairObservation:
 def make_observation(
     config: SwarmConfig, observation: str = "paper", scale_observation: bool = False, critics: bool = True
 ) -> Observation:
-    """What robots observe.
+    """Create an observation.
 
     :param config: the world
     :param observation: "paper", or names of `GROUPS` joined by "+"
-    :param scale_observation: of the paper's, see there
+    :param scale_observation: see ``scaled`` of `PaperObservation`
     :param critics: see `PairObservation`
-    :raises ValueError: unknown name, or scaling of what is scaled
+    :raises ValueError: if a name is unknown, or the pair observation should be scaled
     """
     if observation == "paper":
         return PaperObservation(config, scale_observation)
     pairs = PairObservation(config, observation.split("+"), critics)
     if scale_observation:
         raise ValueError(
-            f"scale_observation=True is for observation='paper' alone; observation={observation!r} is scaled already."
+            f"scale_observation=True is for observation='paper' only; observation={observation!r} is already scaled."
         )
     return pairs

@@ -1,4 +1,4 @@
-"""The Dec-POMDP of Sec. IV-B on top of the swarm: observation, reward, end of an episode. Batched over E swarms."""
+"""The Dec-POMDP of Sec. IV-B on top of the swarm, batched over E swarms: observation, reward and end of episodes."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ from quad_swarm.world.swarm import StepReport, Swarm
 @checked
 @dataclass(frozen=True)
 class RewardConfig:
-    """R = w_g R_g + w_coll R_coll + w_c R_c with the paper's values (Sec. V-A).
+    """Weights of the reward R = w_g R_g + w_coll R_coll + w_c R_c, with the paper's values (Sec. V-A).
 
-    :param goal: w_g r_g, paid in each step in which all robots are at their goals
-    :param collision: w_coll r_coll, taken when two robots collide
-    :param request: w_c, taken for each request
-    :param near_miss: not in the paper: taken in each step for each pair closer than ``near_miss_distance``, in full at
-        ``near_miss_width`` less than that and in proportion before; a signal that is less rare than collisions
-    :param near_miss_exponent: of that proportion: above 1, a slight miss weighs less and one that almost touches more
-    :param near_miss_distance: see there (m); None: what the planner keeps
-    :param near_miss_width: see there (m)
-    :param near_miss_ahead: count also how close the two come by their plans within so many further steps
-    :param near_miss_narrowing: by how much ``near_miss_distance`` is less for the last of those steps, in proportion
-        for those before: plans that are far ahead still change (m)
-    :raises ValueError: a value is negative or not finite; the near misses' distance or width is zero
+    :param goal: w_g r_g, reward for each step in which all robots are at their goals
+    :param collision: w_coll r_coll, penalty for a collision
+    :param request: w_c, penalty for each request
+    :param near_miss: penalty for each step and each pair closer than ``near_miss_distance``. It increases linearly to
+        its full value at ``near_miss_distance - near_miss_width``. Not in the paper; near misses are less rare than
+        collisions.
+    :param near_miss_exponent: exponent of the increase; above 1, slight near misses weigh less
+    :param near_miss_distance: distance of near misses (m), by default the planner's separation
+    :param near_miss_width: width of the increase (m)
+    :param near_miss_ahead: number of future steps in which near misses of plans also count
+    :param near_miss_narrowing: reduction of ``near_miss_distance`` for the last of these steps (m), proportionally less
+        for earlier steps, because plans for the far future still change
+    :raises ValueError: if a value is negative or not finite, or the distance or width of near misses is zero
     """
 
     goal: NonNegativeFloat = 1.3
@@ -54,14 +55,14 @@ class Outcome(NamedTuple):
     """Result of one step of E swarms.
 
     :param reward: team rewards, (E,)
-    :param pair_rewards: the part of the reward that belongs to a robot and one of the others, (E, n, n - 1): its
-        request, their collision, and an equal share of the goal's reward
-    :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" where it has a
-        weight, each (E,)
-    :param terminated: ended by a collision, or by the arrival of all where that ends episodes, (E,) bool
-    :param truncated: ended by the time limit, (E,) bool
-    :param n_requests: requests made, (E,)
-    :param report: what happened in the world
+    :param pair_rewards: the part of a robot's reward that belongs to one of the others, (E, n, n - 1): its request,
+        their collision or near miss, and an equal share of the goal reward
+    :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" if it has a weight, each
+        (E,)
+    :param terminated: whether a collision, or the arrival of all robots, ended the episode, (E,) bool
+    :param truncated: whether the time limit ended the episode, (E,) bool
+    :param n_requests: number of requests, (E,)
+    :param report: report of the world
     """
 
     reward: np.ndarray
@@ -74,12 +75,13 @@ class Outcome(NamedTuple):
 
 
 def requests_of(bits: np.ndarray, neighbours: Neighbours | None = None) -> np.ndarray:
-    """Who gets whose plan.
+    """Convert actions to requests. Announcements become requests of their receivers.
 
-    :param bits: of each robot for each of the others, (..., n, n - 1, 1 or 2) bool: whether it asks it for its plan
-        and, with announcements, whether it sends it the own one
-    :param neighbours: whom robots perceive; then there is one leading axis, of swarms; None: everybody
-    :return: (..., n, n - 1) bool, as if all of these plans had been asked for
+    :param bits: bits of each robot for each of the others, (..., n, n - 1, 1 or 2) bool: whether it requests the
+        other's plan and, with announcements, whether it sends its own plan
+    :param neighbours: whom the robots perceive, which requires exactly one leading axis, that of the swarms; by default
+        all others
+    :return: whose plan each robot gets, (..., n, n - 1) bool
     """
     if bits.shape[-1] == 1:
         return bits[..., 0]
@@ -92,19 +94,19 @@ def requests_of(bits: np.ndarray, neighbours: Neighbours | None = None) -> np.nd
 class RequestTask:
     """Episodes of E swarms.
 
-    :ivar statistics: figures of the running episodes
+    :ivar statistics: statistics of the running episodes
 
     :param swarm: the swarms
-    :param sampler: draws episodes
+    :param sampler: sampler of episodes
     :param reward: weights of the reward
-    :param max_steps: time limit (steps); None: the world's
-    :param observation: what robots observe, the paper's without scaling if None
-    :param continuous_collisions: whether a collision is contact at any time of a step, or at the steps alone; None: as
-        the world says
-    :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper flies on to the time limit
-    :param end_at_collision: end episodes at collisions; otherwise they fly on, to see how deep a collision gets
-    :param announcements: robots may send their plans unasked too, see `act`
-    :raises ValueError: near misses are looked for beyond the plans' end
+    :param max_steps: time limit (steps), by default the world's
+    :param observation: observation of the robots, by default the paper's without scaling
+    :param continuous_collisions: whether contact at any time of a step is a collision, or only contact at the steps; by
+        default as in the world
+    :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper continues to the time limit
+    :param end_at_collision: end episodes at collisions; otherwise they continue, which shows how deep collisions are
+    :param announcements: whether robots may also send their plans without a request, see `act`
+    :raises ValueError: if ``near_miss_ahead`` of the reward exceeds the plans' horizon
     """
 
     def __init__(
@@ -122,8 +124,8 @@ class RequestTask:
         last = swarm.config.planner.horizon - 1
         if reward.near_miss_ahead > last:
             raise ValueError(
-                f"reward.near_miss_ahead={reward.near_miss_ahead}: plans reach planner.horizon - 1 = {last} steps "
-                "beyond the present one."
+                f"reward.near_miss_ahead={reward.near_miss_ahead}: plans reach only planner.horizon - 1 = {last} steps "
+                "beyond the current one."
             )
         self.swarm = swarm
         self.sampler = sampler
@@ -143,30 +145,30 @@ class RequestTask:
 
     @property
     def agent_names(self) -> tuple[str, ...]:
-        """The robots' names."""
+        """Names of the robots."""
         return tuple(f"robot_{index}" for index in range(self.swarm.config.n_robots))
 
     @property
     def observation_layout(self) -> dict[str, Any]:
-        """Which columns of an observation are about the robot itself and which about each of the others."""
+        """Meaning of an observation's columns, see `sb3_maddpg.relational.ObservationLayout`."""
         return self.observation.layout
 
     @property
     def action_cost(self) -> float:
-        """What a request costs."""
+        """Cost of a request."""
         return self.reward.request
 
     @property
     def observation_size(self) -> int:
-        """Length of one robot's observation."""
+        """Length of a robot's observation."""
         return self.observation.size
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
-        """Draw a new episode for one swarm; every random number of the episode comes from ``rng``."""
+        """Draw a new episode for one swarm. All random numbers of the episode derive from ``rng``."""
         self.place(swarm, *self.sampler.sample(rng), rng)
 
     def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, rng: np.random.Generator) -> None:
-        """Begin a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
+        """Start a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
         noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
         self.swarm.reset(swarm, starts, goals, noise_seed)
         self.scenario[swarm] = name
@@ -179,7 +181,7 @@ class RequestTask:
         self.scenario = [name for name, kept in zip(self.scenario, swarms, strict=True) if kept]
 
     def fork(self) -> RequestTask:
-        """A copy of all episodes as they are now, which flies on by itself: the same requests give the same states."""
+        """Return an independent copy of all episodes. The same requests give the same states as in the original."""
         fork = copy(self)
         fork.swarm = self.swarm.fork()
         fork.statistics = deepcopy(self.statistics)
@@ -187,7 +189,7 @@ class RequestTask:
         return fork
 
     def state_dict(self) -> dict[str, Any]:
-        """All of the present state, see `Swarm.state_dict`."""
+        """Return the complete state, see `Swarm.state_dict`."""
         return {
             "swarm": self.swarm.state_dict(),
             "statistics": self.statistics.state_dict(),
@@ -196,9 +198,9 @@ class RequestTask:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state_dict` of the same task gave, bit for bit.
+        """Restore a state from `state_dict` of the same task, bit for bit.
 
-        :raises ValueError: the state of another task
+        :raises ValueError: if the state belongs to another task
         """
         self.swarm.load_state_dict(state["swarm"])
         self.statistics.load_state_dict(state["statistics"])
@@ -206,14 +208,14 @@ class RequestTask:
         self.sampler.set_level(state["level"])
 
     def observe(self, swarms: np.ndarray | None = None) -> np.ndarray:
-        """What every robot observes, (E, n, observation_size) float32; of some swarms only if there is a mask."""
+        """Return the observations of all robots, (E, n, observation_size) float32, or only those of a mask's swarms."""
         return self.observation(self.swarm if swarms is None else self.swarm.part(swarms))
 
     def act(self, bits: np.ndarray) -> Outcome:
-        """One step of every swarm. An announcement arrives as an answer would, and is counted as a request. To one that
-        does not perceive the robot it is sent in vain.
+        """Take one step in every swarm. An announcement arrives like an answer and counts as a request. An announcement
+        to a robot that does not perceive the sender is lost, but still counts.
 
-        :param bits: (E, n, n - 1, n_bits) bool, see `requests_of`
+        :param bits: actions, (E, n, n - 1, n_bits) bool, see `requests_of`
         """
         bits, neighbours = self.sent(bits), self.swarm.neighbours
         requests = requests_of(bits, neighbours)
@@ -221,9 +223,9 @@ class RequestTask:
         return self.step(requests, bits.sum(axis=-1), requests.sum(axis=(1, 2)) + unheard.sum(axis=(1, 2, 3)))
 
     def sent(self, bits: np.ndarray) -> np.ndarray:
-        """What is sent of an action: nothing to an empty place.
+        """Return the actions without the bits for empty slots.
 
-        :param bits: (E, n, n - 1, 1 or 2) bool, see `requests_of`
+        :param bits: actions, (E, n, n - 1, 1 or 2) bool, see `requests_of`
         """
         present = self.swarm.neighbours.present
         return bits if present is None else bits & present[..., None]
@@ -231,12 +233,12 @@ class RequestTask:
     def step(
         self, requests: np.ndarray, messages: np.ndarray | None = None, n_requests: np.ndarray | None = None
     ) -> Outcome:
-        """One step of every swarm.
+        """Take one step in every swarm.
 
-        :param requests: who gets whose plan, as in `Swarm.step`
-        :param messages: how many messages each robot sends because of each of the others, (E, n, n - 1); None: it asks
-            for all plans that it gets
-        :param n_requests: how many requests to count, (E,); None: ``requests``
+        :param requests: whose plan each robot gets, as in `Swarm.step`
+        :param messages: number of bits that each robot sets for each of the others, which the reward penalises,
+            (E, n, n - 1); by default the requests
+        :param n_requests: number of requests to report, (E,); by default that of ``requests``
         """
         if messages is None:
             messages = requests
@@ -273,9 +275,9 @@ class RequestTask:
         )
 
     def _near_misses(self, report: StepReport) -> np.ndarray:
-        """How near each miss is, 0 to 1, (E, n, n - 1)."""
+        """Return the severity of each near miss, 0 to 1, (E, n, n - 1)."""
         reward, ahead, distance = self.reward, self.reward.near_miss_ahead, self.reward.near_miss_distance
-        assert distance is not None  # filled in above
+        assert distance is not None  # set in __init__
         shortfall = distance - report.separation
         if ahead:
             limits = distance - reward.near_miss_narrowing * np.arange(1, ahead + 1) / ahead
@@ -284,7 +286,7 @@ class RequestTask:
         return np.clip(shortfall / reward.near_miss_width, 0.0, 1.0) ** reward.near_miss_exponent
 
     def info(self, outcome: Outcome) -> dict[str, Any]:
-        """The last step for `info`: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
+        """Return the `info` of a step: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
         report = outcome.report
         who = {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
         return who | {
@@ -303,7 +305,7 @@ class RequestTask:
         }
 
     def final_info(self) -> dict[str, Any]:
-        """What `info` says at the end of an episode beside that: arrays with a leading axis of swarms."""
+        """Return the additional `info` at the end of an episode: arrays with a leading axis of swarms."""
         return {"is_success": self.statistics.success, "metrics": self.statistics.metrics()}
 
 
@@ -328,10 +330,10 @@ def make_task(
     solver: str = "auto",
     announcements: bool = False,
 ) -> RequestTask:
-    """The task of an environment; arguments as in `QuadSwarmEnv`.
+    """Create the task of an environment. The other arguments are those of `QuadSwarmEnv`.
 
     :param n_swarms: number of swarms E
-    :raises ValueError: a wrong value; the message names it and the remedy
+    :raises ValueError: if a value is invalid; the message names it and the remedy
     """
     config = make_config(
         preset, world, n_robots=n_robots, memory=memory, planner=planner, noise=noise, radio=radio, space=space

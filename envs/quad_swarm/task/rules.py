@@ -1,8 +1,8 @@
-"""Hand-made rules for whom to ask: the baselines of Sec. V-C and stronger ones.
+"""Hand-made rules for requests: the baselines of Sec. V-C and stronger ones.
 
-A rule maps what the robots of E swarms know to requests. To add one, write the function and name it in `RULES`.
-A length may be given in separations: "cpa:1.1s:1.5" asks at 1.1 times what the planner keeps.
-"&" joins rules of which both must want to ask, "|" rules of which one is enough; "&" binds tighter.
+A rule maps the knowledge of the robots of E swarms to requests. To add a rule, write a function and add it to `RULES`.
+Lengths may be in units of the planner's separation: "cpa:1.1s:1.5" uses 1.1 times the separation.
+"&" requests if both rules do, "|" if at least one does; "&" binds tighter.
 """
 
 from __future__ import annotations
@@ -19,40 +19,41 @@ Rule = Callable[[View], np.ndarray]
 
 
 def none() -> Rule:
-    """Nobody asks (the paper's NC)."""
+    """Never request (the paper's NC)."""
     return lambda view: np.zeros(view.pos.shape[:-1], dtype=bool)
 
 
 def full() -> Rule:
-    """Everybody asks everybody (the paper's FC)."""
+    """Request all plans at every step (the paper's FC)."""
     return lambda view: np.ones(view.pos.shape[:-1], dtype=bool)
 
 
 def distance(threshold: float) -> Rule:
-    """Asks whoever is closer than ``threshold`` (m) (the paper's DBCP)."""
+    """Request from robots closer than ``threshold`` (m) (the paper's DBCP)."""
     return lambda view: length(view.pos) < threshold
 
 
 def cpa(threshold: float, look_ahead: float) -> Rule:
-    """Asks whoever would come closer than ``threshold`` (m) within ``look_ahead`` (s) if both kept their velocity."""
+    """Request from robots that would come closer than ``threshold`` (m) within ``look_ahead`` (s) at constant
+    velocities."""
 
     return lambda view: view.approach(look_ahead)[0] < threshold
 
 
 def soon(time: float) -> Rule:
-    """Asks whoever comes closest, with constant velocities, within ``time`` (s); those who draw apart too."""
+    """Request from robots whose closest approach at constant velocities is within ``time`` (s), or in the past."""
     return lambda view: view.approach(np.inf)[1] < time
 
 
 def event(drift: float) -> Rule:
-    """Event-triggered: asks again when the newest plan is off by more than ``drift`` (m) or has run out, and whoever
-    never was asked."""
+    """Event-triggered: request if the newest received plan is off by more than ``drift`` (m), has expired, or does not
+    exist."""
     return lambda view: (view.drift > drift) | (view.age >= view.horizon)
 
 
 def push(distance: float) -> Rule:
-    """Event-triggered, and decided by who is asked: gets the plan of whoever's plan, anywhere over the horizon, is more
-    than ``distance`` (m) away from what that robot takes the other to predict of it."""
+    """Event-triggered by the sender: a robot's plan is sent if it deviates, anywhere over the horizon, by more than
+    ``distance`` (m) from what the sender presumes that the receiver predicts."""
 
     def rule(view: View) -> np.ndarray:
         presumed = view.presumed(range(view.horizon)).believed
@@ -63,23 +64,23 @@ def push(distance: float) -> Rule:
 
 
 def stale(age: float) -> Rule:
-    """Asks again when the newest plan was made at least ``age`` steps ago or is no longer believed."""
+    """Request if the newest received plan is at least ``age`` steps old or is no longer believed."""
     return lambda view: (view.age >= age) | ~view.prediction.remembers
 
 
 def plan(distance: float) -> Rule:
-    """Asks whoever, as far as is known without asking, comes closer to the own plan than ``distance`` (m)."""
+    """Request from robots whose predicted motion comes closer to the robot's own plan than ``distance`` (m)."""
     return lambda view: view.plan_approach.least < distance
 
 
 def random(probability: float) -> Rule:
-    """Asks each other robot with ``probability``, independently."""
+    """Request from each other robot with ``probability``, independently."""
     if not 0 <= probability <= 1:
         raise ValueError(f"random:{probability}: the probability must lie in [0, 1].")
     return lambda view: np.stack([rng.random(view.pos.shape[1:-1]) < probability for rng in view.rngs])
 
 
-# Arguments in metres, or, with an "s", in the distances that the planner keeps.
+# Arguments that are lengths, in metres or, with the suffix "s", in separations
 _LENGTHS = ("EPS", "DIST")
 
 # Name -> (factory, names of its arguments).
@@ -98,9 +99,9 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
 
 
 def parse_rule(text: str) -> Rule:
-    """The rule that a text such as ``"cpa:0.7:1.5"`` or ``"cpa:0.7:1.5&stale:3|distance:1"`` names.
+    """Parse a rule such as ``"cpa:0.7:1.5"`` or ``"cpa:0.7:1.5&stale:3|distance:1"``.
 
-    :raises ValueError: unknown rule, or arguments that are missing, superfluous or no numbers
+    :raises ValueError: if the rule is unknown, or arguments are missing, superfluous or not numbers
     """
     either = [[_parse_one(part.strip()) for part in joined.split("&")] for joined in text.split("|")]
     if len(either) == len(either[0]) == 1:
@@ -127,7 +128,7 @@ def _parse_one(text: str) -> Rule:
         raise ValueError(f"Rule {text!r} takes {len(arguments)} finite non-negative arguments; write {usage}.")
     lengths = [argument in _LENGTHS for argument in arguments]
     if any(scaled and not length for scaled, length in zip(relative, lengths, strict=True)):
-        raise ValueError(f"Rule {text!r}: only lengths ({', '.join(_LENGTHS)}) can be given in separations, as 1.2s.")
+        raise ValueError(f"Rule {text!r}: only lengths ({', '.join(_LENGTHS)}) can be in separations, as in 1.2s.")
     if not any(relative):
         return factory(*numbers)
 

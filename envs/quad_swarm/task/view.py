@@ -1,7 +1,7 @@
-"""What a robot knows when it decides whom to ask, for rules and for observations.
+"""The knowledge of robots when they decide on requests, for rules and observations.
 
-Axes of the n - 1 others of a robot have fewer places where its neighbourhood is limited, see `world.neighbours`. Nobody
-is in an empty place: it shows a robot that is far away and flies along.
+If the neighbourhood is limited, axes of length n - 1 have fewer entries, one per slot, see `world.neighbours`. An empty
+slot shows a robot that is far away and has the same velocity.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from quad_swarm.world.swarm import Swarm
 
 
 class Presumed(NamedTuple):
-    """What each of the others predicts of a robot, as far as that robot can tell; absolute positions.
+    """How each of the others predicts a robot, as presumed by that robot.
 
-    :param believed: where it would be at the stages asked for, (E, n, n - 1, stages, 3) (m)
-    :param remembers: whether by a plan, else by a constant velocity, (E, n, n - 1) bool
+    :param believed: predicted positions at the given stages, (E, n, n - 1, stages, 3), world frame (m)
+    :param remembers: whether the prediction is a plan, otherwise a constant velocity, (E, n, n - 1) bool
     :param age: steps since that plan was made, (E, n, n - 1)
-    :param error: how far off it is by now, (E, n, n - 1) (m)
+    :param error: current error of that plan, (E, n, n - 1) (m)
     """
 
     believed: np.ndarray
@@ -35,10 +35,11 @@ class Presumed(NamedTuple):
 
 
 class View:
-    """What the robots of E swarms know before they ask, relative to themselves, along the world's axes.
+    """The knowledge of the robots of E swarms before they make requests. Positions are relative to the robot, along the
+    world's axes.
 
     :param swarm: the swarms
-    :param rngs: one generator for each swarm, so that an episode's draws do not depend on what else is in the batch
+    :param rngs: one random number generator per swarm, so that an episode does not depend on the batch it is in
     """
 
     def __init__(self, swarm: Swarm, rngs: Sequence[np.random.Generator] = ()):
@@ -58,64 +59,64 @@ class View:
 
     @property
     def own_pos(self) -> np.ndarray:
-        """The robot's position, (E, n, 3), world frame (m)."""
+        """Estimated positions of the robots, (E, n, 3), world frame (m)."""
         return self._estimate[..., POSITION]
 
     @property
     def own_vel(self) -> np.ndarray:
-        """The robot's velocity, (E, n, 3) (m/s)."""
+        """Estimated velocities of the robots, (E, n, 3) (m/s)."""
         return self._estimate[..., VELOCITY]
 
     @cached_property
     def pos(self) -> np.ndarray:
-        """Positions of the others, (E, n, n - 1, 3) (m)."""
+        """Relative positions of the others, (E, n, n - 1, 3) (m)."""
         return self._observed[0] - self.own_pos[:, :, None]
 
     @cached_property
     def vel(self) -> np.ndarray:
-        """Velocities of the others relative to the robot's, (E, n, n - 1, 3) (m/s)."""
+        """Relative velocities of the others, (E, n, n - 1, 3) (m/s)."""
         return self._observed[1] - self.own_vel[:, :, None]
 
     @cached_property
     def goal(self) -> np.ndarray:
-        """The robot's goal, (E, n, 3) (m)."""
+        """Relative positions of the robots' goals, (E, n, 3) (m)."""
         return self._swarm.goal - self.own_pos
 
     @cached_property
     def plan(self) -> np.ndarray:
-        """The robot's positions at the next N steps by its last plan, (E, n, N, 3) (m)."""
+        """Positions at the next N steps by the robot's own last plan, (E, n, N, 3) (m)."""
         return self.current_plans[:, :, 1:]
 
     @cached_property
     def current_plans(self) -> np.ndarray:
-        """The same from now on, stages 0..N, (E, n, N + 1, 3) (m)."""
+        """Positions now and at the next N steps by the robot's own last plan, (E, n, N + 1, 3) (m)."""
         return self.absolute_plans - self.own_pos[:, :, None]
 
     @cached_property
     def absolute_plans(self) -> np.ndarray:
-        """The same in the world frame, (E, n, N + 1, 3) (m)."""
+        """Like `current_plans`, but in the world frame, (E, n, N + 1, 3) (m)."""
         return advance(self._swarm.planned_positions())
 
     @cached_property
     def prediction(self) -> Prediction:
-        """What the robot predicts of those it does not ask; absolute positions."""
+        """Predictions of the others without requests, in the world frame."""
         return self._swarm.beliefs.predict(*self._observed)
 
     def expected(self, stages: Sequence[int] | None = None) -> np.ndarray:
-        """Where the others will be as far as the robot knows without asking, (E, n, n - 1, stages, 3) (m).
+        """Return the predicted relative positions of the others without requests, (E, n, n - 1, stages, 3) (m).
 
-        :param stages: which of the next N steps, from 0 on; None: all
+        :param stages: indices among the next N steps, counting from 0; None for all
         """
         return self.prediction.believed(stages) - self.own_pos[:, :, None, None]
 
     def presumed(self, stages: Sequence[int]) -> Presumed:
-        """What each of the others predicts of this robot unless it asks, as far as this robot can tell: it knows what
-        it answered, and takes every answer to have arrived.
+        """Return how each of the others predicts this robot without a request, as presumed by this robot. It knows the
+        plans that it sent and assumes that all of them arrived.
 
-        :param stages: which of the next N steps, from 0 on
+        :param stages: indices among the next N steps, counting from 0
         """
         presumed = self._swarm.presume()
-        # Who does not perceive this robot has no plan of it
+        # Others that do not perceive this robot have no plan of it: they predict a constant velocity
         times = self._swarm.config.planner.dt * (np.array(stages) + 1)
         steady = self.own_pos[:, :, None] + times[:, None] * self.own_vel[:, :, None]
         return Presumed(
@@ -126,41 +127,45 @@ class View:
         )
 
     def of_the_other(self, field: np.ndarray, otherwise: np.ndarray | float = 0) -> np.ndarray:
-        """What each of the others has about this robot, of something that robots have about others, (E, n, n - 1,
-        ...).
+        """Swap the roles in values that robots have about others: return the values that the others have about this
+        robot, (E, n, n - 1, ...).
 
-        :param otherwise: what counts for those that do not perceive this robot: it knows who does
+        :param field: values that robots have about others, (E, n, n - 1, ...)
+        :param otherwise: value for others that do not perceive this robot, which knows who does
         """
         return self._swarm.neighbours.of_the_other(field, otherwise)
 
     def of_others(self, field: np.ndarray) -> np.ndarray:
-        """What each of its others has, of something that robots have, (E, n, n - 1, ...)."""
+        """Return the values of each robot's others, (E, n, n - 1, ...).
+
+        :param field: values of all robots, (E, n, ...)
+        """
         return of_others(field, self._swarm.neighbours.others)
 
     @property
     def present(self) -> np.ndarray | None:
-        """Which of its places for others are taken, (E, n, n - 1) bool; None: all."""
+        """Whether each slot is taken, (E, n, n - 1) bool; None if all slots always are."""
         return self._swarm.neighbours.present
 
     @property
     def age(self) -> np.ndarray:
-        """Steps since the newest plan of each of the others was made, N or more without any, (E, n, n - 1)."""
+        """Steps since the newest received plan of each of the others was made, N or more without one, (E, n, n - 1)."""
         return self.prediction.age
 
     @property
     def drift(self) -> np.ndarray:
-        """How far off that plan is by now, (E, n, n - 1) (m)."""
+        """Current error of the newest received plan of each of the others, (E, n, n - 1) (m)."""
         return self.prediction.error
 
     @cached_property
     def plan_approach(self) -> PlanApproach:
-        """How close the robot's plan comes to what it expects of the others."""
+        """Closest approach of the robot's own plan to the predicted others."""
         return self.prediction.approach(self.own_pos, self.plan)
 
     def approach(self, look_ahead: float) -> tuple[np.ndarray, np.ndarray]:
-        """Closest approach if everybody kept the present velocity.
+        """Compute the closest approach at constant velocities.
 
-        :param look_ahead: latest time to look at (s)
+        :param look_ahead: latest time to consider (s)
         :return: distance (m) and time from now (s), both (E, n, n - 1)
         """
         closing = -(self.pos * self.vel).sum(axis=-1)

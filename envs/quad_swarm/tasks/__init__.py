@@ -1,4 +1,4 @@
-"""Long work in pieces: processes that may die, and pieces that are kept until all is done."""
+"""Long work in pieces: executors that survive the death of processes, and a journal of finished pieces."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ ENGINES = ("local", "ray")
 def make_executor(
     engine: str, jobs: int, modules: Sequence[str] = (), address: str | None = None, mixed: bool = False
 ) -> Executor:
-    """What works off pieces; all give the same results, to the last bit.
+    """Create an executor. All executors give bit-identical results.
 
-    :param engine: "local": processes of this machine, or "ray": see `Cluster`
-    :param jobs: how many processes
-    :param modules: imported by each of them first
-    :param address: of a Ray cluster, see `Cluster`
+    :param engine: "local" for processes of this machine, or "ray", see `Cluster`
+    :param jobs: number of processes
+    :param modules: modules that each process imports first
+    :param address: address of a Ray cluster, see `Cluster`
     :param mixed: see `Cluster`
-    :raises ValueError: unknown engine, or an address without Ray
+    :raises ValueError: if the engine is unknown, or there is an address without Ray
     """
     if engine not in ENGINES:
         raise unknown_name("engine", engine, ENGINES)
     if engine == "ray":
         return Cluster(jobs, modules, address, mixed)
     if address is not None:
-        raise ValueError(f"address={address!r} is for engine='ray'; processes of this machine need none.")
+        raise ValueError(f"address={address!r} is for engine='ray' only; leave it out.")
     return Pool(jobs, modules)
 
 

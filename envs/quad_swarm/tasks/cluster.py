@@ -1,4 +1,4 @@
-"""Pieces of work on the machines of a Ray cluster, or in Ray's processes on this one."""
+"""Executor on the machines of a Ray cluster, or in Ray's processes on this machine."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ from typing import Any
 from quad_swarm.errors import shown
 from quad_swarm.tasks.journal import machine
 
-# How often Ray begins a piece again whose process or machine died
+# Number of times that Ray retries a piece whose process or machine died
 _RETRIES = 3
 
 
 class Cluster(Executor):
-    """Ray (https://docs.ray.io) as an executor of `concurrent.futures`. A piece whose process or machine dies is begun
-    again elsewhere, so it must be a function of its arguments. This package, in the same version, must be installed on
-    every machine, and the files that pieces name must lie there under the same path.
+    """Executor of `concurrent.futures` based on Ray (https://docs.ray.io).
 
-    :param jobs: processes on this machine; of no meaning where ``address`` names a cluster
-    :param modules: imported by each process first
-    :param address: of a running cluster, ``auto`` or ``HOST:PORT``; None begins one on this machine and ends it again
-    :param mixed: take results of machines with another processor or other versions of what computes, whose last bits
-        may differ
-    :raises ValueError: Ray is not installed, or there is no such cluster
+    If the process or machine of a piece dies, the piece is repeated elsewhere, so it must be a pure function of its
+    arguments. Every machine needs the same version of this package, and the files that pieces name at the same paths.
+
+    :param jobs: number of processes on this machine, unused if ``address`` names a cluster
+    :param modules: modules that each process imports first
+    :param address: address of a running cluster, ``auto`` or ``HOST:PORT``; None starts a cluster on this machine and
+        stops it at the end
+    :param mixed: accept results of machines with another processor or other library versions, which may differ in the
+        last bits
+    :raises ValueError: if Ray is not installed, or there is no such cluster
     """
 
     def __init__(self, jobs: int, modules: Sequence[str] = (), address: str | None = None, mixed: bool = False):
@@ -41,7 +43,7 @@ class Cluster(Executor):
         self._ray, self._modules, self._mixed = ray, tuple(modules), mixed
         self._begun = not ray.is_initialized()
         if self._begun:
-            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody unasked
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked
             try:
                 ray.init(
                     address=address,
@@ -51,18 +53,18 @@ class Cluster(Executor):
                     logging_level=logging.WARNING,
                 )
             except (ConnectionError, ValueError, RuntimeError) as error:
-                raise ValueError(f"address={shown(address)}: no Ray cluster answers there ({error}).") from error
+                raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
         self._run = ray.remote(_run).options(max_retries=_RETRIES, num_cpus=1)
         self._open: dict[Future[Any], Any] = {}
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `concurrent.futures.Executor.submit`.
 
-        The future raises ValueError where processes died again and again, or the machine is unlike this one.
+        The future raises ValueError if its processes died repeatedly, or its machine differs from this one.
         """
         result: Future[Any] = Future()
         result.set_running_or_notify_cancel()
-        # Unlike pickle it also takes what a script or a module run by python -m defines itself
+        # Unlike pickle, cloudpickle accepts functions defined in a script or in a module run with python -m
         piece = self._ray.cloudpickle.dumps(partial(function, *args, **kwargs))
         reference = self._run.remote(piece, self._modules)
         self._open[result] = reference
@@ -76,7 +78,7 @@ class Cluster(Executor):
         try:
             value, error, trace, where = done.result()
         except self._ray.exceptions.RayError as lost:
-            message = f"{_RETRIES + 1} processes died at the same piece of work, or it was cancelled: {lost}"
+            message = f"{_RETRIES + 1} processes died in the same piece of work, or it was cancelled: {lost}"
             result.set_exception(ValueError(message))
             return
         if error is not None:
@@ -84,15 +86,15 @@ class Cluster(Executor):
             result.set_exception(error)
         elif where != machine() and not self._mixed:
             message = (
-                f"A piece was worked off on a machine unlike this one, where the last bits may differ: {where}, here "
-                f"{machine()}. Use machines of one kind, or allow it (on the command line --mixed)."
+                f"A piece was computed on a machine that differs from this one, so its last bits may differ: {where}, "
+                f"here {machine()}. Use machines of the same kind, or allow it (on the command line --mixed)."
             )
             result.set_exception(ValueError(message))
         else:
             result.set_result(value)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See `concurrent.futures.Executor.shutdown`; what runs is stopped too where futures are to be cancelled."""
+        """See `concurrent.futures.Executor.shutdown`. ``cancel_futures`` also stops running pieces."""
         if cancel_futures:
             for future, reference in list(self._open.items()):
                 self._ray.cancel(reference, force=True)
@@ -111,15 +113,15 @@ class Cluster(Executor):
 
 
 def _run(piece: bytes, modules: Sequence[str]) -> tuple[Any, Exception | None, str, str]:
-    """:return: value, error and its traceback, and the machine"""
+    """Run a piece and return its value, its error and traceback, and the machine."""
     try:
         for module in modules:
             importlib.import_module(module)
         return pickle.loads(piece)(), None, "", machine()
-    except Exception as error:  # it is the caller's
+    except Exception as error:  # passed on to the caller
         trace = traceback.format_exc()
         try:
             pickle.loads(pickle.dumps(error))
-        except Exception:  # some exceptions can be written but not read
+        except Exception:  # some exceptions can be pickled but not unpickled
             error = RuntimeError(repr(error))
         return None, error, trace, machine()

@@ -1,4 +1,4 @@
-"""Pieces of long work that are finished, kept in files until all are: a run that was killed goes on from there."""
+"""Journal of finished pieces of long work, kept in files until all are finished, so that killed runs can continue."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from typing import Any
 from quad_swarm.native.build import cache_directory
 
 _VERSIONS = ("numpy", "torch", "casadi")
-_DAYS = 30  # after which a piece is no longer expected to be fetched
+_DAYS = 30  # after which pieces are deleted
 _SOURCES = (".py", ".cpp", ".hpp")
 
 
 def default_folder() -> Path:
-    """Where pieces are kept: beside the compiled libraries, in the user's cache."""
+    """Return the default folder of pieces, in the same cache as the compiled libraries."""
     return cache_directory() / "pieces"
 
 
 class Journal:
-    """Values that JSON holds, one a file, by keys that say what they are a function of.
+    """JSON values in one file each, by keys of everything that they depend on.
 
-    A value is there whole or not at all. What cannot be written is not kept, with a warning: that costs time alone.
+    Files are written atomically. If writing fails, a warning is issued and pieces are no longer kept.
 
-    :param folder: where; None keeps nothing
+    :param folder: folder of the files; None keeps nothing
     """
 
     def __init__(self, folder: Path | None):
@@ -45,11 +45,11 @@ class Journal:
 
     @staticmethod
     def key(what: str, packages: Iterable[str], files: Iterable[Path] = ()) -> str:
-        """The key of a piece: of its description, of the code that makes it, and of the machine.
+        """Compute the key of a piece from its description, the code and the machine.
 
         :param what: all arguments as text
-        :param packages: names of the packages and modules whose sources it depends on
-        :param files: others that it depends on, such as models
+        :param packages: names of the packages and modules whose sources the piece depends on
+        :param files: other files that it depends on, such as models
         """
         digest = hashlib.sha256(what.encode())
         for part in (*(_sources(name) for name in sorted(set(packages))), *map(_content, files), machine()):
@@ -57,7 +57,7 @@ class Journal:
         return digest.hexdigest()[:32]
 
     def fetch(self, key: str) -> Any:
-        """The value of a piece; None if it is not there."""
+        """Return the value of a piece, None if there is none."""
         if self._folder is None:
             return None
         try:
@@ -66,7 +66,7 @@ class Journal:
             return None
 
     def keep(self, key: str, value: Any) -> None:
-        """Write down a piece."""
+        """Write the value of a piece."""
         if self._folder is None:
             return
         try:
@@ -83,19 +83,19 @@ class Journal:
                 except BaseException:
                     Path(file.name).unlink(missing_ok=True)
                     raise
-        except FileNotFoundError:  # another process has done the same work, and dropped it
+        except FileNotFoundError:  # another process did the same work and dropped it
             return
         except OSError as error:
             warnings.warn(
-                f"Finished pieces cannot be kept in {self._folder} ({error.strerror or error}): a run that is killed "
-                "will begin anew.",
+                f"Finished pieces cannot be kept in {self._folder} ({error.strerror or error}): a killed run will "
+                "start from scratch.",
                 RuntimeWarning,
                 stacklevel=2,
             )
             self._folder = None
 
     def drop(self, keys: Iterable[str]) -> None:
-        """Forget pieces, and what kills have left of them, because what they are part of is done."""
+        """Delete pieces and their temporary files, once the work that they belong to is finished."""
         if self._folder is None:
             return
         names = set(keys)
@@ -118,7 +118,7 @@ def _remove_old(folder: Path) -> None:
 
 @functools.lru_cache(maxsize=64)
 def _sources(name: str) -> str:
-    """Digest of the sources of a package, or of a module that lies in none."""
+    """Return a digest of the sources of a package or a top-level module."""
     top = name.partition(".")[0]
     spec = importlib.util.find_spec(top)
     digest = hashlib.sha256(top.encode())
@@ -138,11 +138,11 @@ def _content(path: Path) -> str:
 
 @functools.cache
 def machine() -> str:
-    """What the last bits of results depend on beside the code: the processor and the versions of what computes."""
+    """Describe what exact results depend on besides the code: the processor and the versions of libraries."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
             processor = sorted({line for line in file if line.startswith(("model name", "flags", "Features"))})
-    except OSError:  # no Linux
+    except OSError:  # not Linux
         processor = [platform.processor()]
     versions = []
     for name in _VERSIONS:

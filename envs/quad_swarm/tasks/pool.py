@@ -1,4 +1,4 @@
-"""Processes that work off pieces, and die without harm."""
+"""Executor with processes whose deaths do no harm."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from multiprocessing.context import SpawnContext
 from types import TracebackType
 from typing import Any
 
-# How often a piece is begun before its workers' deaths are its own fault, or the machine's
+# Number of attempts before a piece, or the machine, is considered the cause of the processes' deaths
 _ATTEMPTS = 3
 
 
@@ -38,22 +38,23 @@ class _Worker:
 
 
 class Pool(Executor):
-    """Processes as in `concurrent.futures.ProcessPoolExecutor`, but one that dies costs the piece it was at alone: a
-    new process begins that piece again, so a piece must be a function of its arguments. All end with their parent,
-    however that ends. Where the ``with`` block is left by an exception, what runs is stopped.
+    """Executor like `concurrent.futures.ProcessPoolExecutor`, but tolerant of dying processes.
 
-    Each process has a pipe of its own and shares no lock: there is nothing that it could leave locked.
+    If a process dies, a new process repeats its piece, so a piece must be a pure function of its arguments. All
+    processes end with their parent, however that ends. An exception in the ``with`` block stops running pieces.
 
-    :param jobs: how many
-    :param modules: imported by each of them first
-    :raises ValueError: less than one
+    Each process has its own pipe and shares no lock, so it cannot leave anything locked.
+
+    :param jobs: number of processes
+    :param modules: modules that each process imports first
+    :raises ValueError: if ``jobs`` is less than 1
     """
 
     def __init__(self, jobs: int, modules: Sequence[str] = ()):
         if jobs < 1:
             raise ValueError(f"jobs={jobs} must be at least 1.")
         self._jobs, self._modules = jobs, tuple(modules)
-        # Spawned, not forked: the numerical libraries behind a model hold threads
+        # Spawned, not forked, because numerical libraries have threads
         self._context: SpawnContext = multiprocessing.get_context("spawn")
         self._waiting: deque[_Piece] = deque()
         self._workers: dict[Connection, _Worker] = {}
@@ -65,7 +66,7 @@ class Pool(Executor):
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `concurrent.futures.Executor.submit`.
 
-        The future raises ValueError where the processes at this piece died again and again.
+        The future raises ValueError if the piece's processes died repeatedly.
         """
         piece = _Piece(partial(function, *args, **kwargs))
         with self._lock:
@@ -79,10 +80,10 @@ class Pool(Executor):
         return piece.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See `concurrent.futures.Executor.shutdown`; what runs is stopped too where futures are to be cancelled."""
+        """See `concurrent.futures.Executor.shutdown`. ``cancel_futures`` also stops running pieces."""
         with self._lock:
             self._closing, self._stopping = True, self._stopping or cancel_futures
-        with contextlib.suppress(OSError):  # all is over
+        with contextlib.suppress(OSError):  # the pool has already ended
             self._wake.send(None)
         if wait and self._manager is not None:
             self._manager.join()
@@ -94,7 +95,7 @@ class Pool(Executor):
         return None
 
     def _manage(self) -> None:
-        """Give out pieces and take in results until the pool is closed and nothing is left."""
+        """Distribute pieces and collect results until the pool is closed and no piece is left."""
         while True:
             with self._lock:
                 stopping, closing = self._stopping, self._closing
@@ -133,7 +134,7 @@ class Pool(Executor):
 
     def _hire(self) -> Connection:
         mine, theirs = self._context.Pipe()
-        # One thread each, or they fight for the cores
+        # One thread per process, so that processes do not compete for cores
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         process = self._context.Process(target=_work, args=(theirs, self._modules), daemon=True)
         process.start()
@@ -161,7 +162,7 @@ class Pool(Executor):
             piece.future.set_exception(error)
 
     def _bury(self, connection: Connection) -> None:
-        """Forget a process that died; its piece waits again, if that was not too often."""
+        """Remove a dead process and requeue its piece, unless it has had all its attempts."""
         worker = self._workers.pop(connection)
         connection.close()
         worker.process.join()
@@ -170,12 +171,12 @@ class Pool(Executor):
         if worker.piece.attempts < _ATTEMPTS:
             self._waiting.appendleft(worker.piece)
         else:
-            message = f"{_ATTEMPTS} processes died at the same piece of work. Is memory short? Use fewer --jobs."
+            message = f"{_ATTEMPTS} processes died in the same piece of work. If memory is short, use fewer --jobs."
             worker.piece.future.set_exception(ValueError(message))
 
     def _end(self) -> None:
         for connection, worker in self._workers.items():
-            connection.close()  # which ends an idle process
+            connection.close()  # this ends an idle process
             if worker.piece is not None:
                 worker.process.kill()
                 worker.piece.future.set_exception(RuntimeError("The pool was stopped."))
@@ -189,7 +190,7 @@ class Pool(Executor):
 
 
 def _work(connection: Connection, modules: Sequence[str]) -> None:
-    """What a process does until its pipe ends."""
+    """Run pieces until the pipe is closed."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this one
     for module in modules:
@@ -202,11 +203,11 @@ def _work(connection: Connection, modules: Sequence[str]) -> None:
         value, error, trace = None, None, ""
         try:
             value = pickle.loads(piece)()
-        except Exception as raised:  # it is the caller's
+        except Exception as raised:  # passed on to the caller
             error, trace = raised, traceback.format_exc()
         try:
             result = pickle.dumps((value, error, trace))
-            pickle.loads(result) if error else None  # some exceptions can be written but not read
+            pickle.loads(result) if error else None  # some exceptions can be pickled but not unpickled
         except Exception as unpicklable:
             error = RuntimeError(f"{error or 'a result'} cannot be sent to the caller: {unpicklable!r}")
             result = pickle.dumps((None, error, trace))

@@ -1,1 +1,1 @@
-"""What is simulated: vehicles in a room, whom they hear of, what they believe, how they fly."""
+"""The simulated world: vehicles in a room, their communication, their beliefs and their flight."""

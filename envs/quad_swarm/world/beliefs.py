@@ -1,10 +1,9 @@
-"""What each robot believes the others will do (Sec. III-C and IV-A).
+"""Beliefs of each robot about the others' motion (Sec. III-C and IV-A).
 
-In order of preference: the plan it requested (made one step ago), the plan it received earlier while that still fits
-what it observes, and a constant velocity.
+A robot believes, in order of preference: the plan it requested (made one step ago), the plan it received earlier, as
+long as it fits what the robot observes, and a constant velocity.
 
-Arrays carry a leading axis of swarms: E swarms of n robots. ``others`` axes list the n - 1 others of a robot in
-ascending order.
+Arrays have a leading axis of E swarms. Axes of length n - 1 list the others of a robot in ascending order.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from quad_swarm.states import like
 
 
 class BeliefSource(IntEnum):
-    """Where a believed trajectory comes from."""
+    """Origin of a believed trajectory."""
 
     CONSTANT_VELOCITY = 0
     REMEMBERED = 1
@@ -31,7 +30,7 @@ class BeliefSource(IntEnum):
 
 @cache
 def other_indices(n_robots: int) -> np.ndarray:
-    """For each robot the indices of the others, ascending: (n, n - 1), read-only."""
+    """Return the indices of each robot's others in ascending order, (n, n - 1), read-only."""
     below = np.arange(n_robots - 1, dtype=np.int64)
     others = below + (below >= np.arange(n_robots)[:, None])
     others.setflags(write=False)
@@ -40,7 +39,7 @@ def other_indices(n_robots: int) -> np.ndarray:
 
 @cache
 def reverse_indices(n_robots: int) -> np.ndarray:
-    """For each robot its place among the others of each of its others, see `other_indices`: (n, n - 1), read-only."""
+    """Return the position of each robot in the rows of its others in `other_indices`, (n, n - 1), read-only."""
     numbers = np.arange(n_robots, dtype=np.int64)[:, None]
     reverse = numbers - (numbers > other_indices(n_robots))
     reverse.setflags(write=False)
@@ -48,16 +47,17 @@ def reverse_indices(n_robots: int) -> np.ndarray:
 
 
 def of_others(field: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """What each of its others has, of something that robots have: (E, n, ...) -> (E, n, n - 1, ...).
+    """Return the values of each robot's others, (E, n, n - 1, ...).
 
-    :param others: see `other_indices`, or `Neighbours.others`
+    :param field: values of all robots, (E, n, ...)
+    :param others: see `other_indices` or `Neighbours.others`
     """
     return field[:, others] if others.ndim == 2 else field[np.arange(len(others))[:, None, None], others]
 
 
 def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:
-    """A trajectory (..., K, 3) at times that are later, or all earlier, by a share of a step, (...) in [0, 1) or
-    (-1, 0]; linear in between, and its first and last pieces go on in a straight line."""
+    """Resample trajectories, (..., K, 3), at times that are later by fractions of a step, (...). The fractions must all
+    lie in [0, 1) or all in (-1, 0]. Interpolation is linear, as is extrapolation of the first and last segments."""
     flat = trajectory.reshape(*trajectory.shape[:-2], -1)
     pieces = flat[..., 3:] - flat[..., :-3]
     pieces *= later[..., None]
@@ -72,10 +72,12 @@ def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:
 
 
 def answered(arriving: np.ndarray, trajectories: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Of trajectories of all robots, (E, n, K, 3), those that reach who asked for them, (number of answers, K, 3).
+    """Select the trajectories that robots receive.
 
-    :param arriving: whose trajectory each robot receives, (E, n, n - 1) bool; the order is that of its true entries
-    :param others: see `other_indices`, or `Neighbours.others`
+    :param arriving: whose trajectory each robot receives, (E, n, n - 1) bool
+    :param trajectories: trajectories of all robots, (E, n, K, 3)
+    :param others: see `other_indices` or `Neighbours.others`
+    :return: received trajectories in the order of the true entries of ``arriving``, (number of answers, K, 3)
     """
     swarms, robots, places = np.nonzero(arriving)
     senders = others[robots, places] if others.ndim == 2 else others[swarms, robots, places]
@@ -83,11 +85,11 @@ def answered(arriving: np.ndarray, trajectories: np.ndarray, others: np.ndarray)
 
 
 class PlanApproach(NamedTuple):
-    """How close a plan comes to what is believed of the others.
+    """Distances between a plan and the believed trajectories of the others.
 
-    :param least: least distance over the next N steps, (E, n, n - 1) (m)
-    :param stage: at which of them it is reached first, from 0 on, (E, n, n - 1)
-    :param last: distance at the last of them, (E, n, n - 1) (m)
+    :param least: smallest distance over the next N steps, (E, n, n - 1) (m)
+    :param stage: first step at which it is reached, counting from 0, (E, n, n - 1)
+    :param last: distance at the last step, (E, n, n - 1) (m)
     """
 
     least: np.ndarray
@@ -97,14 +99,14 @@ class PlanApproach(NamedTuple):
 
 @dataclass(frozen=True)
 class Prediction:
-    """What robots predict of the others as long as they do not request their plans.
+    """Predictions of the others without requests.
 
     :param pos: positions of the others, (E, n, n - 1, 3), world frame (m)
     :param vel: velocities of the others, (E, n, n - 1, 3), world frame (m/s)
-    :param remembered: plans received last, from now on, (E, n, n - 1, N + 1, 3), world frame (m)
-    :param remembers: whether those are believed, else a constant velocity, (E, n, n - 1) bool
-    :param age: steps since the newest plan received was made, N or more: none, (E, n, n - 1)
-    :param error: how far off that plan is by now, (E, n, n - 1) (m)
+    :param remembered: newest received plans, from now on, (E, n, n - 1, N + 1, 3), world frame (m)
+    :param remembers: whether the plan is believed, otherwise a constant velocity, (E, n, n - 1) bool
+    :param age: steps since the newest received plan was made, N or more without one, (E, n, n - 1)
+    :param error: current error of that plan, (E, n, n - 1) (m)
     :param dt: length of a stage (s)
     """
 
@@ -117,44 +119,47 @@ class Prediction:
     dt: float
 
     def believed(self, stages: Sequence[int] | None = None) -> np.ndarray:
-        """Positions at some of the next N steps, 0 is the first; at all of them if None: (E, n, n - 1, stages, 3),
-        world frame (m)."""
+        """Return predicted positions, (E, n, n - 1, stages, 3), world frame (m).
+
+        :param stages: indices among the next N steps, counting from 0; None for all
+        """
         return pairs.believe(self.pos, self.vel, self.remembered, self.remembers, self.dt, stages)
 
     def approach(self, own: np.ndarray, plan: np.ndarray) -> PlanApproach:
-        """How close plans come to what is believed.
+        """Compute the distances between plans and predictions.
 
-        :param own: the robots' positions, (E, n, 3), world frame (m)
-        :param plan: their positions at the next N steps relative to that, (E, n, N, 3) (m)
+        :param own: positions of the robots, (E, n, 3), world frame (m)
+        :param plan: planned positions at the next N steps relative to ``own``, (E, n, N, 3) (m)
         """
         return PlanApproach(*pairs.approach(own, plan, self.pos, self.vel, self.remembered, self.remembers, self.dt))
 
 
 class Beliefs:
-    """The believed trajectories of E swarms and the memory behind them.
+    """The believed trajectories of E swarms, and the memory of received plans.
 
     :param n_swarms: number of swarms E
-    :param n_robots: robots in a swarm n
-    :param horizon: stages of a plan N
+    :param n_robots: number of robots n per swarm
+    :param horizon: number of stages N of a plan
     :param dt: length of a stage (s)
-    :param memory: a plan received earlier is believed while it predicts the observed position to within this distance
-        (m) and is younger than N steps; 0 switches the memory off
-    :param n_others: of how many others a robot believes something; None: of all n - 1
+    :param memory: an earlier plan is believed as long as it predicts the observed position to within this distance (m)
+        and is younger than N steps; 0 disables the memory
+    :param n_others: number of others that a robot has beliefs about, by default all n - 1
+    :raises ValueError: if ``memory`` is negative or NaN
     """
 
     def __init__(
         self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float, n_others: int | None = None
     ):
         if not memory >= 0:
-            raise ValueError(f"memory={memory}: it is a distance in metres, or 0 to switch it off.")
+            raise ValueError(f"memory={memory}: it must be a distance in metres, or 0 to disable the memory.")
         self.horizon = horizon
         self.dt = dt
         self.memory = memory
         shape = (n_swarms, n_robots, n_robots - 1 if n_others is None else n_others)
-        # Remembered positions of now and of the next N steps; age in steps since they were planned, N or more: none.
+        # Remembered positions now and at the next N steps, and steps since they were planned, N or more without a plan
         self._remembered = np.zeros((*shape, horizon + 1, 3))
         self._age = np.full(shape, horizon, dtype=np.int64)
-        # The last prediction: who decides predicts first, and the step does so again.
+        # Cache of the last prediction, which policies and the step both need
         self._known: Prediction | None = None
 
     @property
@@ -168,7 +173,7 @@ class Beliefs:
         self._known = None
 
     def forget_others(self, places: np.ndarray) -> None:
-        """Forget what was received from some of the others, (E, n, n - 1) bool."""
+        """Forget the plans received from some of the others, (E, n, n - 1) bool."""
         self._age[places] = self.horizon
         self._remembered[places] = 0.0
         self._known = None
@@ -179,23 +184,23 @@ class Beliefs:
         self._known = None
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """What is remembered, see `load_state_dict`."""
+        """Return the memory, see `load_state_dict`."""
         return {"remembered": self._remembered.copy(), "age": self._age.copy()}
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from what `state_dict` gave.
+        """Restore a memory from `state_dict`.
 
-        :raises ValueError: the state of other teams
+        :raises ValueError: if the state belongs to other swarms
         """
         self._remembered = like(self._remembered, state["remembered"], "remembered plans")
         self._age = like(self._age, state["age"], "ages of plans")
         self._known = None
 
     def predict(self, pos: np.ndarray, vel: np.ndarray) -> Prediction:
-        """What the robots believe in this step without a request; `update` has not been called for it.
+        """Predict the others without requests. Call this before `update` of the same step.
 
-        :param pos: present positions of the others, (E, n, n - 1, 3), world frame (m)
-        :param vel: present velocities of the others, (E, n, n - 1, 3), world frame (m/s)
+        :param pos: current positions of the others, (E, n, n - 1, 3), world frame (m)
+        :param vel: current velocities of the others, (E, n, n - 1, 3), world frame (m/s)
         """
         known = self._known
         if known is None or not (np.array_equal(known.pos, pos) and np.array_equal(known.vel, vel)):
@@ -213,10 +218,10 @@ class Beliefs:
     def update(
         self, arriving: np.ndarray, pos: np.ndarray, vel: np.ndarray, received: np.ndarray, age: np.ndarray | int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Believed trajectories after this step's requests; arguments as in `receive`.
+        """Compute the believed trajectories after this step's requests. The arguments are those of `receive`.
 
-        :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`, (E, n, n -
-            1)
+        :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`,
+            (E, n, n - 1)
         """
         prediction = self.predict(pos, vel)
         believed = prediction.believed()
@@ -228,24 +233,24 @@ class Beliefs:
     def receive(
         self, arriving: np.ndarray, pos: np.ndarray, vel: np.ndarray, received: np.ndarray, age: np.ndarray | int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Keep what arrives, and let a step pass for what is remembered.
+        """Remember received plans and advance the memory by a step.
 
         :param arriving: whose plans each robot receives, (E, n, n - 1) bool
-        :param pos: present positions of the others, (E, n, n - 1, 3), world frame (m)
-        :param vel: present velocities of the others, (E, n, n - 1, 3), world frame (m/s)
-        :param received: the plans that arrive, as positions now and at the next N steps, (number of answers, N + 1, 3)
-            (m); see `answered`
-        :param age: steps since each of them was made, (number of answers,), or one number for all
-        :return: those of the answers that are newer than what was known: who receives them, and the plans
+        :param pos: current positions of the others, (E, n, n - 1, 3), world frame (m)
+        :param vel: current velocities of the others, (E, n, n - 1, 3), world frame (m/s)
+        :param received: received plans as positions now and at the next N steps, (number of answers, N + 1, 3) (m),
+            see `answered`
+        :param age: steps since each of these plans was made, (number of answers,), or one number for all
+        :return: ``arriving`` and ``received``, without plans that are older than a known one
         """
         prediction = self.predict(pos, vel)
         if isinstance(age, np.ndarray):
-            # An answer may come after one that was made later.
+            # An answer may arrive after a newer one
             newer = age <= prediction.age[arriving]
             arriving, received, age = arriving.copy(), received[newer], age[newer]
             arriving[arriving] = newer
         if self.memory:
-            self._remembered = prediction.remembered  # nobody else reads it any more
+            self._remembered = prediction.remembered  # no one else uses it any more
             self._remembered[arriving] = received
             self._age = prediction.age.copy()
             self._age[arriving] = age
@@ -256,7 +261,7 @@ class Beliefs:
 
 
 def _filled(where: np.ndarray, values: np.ndarray | int) -> np.ndarray:
-    """An array with values where a mask is true, in its order."""
+    """Return an array with the values where a mask is true, in its order, and zeros elsewhere."""
     filled = np.zeros(where.shape, dtype=np.int64)
     filled[where] = values
     return filled

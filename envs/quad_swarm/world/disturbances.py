@@ -1,6 +1,6 @@
-"""What may go wrong in the world: settings, all off by default. `Realisation` draws what comes of them.
+"""Settings of the disturbances, all off by default. `Realisation` draws random numbers accordingly.
 
-Neither planner nor policy is told any of it; they see its consequences as far as a robot could.
+Planners and policies do not know the disturbances. They only observe the consequences that a robot could observe.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pydantic import Field, NonNegativeFloat
 
 from quad_swarm.validation import checked
 
-# Beyond these nothing flies, and numbers lose their meaning before they overflow.
+# Limits far beyond any flight, and small enough for precise calculations
 Disturbance = Annotated[float, Field(ge=0, le=1e3)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -26,11 +26,11 @@ class ProcessNoise:
     :param pos: standard deviation added to each position component in each step (m)
     :param vel: standard deviation added to each velocity component in each step (m/s)
     :param attitude: standard deviation added to roll and pitch in each step (rad)
-    :param wind: speed of a steady horizontal wind whose direction is drawn for each episode (m/s)
-    :param gust: standard deviation of each horizontal component of the gusts that each robot meets on top of that, a
-        first-order Gauss-Markov process (m/s)
+    :param wind: speed of a constant horizontal wind whose direction is drawn for each episode (m/s)
+    :param gust: standard deviation of each horizontal component of the additional gusts at each robot, first-order
+        Gauss-Markov processes (m/s)
     :param gust_time: correlation time of the gusts (s)
-    :raises ValueError: a value is negative, not finite, or beyond 1000 (pi for the attitude)
+    :raises ValueError: if a value is negative, not finite, or above 1000 (pi for the attitude)
     """
 
     pos: Disturbance = 0.0
@@ -47,18 +47,18 @@ class ProcessNoise:
 @checked
 @dataclass(frozen=True)
 class SensingError:
-    """Errors of the estimated states, first-order Gauss-Markov processes with these standard deviations.
+    """Standard deviations of the errors of estimated states, which are first-order Gauss-Markov processes.
 
-    A robot takes itself to be where its estimate says. The others see it there too, as from one motion capture system
-    that tells everybody, each with an error of its own on top.
+    The others observe a robot at its own estimate, as if one motion capture system served all robots, plus an
+    additional error for each observer.
 
-    :param pos: of each component of a robot's position (m)
-    :param vel: of each component of its velocity (m/s)
-    :param attitude: of its roll and pitch (rad)
-    :param others_pos: of each component of another robot's position, different for each observer (m)
-    :param others_vel: of each component of another robot's velocity, different for each observer (m/s)
-    :param correlation_time: in which the errors are forgotten (s); 0 draws them anew in each step
-    :raises ValueError: a value is negative, not finite, or beyond 1000 (pi for the attitude)
+    :param pos: error of each component of a robot's position (m)
+    :param vel: error of each component of its velocity (m/s)
+    :param attitude: error of its roll and pitch (rad)
+    :param others_pos: additional error of each component of another robot's position, different for each observer (m)
+    :param others_vel: additional error of each component of another robot's velocity, different for each observer (m/s)
+    :param correlation_time: correlation time of the errors (s); 0 for white noise
+    :raises ValueError: if a value is negative, not finite, or above 1000 (pi for the attitude)
     """
 
     pos: Disturbance = 0.0
@@ -70,12 +70,12 @@ class SensingError:
 
     @property
     def own(self) -> bool:
-        """Whether robots are wrong about themselves."""
+        """Whether robots' estimates of their own states have errors."""
         return any((self.pos, self.vel, self.attitude))
 
     @property
     def others(self) -> bool:
-        """Whether observers are wrong, each in its own way, about others."""
+        """Whether observers have additional errors about others."""
         return any((self.others_pos, self.others_vel))
 
     def __bool__(self) -> bool:
@@ -85,18 +85,18 @@ class SensingError:
 @checked
 @dataclass(frozen=True)
 class Radio:
-    """How plans travel. A request counts whether or not its answer arrives.
+    """Transmission of plans. A request counts whether or not its answer arrives.
 
-    :param loss: share of the answers that get lost, each for itself
-    :param delay: steps by which answers are late: with 0 a robot receives the plan that was made one step ago
-    :param jitter: further steps by which an answer is late, drawn evenly from 0 to this for each answer; of two plans
-        the one that was made later is kept
-    :param bursts: share of the time in which a link between two robots, in one direction, is interrupted
+    :param loss: probability that an answer is lost, independently for each answer
+    :param delay: delay of answers (steps); with 0 a robot receives the plan that was made one step ago
+    :param jitter: maximum additional delay (steps), drawn uniformly from 0 to this for each answer; robots keep the
+        newer of two plans
+    :param bursts: fraction of the time in which the link from one robot to another is interrupted
     :param burst_length: mean length of an interruption (steps)
-    :param outage: share of the robots that stop answering for good, at a time drawn evenly from the first 5 s; they fly
-        and ask on
-    :raises ValueError: a share lies outside [0, 1] (bursts: below 1), a delay outside 0 to 1000, or a burst is shorter
-        than a step
+    :param outage: probability that a robot stops answering for good, at a time drawn uniformly from the first 5 s; it
+        still flies and makes requests
+    :raises ValueError: if a probability is outside [0, 1] (``bursts``: [0, 1)), a delay is outside 0 to 1000, or
+        ``burst_length`` is less than a step
     """
 
     loss: Share = 0.0
@@ -108,5 +108,5 @@ class Radio:
 
     @property
     def is_random(self) -> bool:
-        """Whether it is left to chance what arrives, and when."""
+        """Whether it is random which answers arrive, and when."""
         return any((self.loss, self.jitter, self.bursts, self.outage))

@@ -1,7 +1,7 @@
-"""Whom each robot perceives: all others or, in large swarms, only the nearest of those within a range.
+"""Perception of other robots: all others or, in large swarms, only the nearest others within a range.
 
-A robot has a place for each of the others that it perceives: m = n - 1 of them, or fewer where its neighbourhood is
-limited. Wherever an axis of an array is said to list the n - 1 others of a robot, it lists these m places.
+A robot has m slots (places) for the others that it perceives: m = n - 1, or fewer if its neighbourhood is limited.
+Array axes that are documented as the n - 1 others of a robot list these m slots.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from quad_swarm.world.beliefs import other_indices, reverse_indices
 @checked
 @dataclass(frozen=True)
 class Neighbourhood:
-    """Whom a robot perceives, predicts and may ask: by default everybody.
+    """Limits of the others that a robot perceives, predicts and may request plans from, by default none.
 
-    :param max_others: so many others at most, the nearest; None: all
-    :param range: others within this distance, of sensors and radio alike (m); None: any
-    :param look_ahead: who is nearest is decided by how near they would come within so long, with the present velocities
-        (s); 0: by the present distance. In a crowd the nearest are not those that matter
-    :raises ValueError: a value is negative, not finite or, but for the look ahead, zero
+    :param max_others: maximum number of others, of which the nearest are chosen; None for all
+    :param range: maximum distance of others, for both sensors and radio (m); None for any distance
+    :param look_ahead: time over which the smallest distance at constant velocities decides which others are nearest
+        (s); 0 for the current distance. In a crowd, the others that are currently nearest are not the most relevant
+    :raises ValueError: if a value is negative or not finite, or a value other than ``look_ahead`` is zero
     """
 
     max_others: PositiveInt | None = None
@@ -36,28 +36,35 @@ class Neighbourhood:
     look_ahead: Annotated[float, Field(ge=0, le=1e3)] = 0.0
 
     def places(self, n_robots: int) -> int:
-        """Of how many others a robot perceives something at most."""
+        """Return the number of slots of a robot.
+
+        :param n_robots: number of robots n per swarm
+        """
         return min(self.max_others or n_robots, n_robots - 1)
 
     def limits(self, n_robots: int) -> bool:
-        """Whether robots may miss others."""
+        """Return whether there may be others that a robot does not perceive.
+
+        :param n_robots: number of robots n per swarm
+        """
         return self.range is not None or self.places(n_robots) < n_robots - 1
 
 
 class Neighbours:
-    """Whom the robots of E swarms perceive now.
+    """The others that the robots of E swarms currently perceive.
 
-    One that stays in the neighbourhood keeps its place, so that whatever is remembered about it needs not be moved. Who
-    comes takes the first place that is free, of several who come at once the one with the lowest number first.
+    A robot that stays in the neighbourhood keeps its slot, so that memories about it need not be moved. New neighbours
+    take the first free slots in ascending order.
 
-    :ivar others: who has each place, (n, n - 1) ascending where everybody perceives everybody, else (E, n, m); an empty
-        place has the robot's own number
-    :ivar reverse: place of a robot at each of those, of the same shape; -1 where that one does not perceive the robot
-    :ivar present: which places are taken, (E, n, m) bool; None: always all
+    :ivar others: index of the robot in each slot: (n, n - 1) in ascending order if all robots perceive all others,
+        otherwise (E, n, m), with the robot's own index in empty slots
+    :ivar reverse: slot of the robot at each of these others, of the same shape; -1 if the other does not perceive the
+        robot
+    :ivar present: whether each slot is taken, (E, n, m) bool; None if all slots always are
 
     :param n_swarms: number of swarms E
-    :param n_robots: robots in a swarm n
-    :param limit: whom they may perceive; None: everybody
+    :param n_robots: number of robots n per swarm
+    :param limit: limits of the neighbourhood; None for none
     """
 
     def __init__(self, n_swarms: int, n_robots: int, limit: Neighbourhood | None = None):
@@ -78,15 +85,15 @@ class Neighbours:
 
     @property
     def limited(self) -> bool:
-        """Whether robots may miss others."""
+        """Whether there may be others that a robot does not perceive."""
         return self.present is not None
 
     def update(self, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
-        """Look who is near now, where robots may miss others.
+        """Update the slots of limited neighbourhoods.
 
         :param pos: positions, (E, n, 3) (m)
         :param vel: velocities, (E, n, 3) (m/s)
-        :return: the places that somebody else has now, or nobody, (E, n, m) bool
+        :return: whether another robot, or none, is in the slot now, (E, n, m) bool
         """
         assert self.present is not None
         before = self.others
@@ -96,8 +103,9 @@ class Neighbours:
         return self.others != before
 
     def reset(self, swarm: int, pos: np.ndarray) -> None:
-        """Fill the places of one swarm, which is at rest, anew.
+        """Fill the slots of one swarm, whose robots are at rest.
 
+        :param swarm: index of the swarm
         :param pos: positions, (n, 3) (m)
         """
         if self.present is None:
@@ -114,29 +122,34 @@ class Neighbours:
             self.reverse = self.reverse[swarms]
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Who has each place, see `load_state_dict`; nothing where that never changes."""
+        """Return the slots, see `load_state_dict`; empty if they never change."""
         if self.present is None:
             return {}
         return {"others": self.others.copy(), "present": self.present.copy(), "reverse": self.reverse.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state_dict` gave.
+        """Restore the slots from `state_dict`.
 
-        :raises ValueError: the state of other swarms
+        :raises ValueError: if the state belongs to other swarms
         """
         if self.present is not None:
             self.others = like(self.others, state["others"], "neighbours")
-            self.present = like(self.present, state["present"], "which neighbours are present")
-            self.reverse = like(self.reverse, state["reverse"], "places at the neighbours")
+            self.present = like(self.present, state["present"], "presence of neighbours")
+            self.reverse = like(self.reverse, state["reverse"], "slots at neighbours")
 
     def perceived(self, places: np.ndarray) -> np.ndarray:
-        """Some places (mask), (E, n, m) bool, without those that are empty."""
+        """Return a mask without empty slots.
+
+        :param places: mask of slots, (E, n, m) bool
+        """
         return places if self.present is None else places & self.present
 
     def of_the_other(self, field: np.ndarray, otherwise: Any = 0) -> np.ndarray:
-        """What each of the others has about a robot, of something that robots have about others, (E, n, m, ...).
+        """Swap the roles in values that robots have about others: return the values that the others have about the
+        robot, (E, n, m, ...).
 
-        :param otherwise: what counts for those that do not perceive the robot, broadcast to that shape
+        :param field: values that robots have about others, (E, n, m, ...)
+        :param otherwise: value for others that do not perceive the robot, broadcast to that shape
         """
         if self.present is None:
             return field[:, self.others, self.reverse]
@@ -146,21 +159,22 @@ class Neighbours:
         return theirs
 
     def numbers(self) -> np.ndarray:
-        """Who has each place, -1 for nobody, (E, n, m), or (n, n - 1) where it is the same for all swarms."""
+        """Return the index of the robot in each slot, -1 for an empty slot, (E, n, m), or (n, n - 1) if all robots
+        perceive all others."""
         return self.others if self.present is None else np.where(self.present, self.others, -1)
 
     def numbers_in(self, swarm: int) -> np.ndarray:
-        """The same in one swarm, (n, m)."""
+        """Return the `numbers` of one swarm, (n, m)."""
         numbers = self.numbers()
         return numbers if self.present is None else numbers[swarm]
 
 
 def spread(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """What is known of the places of each robot by the number of the other instead: of all n - 1 others, in ascending
-    order, (..., n, n - 1).
+    """Convert a mask of slots to a mask of all others in ascending order, which is False for others without a slot.
 
-    :param places: bool, (..., n, m)
-    :param numbers: see `Neighbours.numbers`
+    :param places: mask of slots, (..., n, m) bool
+    :param numbers: indices of the robots in the slots, see `Neighbours.numbers`
+    :return: mask of all others, (..., n, n - 1) bool
     """
     n = places.shape[-2]
     if numbers is other_indices(n):

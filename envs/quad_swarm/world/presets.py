@@ -1,4 +1,4 @@
-"""Worlds with a name, frozen together with `PRESET_VERSION`: results name both, and a change reruns every table."""
+"""Named worlds. They are frozen per `PRESET_VERSION`: results name both, and a change requires new results."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ PRESET_VERSION = 1
 @checked
 @dataclass(frozen=True)
 class SwarmConfig:
-    """Everything that defines a world but the scenario.
+    """Complete definition of a world, except for the scenario.
 
     :param n_robots: number of robots n, 2 to 1000
     :param radius: radius r of the sphere around a robot (m)
-    :param collision_tolerance: two robots collide when their centres are closer than 2r by more than this (m); the
-        planner's soft constraint sits exactly at 2r in the paper's world
-    :param goal_radius: a robot is at its goal within this distance (m); the paper takes r
+    :param collision_tolerance: two robots collide if their centres are closer than 2r minus this tolerance (m), because
+        the planner's soft constraint is exactly at 2r in the paper's world
+    :param goal_radius: a robot is at its goal within this distance (m); r in the paper
     :param memory: see `Beliefs` (m)
     :param quadrotor: physical parameters
-    :param planner: horizon, limits and weights
+    :param planner: horizon, limits and weights of the planner
     :param space: room of the scenarios
-    :param max_steps: time limit of an episode unless another one is given (steps)
-    :param substeps: into how many parts a step is divided to move the robots and to look for collisions; between two
-        of them each robot moves in a straight line
-    :param continuous_collisions: a collision is contact at any time of a step; the paper looks at the steps alone
+    :param max_steps: default time limit of an episode (steps)
+    :param substeps: number of sub-steps per step for simulating the robots and detecting collisions; between sub-steps,
+        each robot moves in a straight line
+    :param continuous_collisions: whether contact at any time of a step is a collision; the paper checks the steps only
     :param noise: disturbances of the flight
     :param sensing: errors of the estimated states
-    :param radio: how plans travel
-    :param neighbourhood: whom robots perceive and may ask, see `quad_swarm.world.neighbours`
-    :param plant: what is flown: "model" is the planner's model (with the disturbances), "crazyflow:cf21B_500" a vehicle
-        of that simulator, see `quad_swarm.plants`
-    :param mismatch: by up to this share each vehicle's parameters differ from the planner's model, drawn evenly for
-        each robot, parameter and episode
-    :param clock_skew: the latest time, as a share of a step, after the beginning of a step at which a robot's new input
-        acts, drawn evenly from the sub-steps up to it for each robot and episode. A robot knows its own and plans from
-        where it will be then
-    :raises ValueError: a value out of its range, a planner that keeps less than 2r, a tolerance that hides every
-        collision, or a step too long for the vehicle's dynamics
+    :param radio: transmission of plans
+    :param neighbourhood: which others robots perceive and may request plans from, see `quad_swarm.world.neighbours`
+    :param plant: simulated vehicle: "model" for the planner's model (with the disturbances), or for example
+        "crazyflow:cf21B_500" for a vehicle of that simulator, see `quad_swarm.plants`
+    :param mismatch: maximum relative deviation of each vehicle's parameters from the planner's model, drawn uniformly
+        for each robot, parameter and episode
+    :param clock_skew: latest time in a step, as a fraction of its length, at which a robot's new input takes effect,
+        drawn uniformly among the sub-steps for each robot and episode. A robot knows its own time and plans from its
+        state at that time
+    :raises ValueError: if a value is out of range, the planner's separation is less than 2r, the tolerance hides every
+        collision, or a step is too long for the vehicle's dynamics
     """
 
     n_robots: Annotated[int, Field(ge=2, le=1000)] = 4
@@ -79,13 +79,13 @@ class SwarmConfig:
         contact, planner = 2 * self.radius, self.planner
         if planner.separation < contact:
             raise ValueError(
-                f"planner.separation={planner.separation}: it must be at least 2 radius = {contact}, "
+                f"planner.separation={planner.separation}: it must be at least 2 * radius = {contact}, "
                 "or left out of `make_config` to follow the radius"
             )
         if not self.collision_tolerance < contact:
             raise ValueError(
-                f"collision_tolerance={self.collision_tolerance}: it must be less than 2 radius = {contact}, "
-                "else nothing is a collision"
+                f"collision_tolerance={self.collision_tolerance}: it must be less than 2 * radius = {contact}, "
+                "otherwise nothing is a collision"
             )
         longest = self.quadrotor.longest_step
         if planner.dt > longest:
@@ -95,46 +95,47 @@ class SwarmConfig:
             )
         if parse_plant(self.plant)[0] != MODEL and self.mismatch:
             raise ValueError(
-                f"mismatch={self.mismatch}: only the vehicles of our own model can be varied, those of "
-                f"plant={self.plant!r} are unlike it anyway: set it to 0"
+                f"mismatch={self.mismatch}: it only applies to plant={MODEL!r}, since plant={self.plant!r} differs "
+                "from the planner's model anyway: set it to 0"
             )
         fastest = longest * (1 - self.mismatch)
         if planner.dt / self.substeps > fastest:
             raise ValueError(
-                f"mismatch={self.mismatch}: the fastest vehicles take sub-steps of up to {fastest:.2g} s, not "
+                f"mismatch={self.mismatch}: the fastest vehicles need sub-steps of at most {fastest:.2g} s, but "
                 f"planner.dt / substeps = {planner.dt / self.substeps:.2g} s: raise substeps"
             )
         reach = self.neighbourhood.range
         if reach is not None and reach < planner.separation:
             raise ValueError(
-                f"neighbourhood.range={reach}: robots must perceive each other at least as far as they keep apart, "
+                f"neighbourhood.range={reach}: robots must perceive others at least up to the distance that they keep, "
                 f"planner.separation={planner.separation}"
             )
         if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
             raise ValueError(
-                f"clock_skew={self.clock_skew} is less than one of the substeps={self.substeps} of a step: raise either"
+                f"clock_skew={self.clock_skew} is shorter than one of the substeps={self.substeps} of a step: raise "
+                "either of them"
             )
 
     @property
     def n_others(self) -> int:
-        """Of how many others a robot perceives something at most."""
+        """Maximum number of others that a robot perceives."""
         return self.neighbourhood.places(self.n_robots)
 
     @property
     def is_limited(self) -> bool:
-        """Whether robots may miss others."""
+        """Whether there may be others that a robot does not perceive."""
         return self.neighbourhood.limits(self.n_robots)
 
     @property
     def is_random(self) -> bool:
-        """Whether the world itself draws random numbers during an episode."""
+        """Whether the world draws random numbers during an episode."""
         return bool(self.noise or self.sensing or self.radio.is_random or self.mismatch or self.clock_skew)
 
 
 _SMALL_ROOM = ScenarioSpace(half_width=3.0, circle_radius=(2.5, 3.0), sector_radius=(1.5, 3.0))
 
-# Eight robots with a margin that holds in continuous time, in a laboratory with motion capture: docs/flight.md gives
-# the source of each level.
+# Eight robots with a margin that holds in continuous time, in a laboratory with motion capture. See docs/flight.md for
+# the source of each value.
 _FLIGHT = SwarmConfig(
     n_robots=8,
     planner=PlannerConfig(horizon=20, dt=0.05, separation=0.8, max_tilt=math.radians(20.0), right_of_way=0.3),
@@ -150,18 +151,17 @@ _FLIGHT = SwarmConfig(
 )
 
 PRESETS: dict[str, SwarmConfig] = {
-    # The paper's four robots. The planner keeps exactly 2r, which is what makes communication matter here.
+    # The paper's four robots. The planner's separation is exactly 2r, which makes communication matter.
     "paper": SwarmConfig(),
-    # Eight robots in a 6 m square with a margin of 4 cm: communication matters although the planner leaves room for
-    # error.
+    # Eight robots in a 6 m square with a margin of 4 cm: communication matters despite the planner's margin for error.
     "dense": SwarmConfig(
         n_robots=8,
         planner=PlannerConfig(separation=0.64, max_tilt=math.radians(20.0)),
         space=_SMALL_ROOM,
     ),
     "flight": _FLIGHT,
-    # The same team without motion capture and in more wind: errors two to four times as large, links that drop out, and
-    # robots that fall silent.
+    # The same team without motion capture and in more wind: errors two to four times as large, interrupted links, and
+    # robots that stop answering.
     "flight-hard": replace(
         _FLIGHT,
         max_steps=300,
@@ -174,16 +174,16 @@ PRESETS: dict[str, SwarmConfig] = {
 
 
 def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, **overrides: Any) -> SwarmConfig:
-    """A preset with some of its fields replaced.
+    """Create a preset with some of its fields replaced.
 
-    The planner's separation follows the radius: where only the radius is given, the planner keeps as much beyond twice
-    the radius as the preset does. ``quadrotor`` may be a name of `VEHICLES` or the path of a vehicle file. With a
-    foreign ``plant`` there is no ``mismatch`` unless given, which is refused.
+    The planner's separation follows the radius: if only the radius is replaced, the margin beyond twice the radius
+    stays that of the preset. ``quadrotor`` may also be a name of `VEHICLES` or the path of a vehicle file. With another
+    ``plant`` than the model, ``mismatch`` defaults to 0.
 
     :param preset: a name of `PRESETS`
-    :param world: fields of `SwarmConfig`; nested ones take a mapping of what to replace in them
-    :param overrides: the same by name; None keeps the preset's value
-    :raises ValueError: unknown preset or field, a value out of its range, or a field that is given twice
+    :param world: fields of `SwarmConfig` to replace, nested ones as mappings
+    :param overrides: further fields by name; None keeps the preset's value
+    :raises ValueError: if the preset or a field is unknown, a value is out of range, or a field is given twice
     """
     if not isinstance(preset, str) or preset not in PRESETS:
         raise unknown_name("preset", preset, PRESETS)
@@ -191,7 +191,9 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
     base = PRESETS[preset]
     planner = changes.get("planner", {})
     if "radius" in changes and isinstance(planner, Mapping) and "separation" not in planner:
-        with contextlib.suppress(TypeError, ValueError, OverflowError):  # no number: the check of the fields says so
+        with contextlib.suppress(
+            TypeError, ValueError, OverflowError
+        ):  # not a number, which the check of the fields reports
             separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
             changes = {**changes, "planner": {**planner, "separation": separation}}
     if isinstance(vehicle := changes.get("quadrotor"), str):
@@ -202,9 +204,9 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
 
 
 def _joined(first: Mapping[str, Any], second: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Two nested mappings as one.
+    """Merge two nested mappings.
 
-    :raises ValueError: both name the same field
+    :raises ValueError: if both have the same field
     """
     joined = dict(first)
     for name, value in second.items():
@@ -214,7 +216,7 @@ def _joined(first: Mapping[str, Any], second: Mapping[str, Any], path: str = "")
             joined[name] = _joined(joined[name], value, f"{path}{name}.")
         else:
             raise ValueError(
-                f"{path}{name} is given twice, {shown(joined[name])} in `world` and {shown(value)} beside it: leave "
-                "one out."
+                f"{path}{name} is given twice, as {shown(joined[name])} in `world` and as the argument "
+                f"{shown(value)}: leave one out."
             )
     return joined

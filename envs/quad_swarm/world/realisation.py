@@ -1,4 +1,4 @@
-"""What chance makes of the disturbances in E swarms: the errors, gusts and losses that are met."""
+"""Realisations of the disturbances in E swarms: the errors, gusts and losses that occur."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from quad_swarm.states import generator_of, generator_state, like
 from quad_swarm.world.beliefs import of_others
 from quad_swarm.world.presets import SwarmConfig
 
-OUTAGE_WITHIN = 5.0  # s, of an episode: when robots stop answering
+OUTAGE_WITHIN = 5.0  # time from the start of an episode within which robots stop answering (s)
 _NEVER = np.iinfo(np.int64).max
 
 
 class Realisation:
-    """Random numbers of E swarms, each from a generator of its own: an episode does not depend on the batch it is in.
+    """Random disturbances of E swarms. Each swarm has its own random number generator, so that an episode does not
+    depend on the batch it is in.
 
     :param config: the world
     :param n_swarms: number of swarms E
     :ivar air: velocity of the air at each robot, (E, n, 2) (m/s)
-    :ivar factors: of each robot's vehicle parameters, (E, n, 8); None where all are as the planner's model
-    :ivar start: sub-step of each step at which each robot's new input acts, (E, n); None where it is the first
+    :ivar factors: factors of each robot's vehicle parameters, (E, n, 8); None without mismatch
+    :ivar start: sub-step at which each robot's new input takes effect, (E, n); None if it is always the first
     """
 
     _ARRAYS = ("_wind", "_gust", "_own", "_observer", "_factors", "_start", "_down", "_silent_from", "_step")
@@ -45,7 +46,7 @@ class Realisation:
         self._step = np.zeros(n_swarms, dtype=np.int64)
 
         noise, sensing = config.noise, config.sensing
-        # Of position, velocity and attitude; the yaw is held
+        # Scales of position, velocity and attitude; yaw has no noise
         self._kick = _by_state(noise.pos, noise.vel, noise.attitude)
         self._own_scale = _by_state(sensing.pos, sensing.vel, sensing.attitude)
         self._observer_scale = np.repeat([sensing.others_pos, sensing.others_vel], 3)
@@ -66,7 +67,7 @@ class Realisation:
         return self._start if self._latest_start else None
 
     def reset(self, swarm: int, seed: int) -> None:
-        """Draw what stays for an episode of one swarm, and begin what varies."""
+        """Draw the constants of an episode of one swarm, and initialise its random processes."""
         config, radio = self.config, self.config.radio
         rng = self._rngs[swarm] = np.random.default_rng(seed)
         direction = rng.uniform(0, 2 * np.pi)
@@ -90,9 +91,9 @@ class Realisation:
             self._observer[swarm] = self._observer_scale * rng.normal(size=self._observer.shape[1:])
 
     def meet(self, places: np.ndarray) -> None:
-        """Draw anew what lies between a robot and one of the others: somebody else has come.
+        """Draw new observation errors and link states for slots with new robots.
 
-        :param places: of whom, (E, n, n - 1) bool
+        :param places: whether the slot has a new robot, (E, n, n - 1) bool
         """
         for swarm in np.flatnonzero(places.any(axis=(1, 2))):
             where, rng = places[swarm], self._rngs[swarm]
@@ -109,7 +110,7 @@ class Realisation:
         self._rngs = [rng for rng, kept in zip(self._rngs, swarms, strict=True) if kept]
 
     def fork(self) -> Realisation:
-        """A copy that draws the same from here on."""
+        """Return a copy that draws the same random numbers from here on."""
         fork = copy(self)
         for name in self._ARRAYS:
             setattr(fork, name, getattr(self, name).copy())
@@ -117,36 +118,36 @@ class Realisation:
         return fork
 
     def state_dict(self) -> dict[str, Any]:
-        """All that is drawn and what draws on, see `load_state_dict`."""
+        """Return all drawn values and the generators' states, see `load_state_dict`."""
         arrays = {name.lstrip("_"): getattr(self, name).copy() for name in self._ARRAYS}
         return {**arrays, "generators": [generator_state(rng) for rng in self._rngs]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state_dict` gave.
+        """Restore a state from `state_dict`.
 
-        :raises ValueError: the state of other teams
+        :raises ValueError: if the state belongs to other swarms
         """
         for name in self._ARRAYS:
             setattr(self, name, like(getattr(self, name), state[name.lstrip("_")], name.lstrip("_")))
         self._rngs = [generator_of(one) for one in state["generators"]]
 
     def estimate(self, state: np.ndarray) -> np.ndarray:
-        """Where robots take themselves to be, (E, n, 9)."""
+        """Return the robots' estimates of their own states, (E, n, 9)."""
         return state + self._own if self.config.sensing.own else state
 
     def observe(self, pos: np.ndarray, vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities of others, (E, n, n - 1, 3) each, as their observers see them."""
+        """Add the observers' errors to positions and velocities of others, (E, n, n - 1, 3) each."""
         if not self.config.sensing.others:
             return pos, vel
         return pos + self._observer[..., :3], vel + self._observer[..., 3:]
 
     def arrivals(self, requests: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Which answers of this step arrive.
+        """Draw which answers of this step arrive.
 
-        :param requests: whom each robot asks, (E, n, n - 1) bool
-        :param others: see `other_indices`, or `Neighbours.others`
-        :return: which are answered, (E, n, n - 1) bool, and by how many steps each is later than the radio's delay,
-            (E, n, n - 1); None where that does not vary
+        :param requests: whose plans each robot requests, (E, n, n - 1) bool
+        :param others: see `other_indices` or `Neighbours.others`
+        :return: which requests are answered, (E, n, n - 1) bool, and the answers' additional delays beyond the radio's
+            delay (steps), (E, n, n - 1), None without jitter
         """
         radio, lateness = self.config.radio, None
         shape = requests.shape[1:]
@@ -166,9 +167,9 @@ class Realisation:
         return requests, lateness
 
     def advance(self) -> np.ndarray | None:
-        """Let a step pass for all that varies.
+        """Advance all random processes by a step.
 
-        :return: what the step adds to the states, (E, n, 9); None without such noise
+        :return: noise to add to the states, (E, n, 9), None without process noise
         """
         self._step += 1
         noise, sensing = self.config.noise, self.config.sensing
@@ -193,10 +194,10 @@ def _by_state(pos: float, vel: float, attitude: float) -> np.ndarray:
 
 
 def _keeps(dt: float, correlation_time: float) -> float:
-    """How much of a Gauss-Markov process is left after a step."""
+    """Return the correlation of a Gauss-Markov process between consecutive steps."""
     return math.exp(-dt / correlation_time) if correlation_time else 0.0
 
 
 def _continued(process: np.ndarray, keeps: float, scale: np.ndarray | float, drawn: np.ndarray) -> np.ndarray:
-    """A stationary Gauss-Markov process one step later."""
+    """Advance a stationary Gauss-Markov process by a step."""
     return keeps * process + math.sqrt(1 - keeps**2) * scale * drawn

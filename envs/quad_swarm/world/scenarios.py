@@ -1,7 +1,7 @@
-"""Where robots start and where they want to go (Sec. V-B).
+"""Starts and goals of robots (Sec. V-B).
 
-A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m). To add one, write
-the function and name it in `SCENARIOS`.
+A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m). To add a scenario,
+write a function and add it to `SCENARIOS`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from quad_swarm.validation import Length, PositiveLength, Range, checked
 Rng = np.random.Generator
 Scenario = Callable[[int, "ScenarioSpace", Rng], tuple[np.ndarray, np.ndarray]]
 
-_DRAWS_PER_POINT = 100  # then the set is begun anew
+_DRAWS_PER_POINT = 100  # before the whole set is redrawn
 _MAX_DRAWS = 20_000
 
 
@@ -27,13 +27,14 @@ class ScenarioSpace:
     """The room that scenarios draw from.
 
     :param half_width: starts and goals of `random` and `random_swap` lie in [-half_width, half_width]^2 (m)
-    :param heights: lowest and highest start and goal (m)
-    :param spacing: smallest distance between two starts, and between two goals (m)
-    :param circle_radius: smallest and largest radius of the circle of `symmetric_swap` (m)
-    :param circle_jitter: starts and goals of `symmetric_swap` are moved by up to this much along each axis (m)
-    :param sector_radius: smallest and largest distance of an `asymmetric_swap` start from the centre (m)
-    :param whole_sectors: `asymmetric_swap` as the paper describes it, for four robots one anywhere in each quadrant:
-        sectors begin at the x axis and are used in full; otherwise they are centred on it and used to 80 %
+    :param heights: minimum and maximum height of starts and goals (m)
+    :param spacing: minimum distance between two starts, and between two goals (m)
+    :param circle_radius: minimum and maximum radius of the circle of `symmetric_swap` (m)
+    :param circle_jitter: maximum displacement of starts and goals of `symmetric_swap` along each axis (m)
+    :param sector_radius: minimum and maximum distance of the starts of `asymmetric_swap` from the centre (m)
+    :param whole_sectors: whether sectors of `asymmetric_swap` start at the x axis and are used completely, as in the
+        paper (for four robots, one anywhere in each quadrant). By default they are centred on the x axis and used to
+        80 %
     """
 
     half_width: PositiveLength = 4.0
@@ -46,13 +47,13 @@ class ScenarioSpace:
 
 
 class DoesNotFit(ValueError):
-    """So many robots do not fit into the room of a scenario."""
+    """Raised if the robots do not fit into the room of a scenario."""
 
 
 def _place(n_points: int, draw: Callable[[int], np.ndarray], spacing: float) -> np.ndarray:
-    """Points ``draw(0) ... draw(n_points - 1)``, (n, 3), redrawn until every two are at least ``spacing`` apart.
+    """Draw points ``draw(0) ... draw(n_points - 1)``, (n, 3), until all are at least ``spacing`` apart.
 
-    :raises DoesNotFit: no such set was found in a bounded number of draws; the message says how many points were placed
+    :raises DoesNotFit: if a limited number of draws finds no such set; the message says how many points were placed
     """
     points = np.empty((n_points, 3))
     placed = most = 0
@@ -68,7 +69,7 @@ def _place(n_points: int, draw: Callable[[int], np.ndarray], spacing: float) -> 
                 return points
     raise DoesNotFit(
         f"{n_points} robots at least {spacing} m apart do not fit into the room of this scenario; about {most} do. "
-        "Ask for fewer robots or a preset with more room."
+        "Choose fewer robots or a larger room."
     )
 
 
@@ -79,12 +80,12 @@ def _in_box(n_robots: int, space: ScenarioSpace, rng: Rng) -> np.ndarray:
 
 
 def random(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Random: starts and goals drawn independently."""
+    """Random: starts and goals are drawn independently."""
     return _in_box(n_robots, space, rng), _in_box(n_robots, space, rng)
 
 
 def random_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Random swapping: each robot flies to another robot's start (a uniform permutation without fixed point)."""
+    """Random swap: each robot flies to another robot's start (a uniform permutation without fixed points)."""
     starts = _in_box(n_robots, space, rng)
     while True:
         order = rng.permutation(n_robots)
@@ -93,10 +94,10 @@ def random_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarr
 
 
 def asymmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Asymmetric swapping: one robot anywhere in each of n sectors; each flies to the start in the opposite sector.
+    """Asymmetric swap: one robot anywhere in each of n sectors, which flies to the start in the opposite sector.
 
     Sectors are centred on the axes and used to 80 % of their width, as in the only such generator that the paper's
-    laboratory published (tud-amr/mrca_vc), or as the paper has them with `ScenarioSpace.whole_sectors`.
+    laboratory published (tud-amr/mrca_vc). With `ScenarioSpace.whole_sectors` they are as in the paper.
     """
     sector = 2 * np.pi / n_robots
     low, high = (0.0, 1.0) if space.whole_sectors else (-0.4, 0.4)
@@ -111,9 +112,10 @@ def asymmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.n
 
 
 def symmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Symmetric swapping: evenly on a circle at one height, each to the opposite point, both ends slightly moved.
+    """Symmetric swap: robots start evenly on a circle at one height and fly to the opposite points; all points are
+    slightly displaced.
 
-    Without the movement mirrored robots dodge to the same side for ever, however much they communicate.
+    Without the displacement, mirrored robots evade to the same side forever, however much they communicate.
     """
     radius, phase, height = rng.uniform(*space.circle_radius), rng.uniform(0, 2 * np.pi), rng.uniform(*space.heights)
 
@@ -128,7 +130,7 @@ def symmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.nd
     return _place(n_robots, draw_around(0.0), space.spacing), _place(n_robots, draw_around(np.pi), space.spacing)
 
 
-# In the order of the curriculum: from where hardly any request is needed to where most are (docs/method.md).
+# In the order of the curriculum, by the number of requests needed (docs/method.md)
 SCENARIOS: dict[str, Scenario] = {
     "random": random,
     "random_swap": random_swap,
@@ -139,13 +141,15 @@ MIXTURES = ("mixed", "curriculum")
 
 
 class ScenarioSampler:
-    """Draws episodes of one scenario, or of a mixture of all.
+    """Sampler of episodes of a scenario or a mixture of scenarios.
 
-    :param name: a name of `SCENARIOS`; "mixed" draws uniformly among them; "curriculum" draws uniformly among the first
-        ``level + 1`` of them; names with weights, as in ``{"symmetric_swap": 3, "random": 1}``, draw in proportion
+    :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among all of them; "curriculum" to draw uniformly
+        among the first ``level + 1`` of them; or a mapping of names to weights, such as ``{"symmetric_swap": 3,
+        "random": 1}``
     :param n_robots: number of robots, at least 2
     :param space: the room
-    :raises ValueError: unknown name, fewer than two robots, or more robots than fit (`DoesNotFit`)
+    :raises ValueError: if a name is unknown, weights are invalid, there are fewer than two robots, or they do not fit
+        (`DoesNotFit`)
     """
 
     def __init__(self, name: str | Mapping[str, float], n_robots: int, space: ScenarioSpace):
@@ -155,7 +159,7 @@ class ScenarioSampler:
         weights = [] if isinstance(name, str) else [float(weight) for weight in name.values()]
         if not isinstance(name, str) and not (all(weight >= 0 for weight in weights) and 0 < sum(weights) < np.inf):
             raise ValueError(
-                f"scenario={dict(name)}: weights are not negative, one of them is positive, and their sum is finite."
+                f"scenario={dict(name)}: weights must not be negative, and their sum must be positive and finite."
             )
         if n_robots < 2:
             raise ValueError(f"n_robots={n_robots}: a swarm needs at least 2 robots.")
@@ -165,7 +169,7 @@ class ScenarioSampler:
         self.level = 0
         self._weights = np.array(weights) / sum(weights) if weights else None
         for scenario in self._names:
-            # Find out at construction, not in the middle of a training, that the robots do not fit.
+            # Fail now rather than during training if the robots do not fit
             SCENARIOS[scenario](n_robots, space, np.random.default_rng(0))
 
     @property
@@ -176,7 +180,7 @@ class ScenarioSampler:
 
     @property
     def n_levels(self) -> int:
-        """Number of levels of the curriculum; 1 where there is none."""
+        """Number of curriculum levels, 1 without a curriculum."""
         return len(SCENARIOS) if self.name == "curriculum" else 1
 
     def _active(self) -> list[str]:
@@ -185,7 +189,7 @@ class ScenarioSampler:
     def set_level(self, level: int) -> None:
         """Set the level of the curriculum.
 
-        :raises ValueError: no such level
+        :raises ValueError: if there is no such level
         """
         if not isinstance(level, (int, np.integer)) or not 0 <= level < self.n_levels:
             raise ValueError(
@@ -194,7 +198,7 @@ class ScenarioSampler:
         self.level = level
 
     def sample(self, rng: Rng) -> tuple[str, np.ndarray, np.ndarray]:
-        """Draw an episode: the scenario's name, starts (n, 3) and goals (n, 3), world frame (m)."""
+        """Draw an episode and return the scenario's name, starts (n, 3) and goals (n, 3), world frame (m)."""
         active = self._active()
         if self._weights is not None:
             name = active[int(rng.choice(len(active), p=self._weights))]

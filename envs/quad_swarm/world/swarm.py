@@ -1,6 +1,6 @@
-"""E swarms of n robots: who asks whom -> beliefs -> plans -> dynamics. No reward, no episode: that is `task`.
+"""Simulation of E swarms of n robots: requests -> beliefs -> plans -> dynamics. Rewards and episodes are in `task`.
 
-Axes of the n - 1 others of a robot have fewer places where its neighbourhood is limited, see `neighbours`.
+If the neighbourhood is limited, axes of length n - 1 have fewer entries, one per slot, see `neighbours`.
 """
 
 from __future__ import annotations
@@ -24,29 +24,31 @@ from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
 
-# So many separations away an empty place shows a robot: nothing that anybody plans comes near it
+# Distance (in separations) at which an empty slot shows a robot, far beyond all plans
 _NOBODY = 30.0
-_FARTHEST = 1e4  # m, of starts and goals; far beyond any room, and well before squares lose their meaning
+_FARTHEST = 1e4  # limit of starts and goals (m), far beyond any room and small enough for precise squares
 
 
 class StepReport(NamedTuple):
-    """What happened in one step of E swarms.
+    """Report of one step of E swarms.
 
     :param min_separation: smallest distance between two robots after the step, (E,) (m)
-    :param min_separation_continuous: smallest distance during the step, each robot moving in a straight line between
-        two sub-steps, (E,) (m)
-    :param others: who the others are, -1: an empty place, (E, n, n - 1), or (n, n - 1) where all swarms have the same
+    :param min_separation_continuous: smallest distance between two robots during the step, with straight motion between
+        sub-steps, (E,) (m)
+    :param others: indices of the others, -1 for an empty slot, (E, n, n - 1), or (n, n - 1) if they are the same in all
+        swarms
     :param separation: distance of each robot to each of the others after the step, (E, n, n - 1) (m)
     :param colliding: which of the others each robot collides with after the step, (E, n, n - 1) bool
-    :param colliding_continuous: the same at any time during the step
+    :param colliding_continuous: which of the others each robot collides with at any time during the step,
+        (E, n, n - 1) bool
     :param collision: whether two robots collide after the step (the paper's check), (E,) bool
     :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
-    :param changed: places that somebody else has after the step, or nobody, (E, n, n - 1) bool; None where that never
-        happens
+    :param changed: whether another robot, or none, is in the slot after the step, (E, n, n - 1) bool; None if slots
+        never change
     :param moved: distance that each robot flew, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
-    :param plan_age: steps since the plans were made that are believed, (E, n, n - 1); only where one is
+    :param plan_age: age of each believed plan (steps), (E, n, n - 1); meaningless where no plan is believed
     :param plan_status: `PlanStatus` of each robot's plan, (E, n)
     :param iterations: solver iterations of each robot, (E, n)
     :param solve_seconds: wall-clock time of the planner's batch call (s)
@@ -71,14 +73,14 @@ class StepReport(NamedTuple):
 
 
 class Swarm:
-    """State, plans and beliefs of E swarms that do not see each other and share one planner call.
+    """State, plans and beliefs of E independent swarms, which share one planner call.
 
     :ivar state: true states, (E, n, 9)
     :ivar goal: goals, (E, n, 3), world frame (m)
-    :ivar neighbours: whom each robot perceives
-    :ivar chance: errors, gusts and losses that are met
-    :ivar beliefs: what each robot believes of the others
-    :ivar presumed_beliefs: what each robot's others take it to believe of them: all that they answered has arrived
+    :ivar neighbours: which others each robot perceives
+    :ivar chance: realisation of the disturbances
+    :ivar beliefs: beliefs of each robot about the others
+    :ivar presumed_beliefs: beliefs of each robot as the others presume them, assuming that all their answers arrived
 
     :param config: the world
     :param n_swarms: number of swarms E
@@ -99,15 +101,15 @@ class Swarm:
         differ = config.radio.is_random or config.sensing.others
         self.presumed_beliefs = Beliefs(*beliefs) if differ else self.beliefs
         self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
-        # Positions planned in the last steps, the oldest first: what a late answer holds
+        # Planned positions of the last steps, oldest first, which late answers contain
         late = config.radio.delay + config.radio.jitter
         self._earlier = [self.plans[..., POSITION].copy() for _ in range(late)]
-        self._u = np.zeros((n_swarms, n, 4))  # inputs that act
+        self._u = np.zeros((n_swarms, n, 4))  # current inputs
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
             number = np.zeros((n, n), dtype=int)
             number[self._pairs] = np.arange(len(self._pairs[0]))
-            # Which pair each robot is with each of the others
+            # Index of the pair of each robot and each of its others
             self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
 
     @property
@@ -126,16 +128,16 @@ class Swarm:
         return self.state[..., VELOCITY]
 
     def estimate(self) -> np.ndarray:
-        """The state in which each robot takes itself to be, (E, n, 9)."""
+        """Return the robots' estimates of their own states, (E, n, 9)."""
         return self.chance.estimate(self.state)
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (m) and velocities (m/s) of the others as each robot sees them, (E, n, n - 1, 3) each, world
-        frame."""
+        """Return positions (m) and velocities (m/s) of the others as each robot observes them, (E, n, n - 1, 3) each,
+        world frame."""
         return self.chance.observe(*self._seen_by_all())
 
     def _seen_by_all(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same without what each observer gets wrong in its own way."""
+        """Return the same as `observe`, but without the additional errors of the observers."""
         estimate, neighbours = self.estimate(), self.neighbours
         seen = of_others(estimate, neighbours.others)
         pos, vel = seen[..., POSITION], seen[..., VELOCITY]
@@ -144,7 +146,7 @@ class Swarm:
         return pos, vel
 
     def presume(self) -> Prediction:
-        """What the others of each robot take it to predict of them as long as it does not ask."""
+        """Return each robot's predictions without requests, as the others presume them."""
         return self.presumed_beliefs.predict(*self._seen_by_all())
 
     @property
@@ -153,17 +155,18 @@ class Swarm:
         return self._plans.x.reshape(*self.state.shape[:2], *self._plans.x.shape[1:])
 
     def planned_positions(self) -> np.ndarray:
-        """Planned positions at the beginning of the last step and of the N steps from there, (E, n, N + 1, 3) (m):
-        those of `plans`, which begin where a robot's input acts."""
+        """Planned positions at the start of the last step and of the N steps after it, (E, n, N + 1, 3) (m). With clock
+        skew, `plans` start when the robot's input takes effect and are resampled here."""
         plans = self.plans[..., POSITION]
         start = self.chance.start
         return plans if start is None else resampled(plans, -start / self.config.substeps)
 
     def planned_separation(self, steps: int, others: np.ndarray) -> np.ndarray:
-        """How far each robot is from each of the others by their plans in each of the ``steps`` after the present
-        one, (E, n, n - 1, steps) (m); infinity for an empty place.
+        """Return the planned distances of each robot to each of the others in the ``steps`` after the current one,
+        (E, n, n - 1, steps) (m), infinity for an empty slot.
 
-        :param others: who they are, see `StepReport`
+        :param steps: number of steps
+        :param others: indices of the others, see `StepReport`
         """
         plans = self.planned_positions()[..., 2 : 2 + steps, :]
         if self.neighbours.limited:
@@ -174,10 +177,13 @@ class Swarm:
         return np.sqrt(_dot(between, between))[:, self._pair_of]
 
     def reset(self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
-        """Put one swarm's robots at rest at ``starts`` and give them ``goals``, both (n, 3), world frame (m).
+        """Place the robots of one swarm at rest.
 
-        :param noise_seed: seed of the disturbances; without any, it does not matter
-        :raises ValueError: starts or goals are not n finite points
+        :param swarm: index of the swarm
+        :param starts: starts, (n, 3), world frame (m)
+        :param goals: goals, (n, 3), world frame (m)
+        :param noise_seed: seed of the disturbances, unused without any
+        :raises ValueError: if starts or goals are not n finite points
         """
         n = self.config.n_robots
         starts, goals = _points("starts", starts, n), _points("goals", goals, n)
@@ -209,7 +215,7 @@ class Swarm:
         self._earlier = [plans[swarms] for plans in self._earlier]
 
     def part(self, swarms: np.ndarray) -> Swarm:
-        """Some of the swarms (mask) to look at: a copy, but for the planner and the generators."""
+        """Return a copy of the given swarms (mask), which shares the planner and the random number generators."""
         part = copy(self)
         part.beliefs = copy(self.beliefs)
         part.presumed_beliefs = part.beliefs if self.presumed_beliefs is self.beliefs else copy(self.presumed_beliefs)
@@ -219,18 +225,18 @@ class Swarm:
         return part
 
     def fork(self) -> Swarm:
-        """A copy of all swarms that flies on by itself, with the disturbances that these would meet."""
+        """Return an independent copy of all swarms, with the same future disturbances."""
         fork = self.part(np.ones(self.n_swarms, dtype=bool))
         fork.chance = self.chance.fork()
         return fork
 
     def state_dict(self) -> dict[str, Any]:
-        """All of the present state, see `load_state_dict`: plain numbers and arrays.
+        """Return the complete state as plain values and arrays, see `load_state_dict`.
 
-        :raises ValueError: a foreign simulator flies, whose state nobody can read
+        :raises ValueError: if the plant is another simulator, which does not provide its state
         """
         if self.config.plant != MODEL:
-            raise ValueError(f"plant={self.config.plant!r} keeps its state to itself: only plant={MODEL!r} tells it.")
+            raise ValueError(f"plant={self.config.plant!r} does not provide its state: only plant={MODEL!r} does.")
         presumed = None if self.presumed_beliefs is self.beliefs else self.presumed_beliefs.state_dict()
         return {
             "state": self.state.copy(),
@@ -245,9 +251,9 @@ class Swarm:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `state_dict` of a swarm of the same world gave, bit for bit.
+        """Restore a state from `state_dict` of swarms in the same world, bit for bit.
 
-        :raises ValueError: the state of other swarms
+        :raises ValueError: if the state belongs to other swarms
         """
         self.state = like(self.state, state["state"], "state")
         self.goal = like(self.goal, state["goal"], "goal")
@@ -257,7 +263,9 @@ class Swarm:
             **{name: like(one, plans[name], f"plans.{name}") for name, one in self._plans._asdict().items()}
         )
         if len(state["earlier"]) != len(self._earlier):
-            raise ValueError(f"The state holds {len(state['earlier'])} earlier plans, this world {len(self._earlier)}.")
+            raise ValueError(
+                f"The state has {len(state['earlier'])} earlier plans, but this world has {len(self._earlier)}."
+            )
         self._earlier = [
             like(mine, one, "earlier plans") for mine, one in zip(self._earlier, state["earlier"], strict=True)
         ]
@@ -269,10 +277,10 @@ class Swarm:
             self.neighbours.load_state_dict(state["neighbours"])
 
     def step(self, requests: np.ndarray) -> StepReport:
-        """Let every robot ask, plan and fly for one step.
+        """Let all robots make requests, plan and fly for one step.
 
-        :param requests: whom each robot asks, (E, n, n - 1) bool, the others of a robot in ascending order or as in
-            `neighbours`, which has no empty place asked
+        :param requests: whose plans each robot requests, (E, n, n - 1) bool, with the others in ascending order or as
+            in `neighbours`, and False for empty slots
         """
         believed, source = self._believe(requests)
         started = time.perf_counter()
@@ -282,10 +290,10 @@ class Swarm:
         return report if self.neighbours.present is None else report._replace(changed=self._look_around())
 
     def _look_around(self) -> np.ndarray:
-        """Forget those who are out of reach now, and begin with those who have come: what a robot knew of one that it
-        loses sight of is of no use when they meet again.
+        """Update the neighbours, forget those that left, and draw the disturbances of those that came. Knowledge about
+        a robot that left is not kept for its return.
 
-        :return: places that somebody else has now, or nobody, (E, n, m) bool
+        :return: whether another robot, or none, is in the slot now, (E, n, m) bool
         """
         changed = self.neighbours.update(self.pos, self.vel)
         if changed.any():
@@ -295,11 +303,11 @@ class Swarm:
         return changed
 
     def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What robots believe once answers have arrived, see `Beliefs.update`."""
+        """Return the beliefs after the answers have arrived, see `Beliefs.update`."""
         radio, others = self.config.radio, self.neighbours.others
         trajectories = advance(self.planned_positions())
         if self._earlier:
-            self._earlier = [*map(advance, self._earlier), trajectories]  # each as of now
+            self._earlier = [*map(advance, self._earlier), trajectories]  # advanced to the current step
             trajectories = self._earlier[-1 - radio.delay]
         age = 1 + radio.delay
         if self.presumed_beliefs is not self.beliefs:
@@ -316,7 +324,7 @@ class Swarm:
         return self.beliefs.update(arriving, *self.observe(), received, ages)
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
-        """What each robot has to plan for, from the time on when its input will act."""
+        """Return the robots' planning problems, which start when their inputs take effect."""
         x, start = self.estimate(), self.chance.start
         if start is not None:
             later = start / self.config.substeps
@@ -329,7 +337,7 @@ class Swarm:
         return Problems(x.reshape(-1, 9), self.goal.reshape(-1, 3), others, announced=announced)
 
     def _fly(self) -> list[np.ndarray]:
-        """Move the robots by a step; their positions before it and after each sub-step, (E, n, 3) each (m)."""
+        """Move the robots by a step. Returns positions before it and after each sub-step, (E, n, 3) each (m)."""
         chance, before, planned = self.chance, self._u, self._plans.u[:, 0].reshape(self._u.shape)
         positions = [self.pos.copy()]
         for k in range(self.config.substeps):
@@ -368,17 +376,18 @@ class Swarm:
         )
 
     def _separations(self, positions: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """See `quad_swarm.native.pairs.separations`: of all pairs, whether they perceive each other or not."""
+        """Return the separations of all pairs, including those that do not perceive each other, see
+        `quad_swarm.native.pairs.separations`."""
         if self.neighbours.limited:
             return separations(np.stack(positions), self.neighbours.others)
-        # The same in another order of operations, to which the figures of the presets hold to the last bit
+        # Another order of operations, which keeps the results of the presets bit-identical
         i, j = self._pairs
         apart = [each[:, i] - each[:, j] for each in positions]
         if len(apart) == 2:
             start, end = apart[0][None], apart[1][None]
         else:
             start, end = np.stack(apart[:-1]), np.stack(apart[1:])
-        # Closest point of the segments from start to end to the origin.
+        # Closest points to the origin on the segments from start to end
         change = end - start
         along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
         closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
@@ -392,9 +401,9 @@ class Swarm:
 
 
 def _points(name: str, points: Any, count: int) -> np.ndarray:
-    """Points as an array, (count, 3) (m).
+    """Convert points to an array, (count, 3) (m).
 
-    :raises ValueError: another shape, no numbers, or farther away than `_FARTHEST`
+    :raises ValueError: if the points have another shape, are not numbers, or are farther away than `_FARTHEST`
     """
     try:
         array = np.asarray(points, dtype=float)

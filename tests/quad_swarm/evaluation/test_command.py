@@ -116,16 +116,16 @@ def test_world_can_be_changed(capsys):
         (["--policy", "none", "--preset", "papper"], "Did you mean 'paper'"),
         (["--policy", "none", "--n-robots", "99"], "do not fit"),
         (["--policy", "none", "--episodes", "0"], "episodes=0"),
-        (["--policy", "none", "--seed", "-1"], "seed=-1: sets of held-out episodes are counted from 0"),
+        (["--policy", "none", "--seed", "-1"], "seed=-1: sets of held-out episodes count from 0"),
         (["--policy", "none", "--solver", "fatrob"], "Did you mean 'fatrop'"),
         (["--policy", "none", "--world", "separation"], "write NAME=VALUE"),
         (["--policy", "none", "--world", "planner.seperation=1"], "Did you mean 'separation'"),
-        (["--policy", "none", "--world", "memory={"], "'{' is no valid YAML"),
+        (["--policy", "none", "--world", "memory={"], "'{' is not valid YAML"),
         (["--policy", "none", "--world", "preset=dense"], "Unknown SwarmConfig parameter 'preset'"),
-        (["--policy", "none", "--world", "noise=1", "noise.wind=2"], "was given a plain value before"),
+        (["--policy", "none", "--world", "noise=1", "noise.wind=2"], "already has a plain value"),
         (["--policy", "none", "--world", "noise.wind=1", "noise.wind=2"], "is given twice"),
         (["--policy", "none", "--scenario", "all", "random"], "'all' already names every scenario"),
-        (["--policy", "pretrained:quad-swarm-paper"], "`sb3-maddpg evaluate` knows"),
+        (["--policy", "pretrained:quad-swarm-paper"], "only `sb3-maddpg evaluate` also accepts"),
         (["--policy", "none", "--json", "."], "--json . is a folder"),
         (["--policy", "none", "--csv", "."], "--csv . is a folder"),
         (["--policy", "none", "--latex", "."], "--latex . is a folder"),
@@ -154,7 +154,7 @@ def test_a_damaged_model_is_named(tmp_path, capsys):
     assert str(broken) in error
     assert "Is the file complete" in error
     assert main(["--policy", str(broken), "--algo", "quad_swarm:Nothing"]) == 2
-    assert "no importable module:Class" in capsys.readouterr().err
+    assert "not an importable module:Class" in capsys.readouterr().err
 
 
 def test_a_scenario_named_twice_is_flown_once(capsys):
@@ -177,7 +177,7 @@ def test_models_fly_in_the_world_that_they_were_trained_in(capsys):
     assert "note: quad-swarm-dense was trained in 'dense', this is 'paper'" in capsys.readouterr().err
     paper = str(pretrained_folder("quad-swarm-paper") / "model.zip")
     assert main(["--policy", dense, paper, *flags]) == 2
-    assert "choose one of these by --preset" in capsys.readouterr().err
+    assert "choose one of these with --preset" in capsys.readouterr().err
 
 
 def test_the_help_names_every_rule_and_the_command(capsys):

@@ -138,7 +138,7 @@ def test_finished_pieces_are_not_flown_again(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluation, "run_episodes", lambda *piece: (again.append(piece), run_episodes(*piece))[1])
     rows = fly_all(conditions, 15, journal=tmp_path)
     assert len(again) == 5, "one was whole"
-    assert "1 of 6 pieces were flown before" in capsys.readouterr().err
+    assert "1 of 6 pieces were finished before" in capsys.readouterr().err
     assert untimed(rows) == untimed(fly_all(conditions, 15))
     assert not list(tmp_path.iterdir()), "nothing is kept of what is done"
 

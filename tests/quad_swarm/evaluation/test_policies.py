@@ -71,7 +71,7 @@ def test_a_model_tells_its_world(model):
 
 @pytest.fixture(scope="module")
 def relational(tmp_path_factory) -> str:
-    """The path of a model that looks at its neighbours one by one and announces."""
+    """Return the path of a relational model that announces."""
     kwargs = {"preset": "flight", "n_robots": 3, "observation": "state+approach+told+mask", "announcements": True}
     path = str(tmp_path_factory.mktemp("relational") / "model.zip")
     MADDPG("PairPolicy", gym.make("QuadSwarm-v0", **kwargs), buffer_size=2000, seed=0).save(path)

@@ -68,7 +68,7 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
     assert main(["--policy", "full", "--scenario", "symetric_swap", *out]) == 2
     assert "symmetric_swap" in capsys.readouterr().err
     assert main(["--policy", "full", "--episode", "-1", *out]) == 2
-    assert "counted from 0" in capsys.readouterr().err
+    assert "count from 0" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

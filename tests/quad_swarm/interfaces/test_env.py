@@ -117,7 +117,7 @@ def test_a_hopeless_planner_never_raises():
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.ones(11), r"shape \(11,\); the action space has \(12,\): 3 bits for each"),
+        (np.ones(11), r"shape \(11,\); the action space has \(12,\): 3 bits per robot"),
         (np.full(12, 0.5), r"contains .*0\.5.*Threshold"),
         (np.full(12, np.nan), "contains .*nan"),
         (np.full(12, 2), "must be 0 or 1"),
@@ -153,7 +153,7 @@ def test_refuses_senseless_arguments(kwargs, message):
     ("options", "message"),
     [
         ({"start": np.zeros((4, 3))}, "reset option 'start'"),
-        ({"starts": np.zeros((4, 3))}, "give both"),
+        ({"starts": np.zeros((4, 3))}, "pass both"),
         ({"starts": np.full((4, 3), np.nan), "goals": np.zeros((4, 3))}, "finite points"),
     ],
 )

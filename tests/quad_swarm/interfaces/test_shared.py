@@ -35,7 +35,7 @@ def test_seeds_may_be_numpy_s(env, seed):
 
 @pytest.mark.parametrize("seed", [-1, 0.5, "x", np.float64(1), {}])
 def test_refuses_senseless_seeds(env, seed):
-    with pytest.raises(ValueError, match="a seed is an integer of at least 0, or None"):
+    with pytest.raises(ValueError, match="a seed must be a non-negative integer or None"):
         env.reset(seed=seed)
 
 
@@ -64,7 +64,7 @@ def test_actions_become_bits_of_each_robot_for_each_of_the_others():
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        ([1, 0], r"Whose has shape \(2,\); the action space has \(6,\): 2 bits for each robot"),
+        ([1, 0], r"Whose has shape \(2,\); the action space has \(6,\): 2 bits per robot"),
         ([0, 1, 0, 1, 0, 0.3], r"Whose contains .*0\.3.*; every entry must be 0 or 1\. Threshold scores"),
         ([0, 1, 0, 1, 0, -1], "contains .*-1"),
         ([0, 1, 0, 1, 0, np.inf], "contains .*inf"),

@@ -133,7 +133,7 @@ def break_compiler(kind: str, folder: Path, monkeypatch) -> str:
         return "no C\\+\\+ compiler: install"
     if kind == "misnamed":
         monkeypatch.setenv("CXX", "no-such-compiler")
-        return "CXX='no-such-compiler' is no command"
+        return "CXX='no-such-compiler' is not a command"
     if kind == "cache":
         (folder / "file").touch()
         monkeypatch.setenv("QUAD_SWARM_CACHE", str(folder / "file"))
@@ -235,7 +235,7 @@ def test_a_library_of_another_machine_is_not_used(tmp_path, monkeypatch, stub_co
 @pytest.mark.parametrize("value", [" ", "'x"])
 def test_nonsense_in_cxx_is_named(value, monkeypatch):
     monkeypatch.setenv("CXX", value)
-    with pytest.raises(BuildError, match=f"CXX={value!r} is no command"):
+    with pytest.raises(BuildError, match=f"CXX={value!r} is not a command"):
         build_module.compiler()
 
 

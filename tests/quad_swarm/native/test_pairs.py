@@ -42,7 +42,7 @@ def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace
 
 
 def neighbourhoods(s: SimpleNamespace) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Who is near whom along the paths of a scene."""
+    """Return the neighbours along the paths of a scene."""
     _, n_swarms, n, _ = s.path.shape
     m = max((n - 1) // 2, 1)
     others = np.broadcast_to(np.arange(n)[:, None], (n_swarms, n, m)).astype(np.int64)

@@ -30,7 +30,7 @@ def test_a_vehicle_file_is_written_that_worlds_take(plant, vehicle, tmp_path, ca
     pytest.importorskip("mujoco", reason="the extra `plants` is not installed")
     path = tmp_path / "vehicle.yml"
     assert main(["--plant", plant, "--out", str(path)]) == 0
-    assert "left over: roll and pitch" in capsys.readouterr().out
+    assert "residuals: roll and pitch" in capsys.readouterr().out
     found = load_vehicle(str(path))
     for name in VEHICLE_PARAMETERS:
         assert getattr(found, name) == pytest.approx(getattr(VEHICLES[vehicle], name), rel=0.02)

@@ -22,7 +22,7 @@ def make(dt: float = 0.01) -> RemotePlant:
 
 
 def test_what_the_simulator_refuses_arrives_as_it_is():
-    with pytest.raises(ValueError, match=r"crazyflow moves in steps of 2 ms"):
+    with pytest.raises(ValueError, match=r"crazyflow needs sub-steps that are multiples of 2 ms"):
         make(0.005001)
 
 
@@ -32,7 +32,7 @@ def test_all_plants_share_one_process_until_it_dies():
     state, u, air = np.zeros((1, 2, 9)), np.zeros((1, 2, 4)), np.zeros((1, 2, 2))
     assert np.isfinite(first.step(state, u, air, None)).all()
     os.kill(first._server.process.pid, signal.SIGKILL)
-    with pytest.raises(RuntimeError, match="The simulator's process ended with -9"):
+    with pytest.raises(RuntimeError, match="The simulator's process exited with -9"):
         first.step(state, u, air, None)
     third = make()
     assert third._server is not first._server

@@ -19,7 +19,7 @@ from quad_swarm.task.request_task import RewardConfig, make_task, requests_of
         ({"scenario": 5}, "scenario=5: it must be a valid string or it must be a valid mapping"),
         ({"scenario": {"random": "often"}}, "scenario=.*'often'"),
         ({"observation": 5}, "observation=5: it must be a valid string"),
-        ({"observation": "state", "scale_observation": True}, "observation='state' is scaled already"),
+        ({"observation": "state", "scale_observation": True}, "observation='state' is already scaled"),
         ({"preset": []}, r"preset=\[\]: it must be a valid string"),
         ({"solver": 5}, "solver=5: it must be a valid string"),
         ({"memory": -1.0}, r"memory=-1\.0: it must be greater than or equal to 0"),

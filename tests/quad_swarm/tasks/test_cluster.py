@@ -125,7 +125,10 @@ def test_processes_may_be_killed_at_random(tmp_path):
 
 def test_machines_of_another_kind_are_refused_unless_asked_for(monkeypatch):
     monkeypatch.setattr(cluster, "machine", lambda: "a processor of its own")
-    with Cluster(2) as executor, pytest.raises(ValueError, match=r"machine unlike this one.*a processor of its own"):
+    with (
+        Cluster(2) as executor,
+        pytest.raises(ValueError, match=r"machine that differs from this one.*a processor of its own"),
+    ):
         executor.submit(square, 2).result(timeout=60)
     with Cluster(2, mixed=True) as executor:
         assert executor.submit(square, 2).result(timeout=60) == 4
@@ -184,7 +187,7 @@ def test_a_machine_may_be_lost(tmp_path):
 def test_an_address_where_nobody_answers():
     ray.shutdown()
     try:
-        with pytest.raises(ValueError, match=r"address='auto': no Ray cluster answers there"):
+        with pytest.raises(ValueError, match=r"address='auto': no Ray cluster responds there"):
             Cluster(1, address="auto")
     finally:
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)

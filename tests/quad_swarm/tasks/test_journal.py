@@ -38,7 +38,7 @@ def test_keeps_nothing_without_a_folder():
 def test_where_nothing_can_be_written_the_work_goes_on(tmp_path):
     (tmp_path / "file").touch()
     journal = Journal(tmp_path / "file" / "pieces")
-    with pytest.warns(RuntimeWarning, match="a run that is killed will begin anew") as notices:
+    with pytest.warns(RuntimeWarning, match="a killed run will start from scratch") as notices:
         journal.keep("a", 1)
     assert len(notices) == 1
     journal.keep("b", 1)  # said once is enough

@@ -109,7 +109,7 @@ def test_a_process_that_dies_costs_its_piece_only(tmp_path):
         always = pool.submit(die)
         assert [future.result() for future in others] == [x * x for x in range(8)]
         assert twice.result() == "alive"
-        with pytest.raises(ValueError, match="3 processes died at the same piece"):
+        with pytest.raises(ValueError, match="3 processes died in the same piece"):
             always.result()
         assert pool.submit(square, 3).result() == 9
 

@@ -27,5 +27,5 @@ def test_a_plan_that_does_not_fit_is_refused(bad):
 
 @pytest.mark.parametrize("message", [b"", b"123456", b"1234567"])
 def test_what_is_no_plan_is_refused(message):
-    with pytest.raises(ValueError, match="is no plan"):
+    with pytest.raises(ValueError, match="is not a plan"):
         unpack_plan(message)

@@ -1,4 +1,4 @@
-"""Limited neighbourhoods: who has which place, what goes with a robot, and that nothing else changes."""
+"""Limited neighbourhoods: the slots, knowledge that is forgotten, and that everything else is unchanged."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def asked(swarm: Swarm, rng: np.random.Generator, share: float = 0.3) -> np.ndar
 
 
 def placed(*points: tuple[float, float], neighbourhood: dict, preset: str = "paper", **world) -> Swarm:
-    """A swarm at rest at some points, 1.5 m high."""
+    """Return a swarm at rest at some points, at a height of 1.5 m."""
     config = make_config(preset, n_robots=len(points), world={"neighbourhood": neighbourhood, **world})
     swarm = Swarm(config, 1)
     starts = np.column_stack([points, np.full(len(points), 1.5)])
@@ -134,19 +134,19 @@ def test_who_leaves_is_forgotten_and_who_stays_is_not():
     swarm.step(swarm.neighbours.perceived(np.ones((1, 3, 2), dtype=bool)))
     pos, vel = swarm.observe()
     assert swarm.beliefs.predict(pos, vel).remembers[0, 0].all()
-    swarm.state[0, 1, 0] = 3.0  # out of everybody's range
+    swarm.state[0, 1, 0] = 3.0  # out of range of all others
     swarm.step(np.zeros((1, 3, 2), dtype=bool))
     assert swarm.neighbours.numbers()[0].tolist() == [[-1, 2], [-1, -1], [0, -1]]
     remembers = swarm.beliefs.predict(*swarm.observe()).remembers
     assert remembers[0].tolist() == [[False, True], [False, False], [True, False]]
-    swarm.state[0, 1, 0] = 1.5  # back where it was
+    swarm.state[0, 1, 0] = 1.5  # back at its start
     swarm.step(np.zeros((1, 3, 2), dtype=bool))
     assert swarm.neighbours.numbers()[0, 0].tolist() == [1, 2]
     assert swarm.beliefs.predict(*swarm.observe()).age[0, 0].tolist()[0] >= swarm.config.planner.horizon
 
 
 def test_errors_of_an_observer_stay_with_the_one_that_is_observed():
-    """And who comes is drawn anew, from the same distribution."""
+    """New neighbours get new draws from the same distribution."""
     swarm = make_swarm(FEW, n_swarms=40)
     rng, drawn, kept, anew = np.random.default_rng(0), [], [], []
     for _ in range(40):
@@ -173,7 +173,7 @@ def test_nobody_plans_around_an_empty_place(solver):
     for _ in range(5):
         swarm.step(np.zeros((2, 2, 1), dtype=bool))
     assert not swarm.neighbours.present.any()
-    assert np.array_equal(swarm.plans[0, 0], swarm.plans[1, 0]), "on which side the other is makes no difference"
+    assert np.array_equal(swarm.plans[0, 0], swarm.plans[1, 0]), "the side of the other makes no difference"
 
 
 def test_nobody_can_be_asked_who_is_not_perceived():
@@ -189,7 +189,7 @@ def test_nobody_can_be_asked_who_is_not_perceived():
         outcome = task.act(everything)
         assert np.array_equal(outcome.report.others, numbers)
         assert (outcome.report.belief_source[numbers < 0] == BeliefSource.CONSTANT_VELOCITY).all()
-        assert np.array_equal(outcome.n_requests, n_present + (n_present - hears)), "some announce in vain"
+        assert np.array_equal(outcome.n_requests, n_present + (n_present - hears)), "some announcements are lost"
         assert np.array_equal(outcome.reward_terms["requests"], -task.reward.request * 2 * n_present)
         assert np.array_equal(outcome.pair_rewards != 0, numbers >= 0)
         unheard += int((n_present - hears).sum())
@@ -216,7 +216,7 @@ def test_rules_ask_whom_they_perceive(rule):
 
 def test_who_does_not_perceive_a_robot_is_taken_to_expect_a_constant_velocity():
     swarm = placed((0, 0), (1.2, 0), (1.9, 0), neighbourhood={"max_others": 1}, planner={"separation": 0.6})
-    assert swarm.neighbours.numbers()[0].tolist() == [[1], [2], [1]]  # nobody perceives robot 0
+    assert swarm.neighbours.numbers()[0].tolist() == [[1], [2], [1]]  # no robot perceives robot 0
     swarm.state[0, 0, 3:6] = [0.1, 0.2, 0.3]
     presumed = View(swarm).presumed([0, 4])
     step = swarm.config.planner.dt * np.array([0.1, 0.2, 0.3])
@@ -226,7 +226,7 @@ def test_who_does_not_perceive_a_robot_is_taken_to_expect_a_constant_velocity():
 
 
 def test_robots_that_do_not_perceive_each_other_collide_all_the_same():
-    """Two that are each other's nearest meet two others in mid-step."""
+    """Two pairs of nearest neighbours meet during a step."""
     points = [(0.0, 0.0), (0.0, 0.8), (3.0, 0.0), (3.0, 0.8)]
     swarm = placed(*points, neighbourhood={"max_others": 1})
     before = swarm.pos.copy()

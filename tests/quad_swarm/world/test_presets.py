@@ -58,7 +58,7 @@ def test_the_separation_follows_the_radius_unless_it_is_given():
         lambda: make_config("paper", planner={"separation": 0.59}),
         lambda: SwarmConfig(radius=0.5, planner=PlannerConfig()),
     ):
-        with pytest.raises(ValueError, match=r"^planner\.separation=0\.[569]+: it must be at least 2 radius"):
+        with pytest.raises(ValueError, match=r"^planner\.separation=0\.[569]+: it must be at least 2 \* radius"):
             make()
 
 
@@ -76,7 +76,7 @@ def test_the_separation_follows_the_radius_unless_it_is_given():
         ({"planner": 5}, "planner=5: it must be a mapping"),
         ({"radius": float("nan")}, "radius=nan: it must be a finite number"),
         ({"radius": -1}, "radius=-1: it must be greater than 0"),
-        ({"collision_tolerance": 5}, r"collision_tolerance=5\.0: it must be less than 2 radius = 0\.6"),
+        ({"collision_tolerance": 5}, r"collision_tolerance=5\.0: it must be less than 2 \* radius = 0\.6"),
         ({"memory": {"far": 1}}, "memory={'far': 1}: it must be a valid number"),
         ({"noise": -1}, "noise=-1: it must be a mapping"),
         ({"noise": {"pos": -1}}, r"noise\.pos=-1: it must be greater than or equal to 0"),
@@ -89,7 +89,7 @@ def test_the_separation_follows_the_radius_unless_it_is_given():
         ({"space": {"spacing": 1e300}}, r"space\.spacing=1e\+300: it must be less than or equal to 10000"),
         ({"space": {"half_width": 1e300}}, r"space\.half_width=1e\+300: it must be less than"),
         ({"space": {"half_width": 0}}, r"space\.half_width=0: it must be greater than 0"),
-        ({"space": {"heights": [2, 1]}}, r"space\.heights=\[2, 1\]: it must be lowest first"),
+        ({"space": {"heights": [2, 1]}}, r"space\.heights=\[2, 1\]: it must be the lowest value first"),
         ({"goal_radius": 1e300}, r"goal_radius=1e\+300: it must be less than or equal to 10000"),
         ({"radius": 10**400}, r"radius=10* \.\.\. 0*: it must be"),
         ({"radius": 10**5000}, "radius=<int>: it must be"),
@@ -111,7 +111,7 @@ def test_nonsense_is_refused_in_one_line(values, message):
 
 
 def test_what_is_given_twice_is_refused():
-    with pytest.raises(ValueError, match=r"radius is given twice, 0\.5 in `world` and 0\.4 beside it"):
+    with pytest.raises(ValueError, match=r"radius is given twice, as 0\.5 in `world` and as the argument 0\.4"):
         make_config("paper", {"radius": 0.5}, radius=0.4)
     with pytest.raises(ValueError, match=r"planner\.dt is given twice"):
         make_config("paper", {"planner": {"dt": 0.1}}, planner={"dt": 0.05})

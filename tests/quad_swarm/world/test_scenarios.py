@@ -107,8 +107,8 @@ def test_weights_are_shares():
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ({"random": -1, "random_swap": 2}, "not negative"),
-        ({"random": 1e308, "random_swap": 1e308}, "their sum is finite"),
+        ({"random": -1, "random_swap": 2}, "not be negative"),
+        ({"random": 1e308, "random_swap": 1e308}, "their sum must be positive and finite"),
         ({"rnadom": 1}, "Did you mean 'random'"),
     ],
 )

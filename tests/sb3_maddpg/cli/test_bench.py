@@ -45,7 +45,7 @@ def test_bench_says_where_the_time_goes(capsys):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["-n", "0"], "--n-timesteps=0: give 1 or more"),
+        (["-n", "0"], "--n-timesteps=0: choose 1 or more"),
         (["--json", "folder"], "folder: Is a directory"),
         (["--json", "file/bench.json"], "file"),
     ],

@@ -17,7 +17,7 @@ def test_what_is_not_common_is_left_to_others():
 
 @pytest.mark.parametrize("name", ["../..", "", ".json", "a b", "\0", "json."])
 def test_what_names_no_package_is_refused(name):
-    with pytest.raises(ValueError, match=r"^--gym-packages .*: give the names of packages"):
+    with pytest.raises(ValueError, match=r"^--gym-packages .*: write the names of packages"):
         import_packages(["json", name])
 
 

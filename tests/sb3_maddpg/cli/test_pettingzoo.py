@@ -119,7 +119,7 @@ def test_the_packaged_recipes_train_both_kinds_of_actions(in_logs, capsys, algor
         ([*SPREAD, "--env-kwargs", "continous_actions:True"], "did you mean 'continuous_actions'?"),
         ([*SPREAD, "--eval-env-kwargs", "entry:'mpe2.simple_v3'"], "Unknown argument of mpe2/simple_spread_v3 'entry'"),
         ([*SPREAD, "--env-kwargs", "wrappers:['supersuit.dtype_v1']"], "supersuit.dtype_v1 cannot be imported"),
-        ([*SPREAD, "--env-kwargs", "wrappers:['supersuit.black_death_v3']"], "black_death_v3 keeps agents that ended"),
+        ([*SPREAD, "--env-kwargs", "wrappers:['supersuit.black_death_v3']"], "black_death_v3 keeps dead agents"),
     ],
 )
 def test_what_is_no_pettingzoo_module_is_refused(in_logs, capsys, argv, message):

@@ -49,23 +49,23 @@ def test_a_file_without_a_recipe_is_refused(capsys, text, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"learning_rate": float("nan")}, "learning_rate=nan: give a finite number, or lin_NUMBER"),
-        ({"learning_rate": "nan"}, "learning_rate='nan': give a finite number, or lin_NUMBER"),
-        ({"learning_rate": "lin_x"}, "learning_rate='lin_x': give a finite number, or lin_NUMBER"),
+        ({"learning_rate": float("nan")}, "learning_rate=nan: write a finite number, or lin_NUMBER"),
+        ({"learning_rate": "nan"}, "learning_rate='nan': write a finite number, or lin_NUMBER"),
+        ({"learning_rate": "lin_x"}, "learning_rate='lin_x': write a finite number, or lin_NUMBER"),
         ({"n_timesteps": 0}, "n_timesteps=0: input should be greater than 0"),
-        ({"n_timesteps": "many"}, "n_timesteps='many': give a number"),
+        ({"n_timesteps": "many"}, "n_timesteps='many': write a number"),
         ({"n_timesteps": None}, "n_timesteps=None: input should be a valid integer"),
         ({"n_envs": 1.5}, "n_envs=1.5: input should be a valid integer"),
         ({"env_kwargs": 3}, "env_kwargs=3: input should be a valid dictionary"),
         ({"policy_kwargs": "dict(net_arch=print(1))"}, "print(1) is not evaluated"),
         ({"policy_kwargs": "dict(net_arc=[8])"}, "did you mean 'net_arch'?"),
         ({"policy_kwargs": [1]}, "policy_kwargs=[1]: input should be a valid dictionary"),
-        ({"batch_size": "big"}, "batch_size='big': give a number"),
+        ({"batch_size": "big"}, "batch_size='big': write a number"),
         ({"tau": float("nan")}, "tau=nan: input should be a finite number"),
         ({"normalize": "dict(a=exit())"}, "exit() is not evaluated"),
-        ({"n_envs": 1e9}, "n_envs=1000000000.0: give 10000 or less"),
-        ({"noise_type": "x", "noise_std": 1}, "noise_type='x': give normal or ornstein-uhlenbeck"),
-        ({"noise_type": "", "noise_std": 1}, "noise_type='': give normal or ornstein-uhlenbeck"),
+        ({"n_envs": 1e9}, "n_envs=1000000000.0: choose 10000 or less"),
+        ({"noise_type": "x", "noise_std": 1}, "noise_type='x': choose normal or ornstein-uhlenbeck"),
+        ({"noise_type": "", "noise_std": 1}, "noise_type='': choose normal or ornstein-uhlenbeck"),
         ({"noise_type": "normal"}, "noise_std=None: noise_type needs a standard deviation"),
         ({"noise_type": "normal", "noise_std": -1}, "noise_std=-1: input should be greater than or equal to 0"),
         ({"policy": ["x"]}, "policy=['x']: input should be a valid string"),
@@ -92,24 +92,24 @@ def test_a_key_that_is_missing_is_named(capsys):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["-n", "0"], "--n-timesteps=0: give 1 or more, or -1"),
+        (["-n", "0"], "--n-timesteps=0: choose 1 or more, or -1"),
         (["-n", "-5"], "--n-timesteps=-5: "),
-        (["--n-eval-envs", "0"], "--n-eval-envs=0: give 1 or more"),
+        (["--n-eval-envs", "0"], "--n-eval-envs=0: choose 1 or more"),
         (["--eval-freq", "0"], "--eval-freq=0: "),
         (["--save-freq", "-7"], "--save-freq=-7: "),
         (["--eval-episodes", "0"], "--eval-episodes=0: "),
         (["--num-threads", "0"], "--num-threads=0: "),
         (["--seed", "4294967296"], "Seed must be between"),
-        (["-optimize", "--storage", "x"], "--storage='x': give a file FILE.log, or the URL of a database"),
-        (["-optimize", "--storage", ""], "--storage='': give a file FILE.log, or the URL of a database"),
-        (["-optimize", "--storage", "x://y"], "--storage='x://y': give a file FILE.log, or the URL of a database"),
+        (["-optimize", "--storage", "x"], "--storage='x': name a file FILE.log, or the URL of a database"),
+        (["-optimize", "--storage", ""], "--storage='': name a file FILE.log, or the URL of a database"),
+        (["-optimize", "--storage", "x://y"], "--storage='x://y': name a file FILE.log, or the URL of a database"),
         (
             ["--storage", "sqlite:////no/such/x.db", "--study-name", "a", "--trial-id", "0"],
             "cannot be opened: unable to",
         ),
-        (["--gym-packages", "../.."], "--gym-packages '../..': give the names of packages"),
-        (["--n-eval-envs", "1000000000"], "--n-eval-envs=1000000000: give 10000 or less"),
-        (["-params", "n_envs:1e9"], "n_envs=1000000000.0: give 10000 or less"),
+        (["--gym-packages", "../.."], "--gym-packages '../..': write the names of packages"),
+        (["--n-eval-envs", "1000000000"], "--n-eval-envs=1000000000: choose 10000 or less"),
+        (["-params", "n_envs:1e9"], "n_envs=1000000000.0: choose 10000 or less"),
         (["-params", "learning_rate:nan"], "nan is not a finite number"),
         (["-params", "learning_rate:1e999"], "inf is not a finite number"),
     ],
@@ -121,7 +121,7 @@ def test_a_number_that_no_training_can_be_asked_for_is_refused(capsys, argv, mes
 @pytest.mark.parametrize("command", ["enjoy", "record", "bench"])
 def test_how_long_is_at_least_one_step(capsys, command):
     assert main([command, "--env", "OwnBit-v0", "-n", "-3"]) == 2
-    assert "--n-timesteps=-3: give 1 or more." in capsys.readouterr().err
+    assert "--n-timesteps=-3: choose 1 or more." in capsys.readouterr().err
 
 
 def test_without_an_environment_the_option_is_named(capsys):

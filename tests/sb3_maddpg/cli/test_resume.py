@@ -114,16 +114,16 @@ def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for argv, message in (
         (["--resume"], "no run in logs has checkpoints"),
-        (["--resume", "nowhere"], "nowhere is no folder of a run with checkpoints"),
+        (["--resume", "nowhere"], "nowhere is not the folder of a run with checkpoints"),
         (["--resume", "nowhere", "--seed", "3"], "leave out --seed 3"),
-        (["--env", "OwnBit-v0", "--checkpoint-every", "-5"], "--checkpoint-every -5: give a number of steps, or 0"),
+        (["--env", "OwnBit-v0", "--checkpoint-every", "-5"], "--checkpoint-every -5: pass a number of steps, or 0"),
     ):
         assert main(["train", *argv]) == 2
         assert message in capsys.readouterr().err
     Path("run").mkdir()
     Path("run/command.json").write_text(json.dumps({"argv": [], "every": None}))
     assert main(["train", "--resume", "run"]) == 2
-    assert "run has no checkpoint that is whole" in capsys.readouterr().err
+    assert "run has no complete checkpoint" in capsys.readouterr().err
 
 
 def test_checkpoints_can_be_switched_off(tmp_path, monkeypatch):

@@ -52,7 +52,7 @@ def test_yaml_calls_nothing(run, capsys, name):
     (run / name).write_text("!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path [caught]]")
     assert main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]) == 2
     assert not Path("caught").exists()
-    assert f"{name} names what is no plain value" in capsys.readouterr().err
+    assert f"{name} holds a value that is not plain" in capsys.readouterr().err
 
 
 def test_yaml_without_end_is_refused():

@@ -55,7 +55,7 @@ def test_a_search_goes_on_after_kills(tmp_path, monkeypatch):
     process = start(*words)
     output, _ = process.communicate(timeout=200)
     assert process.returncode == 0, output
-    assert "The search goes on after" in output
+    assert "The search continues after" in output
     (report,) = Path("logs/maddpg").glob("report*.csv")
     states = list(pd.read_csv(report)["state"])
     assert states.count("COMPLETE") + states.count("PRUNED") == 4
@@ -74,7 +74,7 @@ def test_an_interrupted_search_is_kept(tmp_path, monkeypatch):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
-    assert "The search was interrupted; the same command goes on" in output
+    assert "The search was interrupted; repeat the command to continue" in output
     assert len(list(Path("logs/maddpg").glob("*_search_*.log"))) == 1
 
 

@@ -91,7 +91,7 @@ def test_killed_and_begun_again_all_seeds_end_as_if_nothing_had_happened(kind, t
     again = start(parts, "--seeds", "1-2", "--jobs", "2")
     output, _ = again.communicate(timeout=200)
     assert again.returncode == 0, output
-    assert "goes on with" in output
+    assert "resumes" in output
     assert weights(parts) == weights(alone)
     assert set(weights(parts)) == {1, 2}
     third = start(parts, "--seeds", "1-3", "--jobs", "2")
@@ -111,10 +111,10 @@ def test_a_training_that_fails_is_told(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--seeds", "0-1", "--seed", "3"], "--seeds and --seed: give one of them"),
+        (["--seeds", "0-1", "--seed", "3"], "--seeds and --seed exclude each other"),
         (["--seeds", "0", "--jobs", "0"], "--jobs 0 must be at least 1"),
         (["--seeds", "x"], "write numbers and ranges"),
-        (["--seeds", "0", "--resume"], "--resume goes on with one run"),
+        (["--seeds", "0", "--resume"], "--resume continues one run"),
     ],
 )
 def test_what_does_not_go_together_is_refused(words, message, tmp_path, monkeypatch, capsys):

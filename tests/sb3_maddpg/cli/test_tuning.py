@@ -215,7 +215,7 @@ def test_classes_of_a_trial_have_a_form_in_a_recipe():
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--trial-id", "0"], "give --storage and --study-name"),
+        (["--trial-id", "0"], "pass --storage and --study-name"),
         (["--trial-id", "0", "--storage", "t.log", "--study-name", "s"], "There is no file t.log"),
         (["--trial-id", "0", "--storage", "s.log", "--study-name", "stud"], "did you mean 'study'"),
     ],

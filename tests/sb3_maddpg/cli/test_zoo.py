@@ -165,7 +165,7 @@ def test_a_recipe_names_its_replay_buffer_by_a_dotted_path(arena):
 @pytest.mark.parametrize(
     ("recipe", "argv", "message"),
     [
-        ({"replay_buffer_class": "sb3_maddpg.Prior"}, [], "no attribute 'Prior'). Give the dotted path of a class"),
+        ({"replay_buffer_class": "sb3_maddpg.Prior"}, [], "no attribute 'Prior'). Use the dotted path of a class"),
         ({"estimatr": "score"}, [], "Unknown key in the recipe for maddpg 'estimatr': did you mean 'estimator'?"),
         ({}, ["-params", "taau:0.1"], "did you mean 'tau'?"),
         ({"policy_kwargs": {"net_arc": [8]}}, [], "did you mean 'net_arch'?"),

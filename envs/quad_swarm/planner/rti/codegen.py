@@ -1,7 +1,7 @@
-"""Writes the C++ of one optimal control problem: constants and straight-line code for its exact sparsity.
+"""Generator of the C++ code of an optimal control problem: constants and straight-line code for its exact sparsity.
 
-Every formula is a CasADi expression; `_emit` walks its instruction list and prints one lane operation for each. What
-the sparsity of the dynamics leaves out is never computed, and no number of the problem stands in the C++ source.
+Every formula is a CasADi expression, and `_emit` prints one lane operation for each of its instructions. Structural
+zeros of the dynamics are never computed. The handwritten C++ source contains no numbers of the problem.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from quad_swarm.planner.problem import OptimalControlProblem
 
 
 def generate_model(problem: OptimalControlProblem) -> str:
-    """The header ``model.hpp`` that `kernel.cpp` includes.
+    """Generate the header ``model.hpp``, which `kernel.cpp` includes.
 
-    :param problem: the problem, with all its numbers
+    :param problem: the problem
+    :return: text of the header
     """
     nx, nu, n_others = problem.nx, problem.nu, problem.n_others
     state, low, high = _state_bounds(problem)
@@ -63,7 +64,7 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
     x, u, x0 = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("x0", nx)
     goal, other, distance = ca.SX.sym("goal", 3), ca.SX.sym("other", 3), ca.SX.sym("distance")
     hessian, gradient = ca.hessian(problem.goal_cost(x, x0, goal), x)
-    # Of the repulsion r(d)^2 the Gauss-Newton part: gradient 2 r r', curvature 2 r'^2.
+    # Gauss-Newton approximation of the repulsion r(d)^2: gradient 2 r r', curvature 2 r'^2
     residual = problem.repulsion_residual(distance)
     slope = ca.jacobian(residual, distance)
     single = OptimalControlProblem(problem.config, problem.quadrotor, 1)
@@ -91,7 +92,7 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
 def _riccati(
     problem: OptimalControlProblem, dynamics_a: tuple[ca.SX, ca.SX], dynamics_b: tuple[ca.SX, ca.SX]
 ) -> list[str]:
-    """One stage of the Riccati recursion, with R + B'PB = L D L' and the gain K = -(R + B'PB)^-1 B'PA."""
+    """Return one stage of the Riccati recursion, with R + B'PB = L D L' and the gain K = -(R + B'PB)^-1 B'PA."""
     nx, nu = problem.nx, problem.nu
     (a, a_symbols), (b, b_symbols) = dynamics_a, dynamics_b
     u = ca.SX.sym("u", nu)
@@ -127,7 +128,7 @@ def _riccati(
         "factor": factor_symbols,
         "gain": gain_symbols,
     }
-    # At stage 0 the state is given: no gain, and nothing before it.
+    # The state of stage 0 is given, so there is no gain and no earlier stage
     return [
         _emit("riccati", factor_inputs, {"factor": factor, "gain": gain, "p_previous": _packed(p_previous)}),
         _emit("riccati_first", {k: factor_inputs[k] for k in ("p", "b", "weight")}, {"factor": factor}),
@@ -147,7 +148,7 @@ def _riccati(
 
 
 def _state_bounds(problem: OptimalControlProblem) -> tuple[list[int], list[float], list[float]]:
-    """States with bounds, their lower and their upper bounds, read from the rows of `box_violations`."""
+    """Return the indices of bounded states, their lower and their upper bounds, from the rows of `box_violations`."""
     x = ca.SX.sym("x", problem.nx)
     rows = problem.box_violations(x)
     jacobian = ca.jacobian(rows, x)
@@ -165,7 +166,8 @@ def _state_bounds(problem: OptimalControlProblem) -> tuple[list[int], list[float
 
 
 def _varying(name: str, matrix: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """A matrix with symbols for the entries that vary; those symbols; their expressions. Constants stay constants."""
+    """Replace the entries of a matrix that are not constant by symbols. Returns the matrix, the symbols and the
+    expressions of these entries."""
     entries = matrix.nonzeros()
     values = [entry for entry in entries if not entry.is_constant()]
     symbols = ca.SX.sym(name, len(values))
@@ -175,7 +177,7 @@ def _varying(name: str, matrix: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
 
 
 def _packed(symmetric: ca.SX) -> ca.SX:
-    """Lower triangle row by row."""
+    """Return the lower triangle row by row."""
     return ca.vertcat(*[symmetric[i, j] for i in range(symmetric.shape[0]) for j in range(i + 1)])
 
 
@@ -194,7 +196,7 @@ def _unpacked_factor(packed: ca.SX, n: int) -> tuple[ca.SX, ca.SX]:
 
 
 def _factorise(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """L (its part below the unit diagonal) and 1 / D of a positive definite L D L'."""
+    """Factorise a positive definite matrix L D L'. Returns L (below its unit diagonal) and 1 / D."""
     n = matrix.shape[0]
     lower = ca.SX(n, n)
     d: list[ca.SX] = []
@@ -251,7 +253,7 @@ _BINARY = {
 
 
 def _emit(name: str, inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]) -> str:
-    """A C++ function of lanes that evaluates the outputs; arrays hold each argument column by column.
+    """Generate a C++ function of lanes that evaluates the outputs. Arrays hold each argument column by column.
 
     :param name: name of the C++ function
     :param inputs: argument names and their symbols
@@ -265,16 +267,16 @@ def _emit(name: str, inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca.SX]) 
 
 
 class _Walk:
-    """The instruction list of a CasADi function in single-assignment form, products fused into the sums they feed."""
+    """Instructions of a CasADi function in single-assignment form, with products fused into the sums that use them."""
 
     def __init__(self, function: ca.Function, inputs: list[str], outputs: list[str]):
         self._operation: list[int] = []
         self._operands: list[tuple[int, ...]] = []
-        self._text: dict[int, str] = {}  # of inputs and constants
+        self._text: dict[int, str] = {}  # text of inputs and constants
         self._uses: list[int] = []
         self._constants: dict[int, float] = {}
         self._stores: list[tuple[str, int]] = []
-        at: dict[int, int] = {}  # slot of CasADi's work vector -> the value that stands there
+        at: dict[int, int] = {}  # slot of CasADi's work vector -> its current value
         for k in range(function.n_instructions()):
             operation = function.instruction_id(k)
             read, written = function.instruction_input(k), function.instruction_output(k)
@@ -309,7 +311,7 @@ class _Walk:
         return value
 
     def lines(self) -> list[str]:
-        """The statements of the C++ function's body."""
+        """Return the statements of the C++ function's body."""
         fused: dict[int, str] = {}
         hidden: set[int] = set()
         for value, operation in enumerate(self._operation):

@@ -1,4 +1,4 @@
-"""The batched real-time iteration: every problem of a batch in one call of compiled code."""
+"""The batched real-time iteration, which solves a batch of problems in one call of compiled code."""
 
 from __future__ import annotations
 
@@ -16,25 +16,27 @@ from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Pro
 from quad_swarm.planner.rti.codegen import generate_model
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams
 
-# Of the iteration, and the type that it has in C++
+# Precision of the iteration -> type in C++
 PRECISIONS = {"float32": "float", "float64": "double"}
 _FUNCTION = "quad_swarm_rti"
 _SOURCES = Path(__file__).parent
 
 
 class RtiSolver:
-    """Few iterations of sequential quadratic programming, many problems at once (docs/planner.md).
+    """Solver with few iterations of sequential quadratic programming on batches of problems (docs/planner.md).
 
-    One iteration is a controller, not an optimum. The states of a guess are not used: they follow from its inputs.
+    The result is a good controller rather than a converged optimum. The states of an initial guess are not used, since
+    they follow from its inputs.
 
     :param problem: the problem
-    :param sqp_iterations: quadratic programs solved for each problem
-    :param extra_iterations: how many more are solved at most for a problem whose inputs the last one still changed by
+    :param sqp_iterations: number of quadratic programs solved for each problem
+    :param extra_iterations: maximum number of additional quadratic programs for a problem whose inputs still changed by
         more than 0.3 of their limits
-    :param precision: "float32" or "float64", of the iteration; plans are rolled out in double precision
-    :param max_iterations: interior-point iterations after which a quadratic program counts as failed (never a time
-        limit: results must repeat)
+    :param precision: precision of the iteration, "float32" or "float64"; plans are rolled out in double precision
+    :param max_iterations: number of interior-point iterations after which a quadratic program counts as failed. There
+        is no time limit, so that results are reproducible
     :param tolerance: mean complementarity at which a quadratic program counts as solved
+    :raises ValueError: if a number of iterations or the precision is invalid
     """
 
     name = "rti"
@@ -64,9 +66,9 @@ class RtiSolver:
         self._kernel: Any = None
 
     def compile(self) -> None:
-        """Have the kernel compiled and loaded now instead of at the first solve.
+        """Compile and load the kernel now instead of at the first solve.
 
-        :raises BuildError: it cannot be compiled here
+        :raises BuildError: if it cannot be compiled
         """
         if self._kernel is None:
             model = _generated(self.problem.config, self.problem.quadrotor, self.problem.n_others)
@@ -102,14 +104,15 @@ class RtiSolver:
         return solution
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"_kernel": None}  # loaded again in the process that needs it
+        return self.__dict__ | {"_kernel": None}  # loaded on demand in another process
 
 
 def build_kernel(model: str, precision: str) -> Path:
-    """The kernel of a problem, see `build`.
+    """Build the kernel of a problem, see `build`.
 
-    :param model: the header that `generate_model` wrote
+    :param model: header from `generate_model`
     :param precision: one of `PRECISIONS`
+    :return: path of the library
     """
     sources = {name: (_SOURCES / name).read_text(encoding="utf-8") for name in ("lanes.hpp", "kernel.cpp")}
     return build("rti", "kernel.cpp", {**sources, "model.hpp": model}, [f"REAL={PRECISIONS[precision]}"])
@@ -117,12 +120,12 @@ def build_kernel(model: str, precision: str) -> Path:
 
 @functools.lru_cache(maxsize=64)
 def _generated(config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int) -> str:
-    """`generate_model` takes most of a second, and a process makes many swarms of the same world."""
+    """Cache `generate_model`, which takes most of a second, for the swarms of the same world."""
     return generate_model(OptimalControlProblem(config, quadrotor, n_others))
 
 
 def _array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The array as the kernel reads it; it trusts the shape, so that is checked here."""
+    """Convert an array for the kernel and check its shape, which the kernel does not."""
     array = np.ascontiguousarray(array, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}; this solver takes {shape}.")
