@@ -23,7 +23,7 @@ from quad_swarm.world.beliefs import other_indices
 from studies.swarm.figures import NAMES, draw_asking, draw_fronts, draw_trajectories, flights, rate_of
 from studies.swarm.fly_flight import PAPERS, best_rule
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, absolute_path, best_rules, models
-from studies.swarm.tune_flight import families
+from studies.swarm.tune_flight import FULL, families
 
 RESULTS = ("results", "results/swarm_tables", "results/teams", "results/robustness", "results/asking", "lab_notebook")
 PAGES = (ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in (*RESULTS, "swarm_learning", "flight")))
@@ -389,6 +389,17 @@ def flight_targets(rows: Rows) -> str:
     )
 
 
+def tuned_table(rows: Rows) -> str:
+    """Return the validation figures of the settings for `flight` that are as safe as full communication everywhere."""
+    cells = dict.fromkeys((row["n_robots"], row["scenario"]) for row in rows if row["family"] != FULL and row["safe"])
+    lines = []
+    for setting in dict.fromkeys(row["setting"] for row in rows if row["safe"]):
+        here = {(row["n_robots"], row["scenario"]): row for row in rows if row["setting"] == setting}
+        texts = [f"{here[c]['collisions']}/{here[c]['episodes']}, {here[c]['request_share']:.2%}" for c in cells]
+        lines.append([label(setting), *texts])
+    return table(["", *(f"{n} robots, {name.replace('_', ' ')}" for n, name in cells)], lines)
+
+
 def headline_table(rows: Rows, best: str) -> str:
     """Format the sealed flights of `flight` in five rows: eight robots, except for the paper's settings; seeds as
     ranges.
@@ -516,7 +527,7 @@ def main() -> None:
     names = "rules test sweep robustness unseen teams asking interventions ppo counterfactual training counts quadrants"
     rows = {
         name: read_rows(args.data / f"{name}.json")
-        for name in [*names.split(), "checkpoints", "flight", "flight_world"]
+        for name in [*names.split(), "checkpoints", "flight", "flight_tuning", "flight_world"]
     }
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
     blocks = {
@@ -544,6 +555,7 @@ def main() -> None:
         "training": training_table(rows["training"]),
         "headline": headline_table(rows["flight"], best_rule()) if rows["flight"] else "Not flown yet.",
         "flight": flight_table(rows["flight"]),
+        "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),
         "world": worlds_table(rows["flight_world"], "world"),
         "delays": worlds_table(rows["flight_world"], "delays"),

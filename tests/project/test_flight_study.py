@@ -205,6 +205,22 @@ def test_the_tables_of_the_sealed_flights_compare_with_full_and_the_rule():
     assert report.flight_table([]) == report.flight_targets([]) == "Not flown yet."
 
 
+def test_settings_that_are_safe_are_tabled_with_their_validation_figures():
+    figures = {"collisions": 1, "episodes": 2000, "request_share": 0.0125}
+    rows = [
+        {"family": family, "setting": setting, "safe": safe, "n_robots": n, "scenario": "random", **figures}
+        for family, setting, safe in (("full", "full", True), ("r", "cpa:1:2", True), ("r", "cpa:2:2", False))
+        for n in (12, 8)
+    ]
+    assert report.tuned_table(rows).splitlines() == [
+        "|  | 12 robots, random | 8 robots, random |",
+        "| --- | --- | --- |",
+        "| `full` | 1/2000, 1.25% | 1/2000, 1.25% |",
+        "| `cpa:1:2` | 1/2000, 1.25% | 1/2000, 1.25% |",
+    ]
+    assert report.tuned_table([]) == "Not flown yet."
+
+
 def test_the_headline_table_has_five_rows_and_gives_seeds_as_ranges():
     def row(policy: str, collisions: int, n_robots: int = 8, name: str = "symmetric_swap") -> dict:
         figures = {"n_robots": n_robots, "scenario": name, "policy": policy, "requests": 10 * collisions}
@@ -237,7 +253,7 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
         fly_flight.best_model()
     assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
     monkeypatch.setattr(fly_flight, "NAMES", NAMES[:1])
-    monkeypatch.setattr(fly_flight, "tuned_models", list)
+    monkeypatch.setattr(fly_flight, "models", lambda recipe: [])
     monkeypatch.setattr("sys.argv", ["", "--quick", "--jobs", "1", "--n-robots", "4", "--json", f"{tmp_path}/f.json"])
     fly_flight.main()
     rows = read_rows(tmp_path / "f.json")
