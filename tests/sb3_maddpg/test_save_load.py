@@ -232,7 +232,7 @@ def test_a_replay_buffer_that_does_not_fit_is_refused_where_it_is_loaded(tmp_pat
 def test_other_numbers_of_environments_need_an_empty_replay_buffer():
     model = learned()
     before = model.get_env()
-    with pytest.raises(ValueError, match=r"holds transitions of 1 environment\(s\) .* those of 2: .*reset"):
+    with pytest.raises(ValueError, match=r"holds transitions of 1 parallel environment\(s\) .* those of 2: .*reset"):
         model.set_env(make_vec_env("OwnBit-v0", 2))
     assert model.get_env() is before
     model.replay_buffer.reset()

@@ -174,7 +174,7 @@ def test_models_fly_in_the_world_that_they_were_trained_in(capsys):
     assert "robots: 8; preset: dense;" in printed.out
     assert not printed.err
     assert main(["--policy", dense, *flags, "--preset", "paper"]) == 0
-    assert "note: quad-swarm-dense was trained in 'dense', this is 'paper'" in capsys.readouterr().err
+    assert "note: quad-swarm-dense was trained in 'dense', but this is 'paper'" in capsys.readouterr().err
     paper = str(pretrained_folder("quad-swarm-paper") / "model.zip")
     assert main(["--policy", dense, paper, *flags]) == 2
     assert "choose one of these with --preset" in capsys.readouterr().err
