@@ -434,7 +434,7 @@ def seeds_rate(rows: Rows) -> str:
     """Format the collisions of several seeds in the same episodes, with the envelope of their intervals."""
     if not rows:
         return "-"
-    counts = spread([str(count) for count in sorted(row["collisions"] for row in rows)])
+    counts = spread([f"{count:,}" for count in sorted(row["collisions"] for row in rows)])
     low, high = 100 * min(row["collision_low"] for row in rows), 100 * max(row["collision_high"] for row in rows)
     return f"{counts} of {rows[0]['episodes']:,} [{low:.2f}, {high:.2f}] %"
 

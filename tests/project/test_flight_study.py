@@ -232,7 +232,7 @@ def test_the_headline_table_has_five_rows_and_gives_seeds_as_ranges():
     rows += [row("d/faithful_flight_seed0.zip", 99, n_robots=4), row("d/flight_seed0.zip@0.4", 77, n_robots=4)]
     lines = [line.split(" | ")[1:] for line in report.headline_table(rows, "cpa:1:2|push:0.1").splitlines()[2:]]
     assert len(lines) == 5
-    assert lines[0][:3] == ["9000 of 12,000 [37.50, 150.00] %", "-", "9000.00%"]
+    assert lines[0][:3] == ["9,000 of 12,000 [37.50, 150.00] %", "-", "9000.00%"]
     assert lines[2][0] == "2 of 12,000 [0.01, 0.03] %"
     assert lines[3][0].startswith("99 of 12,000")
     assert lines[4] == ["1 to 3 of 12,000 [0.00, 0.05] %", "6 of 12,000 [0.03, 0.10] %", "1.00% to 4.50%", "2,000 |"]
