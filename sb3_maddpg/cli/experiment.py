@@ -39,7 +39,7 @@ from sb3_maddpg.cli.literals import format_literal, parse_literal
 from sb3_maddpg.cli.options import PROG, check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
-from sb3_maddpg.cli.search import STUDY, as_absolute, bring_back, kept_search, open_storage, sign
+from sb3_maddpg.cli.search import STUDY, as_absolute, bring_back, enlist, kept_search, open_storage, sign
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.team import Team
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
@@ -387,15 +387,17 @@ class TeamExperimentManager(ExperimentManager):
         return tuple(getattr(self, name) for name in (*names, "n_eval_episodes", "n_eval_envs", "sampler", "pruner"))
 
     def _bring_back(self) -> optuna.Study | None:
-        """Load the study if it exists, and queue trials of killed processes again."""
+        """Open the study if it has a name, and queue trials of killed processes again."""
         assert self.storage is not None
-        if self.study_name is None or (self.storage.endswith(".log") and not Path(self.storage).is_file()):
+        if self.study_name is None:  # Optuna will generate one
             return None
-        try:
-            study = optuna.load_study(storage=open_storage(self.storage), study_name=self.study_name)
-        except KeyError:  # the study is new
-            return None
+        if self.storage.endswith(".log"):
+            Path(self.storage).parent.mkdir(parents=True, exist_ok=True)
+        study = optuna.create_study(
+            storage=open_storage(self.storage), study_name=self.study_name, direction="maximize", load_if_exists=True
+        )
         count, finished = bring_back(study), _finished(study)
+        enlist(study)
         if finished or count:
             print(f"The search continues after {finished} finished trials; {count} killed trials are repeated.")
         return study

@@ -15,6 +15,7 @@ from sb3_maddpg.utils import process_runs
 
 STUDY = "search"
 _PROCESS = "process"  # attribute of a trial that identifies the process running it
+_WORKER = "worker "  # prefix of the attributes of a study that identify the processes that work on it
 
 
 def kept_search(folder: Path, env_name: str, settings: Any) -> Path:
@@ -44,6 +45,16 @@ def as_absolute(storage: str) -> str:
     return str(Path(storage).resolve()) if storage.endswith(".log") else storage
 
 
+def enlist(study: optuna.Study) -> None:
+    """
+    Note that this process works on a study. Call it before the first trial: a process may be killed after Optuna
+    created a trial and before ``sign``.
+
+    :param study: a study
+    """
+    study.set_user_attr(_WORKER + _me(), True)
+
+
 def sign(trial: optuna.Trial) -> None:
     """
     Mark a trial as run by this process, for ``bring_back``.
@@ -61,10 +72,13 @@ def bring_back(study: optuna.Study) -> int:
     :param study: a study that may have trials of killed processes
     :return: number of trials that will be repeated
     """
+    workers = [name.removeprefix(_WORKER) for name in study.user_attrs if name.startswith(_WORKER)]
     count = 0
     for trial in study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
         owner = trial.user_attrs.get(_PROCESS)
-        if not isinstance(owner, str) or _may_run(owner):
+        # A trial without parameters and owner has only just been created, by one of the workers
+        owners = [owner] if isinstance(owner, str) else [] if trial.params else workers
+        if not owners or any(map(_may_run, owners)):
             continue
         try:
             study.tell(trial.number, state=TrialState.FAIL)

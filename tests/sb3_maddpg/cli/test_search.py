@@ -14,7 +14,7 @@ import pytest
 import yaml
 from optuna.trial import TrialState
 
-from sb3_maddpg.cli.search import bring_back, kept_search, open_storage, sign
+from sb3_maddpg.cli.search import bring_back, enlist, kept_search, open_storage, sign
 
 pytest.importorskip("rl_zoo3")
 RECIPE = {"n_timesteps": 400, "policy": "MlpPolicy", "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
@@ -109,6 +109,17 @@ def test_trials_of_processes_that_are_gone_come_back_with_their_parameters(study
     assert bring_back(study) == 0, "once is enough"
     again = study.ask()
     assert again.suggest_float("x", 0, 1) == killed.params["x"]
+
+
+@pytest.mark.parametrize("alive", [False, True])
+def test_a_trial_whose_process_was_killed_before_it_signed_comes_back(study, alive):
+    """Only if no worker is left that may be about to sign it."""
+    study.set_user_attr(f"worker {socket.gethostname()} {2**22 + 1} 1", True)
+    if alive:
+        enlist(study)
+    unsigned = study.ask()
+    assert bring_back(study) == 1 - alive
+    assert (study.trials[unsigned.number].state == TrialState.RUNNING) == alive
 
 
 def test_a_lock_that_a_killed_process_left_is_released(tmp_path, monkeypatch):
