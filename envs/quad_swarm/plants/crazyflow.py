@@ -11,6 +11,7 @@ import io
 import logging
 import warnings
 from copy import copy
+from functools import lru_cache
 
 import numpy as np
 
@@ -37,7 +38,8 @@ _ALTITUDE = 100.0
 class CrazyflowPlant:
     """`Plant` without the factors of vehicle parameters, which only our own model has.
 
-    Dropped swarms stay in the simulation to avoid a recompilation.
+    Dropped swarms stay in the simulation to avoid a recompilation, and plants of the same size share a compiled
+    simulation.
 
     :param vehicle: a drone of Crazyflow; Holybro's has second-order attitude dynamics, the others use first principles
     :param drag: drag coefficients along x and y, for the force of the wind (1/s)
@@ -51,43 +53,34 @@ class CrazyflowPlant:
         self._n_steps = round(dt * _FREQUENCY)
         if self._n_steps < 1 or abs(self._n_steps / _FREQUENCY - dt) > 1e-9:
             raise ValueError(f"crazyflow needs sub-steps that are multiples of {1000 / _FREQUENCY:.0f} ms, not {dt} s.")
-        dynamics = Dynamics.so_rpy if vehicle == "hb_x500" else Dynamics.first_principles
-        mujoco.set_mju_user_warning(lambda message: None)  # they concern the copying of drones
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            self._sim = Sim(
-                n_worlds=n_swarms,
-                n_drones=n_robots,
-                drone=Drone(vehicle),
-                dynamics=dynamics,
-                control=Control.attitude,
-                freq=_FREQUENCY,
-                attitude_freq=_FREQUENCY,
-            )
+        self._sim = _simulation(vehicle, n_swarms, n_robots)
         drone = self._sim.data.params
         self._mass = _number(drone.mass)
         # Offset (N) and slope of the rotors' force as a function of the commanded thrust
         self._thrust = (0.0, 1.0)
-        if dynamics == Dynamics.so_rpy:
+        if self._sim.dynamics == Dynamics.so_rpy:
             self._thrust = (_number(drone.acc_coef), _number(drone.cmd_f_coef))
         self._drag = np.array(drag)
         self._kept = np.arange(n_swarms)
-        self._data = self._sim.data
+        self._data = self._sim.default_data
+        self._placed: dict[int, np.ndarray] = {}  # attitudes of the swarms placed since the last step
 
     def place(self, swarm: int, state: np.ndarray) -> None:
         """See `Plant`."""
-        k, states = int(self._kept[swarm]), self._data.states
-        default = self._sim.default_data.states
-        hover = self._hover_rotors()
-        self._data = self._data.replace(
-            states=states.replace(
-                pos=states.pos.at[k].set(state[:, POSITION] + [0, 0, _ALTITUDE]),
-                vel=states.vel.at[k].set(state[:, VELOCITY]),
-                quat=states.quat.at[k].set(Rotation.from_euler("xyz", state[:, ATTITUDE]).as_quat()),
-                ang_vel=states.ang_vel.at[k].set(default.ang_vel[k]),
-                rotor_vel=states.rotor_vel.at[k].set(hover),
-            )
-        )
+        self._placed = {**self._placed, int(self._kept[swarm]): state[:, ATTITUDE]}
+
+    def _put(self) -> None:
+        """Move the placed swarms to the simulation, except for what every step sets."""
+        if not self._placed:
+            return
+        swarms, states = list(self._placed), self._data.states
+        quat, ang_vel, rotor_vel = np.array(states.quat), np.array(states.ang_vel), np.array(states.rotor_vel)
+        angles = np.stack(list(self._placed.values()))
+        quat[swarms] = Rotation.from_euler("xyz", angles.reshape(-1, 3)).as_quat().reshape(*angles.shape[:2], 4)
+        ang_vel[swarms] = np.asarray(self._sim.default_data.states.ang_vel)[swarms]
+        rotor_vel[swarms] = self._hover_rotors()
+        moved = states.replace(quat=jnp.asarray(quat), ang_vel=jnp.asarray(ang_vel), rotor_vel=jnp.asarray(rotor_vel))
+        self._data, self._placed = self._data.replace(states=moved), {}
 
     def _hover_rotors(self) -> float:
         """Return the speed of a rotor at hover, 0 if the dynamics do not model rotors."""
@@ -109,6 +102,7 @@ class CrazyflowPlant:
         """See `Plant`."""
         if not len(self._kept):
             return state.copy()
+        self._put()
         states = self._data.states
         shape = states.pos.shape[:2]
         force_up = self._mass * thrust(state, u)
@@ -134,6 +128,23 @@ class CrazyflowPlant:
         quaternions = np.asarray(states.quat)[self._kept].reshape(-1, 4)
         after[..., ATTITUDE] = Rotation.from_quat(quaternions).as_euler("xyz").reshape(*state.shape[:2], 3)
         return after
+
+
+@lru_cache(maxsize=4)
+def _simulation(vehicle: str, n_swarms: int, n_robots: int) -> Sim:
+    """Return a simulation, which takes long to make. Only its functions are used, plants keep their own data."""
+    mujoco.set_mju_user_warning(lambda message: None)  # they concern the copying of drones
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Sim(
+            n_worlds=n_swarms,
+            n_drones=n_robots,
+            drone=Drone(vehicle),
+            dynamics=Dynamics.so_rpy if vehicle == "hb_x500" else Dynamics.first_principles,
+            control=Control.attitude,
+            freq=_FREQUENCY,
+            attitude_freq=_FREQUENCY,
+        )
 
 
 def _number(value: object) -> float:
