@@ -331,6 +331,24 @@ def worlds_table(rows: Rows, part: str) -> str:
     return table([*head, "arrived", "steps"], lines) if lines else "Not flown yet."
 
 
+def plants_table(rows: Rows) -> str:
+    """Format the part `plants` of `studies.swarm.flight_world`: collisions, arrivals and requests by policy."""
+    chosen = [row for row in rows if row["part"] == "plants"]
+    policies = list(dict.fromkeys(row["policy"] for row in chosen))
+    lines: dict[tuple[str, str, float], dict[str, str]] = {}
+    for row in chosen:
+        changed = row["changed"]
+        key = changed["plant"], changed["quadrotor"], changed["planner"]["separation"]
+        text = f"{rate(row)}, {row['arrived'] / row['episodes']:.1%} arrive"
+        if row["policy"] not in ("none", "full"):
+            text += f", {row['request_share']:.2%} asked"
+        lines.setdefault(key, {})[row["policy"]] = text
+    return table(
+        ["simulator", "planner's model", "separation (m)", *map(label, policies)],
+        [[*map(str, key), *(cells.get(policy, "-") for policy in policies)] for key, cells in sorted(lines.items())],
+    )
+
+
 def against(row: dict[str, Any], rival: dict[str, Any]) -> Comparison:
     """Compare the outcomes of the same episodes."""
     pairs = [[{"collided": letter == "1"} for letter in one["outcomes"]] for one in (row, rival)]
@@ -561,7 +579,7 @@ def main() -> None:
         "delays": worlds_table(rows["flight_world"], "delays"),
         "delay check": worlds_table(rows["flight_world"], "delay_check"),
         "paper flight": counts_table([row for row in rows["flight_world"] if row["part"] == "paper"]),
-        "plants": worlds_table(rows["flight_world"], "plants"),
+        "plants": plants_table(rows["flight_world"]),
     }
     flown = {
         preset: flights(models(preset)[0], best_rules(preset)["symmetric_swap"], preset)
