@@ -4,8 +4,8 @@
 time, half at successive points of a commit: before and after each write, sync and rename. Then the disk is full at each
 of these points, the newest checkpoint is truncated or has a bit flipped, each `DAMAGED` times, and a second process
 tries to use the same folder. With ``--every`` there are only kills, with this interval in seconds. The result must have
-the same digest (`sb3_maddpg.checkpoints.digest`) as an uninterrupted run with the same seed. JSON: one row for each
-kill and fault, and one for the result.
+the same digest (`sb3_maddpg.checkpoints.digest`) as that of an uninterrupted run with the same seed, which trains at
+the same time. JSON: one row for each kill and fault, and one for the result.
 """
 
 from __future__ import annotations
@@ -222,11 +222,15 @@ def main() -> None:
     if args.child is not None:
         return child(args.child, args.steps)
     with tempfile.TemporaryDirectory() as whole, tempfile.TemporaryDirectory() as parts:
-        expected = start(Path(whole), args.steps).communicate()[0].strip()
-        rows = kills(args, Path(parts))
-        if args.faults and not args.every:
-            rows += faults(args, Path(parts))
-        found = start(Path(parts), args.steps).communicate()[0].strip()
+        uninterrupted = start(Path(whole), args.steps)
+        try:
+            rows = kills(args, Path(parts))
+            if args.faults and not args.every:
+                rows += faults(args, Path(parts))
+            found = start(Path(parts), args.steps).communicate()[0].strip()
+            expected = uninterrupted.communicate()[0].strip()
+        finally:
+            uninterrupted.kill()
     early = [row for row in rows if row["done"]]
     # Damaged checkpoints are skipped; all other checkpoints must survive
     lost = [row for row in rows if row["kept_step"] < row["from_step"] and ":" not in row["kill"]]
