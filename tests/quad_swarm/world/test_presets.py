@@ -1,18 +1,31 @@
 """The settings of a world: what is accepted, and what is refused with its path, its value and what is allowed."""
 
 import dataclasses
+import json
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from quad_swarm.planner import PlannerConfig
-from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
+
+FROZEN = json.loads(Path(__file__).with_name(f"presets_v{PRESET_VERSION}.json").read_text())
 
 
-def test_presets_keep_their_numbers():
-    paper, dense = PRESETS["paper"], PRESETS["dense"]
-    assert (paper.radius, paper.planner.separation, dense.radius, dense.planner.separation) == (0.3, 0.6, 0.3, 0.64)
+def test_presets_are_frozen():
+    """Results name the version of the presets. A new field needs a default that changes nothing."""
+    for name, frozen in FROZEN.items():
+        values = json.loads(json.dumps(dataclasses.asdict(PRESETS[name])))
+        for part, value in frozen.items():
+            found = {key: values[part][key] for key in value} if isinstance(value, dict) else values[part]
+            assert found == value, (name, part)
+    assert FROZEN.keys() == PRESETS.keys()
+
+
+def test_replacing_by_the_same_changes_nothing():
+    dense = PRESETS["dense"]
     assert make_config("dense", n_robots=None) == dense
     assert make_config("dense", radius=0.3) == dense
 
