@@ -145,8 +145,8 @@ class PricedBit(TeamTask):
 
 class OneOfBits(TeamTask):
     """
-    Exactly one of an agent's three bits must be set, the one that the two signs of its observation select; no bit if
-    both are negative. The right combination pays 1 and any other nothing, so no bit has a value of its own.
+    The two signs of an agent's observation select the only one of its three bits that must be set, or none if both are
+    negative. The right combination pays 1 and any other nothing, so no bit has a value of its own.
     """
 
     n_agents, action_dim, obs_dim = 2, 3, 2
