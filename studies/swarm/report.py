@@ -25,7 +25,8 @@ from studies.swarm.fly_flight import PAPERS, best_rule
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, absolute_path, best_rules, models
 from studies.swarm.tune_flight import FULL, families
 
-RESULTS = ("results", "results/swarm_tables", "results/teams", "results/robustness", "results/asking", "lab_notebook")
+APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
+RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
 PAGES = (ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in (*RESULTS, "swarm_learning", "flight")))
 IMAGES = ROOT / "docs" / "images"
 Rows = list[dict[str, Any]]
