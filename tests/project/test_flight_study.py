@@ -40,7 +40,7 @@ def test_every_rule_can_be_read(family):
 @pytest.mark.parametrize("part", flight_world.PARTS)
 def test_every_condition_is_a_world_and_none_is_named_twice(part, monkeypatch):
     monkeypatch.setattr(flight_world, "best_rule", lambda: "plan:0.8&stale:8")
-    monkeypatch.setattr(flight_world, "tuned_models", lambda: ["model.zip@0.9"])
+    monkeypatch.setattr(flight_world, "tuned_models", lambda: [f"model{seed}.zip@0.9" for seed in range(5)])
     work = list(flight_world.jobs(part))
     assert len({str(job) for job in work}) == len(work) >= 12
     for job in work:
