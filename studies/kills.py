@@ -225,6 +225,7 @@ def main() -> None:
         uninterrupted = start(Path(whole), args.steps)
         try:
             rows = kills(args, Path(parts))
+            killed = sum(not row["done"] for row in rows)
             if args.faults and not args.every:
                 rows += faults(args, Path(parts))
             found = start(Path(parts), args.steps).communicate()[0].strip()
@@ -238,11 +239,11 @@ def main() -> None:
     same = bool(expected) and found == expected
     verdict = "the same" if same else "DIFFERENT"
     print(
-        f"{args.kills} kills, {len(rows) - args.kills} faults and kills after them, {len(lost)} lost checkpoints, "
+        f"{killed} kills, {len(rows) - killed} faults and kills after them, {len(lost)} lost checkpoints, "
         f"{len(early)} kills after the end; the digest is {verdict}: {found}"
     )
     if args.json:
-        write_rows(args.json, [*rows, {"kills": args.kills, "lost": len(lost), "expected": expected, "found": found}])
+        write_rows(args.json, [*rows, {"kills": killed, "lost": len(lost), "expected": expected, "found": found}])
     sys.exit(0 if same and not lost and not intruded and not early else 1)
 
 

@@ -98,7 +98,7 @@ def main() -> None:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         panels[1].yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         label = f"mean and range of {len(logs)} seeds" if len(logs) > 1 else "one seed"
-        panels[0].annotate(label, (0.97, 0.06), xycoords="axes fraction", ha="right", color=LEARNED)
+        panels[1].annotate(label, (0.97, 0.2), xycoords="axes fraction", ha="right", color=LEARNED)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(args.out)
     print(f"drew {args.out}; no and full communication: {none}, {full}")
