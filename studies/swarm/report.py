@@ -427,7 +427,7 @@ def headline_table(rows: Rows, best: str) -> str:
     :param best: the tuned rule
     """
     eight, four = ([row for row in rows if row["n_robots"] == n] for n in (8, 4))
-    rule = f"best of {sum(map(len, families().values()))} hand-made rules ({label(best)})"
+    rule = f"best of {sum(map(len, families().values()))} hand-made rules"
     groups = {
         "nobody asks (`none`)": [row for row in eight if row["policy"] == "none"],
         "everybody asks everybody (`full`)": [row for row in eight if row["policy"] == "full"],
@@ -455,7 +455,9 @@ def seeds_rate(rows: Rows) -> str:
         return "-"
     counts = spread([f"{count:,}" for count in sorted(row["collisions"] for row in rows)])
     low, high = 100 * min(row["collision_low"] for row in rows), 100 * max(row["collision_high"] for row in rows)
-    return f"{counts} of {rows[0]['episodes']:,} [{low:.2f}, {high:.2f}] %"
+    # Narrow columns would break lines anywhere
+    lines = (f"{counts} of {rows[0]['episodes']:,}", f"[{low:.2f}, {high:.2f}] %")
+    return "<br>".join(line.replace(" ", "&nbsp;") for line in lines)
 
 
 def changes(changed: Any, path: str = "") -> str:
