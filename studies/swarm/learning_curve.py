@@ -75,8 +75,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="image file to write")
     args = parser.parse_args()
     logs = [np.load(run / "evaluations.npz") for run in args.runs]
-    (model,) = args.runs[0].glob("QuadSwarm-v0.zip")
-    spec = MADDPG.load(model).env_spec
+    spec = MADDPG.load(args.runs[0] / "QuadSwarm-v0.zip").env_spec
     assert spec is not None, "models of registered environments have one"
     kwargs = spec["kwargs"] | {"scenario": SCENARIO}
     none, full = (reference(kwargs, bit) for bit in (0, 1))
