@@ -6,6 +6,7 @@ import importlib
 import logging
 import os
 import pickle
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
@@ -56,6 +57,7 @@ class Cluster(Executor):
                 raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
         self._run = ray.remote(_run).options(max_retries=_RETRIES, num_cpus=1)
         self._open: dict[Future[Any], Any] = {}
+        self._lock = threading.RLock()  # Ray settles results in threads of its own
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `concurrent.futures.Executor.submit`.
@@ -72,9 +74,12 @@ class Cluster(Executor):
         return result
 
     def _settle(self, result: Future[Any], done: Future[Any]) -> None:
-        self._open.pop(result, None)
-        if result.done():
-            return
+        with self._lock:
+            self._open.pop(result, None)
+            if not result.done():
+                self._set(result, done)
+
+    def _set(self, result: Future[Any], done: Future[Any]) -> None:
         try:
             value, error, trace, where = done.result()
         except self._ray.exceptions.RayError as lost:
@@ -96,12 +101,14 @@ class Cluster(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """See `concurrent.futures.Executor.shutdown`. ``cancel_futures`` also stops running pieces."""
         if cancel_futures:
-            for future, reference in list(self._open.items()):
-                self._ray.cancel(reference, force=True)
-                if not future.done():
+            with self._lock:
+                stopped, self._open = self._open, {}
+                for future in stopped:
                     future.set_exception(RuntimeError("The executor was stopped."))
-        elif wait and self._open:
-            self._ray.wait(list(self._open.values()), num_returns=len(self._open))
+            for reference in stopped.values():
+                self._ray.cancel(reference, force=True)
+        elif wait and (running := list(self._open.values())):
+            self._ray.wait(running, num_returns=len(running))
         if self._begun and (wait or cancel_futures):
             self._ray.shutdown()
 
