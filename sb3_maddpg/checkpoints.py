@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 import platform
 import random
@@ -48,14 +49,15 @@ from sb3_maddpg.model_files import as_damage
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import shown, sync_folder
 
-_FORMAT = 1
+_FORMAT = 2
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
 _SEGMENTS = "segments"
 # Called with the name of each step of writing; tests replace it by a function that kills the process
 fault: Callable[[str], None] = lambda point: None  # noqa: E731
-_ROWS = 64  # rows of a replay buffer to write at once
-# Minimum time between checkpoints: in seconds, and as a multiple of the time that one takes
-_SECONDS, _SHARE = 30.0, 100.0
+_BLOCK = 2**25  # bytes of a replay buffer to write at once
+# Minimum time between checkpoints (s), and maximum fraction of the time that they may take
+_SECONDS, _SHARE = 30.0, 0.015
+_BYTES_PER_SECOND = 2e8  # assumed before the first checkpoint
 _LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 _LOGGED = ("name_to_value", "name_to_count", "name_to_excluded")
 
@@ -68,8 +70,8 @@ class RunCheckpoint(BaseCallback):
     checkpoint and then ends the process with that signal. A second signal ends the process at once.
 
     :param folder: folder for the checkpoints of this run only
-    :param every: number of steps between checkpoints; None to write one every half minute, or less often if
-        checkpoints would take more than a hundredth of the time
+    :param every: number of steps between checkpoints; None to write one every half minute, or less often if all
+        checkpoints together would take more than 1.5 % of the time
     :param keep: number of most recent checkpoints to keep
     :param verbose: 1 to print what is written
     :raises ValueError: if ``every`` or ``keep`` is less than 1
@@ -81,7 +83,9 @@ class RunCheckpoint(BaseCallback):
             raise ValueError(f"every={every}, keep={keep}: both must be at least 1.")
         self.folder, self.every, self.keep = Path(folder), every, keep
         self.saved_at = 0
-        self._due = time.monotonic() + _SECONDS
+        self._started = self._ended = time.monotonic()  # of training, and of the last checkpoint
+        self._taken = 0.0
+        self._bytes_per_second = _BYTES_PER_SECOND
         self._signal: int | None = None
         self._handlers: dict[int, Any] = {}
         self.inexact: str | None = None
@@ -104,6 +108,8 @@ class RunCheckpoint(BaseCallback):
             self._pending = None
         else:
             self.saved_at = self.model.num_timesteps
+        self._started = self._ended = time.monotonic()
+        self._taken = 0.0
 
         if threading.current_thread() is threading.main_thread():
             for name in ("SIGTERM", "SIGHUP"):
@@ -125,11 +131,24 @@ class RunCheckpoint(BaseCallback):
             print(f"Ended by {signal.Signals(self._signal).name} at step {self.model.num_timesteps}.", flush=True)
             _end_by(self._signal)
         steps = self.model.num_timesteps - self.saved_at
-        if steps >= self.every if self.every is not None else time.monotonic() >= self._due and steps > 0:
+        if steps >= self.every if self.every is not None else steps > 0 and self._is_time():
             self.save()
 
     def _on_step(self) -> bool:
         return True
+
+    def _is_time(self) -> bool:
+        now = time.monotonic()
+        if now - self._ended < _SECONDS:
+            return False
+        expected = self._bytes_to_write() / self._bytes_per_second
+        return self._taken + expected <= _SHARE * (now - self._started + expected)
+
+    def _bytes_to_write(self) -> int:
+        buffer = cast(MADDPG, self.model).replay_buffer
+        assert isinstance(buffer, TeamReplayBuffer)
+        first, end = self._new_rows(buffer)
+        return (end - first) * buffer.n_envs * _stored(buffer).itemsize
 
     def save(self) -> Path | None:
         """
@@ -140,7 +159,7 @@ class RunCheckpoint(BaseCallback):
         model = cast(MADDPG, self.model)
         steps = model.num_timesteps
         self.saved_at = steps
-        started = time.perf_counter()
+        started, size = time.monotonic(), self._bytes_to_write()
         try:
             segments = self._write_segments(model)
             state = _state_of(model, _callbacks(self._root()))
@@ -156,8 +175,10 @@ class RunCheckpoint(BaseCallback):
                 shutil.rmtree(path, ignore_errors=True)
             return None
         finally:
-            taken = time.perf_counter() - started
-            self._due = time.monotonic() + max(_SECONDS, _SHARE * taken)
+            self._ended = time.monotonic()
+            taken = self._ended - started
+            self._taken += taken
+            self._bytes_per_second = max(size, 1) / max(taken, 1e-6)
         self._segments = segments
         self._tidy()
         if self.verbose:
@@ -171,28 +192,38 @@ class RunCheckpoint(BaseCallback):
         # A CallbackList is not the parent of its callbacks, but it is a local variable of learn()
         return self.locals.get("callback", root)
 
+    def _kept_segments(self, buffer: TeamReplayBuffer) -> list[dict[str, Any]]:
+        """:return: the segments written so far that still belong to the buffer, oldest first"""
+        oldest = buffer.n_added - buffer.size()
+        return [one for one in self._segments if oldest < one["end"] <= buffer.n_added]
+
+    def _new_rows(self, buffer: TeamReplayBuffer) -> tuple[int, int]:
+        """
+        :return: the rows to write, from first to end: those since the last checkpoint, and the one before them, whose
+            end may have changed
+        """
+        oldest, kept = buffer.n_added - buffer.size(), self._kept_segments(buffer)
+        return max(kept[-1]["end"] - 1 if kept else oldest, oldest), buffer.n_added
+
     def _write_segments(self, model: MADDPG) -> list[dict[str, Any]]:
         """
-        Write the transitions since the last checkpoint, and the one before them, whose end may have changed.
+        Write the new rows of the replay buffer.
 
         :return: the segments that hold the buffer, oldest first
         """
         buffer = model.replay_buffer
         assert isinstance(buffer, TeamReplayBuffer)
-        oldest, end = buffer.n_added - buffer.size(), buffer.n_added
-        kept = [one for one in self._segments if one["end"] > oldest and one["end"] <= end]
-        first = max(kept[-1]["end"] - 1 if kept else oldest, oldest)
-        rows = np.arange(first, end + int(buffer.optimize_memory_usage)) % buffer.buffer_size
+        kept, (first, end) = self._kept_segments(buffer), self._new_rows(buffer)
         name = f"{first:012d}-{end:012d}.rows"
         path = self.folder / _SEGMENTS / name
         path.parent.mkdir(parents=True, exist_ok=True)
         found = hashlib.sha256()
         with path.open("wb") as file:
             fault("opened rows")
-            for part in np.array_split(rows, max(len(rows) // _ROWS, 1)):
-                block = buffer.records[part].tobytes()
-                found.update(block)
-                file.write(block)
+            for rows in _blocks(buffer, first, end):
+                for part in _stored_block(buffer, rows, end):
+                    found.update(part)
+                    file.write(part)
             file.flush()
             os.fsync(file.fileno())
         sync_folder(path.parent)
@@ -450,17 +481,67 @@ def _columns(buffer: TeamReplayBuffer) -> dict[str, np.ndarray]:
     return {name: used[name] for name in buffer.records.dtype.names or ()}
 
 
+def _stored(buffer: TeamReplayBuffer) -> np.dtype:
+    """:return: type of the transitions in segments, without next observations"""
+    fields = buffer.records.dtype
+    return np.dtype([(name, fields[name]) for name in fields.names or () if name != "next_observations"])
+
+
+def _blocks(buffer: TeamReplayBuffer, first: int, end: int) -> list[np.ndarray]:
+    """:return: the rows of a segment, counted since the buffer was empty, in blocks of about `_BLOCK` bytes"""
+    rows = np.arange(first, end + int(buffer.optimize_memory_usage))
+    rows_at_once = max(_BLOCK // buffer.records[0].nbytes, 1)
+    return np.array_split(rows, max(math.ceil(len(rows) / rows_at_once), 1))
+
+
+def _stored_block(buffer: TeamReplayBuffer, rows: np.ndarray, end: int) -> Iterator[bytes]:
+    """
+    Yield the content of a block: transitions, which of them have a next observation other than the next row's
+    observation, and those next observations.
+    """
+    places = rows % buffer.buffer_size
+    block = np.empty((len(rows), buffer.n_envs), _stored(buffer))
+    for name in block.dtype.names or ():
+        block[name] = buffer.records[name][places]
+    yield block.tobytes()
+    if not buffer.optimize_memory_usage:
+        after = buffer.next_observations[places]
+        differs = _differs(after, buffer.observations[(places + 1) % buffer.buffer_size])
+        differs[rows == end - 1] = True
+        yield differs.tobytes()
+        yield after[differs].tobytes()
+
+
+def _differs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """:return: for each row and environment, whether two arrays differ in any bit, as 0.0 and -0.0 do"""
+    shape = (*first.shape[:2], math.prod(first.shape[2:]) * first.itemsize)
+    return (first.view(np.uint8).reshape(shape) != second.view(np.uint8).reshape(shape)).any(axis=-1)
+
+
 def _read_segments(
     folder: Path, buffer: TeamReplayBuffer, segments: list[dict[str, Any]], counters: dict[str, Any]
 ) -> None:
     buffer.pos, buffer.full = counters["pos"], counters["full"]
+    size, stored = buffer.buffer_size, _stored(buffer)
     for one in segments:
-        row = one["first"]
+        same = []  # rows and environments whose next observation is the next row's observation
         with (folder / _SEGMENTS / one["name"]).open("rb") as file:
-            while len(rows := np.fromfile(file, buffer.records.dtype, _ROWS * buffer.n_envs)):
-                rows = rows.reshape(-1, buffer.n_envs)
-                buffer.records[np.arange(row, row + len(rows)) % buffer.buffer_size] = rows
-                row += len(rows)
+            for rows in _blocks(buffer, one["first"], one["end"]):
+                shape = (len(rows), buffer.n_envs)
+                places = rows % size
+                block = np.fromfile(file, stored, math.prod(shape)).reshape(shape)
+                for name in stored.names or ():
+                    buffer.records[name][places] = block[name]
+                if not buffer.optimize_memory_usage:
+                    differs = np.fromfile(file, bool, math.prod(shape)).reshape(shape)
+                    row, env = np.nonzero(differs)
+                    after = buffer.next_observations
+                    found = np.fromfile(file, after.dtype, len(row) * math.prod(after.shape[2:]))
+                    after[places[row], env] = found.reshape(len(row), *after.shape[2:])
+                    row, env = np.nonzero(~differs)
+                    same.append((places[row], env))
+        for place, env in same:
+            buffer.next_observations[place, env] = buffer.observations[(place + 1) % size, env]
 
 
 def _write(path: Path, model: MADDPG, state: dict[str, Any], segments: list[dict[str, Any]]) -> None:

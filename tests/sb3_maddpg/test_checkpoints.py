@@ -109,6 +109,7 @@ def kill_at(monkeypatch, point: str, times: int) -> None:
 
 @pytest.mark.parametrize("name", RUNS)
 def test_a_resumed_run_ends_as_the_uninterrupted_one(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "_BLOCK", 5000)  # several blocks in each segment
     expected = digest(make(name).learn(STEPS, callback=[RunCheckpoint(tmp_path / "a", EVERY)]))
     assert expected == digest(make(name).learn(STEPS)), "checkpoints change nothing"
     kill_at(monkeypatch, "committed", 3)
@@ -185,6 +186,42 @@ def test_only_new_transitions_are_written(tmp_path):
     assert all(abs(size / row - EVERY) < 8 for size in sizes)
     make("replayed", buffer_size=150).learn(STEPS, callback=[RunCheckpoint(tmp_path / "ring", EVERY)])
     assert len(list((tmp_path / "ring" / "segments").iterdir())) <= 4, "what the ring has overwritten is removed"
+
+
+def test_observations_are_written_once(tmp_path):
+    model = make("swarms")
+    model.learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
+    record = model.replay_buffer.records.dtype
+    for path in (tmp_path / "segments").iterdir():
+        first, end = map(int, path.stem.split("-"))
+        rows = (end - first) * model.n_envs
+        assert path.stat().st_size < rows * (record.itemsize - 0.8 * record["next_observations"].itemsize)
+
+
+@pytest.mark.parametrize(("seconds", "expected"), [(0.01, 66), (3.0, 10), (60.0, 0)])
+def test_checkpoints_take_no_more_than_their_share(seconds, expected, tmp_path, monkeypatch):
+    now = [1000.0]
+
+    def write(target: Path, _) -> Path:
+        now[0] += seconds
+        return target
+
+    monkeypatch.setattr(checkpoints.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(checkpoints, "_commit", write)
+    checkpoint = RunCheckpoint(tmp_path)
+    checkpoint.init_callback(make("replayed").learn(1))
+    checkpoint.on_training_start({}, {})
+    monkeypatch.setattr(checkpoint, "_bytes_to_write", lambda: int(seconds * 2e8))
+    monkeypatch.setattr(checkpoint, "_write_segments", lambda model: [])
+    steps = []
+    while now[0] < 3000.0:
+        checkpoint.model.num_timesteps += 1
+        now[0] += 1.0
+        checkpoint.on_rollout_start()
+        if checkpoint.saved_at == checkpoint.model.num_timesteps:
+            steps.append(checkpoint.saved_at)
+            assert len(steps) * seconds <= 0.02 * (now[0] - 1000.0)
+    assert len(steps) == expected
 
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "missing", "segment"])
