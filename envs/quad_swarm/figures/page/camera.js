@@ -10,7 +10,7 @@ const GLIDE = 450; // ms from one preset to another
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 export class Camera {
-  // :param layout: () -> {aspect, head} of a view :param changed: called whenever another picture is due
+  // :param layout: () -> {aspect, head} of a view :param changed: called whenever the picture must be redrawn
   constructor(canvas, layout, changed) {
     this.layout = layout;
     this.changed = changed;
@@ -27,7 +27,7 @@ export class Camera {
     this.frame();
   }
 
-  // Where the presets look follows the size of the window until somebody turns the camera.
+  // Until the user turns the camera, the presets' directions depend on the size of the window.
   frame() {
     if (this.preset === null || this.preset === "chase") return;
     const {aspect, head} = this.layout(), {position: from, target} = framed(this.preset, aspect, head);
@@ -59,7 +59,7 @@ export class Camera {
     this.changed();
   }
 
-  // Moves to where it looks next instead of jumping there.
+  // Moves smoothly to the next view.
   glide() {
     if (calm || this.time === undefined) return;
     const from = flights.map((_, view) => {
@@ -69,7 +69,7 @@ export class Camera {
     this.gliding = {from, begin: performance.now()};
   }
 
-  // From now on the camera stays where it is but for what hands do.
+  // From now on, only the user moves the camera.
   release() {
     this.gliding = null;
     if (this.preset === "chase") {
@@ -85,7 +85,7 @@ export class Camera {
     return new Vector3(...position(flights[view], this.robot, Math.min(this.time ?? 0, flights[view].steps), [0, 0, 0]));
   }
 
-  // Where the camera of a view is at a time: around its own flight's robot, where one is followed.
+  // The camera of a view at a time. If a robot is followed, it is around this robot in the view's own flight.
   eye(view, t) {
     this.time = t;
     const there = this.aim(view, t), {from, begin} = this.gliding ?? {};

@@ -1,4 +1,4 @@
-// The flights that the page shows, and what is read off them at a time. Times are in steps, fractional between steps.
+// The flights that the page shows, and quantities derived from them at a time. Times are in steps, fractional between steps.
 
 export const data = JSON.parse(document.getElementById("data").textContent);
 export const flights = data.flights;
@@ -30,7 +30,7 @@ export const fileName = `${data.scenario}_${nRobots}_robots`;
 export const fullName = flight => `${flight.name} (${flight.detail})`;
 
 export const seconds = (step, digits = 1) => `${(step * data.dt).toFixed(digits)}\u00a0s`;
-// Centimetres, and millimetres where they decide on a collision
+// With two decimals, and three where they decide on a collision
 export const metres = distance => `${distance.toFixed(Math.abs(distance - contact) < 0.01 ? 3 : 2)}\u00a0m`;
 export const grouped = number => String(number).replace(/\B(?=(\d{3})+$)/g, "\u202f");
 export function percent(part, whole) {
@@ -38,7 +38,7 @@ export function percent(part, whole) {
   return `${share === 0 || share >= 99.95 ? share.toFixed(0) : share.toFixed(1)}\u00a0%`;
 }
 
-// Okabe and Ito's colours; after eight they come again, darker and then lighter.
+// Okabe and Ito's colours; after eight they repeat, darker and then lighter.
 export function colour(i) {
   const base = data.colours[i % data.colours.length], round = Math.floor(i / data.colours.length) % 3;
   if (round === 0) return base;
@@ -52,7 +52,7 @@ const ends = (t, length) => {
   return [k, Math.min(k + 1, length - 1), Math.min(Math.max(t - k, 0), 1)];
 };
 
-// Catmull-Rom between steps: velocities have no jumps, and at a step it is what was flown.
+// Catmull-Rom interpolation: velocities are continuous, and positions at the steps are those that were flown.
 export function position(flight, i, t, out) {
   const p = flight.positions, [k, next, s] = ends(t, p.length);
   const before = p[Math.max(k - 1, 0)][i], after = p[Math.min(next + 1, p.length - 1)][i], a = p[k][i], b = p[next][i];

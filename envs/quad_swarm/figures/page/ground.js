@@ -1,4 +1,4 @@
-// The floor: a grid of metres that fades into the background, figures along two sides of it, and shadows.
+// The floor: a grid of metres that fades into the background, numbers along two of its sides, and shadows.
 
 import {
   CanvasTexture, Color, Group, Mesh, MeshBasicMaterial, PlaneGeometry, ShaderMaterial, ShadowMaterial, SRGBColorSpace, Vector2,

@@ -33,7 +33,7 @@ function say(text, seconds_ = 8) {
 
 const panels = flights.map(flight => new Panel(flight, element("stage"), element("details"), tooltip, step => { pause(); seek(step); }));
 
-// The cells of the stage, as the canvas behind them needs them
+// The cells of the stage in the form that the canvas behind them needs
 function rects() {
   const stage = element("stage").getBoundingClientRect();
   return panels.map(({cell}) => {
@@ -73,7 +73,7 @@ function advance(elapsed) {
   }
 }
 
-// A machine that is too slow for all pixels gets fewer of them while it plays.
+// While playing, slow machines render at a lower resolution.
 function adapt(elapsed) {
   if (!elapsed) return;
   state.pace = 0.9 * (state.pace ?? 1 / 60) + 0.1 * elapsed;
@@ -148,7 +148,7 @@ function choose(view, robot) {
   if (!state.playing) remember();
 }
 
-// What the lists say about the camera
+// Shows the state of the camera in the lists
 function mark() {
   element("view").value = camera.preset ?? "";
   element("follow").value = camera.robot ?? "";
@@ -161,7 +161,7 @@ function fill(select, options) {
 function begin3D() {
   const canvas = element("canvas");
   try {
-    // Asked first on a canvas of its own, because three.js would fill the console
+    // Checked on a separate canvas first, because three.js would fill the console with errors
     if (!document.createElement("canvas").getContext("webgl2")) throw new Error("no WebGL");
     views = new Views(canvas);
   } catch {
@@ -186,7 +186,7 @@ function begin3D() {
     const all = rects(), view = all.findIndex(r => x >= r.x && x < r.x + r.width && y >= r.y && y < r.y + r.height);
     if (view < 0) return;
     const robot = views.robotAt(view, x - all[view].x, y - all[view].y, all[view], camera.eye(view, state.now));
-    // A click is no turn of the camera
+    // A click does not turn the camera
     if (camera.preset === null) camera.preset = pressed[2];
     if (robot === null) mark();
     else choose(undefined, robot === camera.robot ? null : robot);
@@ -198,7 +198,7 @@ function begin3D() {
   if (hash.has("follow") && Number.isInteger(robot) && robot >= 0 && robot < nRobots) choose(undefined, robot);
 }
 
-// Exports draw on a canvas of their own, so that the page stays as it is.
+// Exports draw on a separate canvas, so that the page does not change.
 async function withPicture(width, height, ratio, action) {
   const own = new Views(document.createElement("canvas"));
   try {
@@ -263,8 +263,8 @@ function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 
-// For scripts: `prepare` returns how long the animation is (s), `renderFrame` the picture of a time (s) as a data URL,
-// which depends on nothing else.
+// For scripts: `prepare` returns how long the animation is (s), `renderFrame` the picture at a time (s) as a data URL,
+// which depends on the time only.
 function beginHero() {
   document.body.className = "hero";
   let picture = null, still = null;

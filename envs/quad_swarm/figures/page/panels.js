@@ -28,7 +28,7 @@ function summary(flight) {
 }
 
 export class Panel {
-  // :param seek: called with the step that somebody points at
+  // :param seek: called with the step that the user points at
   constructor(flight, stage, column, tooltip, seek) {
     this.flight = flight;
     this.cell = document.createElement("section");
@@ -44,8 +44,8 @@ export class Panel {
     this.details.querySelector(".summary").textContent = summary(flight);
     const captions = [
       this.flight.announces
-        ? "Who gets whose plan, asked for or sent unasked: a lane for each pair, one block for each robot that gets it, in the colour of the robot whose plan it is"
-        : "Who asks whom: a lane for each pair, one block for each robot that asks, in the colour of the robot that is asked",
+        ? "Who receives whose plan, requested or announced: one lane per pair, one block per receiving robot, in the colour of the robot whose plan it is"
+        : "Who asks whom: one lane per pair, one block per asking robot, in the colour of the robot that is asked",
       `Closest two robots (m)${Math.max(...flight.separation) > top ? `; dashed where it is more than ${top.toFixed(1)} m` : ""}`,
       "Requests so far",
     ];
@@ -109,4 +109,4 @@ export const legend = [
 
 export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
   `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
-  `${flights.length > 1 ? "All policies fly the same episode, in step. " : ""}A request is one robot asking another in one step.`;
+  `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A request is one robot asking another in one step.`;

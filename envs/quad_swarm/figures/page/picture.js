@@ -1,4 +1,4 @@
-// The views with their titles and counters as one picture: for export, and for animations made by a script.
+// The views with titles and counters as one picture, for export and for animations made by a script.
 
 import {
   askedUntil, flights, grouped, hasArrived, hasCollided, metres, nRobots, percent, possibleUntil, seconds, separationAt, title,

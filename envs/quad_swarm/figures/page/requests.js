@@ -1,5 +1,6 @@
 // Who asks whom: arcs with an arrowhead at the one who is asked. A light runs along in the asker's colour, and back in
-// that of the one who is asked: its plan. One that is sent unasked runs from its owner, in its colour. All arcs of a view are one instanced mesh, bent by the vertex shader.
+// that of the one who is asked: its plan. An announced plan runs from its owner, in its colour. All arcs of a view are one
+// instanced mesh, bent by the vertex shader.
 
 import {
   BufferAttribute, Color, DynamicDrawUsage, InstancedBufferAttribute, InstancedBufferGeometry, Mesh, ShaderMaterial, Vector2,
@@ -108,7 +109,7 @@ export class Requests {
     for (const attribute of [from, to, asker, asked, strength, phase]) attribute.needsUpdate = true;
     this.geometry.instanceCount = count;
     this.mesh.visible = count > 0;
-    // Where everybody asks everybody single arcs cannot be followed anyway: thin and pale, so that robots stay visible
+    // With full communication, single arcs cannot be followed anyway. They are thin and pale, so that robots stay visible
     const crowd = Math.min(1, Math.max(0, (Math.max(...[step, step - 1].map(k => flight.requests[k]?.length ?? 0)) - 6) / 40));
     this.uniforms.width.value = 2.6 - 1.6 * crowd;
     this.uniforms.base.value = (dark ? 0.9 : 0.95) - 0.7 * crowd;

@@ -1,4 +1,4 @@
-// Who gets whose plan: a lane for each pair, grouped by the robot that gets it, in the colour of the one whose it is.
+// Who receives whose plan: one lane per pair, grouped by the receiving robot, in the colour of the plan's owner.
 
 import {colour, nRobots, percent} from "./data.js";
 import {add, begin, cursor, stepUnder, timeScale} from "./plots.js";

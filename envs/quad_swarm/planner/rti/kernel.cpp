@@ -4,7 +4,7 @@
 // model.hpp is generated from the problem: its sizes, its bounds, and straight-line code for its derivatives and for
 // one stage of the Riccati recursion. Nothing in this file knows a quadrotor.
 //
-// A lane that is done, or whose numbers have gone bad, is frozen by a select. No lane ever reads another.
+// A lane that has converged, or whose numbers are no longer finite, is frozen by a select. No lane reads another.
 #include <algorithm>
 #include <numeric>
 #include <vector>
@@ -19,8 +19,8 @@ constexpr int INPUT_STRIDE = 4;
 
 struct Options {
   std::int64_t max_iterations;  // of the interior-point method, for each quadratic program
-  // On the mean complementarity, relative to 1 + COST_IN_TOLERANCE times what violations cost: where that is large,
-  // single precision cannot reach less, and nothing would be gained by it.
+  // On the mean complementarity, relative to 1 + COST_IN_TOLERANCE times the cost of violations. Where this cost is
+  // large, single precision cannot reach a smaller complementarity, and nothing would be gained by it.
   double tolerance;
 };
 
@@ -51,7 +51,7 @@ struct Inequality {
   V value;              // h, at the point of linearisation
   V slack, multiplier;  // t, lambda > 0 with t = h + g z + lambda / rho at the solution
   V slack_step, multiplier_step;
-  V offset;           // c in lambda = c - w (h + g z), what Newton's method makes of t lambda = target
+  V offset;           // c in lambda = c - w (h + g z), the linearisation of t lambda = target
   V scaling;          // 1 / (t + lambda / rho)
   V inverse_product;  // 1 / (t lambda)
 
@@ -70,7 +70,7 @@ struct Inequality {
   // w in lambda = c - w (h + g z)
   V weight() const { return multiplier * scaling; }
 
-  // What it pushes with along g at z = 0.
+  // The force along g at z = 0.
   V force() const { return negative_multiply_add(weight(), value, offset); }
 
   // Make lambda a linear function of z, for the predictor's target 0. One division serves all that need one.
@@ -100,7 +100,7 @@ struct Inequality {
     curvature = multiply_add(slack_step, multiplier_step, curvature);
   }
 
-  // Take a part of the step; adds the complementarity reached, and what the violation costs.
+  // Take a part of the step; add the complementarity reached and the cost of the violation.
   void advance(V part, V& complementarity, V& cost) {
     slack = multiply_add(part, slack_step, slack);
     multiplier = multiply_add(part, multiplier_step, multiplier);
@@ -113,10 +113,10 @@ struct Inequality {
 template <class V>
 struct Stage {
   V u[NU], x[NX];
-  V a[N_A], b[N_B];  // entries of dx_{k+1}/dx_k and dx_{k+1}/du_k that are no constants
+  V a[N_A], b[N_B];  // entries of dx_{k+1}/dx_k and dx_{k+1}/du_k that are not constant
   V input_gradient[NU];
   V others[N_OTHERS][3];
-  V clearance[N_OTHERS];     // to keep beyond the separation
+  V clearance[N_OTHERS];     // distance to keep in addition to the separation
   V direction[N_OTHERS][3];  // from each other robot to this one
   V repulsion_gradient[N_OTHERS], repulsion_curvature[N_OTHERS];
   V bound_sign[N_BOUNDS];
@@ -124,7 +124,7 @@ struct Stage {
   Inequality<V, true> bound[N_BOUNDS], separation[N_OTHERS];
   V factor[N_FACTOR], gain[NU * NX], feedforward[NU];  // of the Riccati recursion
   V du[NU];      // step of the input so far
-  V new_du[NU];  // and where the interior-point iteration wants it
+  V new_du[NU];  // step of the input that the interior-point iteration proposes
 };
 
 constexpr double INEQUALITIES = N * (2.0 * NU + N_BOUNDS + N_OTHERS);
@@ -137,7 +137,7 @@ class LaneGroup {
   using V = typename LaneTypes<T, W>::Real;
   using Mask = MaskOf<V>;
 
-  // Some problems of the batch, at most W; lanes left over repeat the last of them.
+  // A group of at most W problems of the batch. Unused lanes repeat the last problem.
   void solve(const Batch& batch, const double* u_guess, const std::int64_t* problems, int count, std::int64_t rounds,
              const Options& options) {
     load(batch, u_guess, problems, count);
@@ -205,7 +205,7 @@ class LaneGroup {
       }
       x = s.x;
       for (int i = 0; i < N_BOUNDS; i++) {
-        // Of a state's two bounds only the nearer one enters; the other lies across the room.
+        // Only the nearer of a state's two bounds enters the problem; the other is out of reach.
         const V low = x[BOUNDED_STATE[i]] - splat<V>(STATE_LOW[i]);
         const V high = splat<V>(STATE_HIGH[i]) - x[BOUNDED_STATE[i]];
         s.bound_sign[i] = select<V>(low < high, splat<V>(1), splat<V>(-1));
@@ -350,7 +350,7 @@ class LaneGroup {
     }
   }
 
-  // Take the step in the active lanes; gives their mean complementarity and what violations cost.
+  // Take the step in the active lanes; return their mean complementarity and the cost of violations.
   void advance(Mask active, V step, V& complementarity, V& cost) {
     const V part = select<V>(active, step, V{});
     V sum = V{};
@@ -462,7 +462,7 @@ extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
   std::vector<std::int64_t> problems(count);
   std::iota(problems.begin(), problems.end(), 0);
   solve_all(batch, u_guess, problems, sqp_iterations, options);
-  // The few problems that still move go on together, in groups of their own.
+  // The few problems that have not converged continue together in new groups.
   for (std::int64_t k = 0; k < extra_iterations; k++) {
     const auto settled = [&](std::int64_t problem) { return !moving[problem]; };
     problems.erase(std::remove_if(problems.begin(), problems.end(), settled), problems.end());
