@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-RECIPE ?= zoo_configs/quad_swarm_paper.yml
+RECIPE ?= zoo_configs/quad_swarm_flight.yml
 STEPS ?= 400000
 SEED ?= 0
 LOGS ?= logs
@@ -11,7 +11,7 @@ JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
 BENCHMARKS ?= planner env training scaling estimators
 TEAMS ?= 6 12 16
 TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan and stale" "plan, or cpa and stale" "two cpa"
-POLICIES ?= none full distance:4 cpa:0.65:1.5
+POLICIES ?= none full distance:4 "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
 PEERS := agilerl benchmarl xuance
 
 .PHONY: help install train test lint docs page bench bench-peers results results-quick clean
