@@ -1,13 +1,15 @@
 """Measure the cost of checkpoints during training: ``python benchmarks/checkpoints.py [--seconds 120] [--json F]``.
 
-Trains with `RunCheckpoint`, by time as in ``sb3-maddpg train`` and with a checkpoint every 10,000 steps, and measures
-the time of writing checkpoints, synced to disk. JSON: one row per training with recipe, every, steps, seconds,
-checkpoints, share of the time, and megabytes on disk at the end.
+Trains four robots with flat observations, and fourteen with the recipe ``quad_swarm_flight.yml``. Checkpoints are
+written by time, as in ``sb3-maddpg train``, or every 10,000 steps, and synced to disk. ``--whole`` trains the recipe to
+its end instead. JSON: one row per training with recipe, every, steps, seconds, checkpoints, share of the time, and
+megabytes on disk at the end.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import tempfile
 import time
@@ -17,32 +19,33 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import gymnasium
+import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor
 
 import quad_swarm  # noqa: F401 - registers the environment
-from quad_swarm.evaluation.rows import write_rows
-from sb3_maddpg import MADDPG
+from quad_swarm.evaluation.rows import read_rows, write_rows
+from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
 from sb3_maddpg.checkpoints import RunCheckpoint
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
-# Arguments of the environments and of the algorithm, as in recipes that fill their replay buffers
-RECIPES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "four robots, flat observations": (
-        {"num_envs": 8, "preset": "paper"},
-        {"policy": "MlpPolicy", "batch_size": 512, "buffer_size": 100_000, "train_freq": 2},
-    ),
-    "fourteen robots, pairs": (
-        {
-            "num_envs": 16,
-            "preset": "flight",
-            "n_robots": 14,
-            "observation": "state+approach+memory+plan+told+mask+critic",
-            "world": {"space": {"circle_radius": [3.0, 4.0]}},
-        },
-        {"policy": "PairPolicy", "policy_kwargs": {"pair_credit": True}, "batch_size": 96, "buffer_size": 24_000},
-    ),
-}
+FILE = Path(__file__).parents[1] / "zoo_configs" / "quad_swarm_flight.yml"
+FOUR, FOURTEEN = "four robots, flat observations", FILE.name
+
+
+def arguments_of(recipe: str) -> tuple[dict[str, Any], dict[str, Any], int]:
+    """Return the arguments of the environments and of the algorithm, and the number of steps of a whole training."""
+    if recipe == FOUR:
+        arguments = {"policy": "MlpPolicy", "batch_size": 512, "buffer_size": 100_000, "train_freq": 2}
+        return {"num_envs": 8, "preset": "paper"}, arguments | {"learning_starts": 1000}, 1_000_000
+    arguments = yaml.safe_load(FILE.read_text())["QuadSwarm-v0"]
+    env = {"num_envs": arguments.pop("n_envs"), **arguments.pop("env_kwargs")}
+    steps = arguments.pop("n_timesteps")
+    for name in ("vec_env", "eval_env_kwargs"):
+        del arguments[name]
+    arguments["learning_rate"] = float(arguments["learning_rate"].removeprefix("lin_"))
+    arguments["replay_buffer_class"] = PrioritizedTeamReplayBuffer
+    return env, arguments, steps
 
 
 class Stopwatch(RunCheckpoint):
@@ -75,18 +78,19 @@ class EndAfter(BaseCallback):
 
 
 def measure(recipe: str, every: int | None, seconds: float) -> dict[str, Any]:
-    """Train and return the row of the training."""
-    env_kwargs, arguments = RECIPES[recipe]
+    """Train for a time, or to the end of the recipe if this is infinite, and return the row of the training."""
+    env_kwargs, arguments, steps = arguments_of(recipe)
     env = VecMonitor(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", **env_kwargs)))
-    model = MADDPG(env=env, learning_starts=1000, seed=0, **{"train_freq": 1, **arguments})
+    model = MADDPG(env=env, seed=0, **arguments)
     with tempfile.TemporaryDirectory(dir=".") as folder:
         checkpoint, end = Stopwatch(folder, every), EndAfter(seconds)
-        model.learn(10**9, [checkpoint, end])
+        model.learn(steps, [checkpoint, end])
         elapsed = time.perf_counter() - end.started
         size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
     return {
         "recipe": recipe,
         "every": every,
+        "whole": math.isinf(seconds),
         "steps": model.num_timesteps,
         "seconds": elapsed,
         "checkpoints": checkpoint.count,
@@ -99,20 +103,24 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=120.0, help="seconds per training (default %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--whole", action="store_true", help="train the recipe to its end")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="add the rows to this file")
     args = parser.parse_args()
+    work = (
+        [(FOURTEEN, None)] if args.whole else [(name, every) for name in (FOUR, FOURTEEN) for every in (None, 10_000)]
+    )
     rows = []
-    for recipe in RECIPES:
-        for every in (None, 10_000):
-            row = measure(recipe, every, args.seconds)
-            rows.append(row)
-            print(
-                f"{recipe:32} {'by time' if every is None else f'each {every} steps':18} {row['checkpoints']:3} in "
-                f"{row['seconds']:.0f} s, {row['steps']} steps: {row['share']:.2%} of the time, "
-                f"{row['megabytes']:.0f} MB"
-            )
+    for recipe, every in work:
+        row = measure(recipe, every, math.inf if args.whole else args.seconds)
+        rows.append(row)
+        print(
+            f"{recipe:32} {'by time' if every is None else f'each {every} steps':18} {row['checkpoints']:3} in "
+            f"{row['seconds']:.0f} s, {row['steps']} steps: {row['share']:.2%} of the time, "
+            f"{row['megabytes']:.0f} MB",
+            flush=True,
+        )
     if args.json:
-        write_rows(args.json, rows)
+        write_rows(args.json, [*read_rows(args.json), *rows])
 
 
 if __name__ == "__main__":
