@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from logging import WARNING
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_maddpg.env_states import NoStateError, Replayable, load_vec_env_state, tells_state, vec_env_state
-from sb3_maddpg.utils import shown
+from sb3_maddpg.ray_cluster import connect
 
 Call = tuple[str, tuple[Any, ...]]
 
@@ -41,25 +39,8 @@ class RayVecEnv(VecEnv):
     def __init__(self, shards: Sequence[Callable[[], VecEnv]], snapshot_every: int = 100, address: str | None = None):
         if not shards or snapshot_every < 1:
             raise ValueError(f"{len(shards)} shards and snapshot_every={snapshot_every}: both must be at least 1.")
-        try:
-            import ray
-        except ImportError as error:
-            raise ValueError(f'Ray is not installed ({error}): pip install "sb3-maddpg[ray]".') from error
-        self._ray = ray
-        self._begun = not ray.is_initialized()
-        if self._begun:
-            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked
-            try:
-                ray.init(
-                    address=address,
-                    num_cpus=None if address else len(shards),
-                    include_dashboard=None if address else False,
-                    log_to_driver=False,
-                    logging_level=WARNING,
-                )
-            except (ConnectionError, ValueError, RuntimeError) as error:
-                raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
-        self._shards = [_Remote(ray, make) for make in shards]
+        self._ray, self._begun = connect(address, len(shards))
+        self._shards = [_Remote(self._ray, make) for make in shards]
         self.snapshot_every = snapshot_every
         described = self._all("describe")
         sizes = [size for size, *_ in described]

@@ -14,12 +14,16 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
-from sb3_maddpg.checkpoints import newest
+from sb3_maddpg.checkpoints import locked, newest
 from sb3_maddpg.cli.experiment import CHECKPOINTS, COMMAND_FILE
-from sb3_maddpg.utils import shown
+from sb3_maddpg.ray_cluster import connect
+from sb3_maddpg.utils import shown, suggest
 
+ENGINES = ("local", "ray")
 _SECONDS = 60.0  # time for a training to write its last checkpoint
+_RETRIES = 3  # number of times that Ray restarts a training whose machine was lost
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -39,7 +43,15 @@ def parse_seeds(text: str) -> list[int]:
     return list(dict.fromkeys(seeds))
 
 
-def train_seeds(argv: list[str], seeds: list[int], jobs: int, log_folder: str, every: int | None = None) -> int:
+def train_seeds(
+    argv: list[str],
+    seeds: list[int],
+    jobs: int,
+    log_folder: str,
+    every: int | None = None,
+    engine: str = "local",
+    address: str | None = None,
+) -> int:
     """
     Train once per seed. Killed trainings are resumed, and finished ones are skipped.
 
@@ -48,15 +60,26 @@ def train_seeds(argv: list[str], seeds: list[int], jobs: int, log_folder: str, e
     :param jobs: number of trainings at a time
     :param log_folder: folder of the runs; the output of each training goes to ``seed_K.log`` there
     :param every: number of steps between checkpoints, None for checkpoints by time
+    :param engine: "local" for processes of this machine, "ray" for those of a cluster whose machines share the files
+    :param address: address of the cluster, see ``connect``; its size then decides how many trainings run at a time
     :return: exit status of the first training that failed, 0 if none did
     :raises ValueError: if arguments are invalid
     """
     if jobs < 1:
         raise ValueError(f"--jobs {jobs} must be at least 1.")
+    if engine not in ENGINES:
+        raise ValueError(suggest("engine", engine, ENGINES))
+    if address is not None and engine != "ray":
+        raise ValueError(f"--address {address} is for --engine ray only; leave it out.")
     if "--seed" in argv:
         raise ValueError("--seeds and --seed exclude each other: pass only one of them.")
     Path(log_folder).mkdir(parents=True, exist_ok=True)
-    runs = _Trainings(argv, Path(log_folder), every)
+    folder = Path(log_folder)
+    if engine == "ray":
+        runs: _Trainings = _ClusterTrainings(argv, folder, every, address, jobs)
+        jobs = len(seeds)  # each thread waits for a training, and Ray decides when it starts
+    else:
+        runs = _Trainings(argv, folder, every)
     handlers = {}
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name) and threading.current_thread() is threading.main_thread():
@@ -73,6 +96,7 @@ def train_seeds(argv: list[str], seeds: list[int], jobs: int, log_folder: str, e
                 runs.stop()
                 raise
     finally:
+        runs.close()
         for number, handler in handlers.items():
             signal.signal(number, handler)
     return failed
@@ -93,6 +117,8 @@ class _Trainings:
         every = [] if self.every is None else ["--checkpoint-every", str(self.every)]
         words, what = ["train", *argv, *every], "starts"
         run = self._run_of(argv)
+        if run is not None:
+            _wait_until_free(run / CHECKPOINTS)
         if run is not None and newest(run / CHECKPOINTS) is not None:
             words, what = ["train", "--resume", str(run)], f"resumes {run}"
         elif run is not None and not (run / CHECKPOINTS).exists() and any(run.glob("*.zip")):
@@ -129,6 +155,9 @@ class _Trainings:
             except subprocess.TimeoutExpired:
                 process.kill()
 
+    def close(self) -> None:
+        """Release what the trainings needed."""
+
     def _run_of(self, argv: list[str]) -> Path | None:
         """:return: the newest run that this command started, if there is one"""
         found = []
@@ -137,6 +166,73 @@ class _Trainings:
                 if json.loads(path.read_text())["argv"] == argv:
                     found.append(path.parent)
         return max(found, key=lambda run: (run / COMMAND_FILE).stat().st_mtime, default=None)
+
+
+class _ClusterTrainings(_Trainings):
+    """
+    Trainings in the processes of a Ray cluster. A training whose process or machine is lost is resumed elsewhere.
+
+    :param address: see ``connect``
+    :param jobs: number of processes of a cluster on this machine
+    """
+
+    def __init__(self, argv: list[str], log_folder: Path, every: int | None, address: str | None, jobs: int):
+        super().__init__(argv, log_folder, every)
+        self._ray, self._connected = connect(address, jobs)
+        self._start = self._ray.remote(_train_there).options(max_retries=_RETRIES, num_cpus=1)
+        self._references: list[Any] = []
+
+    def train(self, seed: int) -> int:
+        with self._lock:
+            if self._stopped:
+                return 1
+            reference = self._start.remote(os.getcwd(), self.argv, self.log_folder, self.every, seed)
+            self._references.append(reference)
+        output = self.log_folder / f"seed_{seed}.log"
+        print(f"seed {seed}: waits for a process of the cluster; {output}", flush=True)
+        try:
+            status = self._ray.get(reference)
+        except self._ray.exceptions.TaskCancelledError:
+            return 1
+        except self._ray.exceptions.RayError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise ValueError(f"seed {seed}: the training was lost {_RETRIES + 1} times ({reason}).") from error
+        print(f"seed {seed}: {'finished' if status == 0 else f'ended with {status}, see {output}'}", flush=True)
+        return int(status)
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+            for reference in self._references:
+                self._ray.cancel(reference)
+        if self._references:
+            self._ray.wait(self._references, num_returns=len(self._references), timeout=_SECONDS)
+
+    def close(self) -> None:
+        if self._connected:
+            self._ray.shutdown()
+
+
+def _train_there(directory: str, argv: list[str], log_folder: Path, every: int | None, seed: int) -> int:
+    """Train in a process of a cluster, see ``_Trainings.train``."""
+    os.chdir(directory)
+    trainings = _Trainings(argv, log_folder, every)
+    try:
+        return trainings.train(seed)
+    except BaseException:  # cancelled
+        trainings.stop()
+        raise
+
+
+def _wait_until_free(folder: Path) -> None:
+    """Wait for a process whose parent was killed to write its last checkpoint and end."""
+    end = time.monotonic() + _SECONDS
+    while folder.exists() and time.monotonic() < end:
+        try:
+            with locked(folder):
+                return
+        except ValueError:
+            time.sleep(0.1)
 
 
 def _as_exit(number: int, frame: object) -> None:

@@ -35,7 +35,7 @@ from sb3_maddpg.cli.overview import ALGORITHMS, load_environments, overview, pac
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.recipes import LengthOption, check_options
 from sb3_maddpg.cli.safety import no_code_from_files
-from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
+from sb3_maddpg.cli.seeds import ENGINES, parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.utils import suggest
 
@@ -94,7 +94,17 @@ def train(argv: list[str]) -> int:
     if asked.seeds is not None:
         if asked.resume is not None:
             raise ValueError("--resume continues one run; --seeds resumes the runs of its command automatically.")
-        return train_seeds(argv, parse_seeds(asked.seeds), asked.jobs, asked.log_folder, asked.checkpoint_every)
+        return train_seeds(
+            argv,
+            parse_seeds(asked.seeds),
+            asked.jobs,
+            asked.log_folder,
+            asked.checkpoint_every,
+            asked.engine,
+            asked.address,
+        )
+    if asked.engine != "local" or asked.address is not None:
+        raise ValueError("--engine and --address are for --seeds: a single training runs in this process.")
     if asked.resume is None:
         argv += ["--log-folder", asked.log_folder]
     checkpoints: Checkpoints | None = None
@@ -138,6 +148,10 @@ def _resuming(name: str) -> argparse.ArgumentParser:
     group.add_argument(
         "--jobs", type=int, default=os.cpu_count() or 1, help="number of parallel trainings (default %(default)s)"
     )
+    group.add_argument(
+        "--engine", default="local", help=f"{', '.join(ENGINES)}: where the trainings of --seeds run (default local)"
+    )
+    group.add_argument("--address", help="a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
     return parser
 
 

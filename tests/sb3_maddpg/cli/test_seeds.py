@@ -45,7 +45,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen:
     folder.mkdir(exist_ok=True)
     (folder / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
     command = [sys.executable, "-m", "sb3_maddpg", *ARGV, *words]
-    env = {**os.environ, "OMP_NUM_THREADS": "1"}
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
     return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
@@ -100,6 +100,34 @@ def test_killed_and_begun_again_all_seeds_end_as_if_nothing_had_happened(kind, t
     assert set(weights(parts)) == {1, 2, 3}
 
 
+def descendants(pid: int) -> list[int]:
+    found = children(pid)
+    return found + [one for child in found for one in descendants(child)]
+
+
+def trainings_of(process: subprocess.Popen) -> list[int]:
+    """Trainings in processes of Ray."""
+    words = b"-m\0sb3_maddpg\0train\0"
+    return [pid for pid in descendants(process.pid) if words in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+def test_a_cluster_trains_the_same_whatever_dies(tmp_path):
+    pytest.importorskip("ray")
+    alone, there = tmp_path / "alone", tmp_path / "there"
+    expected = start(alone, "--seeds", "1-2", "--jobs", "2")
+    assert expected.wait(timeout=200) == 0, expected.stdout.read()
+    process = start(there, "--seeds", "1-2", "--jobs", "2", "--engine", "ray")
+    wait_for_checkpoints(there, process)
+    training = trainings_of(process)[0]
+    (worker,) = (pid for pid in descendants(process.pid) if training in children(pid))
+    os.kill(worker, signal.SIGKILL)
+    output, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, output
+    assert any("Resuming" in path.read_text() for path in there.glob("logs/seed_*.log"))
+    assert weights(there) == weights(alone)
+
+
 def test_a_training_that_fails_is_told(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "batch_size": -1}}))
@@ -115,6 +143,9 @@ def test_a_training_that_fails_is_told(tmp_path, monkeypatch, capsys):
         (["--seeds", "0", "--jobs", "0"], "--jobs 0 must be at least 1"),
         (["--seeds", "x"], "write numbers and ranges"),
         (["--seeds", "0", "--resume"], "--resume continues one run"),
+        (["--seeds", "0", "--engine", "rai"], "did you mean 'ray'?"),
+        (["--seeds", "0", "--address", "auto"], "--address auto is for --engine ray only"),
+        (["--engine", "ray"], "--engine and --address are for --seeds"),
     ],
 )
 def test_what_does_not_go_together_is_refused(words, message, tmp_path, monkeypatch, capsys):

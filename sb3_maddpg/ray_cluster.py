@@ -1,0 +1,36 @@
+"""Connection to a Ray cluster (https://docs.ray.io), an optional dependency."""
+
+import os
+from logging import WARNING
+from typing import Any
+
+from sb3_maddpg.utils import shown
+
+
+def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
+    """
+    Connect this process to a Ray cluster, unless it is connected already.
+
+    :param address: address of a running cluster, ``auto`` or ``HOST:PORT``; None starts a cluster on this machine
+    :param cpus: number of processes of a cluster that is started here
+    :return: the module ``ray``, and whether this call has connected; the caller then calls ``ray.shutdown`` at the end
+    :raises ValueError: if Ray is not installed, or there is no such cluster
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise ValueError(f'Ray is not installed ({error}): pip install "sb3-maddpg[ray]".') from error
+    if ray.is_initialized():
+        return ray, False
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked
+    try:
+        ray.init(
+            address=address,
+            num_cpus=None if address else cpus,
+            include_dashboard=None if address else False,
+            log_to_driver=False,
+            logging_level=WARNING,
+        )
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
+    return ray, True
