@@ -2,8 +2,9 @@
 
 Trains four robots with flat observations, and fourteen with the recipe ``quad_swarm_flight.yml``. Checkpoints are
 written by time, as in ``sb3-maddpg train``, or every 10,000 steps, and synced to disk. ``--whole`` trains the recipe to
-its end instead. JSON: one row per training with recipe, every, steps, seconds, checkpoints, share of the time, and
-megabytes on disk at the end.
+its end instead. JSON: one row per training with recipe, every, whole, steps, seconds, checkpoints, megabytes on disk at
+the end, and share: the time for which the training stood still and the processor time of the threads that write, as a
+fraction of the whole time.
 """
 
 from __future__ import annotations
@@ -48,19 +49,14 @@ def arguments_of(recipe: str) -> tuple[dict[str, Any], dict[str, Any], int]:
     return env, arguments, steps
 
 
-class Stopwatch(RunCheckpoint):
-    """Checkpoint callback that measures the time of its checkpoints."""
+class Counting(RunCheckpoint):
+    """Checkpoint callback that counts its checkpoints."""
 
-    taken = 0.0
     count = 0
 
-    def save(self) -> Path | None:
-        started = time.perf_counter()
-        try:
-            return super().save()
-        finally:
-            self.taken += time.perf_counter() - started
-            self.count += 1
+    def _begin(self) -> None:
+        super()._begin()
+        self.count += 1
 
 
 class EndAfter(BaseCallback):
@@ -83,7 +79,7 @@ def measure(recipe: str, every: int | None, seconds: float) -> dict[str, Any]:
     env = VecMonitor(GymnasiumVecEnv(gymnasium.make_vec("QuadSwarm-v0", **env_kwargs)))
     model = MADDPG(env=env, seed=0, **arguments)
     with tempfile.TemporaryDirectory(dir=".") as folder:
-        checkpoint, end = Stopwatch(folder, every), EndAfter(seconds)
+        checkpoint, end = Counting(folder, every), EndAfter(seconds)
         model.learn(steps, [checkpoint, end])
         elapsed = time.perf_counter() - end.started
         size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
@@ -94,7 +90,7 @@ def measure(recipe: str, every: int | None, seconds: float) -> dict[str, Any]:
         "steps": model.num_timesteps,
         "seconds": elapsed,
         "checkpoints": checkpoint.count,
-        "share": checkpoint.taken / elapsed,
+        "share": checkpoint.cost / elapsed,
         "megabytes": size / 1e6,
     }
 

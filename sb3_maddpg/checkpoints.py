@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
 import math
 import os
@@ -57,21 +58,24 @@ fault: Callable[[str], None] = lambda point: None  # noqa: E731
 _BLOCK = 2**25  # bytes of a replay buffer to write at once
 # Minimum time between checkpoints (s), and maximum fraction of the time that they may take
 _SECONDS, _SHARE = 30.0, 0.015
-_BYTES_PER_SECOND = 2e8  # assumed before the first checkpoint
+_BYTES_PER_SECOND = 5e8  # of a replay buffer, assumed before the first checkpoint
 _LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 _LOGGED = ("name_to_value", "name_to_count", "name_to_excluded")
 
 
 class RunCheckpoint(BaseCallback):
     """
-    Callback that writes checkpoints between rollouts during training. ``resume`` continues from the newest one.
+    Callback that takes checkpoints between rollouts during training. ``resume`` continues from the newest one.
+
+    A thread writes the replay buffer and syncs all files to disk while the training continues. The state is that of
+    the moment at which the checkpoint was taken. An error in the thread is raised at the beginning of a later rollout.
 
     On SIGTERM and SIGHUP, which clusters and closed terminals send to end a process, the callback writes another
     checkpoint and then ends the process with that signal. A second signal ends the process at once.
 
     :param folder: folder for the checkpoints of this run only
-    :param every: number of steps between checkpoints; None to write one every half minute, or less often if all
-        checkpoints together would take more than 1.5 % of the time
+    :param every: number of steps between checkpoints; None to take one every half minute, or less often if all
+        checkpoints together would cost more than 1.5 % of the time
     :param keep: number of most recent checkpoints to keep
     :param verbose: 1 to print what is written
     :raises ValueError: if ``every`` or ``keep`` is less than 1
@@ -83,9 +87,11 @@ class RunCheckpoint(BaseCallback):
             raise ValueError(f"every={every}, keep={keep}: both must be at least 1.")
         self.folder, self.every, self.keep = Path(folder), every, keep
         self.saved_at = 0
+        # Seconds that checkpoints have cost: time of the training, and processor time of the writing threads
+        self.cost = 0.0
         self._started = self._ended = time.monotonic()  # of training, and of the last checkpoint
-        self._taken = 0.0
         self._bytes_per_second = _BYTES_PER_SECOND
+        self._writer: _Writer | None = None
         self._signal: int | None = None
         self._handlers: dict[int, Any] = {}
         self.inexact: str | None = None
@@ -109,7 +115,7 @@ class RunCheckpoint(BaseCallback):
         else:
             self.saved_at = self.model.num_timesteps
         self._started = self._ended = time.monotonic()
-        self._taken = 0.0
+        self.cost = 0.0
 
         if threading.current_thread() is threading.main_thread():
             for name in ("SIGTERM", "SIGHUP"):
@@ -117,8 +123,11 @@ class RunCheckpoint(BaseCallback):
                     self._handlers[number] = signal.signal(number, self._on_signal)
 
     def _on_training_end(self) -> None:
-        while self._handlers:
-            signal.signal(*self._handlers.popitem())
+        try:
+            self._finish()
+        finally:
+            while self._handlers:
+                signal.signal(*self._handlers.popitem())
 
     def _on_signal(self, number: int, frame: Any) -> None:
         if self._signal is not None:
@@ -130,19 +139,30 @@ class RunCheckpoint(BaseCallback):
             self.save()
             print(f"Ended by {signal.Signals(self._signal).name} at step {self.model.num_timesteps}.", flush=True)
             _end_by(self._signal)
+        if self._writer is not None and not self._writer.is_alive():
+            self._finish()
         steps = self.model.num_timesteps - self.saved_at
         if steps >= self.every if self.every is not None else steps > 0 and self._is_time():
-            self.save()
+            self._begin()
 
     def _on_step(self) -> bool:
+        if self._writer is not None:
+            buffer = cast(MADDPG, self.model).replay_buffer
+            assert isinstance(buffer, TeamReplayBuffer)
+            # The transition of this step overwrites the oldest row, and without next_observations part of the next one
+            overwritten = buffer.n_added - buffer.buffer_size + int(buffer.optimize_memory_usage)
+            if not self._writer.has_copied(overwritten):
+                started = time.monotonic()
+                self._writer.wait_for(overwritten)
+                self.cost += time.monotonic() - started
         return True
 
     def _is_time(self) -> bool:
         now = time.monotonic()
-        if now - self._ended < _SECONDS:
+        if self._writer is not None or now - self._ended < _SECONDS:
             return False
         expected = self._bytes_to_write() / self._bytes_per_second
-        return self._taken + expected <= _SHARE * (now - self._started + expected)
+        return self.cost + expected <= _SHARE * (now - self._started + expected)
 
     def _bytes_to_write(self) -> int:
         buffer = cast(MADDPG, self.model).replay_buffer
@@ -156,34 +176,53 @@ class RunCheckpoint(BaseCallback):
 
         :return: folder of the checkpoint, None if the disk is full; the previous checkpoint stays then
         """
+        self._begin()
+        return self._finish()
+
+    def _begin(self) -> None:
+        """Take a checkpoint, which a thread then writes."""
+        self._finish()
         model = cast(MADDPG, self.model)
-        steps = model.num_timesteps
-        self.saved_at = steps
-        started, size = time.monotonic(), self._bytes_to_write()
-        try:
-            segments = self._write_segments(model)
-            state = _state_of(model, _callbacks(self._root()))
-            self.inexact = state["inexact"]
-            target = _commit(self.folder / f"{_PREFIX}{steps:012d}", lambda path: _write(path, model, state, segments))
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            warnings.warn(
-                f"No space left for a checkpoint at step {steps}: the previous one stays ({error}).", stacklevel=2
-            )
-            for path in self.folder.glob(f"*{_UNFINISHED}"):
-                shutil.rmtree(path, ignore_errors=True)
+        buffer = model.replay_buffer
+        assert isinstance(buffer, TeamReplayBuffer)
+        started = time.monotonic()
+        self.saved_at = model.num_timesteps
+        kept, (first, end) = self._kept_segments(buffer), self._new_rows(buffer)
+        state = _state_of(model, _callbacks(self._root()))
+        self.inexact = state["inexact"]
+        self._writer = _Writer(self.folder, model, _Segment(buffer, first, end), kept, state, self.keep)
+        self._writer.start()
+        self.cost += time.monotonic() - started
+
+    def _finish(self) -> Path | None:
+        """
+        Wait for the thread that writes a checkpoint.
+
+        :return: folder of the checkpoint, None if there is no thread or the disk is full
+        """
+        if self._writer is None:
             return None
-        finally:
-            self._ended = time.monotonic()
-            taken = self._ended - started
-            self._taken += taken
-            self._bytes_per_second = max(size, 1) / max(taken, 1e-6)
-        self._segments = segments
-        self._tidy()
-        if self.verbose:
-            print(f"Checkpoint at step {steps} in {taken:.2f} s: {target}")
-        return target
+        started = time.monotonic()
+        self._writer.join()
+        self._ended = time.monotonic()
+        writer, self._writer = self._writer, None
+        self.cost += self._ended - started + writer.processor_time
+        if writer.processor_time > 0.0:
+            self._bytes_per_second = max(writer.segment.size, 1) / writer.processor_time
+        error = writer.error
+        if error is None:
+            self._segments = writer.segments
+            if self.verbose:
+                print(f"Checkpoint at step {writer.steps}: {writer.target}")
+            return writer.target
+        if not isinstance(error, OSError) or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise error
+        warnings.warn(
+            f"No space left for a checkpoint at step {writer.steps}: the previous one stays ({error}).", stacklevel=2
+        )
+        for path in self.folder.glob(f"*{_UNFINISHED}"):
+            shutil.rmtree(path, ignore_errors=True)
+        return None
 
     def _root(self) -> BaseCallback:
         root: BaseCallback = self
@@ -205,29 +244,119 @@ class RunCheckpoint(BaseCallback):
         oldest, kept = buffer.n_added - buffer.size(), self._kept_segments(buffer)
         return max(kept[-1]["end"] - 1 if kept else oldest, oldest), buffer.n_added
 
-    def _write_segments(self, model: MADDPG) -> list[dict[str, Any]]:
-        """
-        Write the new rows of the replay buffer.
 
-        :return: the segments that hold the buffer, oldest first
-        """
-        buffer = model.replay_buffer
-        assert isinstance(buffer, TeamReplayBuffer)
-        kept, (first, end) = self._kept_segments(buffer), self._new_rows(buffer)
-        name = f"{first:012d}-{end:012d}.rows"
-        path = self.folder / _SEGMENTS / name
+class _Segment:
+    """
+    Rows of a replay buffer at the moment of construction. They may be read later, while the buffer is used, as long as
+    nothing overwrites them: those that the next transition changes are copied at once.
+
+    :param buffer: the replay buffer
+    :param first: first row, counted since the buffer was empty
+    :param end: row after the last one
+    """
+
+    def __init__(self, buffer: TeamReplayBuffer, first: int, end: int):
+        self.buffer, self.first, self.end = buffer, first, end
+        self.blocks = _blocks(buffer, first, end)
+        self._last = list(_stored_block(buffer, self.blocks[-1], end))
+
+    @property
+    def name(self) -> str:
+        return f"{self.first:012d}-{self.end:012d}.rows"
+
+    @property
+    def size(self) -> int:
+        """Approximate number of bytes"""
+        return (self.end - self.first) * self.buffer.n_envs * _stored(self.buffer).itemsize
+
+    def content(self) -> Iterator[tuple[int, list[bytes]]]:
+        """Yield for each block the row after it and its content."""
+        for rows in self.blocks[:-1]:
+            yield rows[-1] + 1, list(_stored_block(self.buffer, rows, self.end))
+        yield self.end + 1, self._last
+
+
+class _Writer(threading.Thread):
+    """
+    Thread that writes a checkpoint.
+
+    :param folder: folder of the checkpoints
+    :param model: the model, which is read at once
+    :param segment: new rows of its replay buffer
+    :param kept: segments written before that still belong to the buffer
+    :param state: everything else
+    :param keep: number of most recent checkpoints to keep
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        model: MADDPG,
+        segment: _Segment,
+        kept: list[dict[str, Any]],
+        state: dict[str, Any],
+        keep: int,
+    ):
+        super().__init__(name="checkpoint")
+        self.folder, self.segment, self.keep = folder, segment, keep
+        self.steps = model.num_timesteps
+        self.segments = list(kept)
+        self.target = folder / f"{_PREFIX}{self.steps:012d}"
+        self.processor_time = 0.0
+        self.error: BaseException | None = None
+        self._copied = segment.first  # rows before this one may be overwritten
+        self._progress = threading.Condition()
+        file = io.BytesIO()
+        model.save(file)
+        arrays: dict[str, np.ndarray] = {}
+        self._state = cast("dict[str, Any]", encode(state, "state", arrays))
+        self._files = {"model.zip": file.getvalue(), "arrays.npz": _npz(arrays)}
+
+    def has_copied(self, row: int) -> bool:
+        """:return: whether a row may be overwritten"""
+        return row < self._copied or not self.is_alive()
+
+    def wait_for(self, row: int) -> None:
+        """Wait until a row may be overwritten."""
+        with self._progress:
+            self._progress.wait_for(lambda: self.has_copied(row))
+
+    def run(self) -> None:
+        try:
+            self._write_segment()
+            _commit(self.target, self._write)
+            self._tidy()
+        except BaseException as error:  # raised in the training's thread
+            self.error = error
+        finally:
+            with self._progress:
+                self._copied = self.segment.end + 1
+                self._progress.notify_all()
+            self.processor_time = time.thread_time()
+
+    def _write_segment(self) -> None:
+        path = self.folder / _SEGMENTS / self.segment.name
         path.parent.mkdir(parents=True, exist_ok=True)
         found = hashlib.sha256()
         with path.open("wb") as file:
             fault("opened rows")
-            for rows in _blocks(buffer, first, end):
-                for part in _stored_block(buffer, rows, end):
+            for end, parts in self.segment.content():
+                with self._progress:
+                    self._copied = end
+                    self._progress.notify_all()
+                for part in parts:
                     found.update(part)
                     file.write(part)
             file.flush()
             os.fsync(file.fileno())
         sync_folder(path.parent)
-        return [*kept, {"name": name, "first": first, "end": end, "sha256": found.hexdigest()}]
+        rows = {"first": self.segment.first, "end": self.segment.end}
+        self.segments.append({"name": self.segment.name, **rows, "sha256": found.hexdigest()})
+
+    def _write(self, path: Path) -> None:
+        state = {**self._state, "segments": encode(self.segments, "segments")}
+        for name, content in {**self._files, "state.json": json.dumps(state).encode()}.items():
+            (path / name).write_bytes(content)
 
     def _tidy(self) -> None:
         """Remove old checkpoints, and segments that no remaining checkpoint needs."""
@@ -488,10 +617,14 @@ def _stored(buffer: TeamReplayBuffer) -> np.dtype:
 
 
 def _blocks(buffer: TeamReplayBuffer, first: int, end: int) -> list[np.ndarray]:
-    """:return: the rows of a segment, counted since the buffer was empty, in blocks of about `_BLOCK` bytes"""
-    rows = np.arange(first, end + int(buffer.optimize_memory_usage))
+    """
+    :return: the rows of a segment, counted since the buffer was empty, in blocks of about `_BLOCK` bytes; the last
+        block has the rows that the next transition changes
+    """
     rows_at_once = max(_BLOCK // buffer.records[0].nbytes, 1)
-    return np.array_split(rows, max(math.ceil(len(rows) / rows_at_once), 1))
+    begins = range(first, end - 1, rows_at_once)
+    blocks = [np.arange(begin, min(begin + rows_at_once, end - 1)) for begin in begins]
+    return [*blocks, np.arange(max(end - 1, first), end + int(buffer.optimize_memory_usage))]
 
 
 def _stored_block(buffer: TeamReplayBuffer, rows: np.ndarray, end: int) -> Iterator[bytes]:
@@ -544,16 +677,13 @@ def _read_segments(
             buffer.next_observations[place, env] = buffer.observations[(place + 1) % size, env]
 
 
-def _write(path: Path, model: MADDPG, state: dict[str, Any], segments: list[dict[str, Any]]) -> None:
-    with (path / "model.zip").open("wb") as file:
-        model.save(file)
-    arrays: dict[str, np.ndarray] = {}
-    text = json.dumps(encode({**state, "segments": segments}, "state", arrays))
-    (path / "state.json").write_text(text)
-    with zipfile.ZipFile(path / "arrays.npz", "w") as archive:
+def _npz(arrays: dict[str, np.ndarray]) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
+    return file.getvalue()
 
 
 def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import time
 from pathlib import Path
 
 import gymnasium
@@ -188,6 +189,27 @@ def test_only_new_transitions_are_written(tmp_path):
     assert len(list((tmp_path / "ring" / "segments").iterdir())) <= 4, "what the ring has overwritten is removed"
 
 
+@pytest.mark.parametrize("name", ["swarms", "memory", "replayed"])
+def test_a_slow_disk_does_not_change_a_checkpoint(name, tmp_path, monkeypatch):
+    """The training overwrites all rows of the buffer while the thread writes."""
+    expected = digest(make(name, buffer_size=100).learn(STEPS))
+    monkeypatch.setattr(checkpoints, "_BLOCK", 1000)
+    waited = []
+    blocks, wait = checkpoints._stored_block, checkpoints._Writer.wait_for
+
+    def slowly(*args):
+        time.sleep(0.002)
+        return blocks(*args)
+
+    monkeypatch.setattr(checkpoints, "_stored_block", slowly)
+    monkeypatch.setattr(checkpoints._Writer, "wait_for", lambda self, row: waited.append(row) or wait(self, row))
+    kill_at(monkeypatch, "committed", 3)
+    with pytest.raises(Killed):
+        make(name, buffer_size=100).learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
+    assert waited, "the training would have overwritten rows that were not yet written"
+    assert digest(go_on(name, tmp_path)) == expected
+
+
 def test_observations_are_written_once(tmp_path):
     model = make("swarms")
     model.learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
@@ -202,17 +224,17 @@ def test_observations_are_written_once(tmp_path):
 def test_checkpoints_take_no_more_than_their_share(seconds, expected, tmp_path, monkeypatch):
     now = [1000.0]
 
-    def write(target: Path, _) -> Path:
+    def begin() -> None:
         now[0] += seconds
-        return target
+        checkpoint.cost += seconds
+        checkpoint.saved_at, checkpoint._ended = checkpoint.model.num_timesteps, now[0]
 
     monkeypatch.setattr(checkpoints.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(checkpoints, "_commit", write)
     checkpoint = RunCheckpoint(tmp_path)
     checkpoint.init_callback(make("replayed").learn(1))
     checkpoint.on_training_start({}, {})
-    monkeypatch.setattr(checkpoint, "_bytes_to_write", lambda: int(seconds * 2e8))
-    monkeypatch.setattr(checkpoint, "_write_segments", lambda model: [])
+    monkeypatch.setattr(checkpoint, "_bytes_to_write", lambda: int(seconds * checkpoints._BYTES_PER_SECOND))
+    monkeypatch.setattr(checkpoint, "_begin", begin)
     steps = []
     while now[0] < 3000.0:
         checkpoint.model.num_timesteps += 1
@@ -220,7 +242,7 @@ def test_checkpoints_take_no_more_than_their_share(seconds, expected, tmp_path, 
         checkpoint.on_rollout_start()
         if checkpoint.saved_at == checkpoint.model.num_timesteps:
             steps.append(checkpoint.saved_at)
-            assert len(steps) * seconds <= 0.02 * (now[0] - 1000.0)
+            assert checkpoint.cost <= 0.02 * (now[0] - 1000.0)
     assert len(steps) == expected
 
 

@@ -1,0 +1,32 @@
+"""Connections to Ray."""
+
+import sys
+
+import pytest
+
+from sb3_maddpg.ray_cluster import connect
+from sb3_maddpg.ray_vec_env import RayVecEnv
+from sb3_maddpg.team_tasks import OwnBit
+
+
+def test_without_ray_the_message_says_how_to_install_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match=r'Ray is not installed .*pip install "sb3-maddpg\[ray\]"'):
+        RayVecEnv([OwnBit])
+
+
+def test_an_address_where_nobody_answers():
+    pytest.importorskip("ray")
+    with pytest.raises(ValueError, match=r"address='127.0.0.1:1': no Ray cluster responds there"):
+        connect("127.0.0.1:1", 1)
+
+
+def test_only_the_first_call_connects():
+    pytest.importorskip("ray")
+    ray, connected = connect(None, 1)
+    try:
+        assert connected
+        assert ray.cluster_resources()["CPU"] == 1
+        assert connect(None, 2) == (ray, False)
+    finally:
+        ray.shutdown()
