@@ -347,6 +347,7 @@ class _Writer(threading.Thread):
                 for part in parts:
                     found.update(part)
                     file.write(part)
+            fault("written rows")
             file.flush()
             os.fsync(file.fileno())
         sync_folder(path.parent)

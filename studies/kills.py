@@ -35,6 +35,7 @@ from sb3_maddpg.vec_env import GymnasiumVecEnv
 SWARMS, EVERY = 8, 400
 POINTS = (
     "opened rows",
+    "written rows",
     "begin",
     *(f"{done} {name}" for name in ("arrays.npz", "model.zip", "state.json") for done in ("written", "synced")),
     "opened manifest",

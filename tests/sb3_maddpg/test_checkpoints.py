@@ -123,7 +123,7 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(name, tmp_path, monkeypatch
 
 
 POINTS = [
-    "opened rows", "begin", "written arrays.npz", "synced model.zip", "written state.json", "opened manifest",
+    "opened rows", "written rows", "begin", "written arrays.npz", "synced model.zip", "written state.json", "opened manifest",
     "manifest", "folder synced", "renamed", "committed",
 ]  # fmt: skip
 
