@@ -123,8 +123,8 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(name, tmp_path, monkeypatch
 
 
 POINTS = [
-    "opened rows", "written rows", "begin", "written arrays.npz", "synced model.zip", "written state.json", "opened manifest",
-    "manifest", "folder synced", "renamed", "committed",
+    "opened rows", "written rows", "begin", "written arrays.npz", "synced model.zip", "written state.json",
+    "opened manifest", "manifest", "folder synced", "renamed", "committed",
 ]  # fmt: skip
 
 

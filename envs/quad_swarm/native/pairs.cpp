@@ -25,9 +25,12 @@ inline double distance(const double* a, const double* b) {
 
 inline double clipped(double value) { return std::min(std::max(value, 0.0), 1.0); }
 
+// The order of operations of NumPy's einsum, in which the presets' separations were first computed
+inline double einsum(const double* a, const double* b) { return (a[0] * b[0] + a[2] * b[2]) + a[1] * b[1]; }
+
 inline double squared_distance(const double* a, const double* b) {
   const double difference[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
-  return dot(difference, difference);
+  return einsum(difference, difference);
 }
 
 // Return the smallest squared distance of two robots that move in straight lines between consecutive positions, which
@@ -42,9 +45,9 @@ double closest(const double* a, const double* b, Integer n_parts, Integer stride
       end[i] = a[part * stride + i] - b[part * stride + i];
       change[i] = end[i] - start[i];
     }
-    const double along = clipped(-dot(start, change) / std::max(dot(change, change), 1e-12));
+    const double along = clipped(-einsum(start, change) / std::max(einsum(change, change), 1e-12));
     for (int i = 0; i < 3; i++) point[i] = start[i] + along * change[i];
-    least = std::min(least, dot(point, point));
+    least = std::min(least, einsum(point, point));
     std::copy(end, end + 3, start);
   }
   return least;
@@ -214,28 +217,33 @@ EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_
   }
 }
 
+// Without `others`, the swarms' results lie next to each other.
 EXPORT void quad_swarm_separations(Integer n_parts, Integer n_swarms, Integer n_robots, Integer n_places,
                                    const double* positions, const Integer* others, double* least, double* least_during,
                                    double* apart, double* apart_during) {
   const double infinity = std::numeric_limits<double>::infinity();
   const Integer stride = 3 * n_robots * n_swarms, last = stride * n_parts;
+  std::vector<double> after(n_robots * n_robots, infinity), during(n_robots * n_robots, infinity);
   for (Integer swarm = 0; swarm < n_swarms; swarm++) {
     const double* pos = positions + 3 * n_robots * swarm;
-    double after = infinity, during = infinity;
+    least[swarm] = least_during[swarm] = infinity;
     for (Integer robot = 0; robot < n_robots; robot++) {
       for (Integer other = robot + 1; other < n_robots; other++) {
-        after = std::min(after, squared_distance(pos + last + 3 * robot, pos + last + 3 * other));
-        during = std::min(during, closest(pos + 3 * robot, pos + 3 * other, n_parts, stride));
-      }
-      for (Integer place = 0; place < n_places; place++) {
-        const Integer k = n_places * (n_robots * swarm + robot) + place, other = others[k];
-        apart[k] = other == robot ? infinity
-                                  : std::sqrt(squared_distance(pos + last + 3 * robot, pos + last + 3 * other));
-        apart_during[k] =
-            other == robot ? infinity : std::sqrt(closest(pos + 3 * robot, pos + 3 * other, n_parts, stride));
+        const Integer one = n_robots * robot + other, two = n_robots * other + robot;
+        after[one] = after[two] = std::sqrt(squared_distance(pos + last + 3 * robot, pos + last + 3 * other));
+        during[one] = during[two] = std::sqrt(closest(pos + 3 * robot, pos + 3 * other, n_parts, stride));
+        least[swarm] = std::min(least[swarm], after[one]);
+        least_during[swarm] = std::min(least_during[swarm], during[one]);
       }
     }
-    least[swarm] = std::sqrt(after);
-    least_during[swarm] = std::sqrt(during);
+    for (Integer robot = 0; robot < n_robots; robot++) {
+      for (Integer place = 0; place < n_places; place++) {
+        const Integer pair = n_places * robot + place, pairs = n_places * n_robots;
+        const Integer other = others ? others[pairs * swarm + pair] : place + (place >= robot);
+        const Integer k = others ? pairs * swarm + pair : n_swarms * pair + swarm;
+        apart[k] = after[n_robots * robot + other];
+        apart_during[k] = during[n_robots * robot + other];
+      }
+    }
   }
 }

@@ -228,42 +228,63 @@ def neighbours(
     return others, present, reverse
 
 
-def separations(positions: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def separations(
+    positions: np.ndarray, others: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Compute the distances between robots after a step and the smallest distances during it, with straight motion
     between sub-steps.
 
     :param positions: positions before the step and after each of the S sub-steps, (S + 1, E, n, 3) (m)
-    :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m)
+    :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m); None for
+        all n - 1 others in ascending order
     :return: smallest distance of all pairs after and during the step, (E,) each (m), and distance of each robot to each
         of its ``others`` after and during the step, (E, n, m) each (m), infinity for none
     """
+    n_swarms, n = positions.shape[1:3]
     if (library := compiled()) is not None:
-        positions, others = np.ascontiguousarray(positions), np.ascontiguousarray(others)
-        least, least_during = np.empty(len(others)), np.empty(len(others))
-        apart, apart_during = np.empty(others.shape), np.empty(others.shape)
+        positions = np.ascontiguousarray(positions)
+        others = None if others is None else np.ascontiguousarray(others)
+        shape = (n_swarms, n, n - 1) if others is None else others.shape
+        least, least_during = np.empty(n_swarms), np.empty(n_swarms)
+        apart, apart_during = (_swarms_last(shape) if others is None else np.empty(shape) for _ in range(2))
         library.quad_swarm_separations(
             len(positions) - 1,
-            *others.shape,
-            *_addresses(positions, others, least, least_during, apart, apart_during),
+            *shape,
+            positions.ctypes.data,
+            None if others is None else others.ctypes.data,
+            *_addresses(least, least_during, apart, apart_during),
         )
         return least, least_during, apart, apart_during
     between = positions[:, :, :, None] - positions[:, :, None]
     start, change = between[:-1], np.diff(between, axis=0)
-    along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
+    along = -_einsum(start, change) / np.maximum(_einsum(change, change), 1e-12)
     closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
-    after, during = np.sqrt(_dot(between[-1], between[-1])), np.sqrt(_dot(closest, closest).min(axis=0))
-    own = np.arange(positions.shape[2])
+    after, during = np.sqrt(_einsum(between[-1], between[-1])), np.sqrt(_einsum(closest, closest).min(axis=0))
+    own = np.arange(n)
     after[:, own, own] = during[:, own, own] = np.inf
-    return (
-        after.min(axis=(1, 2)),
-        during.min(axis=(1, 2)),
-        np.take_along_axis(after, others, axis=2),
-        np.take_along_axis(during, others, axis=2),
-    )
+    if others is None:
+        apart, apart_during = _swarms_last((n_swarms, n, n - 1)), _swarms_last((n_swarms, n, n - 1))
+        apart[...] = after[:, ~np.eye(n, dtype=bool)].reshape(apart.shape)
+        apart_during[...] = during[:, ~np.eye(n, dtype=bool)].reshape(apart.shape)
+    else:
+        apart, apart_during = (np.take_along_axis(one, others, axis=2) for one in (after, during))
+    return after.min(axis=(1, 2)), during.min(axis=(1, 2)), apart, apart_during
+
+
+def _swarms_last(shape: tuple[int, ...]) -> np.ndarray:
+    """Return an empty array (E, n, n - 1) in which the values of a pair in all swarms are adjacent. The layout decides
+    in which order NumPy sums rewards over pairs, and this one keeps them as they have always been."""
+    return np.empty((shape[1] * shape[2], shape[0])).T.reshape(shape)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def _einsum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return dot products in the order of operations of `numpy.einsum`, in which the presets' separations were first
+    computed."""
+    return (a[..., 0] * b[..., 0] + a[..., 2] * b[..., 2]) + a[..., 1] * b[..., 1]
 
 
 def advance(trajectory: np.ndarray) -> np.ndarray:

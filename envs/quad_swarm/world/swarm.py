@@ -353,7 +353,9 @@ class Swarm:
 
     def _report(self, positions: list[np.ndarray], source: np.ndarray, solve_seconds: float) -> StepReport:
         before, pos = positions[0], positions[-1]
-        least, least_continuous, separation, separation_continuous = self._separations(positions)
+        others = self.neighbours.others if self.neighbours.limited else None
+        # Of all pairs, including those that do not perceive each other
+        least, least_continuous, separation, separation_continuous = separations(np.stack(positions), others)
         limit = 2 * self.config.radius - self.config.collision_tolerance
         shape = self.state.shape[:2]
         return StepReport(
@@ -373,30 +375,6 @@ class Swarm:
             plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
-        )
-
-    def _separations(self, positions: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the separations of all pairs, including those that do not perceive each other, see
-        `quad_swarm.native.pairs.separations`."""
-        if self.neighbours.limited:
-            return separations(np.stack(positions), self.neighbours.others)
-        # Another order of operations, which keeps the results of the presets bit-identical
-        i, j = self._pairs
-        apart = [each[:, i] - each[:, j] for each in positions]
-        if len(apart) == 2:
-            start, end = apart[0][None], apart[1][None]
-        else:
-            start, end = np.stack(apart[:-1]), np.stack(apart[1:])
-        # Closest points to the origin on the segments from start to end
-        change = end - start
-        along = -_dot(start, change) / np.maximum(_dot(change, change), 1e-12)
-        closest = start + np.minimum(np.maximum(along, 0.0), 1.0)[..., None] * change
-        separation, separation_continuous = np.sqrt(_dot(end[-1], end[-1])), np.sqrt(_dot(closest, closest).min(axis=0))
-        return (
-            separation.min(axis=-1),
-            separation_continuous.min(axis=-1),
-            separation[:, self._pair_of],
-            separation_continuous[:, self._pair_of],
         )
 
 

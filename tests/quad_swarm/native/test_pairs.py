@@ -66,7 +66,7 @@ def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
         "approach": list(pairs.approach(s.own, s.plan, *belief, DT)),
         "resample": [resampled],
         "neighbours": [array for step in near for array in step],
-        "separations": list(pairs.separations(s.path, near[-1][0])),
+        "separations": [*pairs.separations(s.path, near[-1][0]), *pairs.separations(s.path)],
         "keep_right": list(pairs.keep_right(s.x, others, s.remembers.reshape(others.shape[:2]), 0.3, DT, 1.0, 0.5)),
     }
 
