@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from quad_swarm.native.build import build, load
+from quad_swarm.native.build import addresses, build, load
 
 _MAIN = "rows.cpp"
 _LOOP = """
@@ -65,7 +65,6 @@ class RowFunction:
         for array, length in zip(arrays, self._lengths, strict=True):
             if array is not None and array.size != count * length:
                 raise ValueError(f"{array.size} numbers for {count} rows of {length}.")
-        addresses = (ctypes.c_void_p * len(arrays))(*[None if a is None else a.ctypes.data for a in arrays])
         output = np.empty((count, self._n_out))
-        self._call(count, addresses, output.ctypes.data)
+        self._call(count, (ctypes.c_void_p * len(arrays))(*addresses(*arrays)), *addresses(output))
         return output

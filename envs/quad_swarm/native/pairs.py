@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from quad_swarm.geometry import length
-from quad_swarm.native.build import BuildError, build, load
+from quad_swarm.native.build import BuildError, addresses, build, load
 
 _SOURCE = "pairs.cpp"
 _INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
@@ -63,7 +63,7 @@ def remember(
     later, next_age = np.empty_like(remembered), np.empty_like(age)
     error, remembers = np.empty(age.shape), np.empty(age.shape, dtype=bool)
     library.quad_swarm_remember(
-        age.size, n_stages, memory, *_addresses(pos, remembered, age, later, next_age, error, remembers)
+        age.size, n_stages, memory, *addresses(pos, remembered, age, later, next_age, error, remembers)
     )
     return later, next_age, error, remembers
 
@@ -93,7 +93,7 @@ def believe(
     arrays = [np.ascontiguousarray(array) for array in (pos, vel, remembered, remembers)]
     believed = np.empty((*pos.shape[:-1], len(chosen), 3))
     library.quad_swarm_believe(
-        remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *_addresses(chosen, *arrays, believed)
+        remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *addresses(chosen, *arrays, believed)
     )
     return believed
 
@@ -125,7 +125,7 @@ def approach(
     nearest = np.empty(remembers.shape, dtype=np.int64)
     n_others = remembers.shape[-1]
     n_robots = remembers.size // max(n_others, 1)
-    library.quad_swarm_approach(n_robots, n_others, n_stages, dt, *_addresses(*arrays, least, nearest, last))
+    library.quad_swarm_approach(n_robots, n_others, n_stages, dt, *addresses(*arrays, least, nearest, last))
     return least, nearest, last
 
 
@@ -144,7 +144,7 @@ def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
         return
     n_rows, n_stages = trajectories.shape[2:4]
     later = np.ascontiguousarray(later)
-    library.quad_swarm_resample(later.size, n_rows, n_stages, *_addresses(later, trajectories))
+    library.quad_swarm_resample(later.size, n_rows, n_stages, *addresses(later, trajectories))
 
 
 def keep_right(
@@ -165,9 +165,7 @@ def keep_right(
         others = np.array(others, dtype=float, order="C")
         clearance = np.zeros(others.shape[:-1])
         x, known = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(known)
-        library.quad_swarm_keep_right(
-            *others.shape[:3], width, dt, fade, slow, *_addresses(x, known, others, clearance)
-        )
+        library.quad_swarm_keep_right(*others.shape[:3], width, dt, fade, slow, *addresses(x, known, others, clearance))
         return others, clearance
     velocity = (others[:, :, 1] - others[:, :, 0]) / dt
     pos = others[:, :, 0] - dt * velocity - x[:, None, :3]
@@ -198,7 +196,7 @@ def neighbours(
     if (library := compiled()) is not None:
         others, present = np.array(others, order="C"), np.array(present, order="C")
         pos, vel, reverse = np.ascontiguousarray(pos), np.ascontiguousarray(vel), np.empty_like(others)
-        library.quad_swarm_neighbours(*others.shape, limit, look_ahead, *_addresses(pos, vel, others, present, reverse))
+        library.quad_swarm_neighbours(*others.shape, limit, look_ahead, *addresses(pos, vel, others, present, reverse))
         return others, present, reverse
     n_swarms, n, m = others.shape
     numbers = np.arange(n)
@@ -250,9 +248,7 @@ def separations(
         library.quad_swarm_separations(
             len(positions) - 1,
             *shape,
-            positions.ctypes.data,
-            None if others is None else others.ctypes.data,
-            *_addresses(least, least_during, apart, apart_during),
+            *addresses(positions, others, least, least_during, apart, apart_during),
         )
         return least, least_during, apart, apart_during
     between = positions[:, :, :, None] - positions[:, :, None]
@@ -291,7 +287,3 @@ def advance(trajectory: np.ndarray) -> np.ndarray:
     """Advance trajectories (..., K, 3) by a step; the last segment continues in a straight line."""
     end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
     return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
-
-
-def _addresses(*arrays: np.ndarray) -> list[int]:
-    return [array.ctypes.data for array in arrays]

@@ -56,6 +56,9 @@ class PlanStatus(IntEnum):
     BRAKING = 3
 
 
+_SOLVED, _BRAKING = int(PlanStatus.SOLVED), int(PlanStatus.BRAKING)  # NumPy is slow with enumerations
+
+
 class Plans(NamedTuple):
     """Plans of B robots.
 
@@ -113,7 +116,7 @@ class Planner:
         if self.config.right_of_way:
             problems = keep_right(problems, self.config.right_of_way, self.config.dt)
         x, u, success, iterations = self._solve(problems, x_guess, u_guess)
-        status = np.where(success, PlanStatus.SOLVED, PlanStatus.BRAKING)
+        status = np.where(success, _SOLVED, _BRAKING)
         age = np.zeros(len(status), dtype=np.int64)
 
         failed = np.flatnonzero(~success)

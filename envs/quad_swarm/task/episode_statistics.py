@@ -13,7 +13,7 @@ from quad_swarm.world.messages import REQUEST_BYTES, plan_bytes
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import StepReport
 
-_NO_PLAN = int(BeliefSource.CONSTANT_VELOCITY)
+_NO_PLAN, _SHIFTED = int(BeliefSource.CONSTANT_VELOCITY), int(PlanStatus.SHIFTED)  # NumPy is slow with enumerations
 
 
 def exchange_bytes(config: SwarmConfig) -> int:
@@ -41,6 +41,7 @@ class EpisodeStatistics:
     :ivar plan_ages: sum of the ages of these plans (steps)
     :ivar requests_flown: number of requests in all steps flown
     :ivar path_length: distance flown in the steps counted, mean over the robots (m)
+    :ivar at_goals: whether all robots were at their goals in the last step, not part of the state
     :ivar reached: whether all robots were at their goals at the same time
     :ivar arrived: whether they were so before any collision
     :ivar collided: whether two robots collided, in the sense that ends episodes
@@ -73,6 +74,7 @@ class EpisodeStatistics:
         "solve_seconds": 0.0,
     }
 
+    at_goals: np.ndarray
     steps: np.ndarray
     steps_counted: np.ndarray
     requests: np.ndarray
@@ -94,6 +96,7 @@ class EpisodeStatistics:
 
     def __init__(self, n_swarms: int, config: SwarmConfig):
         self.config = config
+        self.at_goals = np.zeros(n_swarms, dtype=bool)
         for name, value in self._START.items():
             setattr(self, name, np.full(n_swarms, value))
 
@@ -124,26 +127,28 @@ class EpisodeStatistics:
         :param collided: whether two robots collided in the step, in the sense that ends episodes, (E,) bool
         """
         counted = ~(self.reached | self.collided)
+        requests = counted * n_requests
+        used = report.belief_source != _NO_PLAN
         self.steps += 1
         self.steps_counted += counted
-        self.requests += counted * n_requests
-        # `others` has no leading axis of swarms unless the neighbourhood is limited
-        self.possible_requests += counted * (report.others >= 0).sum(axis=(-2, -1))
-        self.peak_requests = np.maximum(self.peak_requests, counted * n_requests)
-        used = report.belief_source.reshape(len(counted), -1) != _NO_PLAN
-        self.plans_used += counted * used.sum(axis=1)
-        self.plan_ages += counted * (used * report.plan_age.reshape(used.shape)).sum(axis=1)
+        self.requests += requests
+        # Only a limited neighbourhood has empty slots
+        possible = used[0].size if report.changed is None else (report.others >= 0).sum(axis=(1, 2))
+        self.possible_requests += counted * possible
+        self.peak_requests = np.maximum(self.peak_requests, requests)
+        self.plans_used += counted * used.sum(axis=(1, 2))
+        self.plan_ages += counted * (used * report.plan_age).sum(axis=(1, 2))
         self.requests_flown += n_requests
         self.path_length += counted * report.moved.mean(axis=1)
         self.collided |= collided
         self.collided_at_steps |= report.collision
         self.collided_continuous |= report.collision_continuous
-        at_goals = report.at_goal.all(axis=1)
-        self.arrived |= at_goals & ~self.collided
-        self.reached |= at_goals
+        self.at_goals = np.all(report.at_goal, axis=1)
+        self.arrived |= self.at_goals & ~self.collided
+        self.reached |= self.at_goals
         self.min_separation = np.minimum(self.min_separation, report.min_separation)
         self.min_separation_continuous = np.minimum(self.min_separation_continuous, report.min_separation_continuous)
-        self.planner_failures += (report.plan_status >= PlanStatus.SHIFTED).sum(axis=1)
+        self.planner_failures += (report.plan_status >= _SHIFTED).sum(axis=1)
         self.solve_seconds += report.solve_seconds / len(self.steps)
 
     @property

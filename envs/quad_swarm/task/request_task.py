@@ -218,6 +218,8 @@ class RequestTask:
         :param bits: actions, (E, n, n - 1, n_bits) bool, see `requests_of`
         """
         bits, neighbours = self.sent(bits), self.swarm.neighbours
+        if bits.shape[-1] == 1:
+            return self.step(bits[..., 0])
         requests = requests_of(bits, neighbours)
         unheard = bits[..., 1:] & (neighbours.reverse < 0)[..., None]
         return self.step(requests, bits.sum(axis=-1), requests.sum(axis=(1, 2)) + unheard.sum(axis=(1, 2, 3)))
@@ -249,7 +251,7 @@ class RequestTask:
             n_requests = requests.sum(axis=(1, 2))
         self.statistics.add(report, n_requests, collided)
         terms = {
-            "goal": self.reward.goal * report.at_goal.all(axis=1),
+            "goal": self.reward.goal * self.statistics.at_goals,
             "collision": -self.reward.collision * collided,
             "requests": -self.reward.request * messages.sum(axis=(1, 2)),
         }
@@ -260,8 +262,10 @@ class RequestTask:
         terminated = collided if self.end_at_collision else np.zeros_like(collided)
         if self.end_at_arrival:
             terminated = terminated | self.statistics.arrived
-        present = np.broadcast_to(report.others >= 0, requests.shape)
-        share = present * (terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1))[..., None]
+        share = terms["goal"][:, None, None] / max(requests.shape[2], 1)
+        if report.changed is not None:  # there may be empty slots
+            present = report.others >= 0
+            share = present * (terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1))[..., None]
         return Outcome(
             reward=sum(terms.values(), start=np.zeros(len(n_requests))),
             pair_rewards=(

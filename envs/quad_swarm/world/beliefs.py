@@ -28,6 +28,9 @@ class BeliefSource(IntEnum):
     REQUESTED = 2
 
 
+_CONSTANT_VELOCITY, _REMEMBERED, _REQUESTED = map(int, BeliefSource)  # NumPy is slow with enumerations
+
+
 @cache
 def other_indices(n_robots: int) -> np.ndarray:
     """Return the indices of each robot's others in ascending order, (n, n - 1), read-only."""
@@ -225,10 +228,9 @@ class Beliefs:
         """
         prediction = self.predict(pos, vel)
         believed = prediction.believed()
-        arriving, received = self.receive(arriving, pos, vel, received, age)
+        arriving, received = self._receive(prediction, arriving, received, age)
         believed[arriving] = received[:, 1:]
-        unasked = np.where(prediction.remembers, BeliefSource.REMEMBERED, BeliefSource.CONSTANT_VELOCITY)
-        return believed, np.where(arriving, BeliefSource.REQUESTED, unasked)
+        return believed, np.where(arriving, _REQUESTED, np.where(prediction.remembers, _REMEMBERED, _CONSTANT_VELOCITY))
 
     def receive(
         self, arriving: np.ndarray, pos: np.ndarray, vel: np.ndarray, received: np.ndarray, age: np.ndarray | int = 1
@@ -243,7 +245,11 @@ class Beliefs:
         :param age: steps since each of these plans was made, (number of answers,), or one number for all
         :return: ``arriving`` and ``received``, without plans that are older than a known one
         """
-        prediction = self.predict(pos, vel)
+        return self._receive(self.predict(pos, vel), arriving, received, age)
+
+    def _receive(
+        self, prediction: Prediction, arriving: np.ndarray, received: np.ndarray, age: np.ndarray | int
+    ) -> tuple[np.ndarray, np.ndarray]:
         if isinstance(age, np.ndarray):
             # An answer may arrive after a newer one
             newer = age <= prediction.age[arriving]

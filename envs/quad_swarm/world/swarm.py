@@ -332,7 +332,7 @@ class Swarm:
             resample(believed, later)
         announced = None
         if self.config.planner.right_of_way:
-            announced = (source != BeliefSource.CONSTANT_VELOCITY).reshape(-1, source.shape[2])
+            announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
         others = believed.reshape(-1, *believed.shape[2:])
         return Problems(x.reshape(-1, 9), self.goal.reshape(-1, 3), others, announced=announced)
 

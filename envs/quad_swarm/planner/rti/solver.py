@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.native.build import build, load
+from quad_swarm.native.build import addresses, build, load
 from quad_swarm.planner.base import Solution
 from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Problems
 from quad_swarm.planner.rti.codegen import generate_model
@@ -95,7 +95,7 @@ class RtiSolver:
         )
         self._kernel(
             count,
-            *[None if array is None else array.ctypes.data for array in (*arguments, *solution)],
+            *addresses(*arguments, *solution),
             self.sqp_iterations,
             self.extra_iterations,
             self.max_iterations,
