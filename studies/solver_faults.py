@@ -1,8 +1,9 @@
 """Make the planner's solver fail and evaluate the swarm.
 
 ``python -m studies.solver_faults [--episodes 1000] [--json F]``. With full communication in `flight`, a fraction of the
-solves fails: the solver reports failure, returns NaN with or without success, or raises for the whole batch. Steps must
-continue, and their results must be finite. JSON: one row for each share and kind, with the keys of `summarise`.
+solves fails: the solver reports failure, returns NaN with or without success, raises for the whole batch, or takes too
+long, so that neither the solve nor the second attempt ends within the step. Steps must continue, and their results must
+be finite. JSON: one row for each share and kind, with the keys of `summarise`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from quad_swarm.planner import Problems, Solution, Solver
 from quad_swarm.world.presets import make_config
 from studies.swarm.protocol import VALIDATION, condition, progress
 
-KINDS = ("reports failure", "NaN and failure", "NaN and success", "raises")
+KINDS = ("reports failure", "NaN and failure", "NaN and success", "raises", "takes too long")
 SHARES = (0.1, 0.5)
 SCENARIOS = ("symmetric_swap", "asymmetric_swap")
 _BATCH = 100
@@ -42,6 +43,7 @@ class FailingSolver:
     def __init__(self, solver: Solver, share: float, kind: str, rng: np.random.Generator):
         self.name = solver.name
         self._solver, self._share, self._kind, self._rng = solver, share, kind, rng
+        self._retries = False  # whether the next call is the second attempt of a step
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """See `Solver`."""
@@ -52,8 +54,11 @@ class FailingSolver:
             return solution
         x, u, success = solution.x.copy(), solution.u.copy(), solution.success.copy()
         fails = self._rng.random(len(success)) < self._share
+        if self._kind == "takes too long":
+            fails |= self._retries
+            self._retries = not self._retries and bool(fails.any() or not success.all())
         success[fails] = self._kind == "NaN and success"
-        if self._kind != "reports failure":
+        if self._kind.startswith("NaN"):
             x[fails, 1:], u[fails, -1] = np.nan, np.inf
         return solution._replace(x=x, u=u, success=success)
 
