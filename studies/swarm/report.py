@@ -310,26 +310,30 @@ def unseen_table(rows: Rows) -> str:
 
 
 def worlds_table(rows: Rows, part: str) -> str:
-    """Format a part of `studies.swarm.flight_world`: contact at any time, with the changes to the worlds."""
-    chosen = [row for row in rows if row["part"] == part]
-    alike = not any(row["changed"] for row in chosen)
-    lines = []
-    for row in chosen:
-        steps = row["steps_to_arrival"]
-        line = [row["preset"]] if alike else [row["preset"], changes(row["changed"])]
-        line += [row["scenario"].replace("_", " "), f"`{row['policy']}`"]
-        line += [rate(row), str(row["collisions_at_steps"]), f"{row['min_separation_quantiles']['0.01']:.2f}"]
-        lines.append([*line, f"{row['arrived']}/{row['episodes']}", "-" if steps is None else f"{steps:.1f}"])
-    head = [
-        "world",
-        *([] if alike else ["changed"]),
-        "scenario",
-        "policy",
-        "collisions, 95 %",
-        "at steps",
-        "closest, 1 % quantile (m)",
-    ]
-    return table([*head, "arrived", "steps"], lines) if lines else "Not flown yet."
+    """Format a part of `studies.swarm.flight_world`: contact at any time, with the changes to the worlds.
+    The columns of the world, the changes and the policy are left out if they are the same in all rows."""
+    columns: dict[str, list[str]] = {}
+    for row in rows:
+        if row["part"] == part:
+            steps = row["steps_to_arrival"]
+            cells = {
+                "world": row["preset"],
+                "changed": changes(row["changed"]),
+                "scenario": row["scenario"].replace("_", " "),
+                "policy": f"`{row['policy']}`",
+                "collisions, 95 %": rate(row),
+                "at steps": str(row["collisions_at_steps"]),
+                "closest, 1 % quantile (m)": f"{row['min_separation_quantiles']['0.01']:.2f}",
+                "arrived": f"{row['arrived']}/{row['episodes']}",
+                "steps": "-" if steps is None else f"{steps:.1f}",
+            }
+            for name, cell in cells.items():
+                columns.setdefault(name, []).append(cell)
+    for name in ("world", "changed", "policy"):
+        if len(set(columns.get(name, []))) == 1:
+            del columns[name]
+    lines = [list(line) for line in zip(*columns.values(), strict=True)]
+    return table(list(columns), lines) if lines else "Not flown yet."
 
 
 def plants_table(rows: Rows) -> str:

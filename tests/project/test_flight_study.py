@@ -154,15 +154,14 @@ def test_full_communication_is_flown_once(flown, tmp_path):
 
 
 def test_conditions_fill_their_tables(tmp_path: Path):
-    jobs = [
-        next(flight_world.jobs("world")),
-        *(list(flight_world.jobs(part))[-1] for part in ("delays", "delay_check")),
-    ]
-    rows = [flight_world.fly(job, 3) for job in jobs]
-    assert "delay check" in report.worlds_table(rows, "delay_check")
-    table = report.worlds_table(rows, "delays")
-    assert "radio.delay=3, radio.jitter=0, planner.right_of_way=0.3" in table
-    assert "3/3" in table
+    parts = {part: list(flight_world.jobs(part)) for part in ("world", "delays", "delay_check")}
+    rows = [flight_world.fly(job, 3) for jobs in parts.values() for job in (jobs[0], jobs[-1])]
+    assert report.worlds_table(rows, "world").startswith("| world | scenario | policy | collisions")
+    for part in ("delays", "delay_check"):
+        table = report.worlds_table(rows, part)
+        assert table.startswith("| changed | scenario | collisions"), "all fly alike, in the same preset"
+        assert "radio.delay=3, radio.jitter=0, planner.right_of_way=0.3" in table
+        assert "3/3" in table
     assert report.worlds_table(rows, "plants") == "Not flown yet."
 
 
