@@ -1,9 +1,10 @@
 """Kill the workers of evaluations and searches, or the commands themselves, and compare the results.
 
-``python -m studies.killed_workers [--what evaluation search] [--kills 20] [--json F]``. At random times, an evaluation
-with two processes loses one of them, or is killed as a whole and restarted. Its table must equal that of an undisturbed
-evaluation. The two workers of a hyperparameter search are killed and restarted. No trial may be lost, and the search
-must end with the requested number of finished trials. JSON: one row for each of the two.
+``python -m studies.killed_workers [--what evaluation cluster search] [--kills 20] [--json F]``. At random times, an
+evaluation with two processes loses one of them, or is killed as a whole and restarted. Its table must equal that of an
+undisturbed evaluation. The same happens to an evaluation in processes of Ray. The two workers of a hyperparameter
+search are killed and restarted. No trial may be lost, and the search must end with the requested number of finished
+trials. JSON: one row for each of the three.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,22 +37,29 @@ SEARCH += ["--n-eval-envs", "1", "--max-total-trials", str(TRIALS), "--storage",
 
 def start(words: list[str], folder: Path) -> subprocess.Popen[bytes]:
     """Start a command of sb3-maddpg in a folder that also holds its cache of pieces."""
-    env = {**os.environ, "OMP_NUM_THREADS": "1", "QUAD_SWARM_CACHE": str(folder / "cache")}
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
+    env["QUAD_SWARM_CACHE"] = str(folder / "cache")
     command = [sys.executable, "-m", "sb3_maddpg", *words]
     return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def children(process: int) -> list[int]:
-    """Return the ids of a process's workers."""
-    found = []
+def workers_of(process: int, engine: str) -> list[int]:
+    """Return the ids of the processes that fly for an evaluation."""
+    parents: dict[int, list[tuple[int, str]]] = {}
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
             parent = int(status.read_text().rpartition(")")[2].split()[1])
             command = (status.parent / "cmdline").read_text()
         except OSError:
             continue
-        if parent == process and "spawn_main" in command:
-            found.append(int(status.parent.name))
+        parents.setdefault(parent, []).append((int(status.parent.name), command))
+    if engine == "local":
+        return [child for child, command in parents.get(process, []) if "spawn_main" in command]
+    found, below = [], [process]
+    while below:
+        for child, command in parents.get(below.pop(), []):
+            below.append(child)
+            found += [child] if command.startswith("ray::") else []
     return found
 
 
@@ -81,9 +90,9 @@ def untimed(path: Path) -> list[dict[str, Any]]:
     return [{key: value for key, value in row.items() if key != "solve_us"} for row in read_rows(path)]
 
 
-def evaluation(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
+def evaluation(folder: Path, count: int, rng: random.Random, engine: str = "local") -> dict[str, Any]:
     """Kill workers of an evaluation, and every fourth time the evaluation itself."""
-    words = [*EVALUATE, "--json", str(folder / "table.json")]
+    words = [*EVALUATE, "--engine", engine, "--json", str(folder / "table.json")]
     start([*EVALUATE, "--json", str(folder / "alone.json")], folder).wait()
     orphans = commands = workers = 0
     process = start(words, folder)
@@ -92,7 +101,7 @@ def evaluation(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
         if process.poll() is not None:  # it finished before enough kills
             process = start(words, folder)
             continue
-        found = children(process.pid)
+        found = workers_of(process.pid, engine)
         if not found:
             continue
         if (workers + commands) % 4 == 3:
@@ -105,7 +114,7 @@ def evaluation(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
             workers += kill(rng.choice(found))
     code = process.wait()
     same = code == 0 and untimed(folder / "table.json") == untimed(folder / "alone.json")
-    row = {"what": "evaluation", "workers_killed": workers, "commands_killed": commands, "orphans": orphans}
+    row = {"what": f"evaluation, {engine}", "workers_killed": workers, "commands_killed": commands, "orphans": orphans}
     return row | {"same": same, "pieces_left": len(list((folder / "cache" / "pieces").glob("*")))}
 
 
@@ -132,16 +141,14 @@ def search(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
     return {"what": "search", "workers_killed": killed, "trials": TRIALS, **counts, "same": same}
 
 
-TRIED = {"evaluation": evaluation, "search": search}
+TRIED = {"evaluation": evaluation, "cluster": partial(evaluation, engine="ray"), "search": search}
 
 
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--what", nargs="+", choices=TRIED, default=list(TRIED), help="default: both")
-    parser.add_argument(
-        "--kills", type=int, default=20, help="number of kills in each of the two (default %(default)s)"
-    )
+    parser.add_argument("--what", nargs="+", choices=TRIED, default=list(TRIED), help="default: all")
+    parser.add_argument("--kills", type=int, default=20, help="number of kills in each of them (default %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     rows = []
