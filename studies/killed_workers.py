@@ -59,7 +59,7 @@ def workers_of(process: int, engine: str) -> list[int]:
     while below:
         for child, command in parents.get(below.pop(), []):
             below.append(child)
-            found += [child] if command.startswith("ray::") else []
+            found += [child] if command.startswith("ray::_run") else []  # not its agents
     return found
 
 
