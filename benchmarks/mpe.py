@@ -274,7 +274,7 @@ def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> Non
     steps = np.array(seeds[0]["timesteps"]) / 1000
     curves = np.array([row["mean_return"] for row in seeds])
     middle, half = curves.mean(axis=0), np.array([interval(values.tolist()) for values in curves.T])
-    style = ("-", "--", "-.", (0, (1, 1)))[index % 4]
+    style = ("-", "--", "-.", (0, (1, 1)), (0, (7, 2, 1, 2, 1, 2)))[index % 5]
     axes.plot(steps, middle, linestyle=style, color=colour_of(index), label=f"{label}, {len(seeds)} seeds")
     axes.fill_between(steps, middle - half, middle + half, color=colour_of(index), alpha=0.15, linewidth=0)
 
