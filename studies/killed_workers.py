@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -141,7 +142,11 @@ def search(folder: Path, count: int, rng: random.Random) -> dict[str, Any]:
     return {"what": "search", "workers_killed": killed, "trials": TRIALS, **counts, "same": same}
 
 
-TRIED = {"evaluation": evaluation, "cluster": partial(evaluation, engine="ray"), "search": search}
+TRIED: dict[str, Callable[[Path, int, random.Random], dict[str, Any]]] = {
+    "evaluation": evaluation,
+    "cluster": partial(evaluation, engine="ray"),
+    "search": search,
+}
 
 
 def main() -> None:

@@ -73,7 +73,8 @@ def flown(monkeypatch):
     return flown
 
 
-FULL: tune_flight.Flown = {cell: [{"collided": False}] * tune_flight.STAGES[-1] for cell in tune_flight.CELLS}
+CELLS = tune_flight.AIMS[12].cells
+FULL: tune_flight.Flown = {cell: [{"collided": False}] * tune_flight.STAGES[-1] for cell in CELLS}
 
 
 def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
@@ -86,12 +87,11 @@ def test_a_rule_has_to_be_safe_in_every_scenario_and_team(flown):
     swaps = itertools.product((4, 8, 12), ("symmetric_swap", "asymmetric_swap"))
     assert {one[1] for one in flown if one[0] == "good"} == {*swaps, *((8, name) for name in NAMES)}
     hardest, other = (
-        {one[3] for one in flown if one[0] == "bad" and (one[1] == tune_flight.CELLS[0]) == same}
-        for same in (True, False)
+        {one[3] for one in flown if one[0] == "bad" and (one[1] == CELLS[0]) == same} for same in (True, False)
     )
     assert max(hardest) == tune_flight.FIRST
     assert max(other) == tune_flight.STAGES[0], "what cannot turn out to be safe is not flown on"
-    assert tune_flight.CELLS[0] == (12, "symmetric_swap")
+    assert CELLS[0] == (12, "symmetric_swap")
 
 
 def test_what_collides_where_others_do_is_not_flown_on(flown, monkeypatch):
@@ -147,7 +147,7 @@ def test_full_communication_is_flown_once(flown, tmp_path):
     stages = (5, 10)
     full = tune_flight.fly_full(Inline(), tmp_path / "t.json", stages)
     assert {len(rows) for rows in full.values()} == {10}
-    assert {one[1] for one in flown} == set(tune_flight.CELLS)
+    assert {one[1] for one in flown} == set(CELLS)
     flown.clear()
     assert tune_flight.fly_full(Inline(), tmp_path / "t.json", stages) == full
     assert not flown
