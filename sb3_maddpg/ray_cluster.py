@@ -1,6 +1,8 @@
 """Connection to a Ray cluster (https://docs.ray.io), an optional dependency."""
 
 import os
+import re
+import socket
 from logging import WARNING
 from typing import Any
 
@@ -24,6 +26,8 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
         return ray, False
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked
     try:
+        if address is not None and (found := re.fullmatch(r"([^/]+):(\d+)", address)):
+            socket.create_connection((found[1], int(found[2])), timeout=5.0).close()  # Ray would wait for minutes
         ray.init(
             address=address,
             num_cpus=None if address else cpus,
@@ -31,6 +35,6 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
             log_to_driver=False,
             logging_level=WARNING,
         )
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, OverflowError, ValueError, RuntimeError) as error:
         raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
     return ray, True

@@ -17,8 +17,9 @@ def test_without_ray_the_message_says_how_to_install_it(monkeypatch):
 
 def test_an_address_where_nobody_answers():
     pytest.importorskip("ray")
-    with pytest.raises(ValueError, match=r"address='127.0.0.1:1': no Ray cluster responds there"):
-        connect("127.0.0.1:1", 1)
+    for address in ("auto", "127.0.0.1:1", "127.0.0.1:99999"):
+        with pytest.raises(ValueError, match=f"address='{address}': no Ray cluster responds there"):
+            connect(address, 1)
 
 
 def test_only_the_first_call_connects():

@@ -6,6 +6,8 @@ import importlib
 import logging
 import os
 import pickle
+import re
+import socket
 import threading
 import traceback
 from collections.abc import Callable, Sequence
@@ -46,6 +48,9 @@ class Cluster(Executor):
         if self._begun:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked
             try:
+                if address is not None and (found := re.fullmatch(r"([^/]+):(\d+)", address)):
+                    # Ray would wait for minutes
+                    socket.create_connection((found[1], int(found[2])), timeout=5.0).close()
                 ray.init(
                     address=address,
                     num_cpus=None if address else jobs,
@@ -53,7 +58,7 @@ class Cluster(Executor):
                     log_to_driver=False,
                     logging_level=logging.WARNING,
                 )
-            except (ConnectionError, ValueError, RuntimeError) as error:
+            except (OSError, OverflowError, ValueError, RuntimeError) as error:
                 raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
         self._run = ray.remote(_run).options(max_retries=_RETRIES, num_cpus=1)
         self._open: dict[Future[Any], Any] = {}

@@ -187,7 +187,8 @@ def test_a_machine_may_be_lost(tmp_path):
 def test_an_address_where_nobody_answers():
     ray.shutdown()
     try:
-        with pytest.raises(ValueError, match=r"address='auto': no Ray cluster responds there"):
-            Cluster(1, address="auto")
+        for address in ("auto", "127.0.0.1:1", "127.0.0.1:99999"):
+            with pytest.raises(ValueError, match=f"address='{address}': no Ray cluster responds there"):
+                Cluster(1, address=address)
     finally:
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
