@@ -41,9 +41,9 @@ def weights(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def start(folder: Path, *words: str) -> subprocess.Popen:
+def start(folder: Path, *words: str, steps: int = RECIPE["n_timesteps"]) -> subprocess.Popen:
     folder.mkdir(exist_ok=True)
-    (folder / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
+    (folder / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "n_timesteps": steps}}))
     command = [sys.executable, "-m", "sb3_maddpg", *ARGV, *words]
     env = {**os.environ, "OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
     return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -115,9 +115,9 @@ def trainings_of(process: subprocess.Popen) -> list[int]:
 def test_a_cluster_trains_the_same_whatever_dies(tmp_path):
     pytest.importorskip("ray")
     alone, there = tmp_path / "alone", tmp_path / "there"
-    expected = start(alone, "--seeds", "1-2", "--jobs", "2")
+    expected = start(alone, "--seeds", "1-2", "--jobs", "2", steps=6000)
     assert expected.wait(timeout=200) == 0, expected.stdout.read()
-    process = start(there, "--seeds", "1-2", "--jobs", "2", "--engine", "ray")
+    process = start(there, "--seeds", "1-2", "--jobs", "2", "--engine", "ray", steps=6000)
     wait_for_checkpoints(there, process)
     training = trainings_of(process)[0]
     (worker,) = (pid for pid in descendants(process.pid) if training in children(pid))
