@@ -168,7 +168,7 @@ class RunCheckpoint(BaseCallback):
         buffer = cast(MADDPG, self.model).replay_buffer
         assert isinstance(buffer, TeamReplayBuffer)
         first, end = self._new_rows(buffer)
-        return (end - first) * buffer.n_envs * _stored(buffer).itemsize
+        return _size_of(buffer, first, end)
 
     def save(self) -> Path | None:
         """
@@ -207,8 +207,10 @@ class RunCheckpoint(BaseCallback):
         self._ended = time.monotonic()
         writer, self._writer = self._writer, None
         self.cost += self._ended - started + writer.processor_time
+        segment = writer.segment
         if writer.processor_time > 0.0:
-            self._bytes_per_second = max(writer.segment.size, 1) / writer.processor_time
+            size = _size_of(segment.buffer, segment.first, segment.end)
+            self._bytes_per_second = max(size, 1) / writer.processor_time
         error = writer.error
         if error is None:
             self._segments = writer.segments
@@ -263,11 +265,6 @@ class _Segment:
     @property
     def name(self) -> str:
         return f"{self.first:012d}-{self.end:012d}.rows"
-
-    @property
-    def size(self) -> int:
-        """Approximate number of bytes"""
-        return (self.end - self.first) * self.buffer.n_envs * _stored(self.buffer).itemsize
 
     def content(self) -> Iterator[tuple[int, list[bytes]]]:
         """Yield for each block the row after it and its content."""
@@ -609,6 +606,11 @@ def _compare_fingerprints(written: dict[str, str]) -> None:
 def _columns(buffer: TeamReplayBuffer) -> dict[str, np.ndarray]:
     used = buffer.records[: buffer.size() + int(buffer.optimize_memory_usage)]
     return {name: used[name] for name in buffer.records.dtype.names or ()}
+
+
+def _size_of(buffer: TeamReplayBuffer, first: int, end: int) -> int:
+    """:return: approximate number of bytes of a segment"""
+    return (end - first) * buffer.n_envs * _stored(buffer).itemsize
 
 
 def _stored(buffer: TeamReplayBuffer) -> np.dtype:

@@ -138,8 +138,7 @@ class _Trainings:
             self._running.append(process)
         print(f"seed {seed}: {what}; {output}", flush=True)
         status = process.wait()
-        print(f"seed {seed}: {'finished' if status == 0 else f'ended with {status}, see {output}'}", flush=True)
-        return abs(status)
+        return _told(seed, status, output)
 
     def stop(self) -> None:
         """Stop all trainings, each with a checkpoint."""
@@ -196,32 +195,31 @@ class _ClusterTrainings(_Trainings):
             return 1
         except self._ray.exceptions.RayError as error:
             reason = str(error).strip().splitlines()[-1]
-            raise ValueError(f"seed {seed}: the training was lost {_RETRIES + 1} times ({reason}).") from error
-        print(f"seed {seed}: {'finished' if status == 0 else f'ended with {status}, see {output}'}", flush=True)
-        return int(status)
+            print(f"seed {seed}: the training was lost {_RETRIES + 1} times ({reason})", flush=True)
+            return 1
+        return _told(seed, status, output)
 
     def stop(self) -> None:
         with self._lock:
             self._stopped = True
             for reference in self._references:
-                self._ray.cancel(reference)
-        if self._references:
-            self._ray.wait(self._references, num_returns=len(self._references), timeout=_SECONDS)
+                self._ray.cancel(reference, force=True)  # the end of its parent ends a training, with a checkpoint
 
     def close(self) -> None:
         if self._connected:
             self._ray.shutdown()
 
 
+def _told(seed: int, status: int, output: Path) -> int:
+    """Print how a training ended and return its exit status."""
+    print(f"seed {seed}: {'finished' if status == 0 else f'ended with {status}, see {output}'}", flush=True)
+    return abs(status)
+
+
 def _train_there(directory: str, argv: list[str], log_folder: Path, every: int | None, seed: int) -> int:
     """Train in a process of a cluster, see ``_Trainings.train``."""
     os.chdir(directory)
-    trainings = _Trainings(argv, log_folder, every)
-    try:
-        return trainings.train(seed)
-    except BaseException:  # cancelled
-        trainings.stop()
-        raise
+    return _Trainings(argv, log_folder, every).train(seed)
 
 
 def _wait_until_free(folder: Path) -> None:
