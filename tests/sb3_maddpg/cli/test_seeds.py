@@ -117,8 +117,18 @@ def test_a_cluster_trains_the_same_whatever_dies(tmp_path):
     alone, there = tmp_path / "alone", tmp_path / "there"
     expected = start(alone, "--seeds", "1-2", "--jobs", "2", steps=6000)
     assert expected.wait(timeout=200) == 0, expected.stdout.read()
-    process = start(there, "--seeds", "1-2", "--jobs", "2", "--engine", "ray", steps=6000)
+    words = ["--seeds", "1-2", "--jobs", "2", "--engine", "ray"]
+    process = start(there, *words, steps=6000)
     wait_for_checkpoints(there, process)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=100)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert not weights(there), "the trainings end with the command"
+    process = start(there, *words, steps=6000)
+    end = time.monotonic() + 100
+    while not trainings_of(process):
+        assert time.monotonic() < end
+        time.sleep(0.1)
     training = trainings_of(process)[0]
     (worker,) = (pid for pid in descendants(process.pid) if training in children(pid))
     os.kill(worker, signal.SIGKILL)
