@@ -282,7 +282,7 @@ def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch):
 
 
 def test_what_tells_no_state_goes_on_with_new_episodes_and_says_so(tmp_path):
-    for env in (lambda: DummyVecEnv([OwnBit]), lambda: SubprocVecEnv([OwnBit], start_method="fork")):
+    for env in (lambda: DummyVecEnv([OwnBit]), lambda: SubprocVecEnv([OwnBit])):
         model = MADDPG("MlpPolicy", env(), buffer_size=300, train_freq=5, **SETTINGS)
         callback = RunCheckpoint(tmp_path, EVERY)
         model.learn(250, callback=[callback])
