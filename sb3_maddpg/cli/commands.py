@@ -266,7 +266,7 @@ COMMANDS: dict[str, Command] = {
     "tune": Command(
         _zoo("tune"),
         "search hyperparameters (train -optimize)",
-        f"  {PROG} tune --env OwnBit-v0 --n-trials 50 --storage logs/tune.log --study-name a",
+        f"  {PROG} tune --env OwnBit-v0 --n-trials 50 --storage logs/tune.log --study-name a --jobs 2",
     ),
     "enjoy": Command(_zoo("enjoy"), "watch a trained model", f"  {PROG} enjoy --env mpe2/simple_spread_v3 -f logs"),
     "record": Command(

@@ -36,10 +36,20 @@ from sb3_maddpg import MADDPG
 from sb3_maddpg.callbacks import DashboardCallback
 from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
 from sb3_maddpg.cli.literals import format_literal, parse_literal
-from sb3_maddpg.cli.options import PROG, check_writable
+from sb3_maddpg.cli.options import check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
-from sb3_maddpg.cli.search import STUDY, as_absolute, bring_back, enlist, kept_search, open_storage, sign
+from sb3_maddpg.cli.search import (
+    STUDY,
+    as_absolute,
+    best_recipe,
+    bring_back,
+    enlist,
+    kept_search,
+    open_storage,
+    sign,
+    tell_best,
+)
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.team import Team
 from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
@@ -357,7 +367,7 @@ class TeamExperimentManager(ExperimentManager):
 
     def hyperparameters_optimization(self) -> None:
         """Search hyperparameters, alone or with other workers, and write the best trial as a recipe."""
-        best = Path(self.log_path, f"{self.env_name}_best.yml")
+        best = best_recipe(Path(self.log_path), self.env_name)
         check_writable(best)
         kept = None
         if self.storage is None:
@@ -377,8 +387,7 @@ class TeamExperimentManager(ExperimentManager):
         params = HYPERPARAMS_CONVERTER[self.algo](self.study.best_params)
         with atomic_write(best, "yml") as file:
             file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
-        print(f"Recipe of the best trial: {best}. To train with it:")
-        print(f"  {PROG} train --algo {self.algo} --env {self.env_name.gym_id} --conf-file {best}")
+        tell_best(self.algo, self.env_name.gym_id, best)
         if kept is not None and self._over():
             kept.unlink(missing_ok=True)
 

@@ -1,19 +1,26 @@
 """Hyperparameter searches that survive killed processes: finished trials are kept, and killed ones are repeated."""
 
+import argparse
 import hashlib
 import os
 import socket
+import uuid
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import optuna
+from huggingface_sb3 import EnvironmentName
 from optuna.storages import BaseStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
+from sb3_maddpg.cli.options import PROG
+from sb3_maddpg.cli.processes import run_all
 from sb3_maddpg.utils import process_runs
 
 STUDY = "search"
+_IDENTITY = "SB3_MADDPG_WORKER"  # environment variable with the identity that a worker keeps when it is restarted
 _PROCESS = "process"  # attribute of a trial that identifies the process running it
 _WORKER = "worker "  # prefix of the attributes of a study that identify the processes that work on it
 
@@ -67,7 +74,8 @@ def sign(trial: optuna.Trial) -> None:
 def bring_back(study: optuna.Study) -> int:
     """
     Mark the trials of dead processes on this machine as failed and queue their hyperparameters again. Trials of other
-    machines are left alone, since it is unknown whether they are still running.
+    machines are left alone, since it is unknown whether they are still running, except those of a worker that a cluster
+    restarts here.
 
     :param study: a study that may have trials of killed processes
     :return: number of trials that will be repeated
@@ -89,8 +97,78 @@ def bring_back(study: optuna.Study) -> int:
     return count
 
 
+def search(argv: list[str], jobs: int, log_folder: str, engine: str = "local", address: str | None = None) -> int:
+    """
+    Search with several workers, which share a study, and print where the best trial is.
+
+    :param argv: arguments of ``tune``, without the log folder
+    :param jobs: number of workers
+    :param log_folder: folder of the logs; the output of each worker goes to ``search_K.log`` there
+    :param engine: see ``run_all``
+    :param address: see ``run_all``
+    :return: exit status of the first worker that failed, 0 if none did
+    :raises ValueError: if arguments are invalid
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default="maddpg")
+    parser.add_argument("--env")
+    parser.add_argument("--storage")
+    parser.add_argument("--study-name")
+    parser.add_argument("--n-trials", type=int, default=500)
+    parser.add_argument("--max-total-trials", type=int)
+    known, _ = parser.parse_known_args(argv)
+    if known.storage is None or known.study_name is None:
+        raise ValueError("--jobs and --engine ray need --storage and --study-name: the workers share that study.")
+    total = known.max_total_trials or known.n_trials
+    argv = [*argv, "--log-folder", log_folder, "--max-total-trials", str(total)]
+    Path(log_folder).mkdir(parents=True, exist_ok=True)
+    workers = [_Worker(number, argv, Path(log_folder)) for number in range(1, max(min(jobs, total), 1) + 1)]
+    failed = run_all(workers, jobs, engine, address)
+    if not failed and known.env is not None:
+        tell_best(known.algo, known.env, best_recipe(Path(log_folder, known.algo), EnvironmentName(known.env)))
+    return failed
+
+
+def best_recipe(folder: Path, env_name: str) -> Path:
+    """
+    :param folder: folder of the algorithm's logs
+    :param env_name: name of the environment
+    :return: path of the recipe of the best trial
+    """
+    return folder / f"{env_name}_best.yml"
+
+
+def tell_best(algo: str, env_id: str, best: Path) -> None:
+    """Print where the recipe of the best trial is, and how to train with it."""
+    print(f"Recipe of the best trial: {best}. To train with it:")
+    print(f"  {PROG} train --algo {algo} --env {env_id} --conf-file {best}")
+
+
+@dataclass(frozen=True)
+class _Worker:
+    number: int
+    argv: list[str]
+    log_folder: Path
+    identity: str = field(default_factory=lambda: uuid.uuid4().hex)
+
+    @property
+    def name(self) -> str:
+        return f"worker {self.number}"
+
+    @property
+    def output(self) -> Path:
+        return self.log_folder / f"search_{self.number}.log"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return {_IDENTITY: self.identity}
+
+    def command(self) -> tuple[list[str], str]:
+        return ["train", *self.argv], "starts"
+
+
 def _me() -> str:
-    return f"{socket.gethostname()} {os.getpid()} {_began(os.getpid())}"
+    return f"{socket.gethostname()} {os.getpid()} {_began(os.getpid())} {os.environ.get(_IDENTITY, '')}".rstrip()
 
 
 def _began(process: int) -> str:
@@ -102,8 +180,9 @@ def _began(process: int) -> str:
 
 
 def _may_run(owner: str) -> bool:
-    host, _, rest = owner.partition(" ")
-    process, _, began = rest.partition(" ")
+    host, process, began, identity = (*owner.split(), "", "", "", "")[:4]
+    if identity and identity == os.environ.get(_IDENTITY) and owner != _me():
+        return False  # this process takes its place
     if host != socket.gethostname() or not process.isdecimal():
         return True
     return process_runs(int(process)) and _began(int(process)) == began

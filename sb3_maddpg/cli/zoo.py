@@ -33,9 +33,11 @@ from sb3_maddpg.cli.literals import StoreValues
 from sb3_maddpg.cli.options import PROG, common_options, did_you_mean, helps, import_packages, modules_beside
 from sb3_maddpg.cli.overview import ALGORITHMS, load_environments, overview, packaged_recipes
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
+from sb3_maddpg.cli.processes import ENGINES
 from sb3_maddpg.cli.recipes import LengthOption, check_options
 from sb3_maddpg.cli.safety import no_code_from_files
-from sb3_maddpg.cli.seeds import ENGINES, parse_seeds, train_seeds
+from sb3_maddpg.cli.search import search
+from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
 from sb3_maddpg.utils import suggest
 
@@ -91,20 +93,9 @@ def train(argv: list[str]) -> int:
         raise ValueError(
             f"--checkpoint-every {asked.checkpoint_every}: pass a number of steps, or 0 for no checkpoints."
         )
-    if asked.seeds is not None:
-        if asked.resume is not None:
-            raise ValueError("--resume continues one run; --seeds resumes the runs of its command automatically.")
-        return train_seeds(
-            argv,
-            parse_seeds(asked.seeds),
-            asked.jobs,
-            asked.log_folder,
-            asked.checkpoint_every,
-            asked.engine,
-            asked.address,
-        )
-    if asked.engine != "local" or asked.address is not None:
-        raise ValueError("--engine and --address are for --seeds: a single training runs in this process.")
+    processes = asked.jobs is not None or asked.engine != "local" or asked.address is not None
+    if asked.seeds is not None or processes:
+        return _in_processes(name, asked, argv)
     if asked.resume is None:
         argv += ["--log-folder", asked.log_folder]
     checkpoints: Checkpoints | None = None
@@ -135,6 +126,18 @@ def train(argv: list[str]) -> int:
     return 0
 
 
+def _in_processes(name: str, asked: argparse.Namespace, argv: list[str]) -> int:
+    """Run trainings of several seeds, or the workers of a search, in processes of their own."""
+    if asked.seeds is None and name == "train":
+        raise ValueError("--jobs, --engine and --address are for --seeds: a single training runs in this process.")
+    if asked.resume is not None:
+        raise ValueError("--resume continues one run; --seeds resumes the runs of its command automatically.")
+    if asked.seeds is None:
+        return search(argv, 1 if asked.jobs is None else asked.jobs, asked.log_folder, asked.engine, asked.address)
+    seeds, jobs = parse_seeds(asked.seeds), os.cpu_count() or 1 if asked.jobs is None else asked.jobs
+    return train_seeds(argv, seeds, jobs, asked.log_folder, asked.checkpoint_every, asked.engine, asked.address)
+
+
 def _resuming(name: str) -> argparse.ArgumentParser:
     """:return: a parser of the options that rl_zoo3 does not have"""
     parser = argparse.ArgumentParser(prog=f"{PROG} {name}", add_help=False, allow_abbrev=False, usage=argparse.SUPPRESS)
@@ -146,11 +149,9 @@ def _resuming(name: str) -> argparse.ArgumentParser:
     )
     group.add_argument("--seeds", metavar="0-9", help="train once per seed")
     group.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, help="number of parallel trainings (default %(default)s)"
+        "--jobs", type=int, help="number of parallel trainings of --seeds (default: one per core), or workers of tune"
     )
-    group.add_argument(
-        "--engine", default="local", help=f"{', '.join(ENGINES)}: where the trainings of --seeds run (default local)"
-    )
+    group.add_argument("--engine", default="local", help=f"{', '.join(ENGINES)}: where they run (default local)")
     group.add_argument("--address", help="a running Ray cluster: auto, or HOST:PORT (default: one on this machine)")
     return parser
 

@@ -13,7 +13,9 @@ import pandas as pd
 import pytest
 import yaml
 from optuna.trial import TrialState
+from processes import children, descendants
 
+from sb3_maddpg.cli.commands import main
 from sb3_maddpg.cli.search import bring_back, enlist, kept_search, open_storage, sign
 
 pytest.importorskip("rl_zoo3")
@@ -76,6 +78,64 @@ def test_an_interrupted_search_is_kept(tmp_path, monkeypatch):
     output, _ = process.communicate(timeout=120)
     assert "The search was interrupted; repeat the command to continue" in output
     assert len(list(Path("logs/maddpg").glob("*_search_*.log"))) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("engine", ["local", "ray"])
+def test_workers_of_a_command_share_its_trials_whatever_dies(engine, tmp_path, monkeypatch):
+    if engine == "ray":
+        pytest.importorskip("ray")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+    words = ["--n-trials", "6", "--storage", "s.log", "--study-name", "s", "--jobs", "2", "--engine", engine]
+
+    def trials() -> list[optuna.trial.FrozenTrial]:
+        try:
+            return optuna.load_study(storage=open_storage("s.log"), study_name="s").trials
+        except KeyError:
+            return []
+
+    process = start(*words)
+    end = time.monotonic() + 200
+    while sum("process" in trial.user_attrs for trial in trials()) < 3:
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    workers = [pid for pid in descendants(process.pid) if b"-optimize" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    assert len(workers) == 2
+    if engine == "local":
+        process.kill()
+        process.communicate(timeout=100)
+        process = start(*words)
+    else:
+        (parent,) = (pid for pid in descendants(process.pid) if workers[0] in children(pid))
+        os.kill(parent, signal.SIGKILL)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert "Recipe of the best trial: logs/maddpg/OwnBit-v0_best.yml" in output
+    assert Path("logs/maddpg/OwnBit-v0_best.yml").exists()
+    states = [trial.state for trial in trials()]
+    assert TrialState.RUNNING not in states
+    # A worker may start a trial while the other finishes the last one
+    assert 6 <= states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED) <= 7
+    assert states.count(TrialState.FAIL) <= 2
+
+
+def test_workers_need_a_study_to_share(capsys):
+    assert main(["tune", "--env", "OwnBit-v0", "--jobs", "2"]) == 2
+    assert "--jobs and --engine ray need --storage and --study-name" in capsys.readouterr().err
+
+
+def test_a_worker_that_a_cluster_restarts_elsewhere_repeats_its_trial(study, monkeypatch):
+    monkeypatch.setenv("SB3_MADDPG_WORKER", "a")
+    mine, others = begin(study, "else 1 2 a"), begin(study, "else 1 2 b")
+    assert bring_back(study) == 1
+    states = {trial.number: trial.state for trial in study.trials}
+    assert states[mine.number] == TrialState.FAIL
+    assert states[others.number] == TrialState.RUNNING
+    signed = study.ask()
+    sign(signed)
+    assert bring_back(study) == 0, "this process runs"
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from processes import children, descendants
 
 from sb3_maddpg.cli.commands import main
 from sb3_maddpg.cli.seeds import parse_seeds
@@ -47,17 +48,6 @@ def start(folder: Path, *words: str, steps: int = RECIPE["n_timesteps"]) -> subp
     command = [sys.executable, "-m", "sb3_maddpg", *ARGV, *words]
     env = {**os.environ, "OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
     return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def children(pid: int) -> list[int]:
-    found = []
-    for status in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            if int(status.read_text().rpartition(")")[2].split()[1]) == pid:
-                found.append(int(status.parent.name))
-        except OSError:
-            continue
-    return found
 
 
 def wait_for_checkpoints(folder: Path, process: subprocess.Popen) -> None:
@@ -98,11 +88,6 @@ def test_killed_and_begun_again_all_seeds_end_as_if_nothing_had_happened(kind, t
     output, _ = third.communicate(timeout=200)
     assert output.count("finished before") == 2
     assert set(weights(parts)) == {1, 2, 3}
-
-
-def descendants(pid: int) -> list[int]:
-    found = children(pid)
-    return found + [one for child in found for one in descendants(child)]
 
 
 def trainings_of(process: subprocess.Popen) -> list[int]:
@@ -155,7 +140,8 @@ def test_a_training_that_fails_is_told(tmp_path, monkeypatch, capsys):
         (["--seeds", "0", "--resume"], "--resume continues one run"),
         (["--seeds", "0", "--engine", "rai"], "did you mean 'ray'?"),
         (["--seeds", "0", "--address", "auto"], "--address auto is for --engine ray only"),
-        (["--engine", "ray"], "--engine and --address are for --seeds"),
+        (["--engine", "ray"], "--jobs, --engine and --address are for --seeds"),
+        (["--jobs", "2"], "a single training runs in this process"),
     ],
 )
 def test_what_does_not_go_together_is_refused(words, message, tmp_path, monkeypatch, capsys):
