@@ -246,6 +246,6 @@ def info_of(batch: dict[str, Any], swarm: int) -> dict[str, Any]:
     return {
         name: info_of(value, swarm)
         if isinstance(value, dict)
-        else (value[swarm].copy() if value.ndim > 1 else value[swarm].item())
+        else (value[swarm].copy() if value.ndim > 1 else value.item(swarm))
         for name, value in batch.items()
     }

@@ -139,11 +139,11 @@ class EpisodeStatistics:
         self.plans_used += counted * used.sum(axis=(1, 2))
         self.plan_ages += counted * (used * report.plan_age).sum(axis=(1, 2))
         self.requests_flown += n_requests
-        self.path_length += counted * report.moved.mean(axis=1)
+        self.path_length += counted * report.moved.sum(axis=1) / report.moved.shape[1]
         self.collided |= collided
         self.collided_at_steps |= report.collision
         self.collided_continuous |= report.collision_continuous
-        self.at_goals = np.all(report.at_goal, axis=1)
+        self.at_goals = report.at_goal.all(axis=1)
         self.arrived |= self.at_goals & ~self.collided
         self.reached |= self.at_goals
         self.min_separation = np.minimum(self.min_separation, report.min_separation)

@@ -355,7 +355,7 @@ class Swarm:
         before, pos = positions[0], positions[-1]
         others = self.neighbours.others if self.neighbours.limited else None
         # Of all pairs, including those that do not perceive each other
-        least, least_continuous, separation, separation_continuous = separations(np.stack(positions), others)
+        least, least_continuous, separation, separation_continuous = separations(np.array(positions), others)
         limit = 2 * self.config.radius - self.config.collision_tolerance
         shape = self.state.shape[:2]
         return StepReport(
