@@ -86,7 +86,7 @@ def believe(
     :param stages: indices among the next N steps, counting from 0; None for all
     :return: positions, (pairs, stages, 3) (m)
     """
-    chosen = np.arange(remembered.shape[-2] - 1) if stages is None else np.array(stages, dtype=np.int64)
+    chosen = _first(remembered.shape[-2] - 1) if stages is None else np.array(stages, dtype=np.int64)
     if (library := compiled()) is None:
         steady = pos[..., None, :] + (dt * (chosen + 1))[:, None] * vel[..., None, :]
         return np.where(remembers[..., None, None], remembered.take(chosen + 1, axis=-2), steady)
@@ -96,6 +96,11 @@ def believe(
         remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *addresses(chosen, *arrays, believed)
     )
     return believed
+
+
+@functools.cache
+def _first(count: int) -> np.ndarray:
+    return np.arange(count)
 
 
 def approach(

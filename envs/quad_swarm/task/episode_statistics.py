@@ -143,7 +143,7 @@ class EpisodeStatistics:
         self.collided |= collided
         self.collided_at_steps |= report.collision
         self.collided_continuous |= report.collision_continuous
-        self.at_goals = report.at_goal.all(axis=1)
+        self.at_goals = np.logical_and.reduce(report.at_goal, axis=1)
         self.arrived |= self.at_goals & ~self.collided
         self.reached |= self.at_goals
         self.min_separation = np.minimum(self.min_separation, report.min_separation)

@@ -255,10 +255,10 @@ class RequestTask:
             "collision": -self.reward.collision * collided,
             "requests": -self.reward.request * messages.sum(axis=(1, 2)),
         }
-        near_misses = np.zeros_like(report.separation)
+        near_misses: np.ndarray | float = 0.0
         if self.reward.near_miss:
             near_misses = self.reward.near_miss * self._near_misses(report)
-            terms["near_miss"] = -near_misses.sum(axis=(1, 2)) / 2
+            terms["near_miss"] = -np.sum(near_misses, axis=(1, 2)) / 2
         terminated = collided if self.end_at_collision else np.zeros_like(collided)
         if self.end_at_arrival:
             terminated = terminated | self.statistics.arrived
