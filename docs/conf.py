@@ -22,6 +22,7 @@ html_logo = "images/logo.svg"
 html_theme_options = {"light_css_variables": {"code-font-size": "0.75rem"}}  # 98 columns fit beside the menu
 html_static_path = ["_static"]
 html_css_files = ["tables.css"]
+html_js_files = ["keyboard.js"]
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
