@@ -115,7 +115,10 @@ def load_vec_env_state(env: VecEnv, state: dict[str, Any]) -> None:
 
 def _told(env: Any) -> Any:
     if not hasattr(env, "state_dict") or not hasattr(env, "load_state_dict"):
-        raise NoStateError(f"{type(env).__name__} has no state_dict() and load_state_dict().")
+        raise NoStateError(
+            f"{type(env).__name__} has no state_dict() and load_state_dict(): if it is deterministic, train with "
+            "--checkpoint-every STEPS, or in Python in sb3_maddpg.env_states.Replayable."
+        )
     return env.state_dict()
 
 
