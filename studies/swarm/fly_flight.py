@@ -1,10 +1,12 @@
-"""Fly the sealed test set of `flight`: ``python -m studies.swarm.fly_flight [--n-robots ...] [--quick] [--json F]``.
+"""Fly a sealed test set of `flight`.
 
-Full and no communication, the best rule and all models, each with a single setting, fly in all scenarios. With four
-robots, the models that were trained with the paper's settings also fly. Conditions that the file already contains are
-not flown again. The policies come from ``flight_tuning.json``, which `studies.swarm.tune_flight` writes: commit it
-first. JSON: one row per condition with the keys of `summarise`, the outcomes of its episodes as text (1: a collision)
-for paired comparisons, and scenario, policy, n_robots.
+``python -m studies.swarm.fly_flight [--up-to 12] [--n-robots ...] [--quick] [--json F]``. Full and no communication,
+the best rule and all models, each with a single setting, fly in all scenarios. With four robots, the models that were
+trained with the paper's settings also fly. Conditions that the file already contains are not flown again. The settings
+are those that `studies.swarm.tune_flight` has written with the same ``--up-to``: commit them first. Those for up to
+sixteen robots fly another set, without the policies that have no setting. JSON: one row per condition with the keys of
+`summarise`, the outcomes of its episodes as text (1: a collision) for paired comparisons, and scenario, policy,
+n_robots.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
     DATA,
-    FLIGHT_TEST,
+    FLIGHT_TESTS,
     NAMES,
     ROOT,
     absolute_path,
@@ -32,7 +34,7 @@ from studies.swarm.protocol import (
     replace_rows,
     world,
 )
-from studies.swarm.tune_flight import FULL, OWN_SWAPS, PRESET
+from studies.swarm.tune_flight import AIMS, FILES, FULL, OWN_SWAPS, PRESET, UP_TO
 
 # Number of episodes per condition by the number of robots
 EPISODES = {8: 12000, 4: 4000, 12: 4000, 16: 4000}
@@ -41,54 +43,59 @@ QUICK = 10
 PAPERS = "faithful_flight"
 
 
-class Job(NamedTuple):
-    """A condition."""
+FLOWN = {12: "flight.json", 16: "flight_sixteen_sealed.json"}  # by the number of robots of the largest team
 
+
+class Job(NamedTuple):
+    """A condition, and the sealed set that it flies."""
+
+    set: int
     n_robots: int
     scenario: str
     policy: str
     episodes: int
 
 
-def tuned() -> Iterator[dict[str, Any]]:
-    """Return the rows of all safe settings except full communication."""
-    return (row for row in known_rows(DATA / "flight_tuning.json") if row["safe"] and row["family"] != FULL)
+def tuned(up_to: int = UP_TO) -> Iterator[dict[str, Any]]:
+    """Return the rows of all safe settings for teams of up to so many robots, except full communication."""
+    return (row for row in known_rows(DATA / FILES[up_to]) if row["safe"] and row["family"] != FULL)
 
 
-def best_rule() -> str:
+def best_rule(up_to: int = UP_TO) -> str:
     """Return the rule that is safe everywhere and makes the fewest requests in both swaps of eight robots."""
-    return _cheapest("rule", lambda setting: not is_model(setting))
+    return _cheapest("rule", up_to, lambda setting: not is_model(setting))
 
 
 def best_model() -> str:
     """Return the model with its threshold that is safe everywhere and makes the fewest requests in both swaps of eight
     robots. This model is shipped."""
-    return _cheapest("model", is_model)
+    return _cheapest("model", UP_TO, is_model)
 
 
-def _cheapest(what: str, is_one: Callable[[str], bool]) -> str:
+def _cheapest(what: str, up_to: int, is_one: Callable[[str], bool]) -> str:
     shares: dict[str, list[float]] = {}
-    for row in tuned():
+    for row in tuned(up_to):
         if is_one(row["setting"]) and (row["n_robots"], row["scenario"]) in OWN_SWAPS:
             shares.setdefault(row["setting"], []).append(row["request_share"])
     if not shares:
-        raise ValueError(f"{DATA / 'flight_tuning.json'} holds no safe {what}: run `studies.swarm.tune_flight` first.")
+        raise ValueError(f"{DATA / FILES[up_to]} holds no safe {what}: run `studies.swarm.tune_flight` first.")
     return min(shares, key=lambda setting: sum(shares[setting]))
 
 
-def tuned_models() -> list[str]:
+def tuned_models(up_to: int = UP_TO) -> list[str]:
     """Return the models with their tuned thresholds. Models without a safe threshold keep their own."""
-    safe = {row["family"]: row["setting"] for row in tuned()}
+    safe = {row["family"]: row["setting"] for row in tuned(up_to)}
     return [safe.get(path, path) for path in models("flight")]
 
 
-def jobs(sizes: list[int], quick: bool) -> list[Job]:
+def jobs(sizes: list[int], quick: bool, up_to: int = UP_TO) -> list[Job]:
     """Return all conditions, by increasing number of robots."""
-    everywhere = ["full", "none", best_rule(), *tuned_models()]
+    first = up_to == UP_TO  # the policies without a setting have flown with this one
+    everywhere = ["full", *(["none"] if first else []), best_rule(up_to), *tuned_models(up_to)]
     return [
-        Job(n, name, policy, QUICK if quick else EPISODES[n])
+        Job(FLIGHT_TESTS[up_to], n, name, policy, QUICK if quick else EPISODES[n])
         for n in sorted(sizes)
-        for policy in (*everywhere, *(models(PAPERS) if n == 4 else ()))
+        for policy in (*everywhere, *(models(PAPERS) if n == 4 and first else ()))
         for name in NAMES
     ]
 
@@ -96,26 +103,34 @@ def jobs(sizes: list[int], quick: bool) -> list[Job]:
 def fly(job: Job) -> dict[str, Any]:
     """Fly a condition and return its row."""
     config = world(PRESET, job.n_robots)
-    ((_, rows),) = fly_kept([condition(job.policy, job.scenario, config)], job.episodes, FLIGHT_TEST).items()
+    ((_, rows),) = fly_kept([condition(job.policy, job.scenario, config)], job.episodes, job.set).items()
     outcomes = "".join("1" if row["collided"] else "0" for row in rows)
-    return {"preset": PRESET, "set": FLIGHT_TEST, **job._asdict(), **summarise(rows, config), "outcomes": outcomes}
+    return {"preset": PRESET, **job._asdict(), **summarise(rows, config), "outcomes": outcomes}
 
 
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--up-to", type=int, choices=AIMS, default=UP_TO, help="as in tune_flight")
     parser.add_argument("--n-robots", nargs="+", type=int, default=list(EPISODES), choices=list(EPISODES))
     parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--json", type=absolute_path, default=DATA / "flight.json", metavar="FILE")
+    parser.add_argument(
+        "--json", type=absolute_path, metavar="FILE", help=f"default: {', '.join(FLOWN.values())} in {DATA}"
+    )
     args = parser.parse_args()
     os.chdir(ROOT)
+    path = args.json or DATA / FLOWN[args.up_to]
     keys = ("n_robots", "scenario", "policy")
-    flown = {tuple(row[key] for key in keys) for row in read_rows(args.json)}
-    work = [job for job in jobs(args.n_robots, args.quick) if (job.n_robots, job.scenario, job.policy) not in flown]
+    flown = {tuple(row[key] for key in keys) for row in read_rows(path)}
+    work = [
+        job
+        for job in jobs(args.n_robots, args.quick, args.up_to)
+        if (job.n_robots, job.scenario, job.policy) not in flown
+    ]
     with workers(args) as pool:
         for row in progress(pool.map(fly, work), "flight", len(work)):
-            replace_rows(args.json, [row], keys)
+            replace_rows(path, [row], keys)
 
 
 if __name__ == "__main__":

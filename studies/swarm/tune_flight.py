@@ -96,6 +96,7 @@ AIMS = {
     16: Aim({16: 4000, 12: 4000, 8: 4000, 4: 4000}, 0.002, tuple(round(0.5 - 0.05 * k, 2) for k in range(10))),
 }
 FILES = {12: "flight_tuning.json", 16: "flight_sixteen.json"}
+UP_TO = 12  # robots of the largest team by default
 
 
 def families() -> dict[str, list[str]]:
@@ -325,7 +326,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("rules", "thresholds"))
     parser.add_argument("models", nargs="*", metavar="MODEL.zip")
-    parser.add_argument("--up-to", type=int, choices=AIMS, default=12, help="number of robots of the largest team")
+    parser.add_argument("--up-to", type=int, choices=AIMS, default=UP_TO, help="number of robots of the largest team")
     parser.add_argument("--quick", action="store_true", help="fly few episodes, to check that everything runs")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, metavar="FILE", help=f"default: {', '.join(FILES.values())} in {DATA}")

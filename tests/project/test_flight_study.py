@@ -15,7 +15,7 @@ from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from studies.swarm import delay_check, flight_world, fly_flight, report, tune_flight
-from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TEST, NAMES, TEST, VALIDATION, WORLDS
+from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TESTS, NAMES, TEST, VALIDATION, WORLDS
 
 CALM = {
     "noise": {"vel": 0, "attitude": 0, "wind": 0, "gust": 0},
@@ -26,7 +26,7 @@ CALM = {
 
 
 def test_sets_of_episodes_are_apart():
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, FLIGHT_TEST, WORLDS}) == 6
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS}) == 7
 
 
 @pytest.mark.parametrize("family", tune_flight.families())
@@ -252,6 +252,13 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
     with pytest.raises(ValueError, match="holds no safe model"):
         fly_flight.best_model()
     assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
+    with pytest.raises(ValueError, match=r"flight_sixteen\.json holds no safe rule"):
+        fly_flight.jobs([16], quick=False, up_to=16)
+    write_rows(tmp_path / "flight_sixteen.json", rules[: len(NAMES)])
+    work = fly_flight.jobs([16], quick=False, up_to=16)
+    assert {(job.set, job.episodes) for job in work} == {(FLIGHT_TESTS[16], 4000)}
+    assert {"full", "plan:0.8"} <= {job.policy for job in work}
+    assert "none" not in {job.policy for job in work}
     monkeypatch.setattr(fly_flight, "NAMES", NAMES[:1])
     monkeypatch.setattr(fly_flight, "models", lambda recipe: [])
     monkeypatch.setattr("sys.argv", ["", "--quick", "--jobs", "1", "--n-robots", "4", "--json", f"{tmp_path}/f.json"])
