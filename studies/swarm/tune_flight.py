@@ -99,13 +99,21 @@ FILES = {12: "flight_tuning.json", 16: "flight_sixteen.json"}
 UP_TO = 12  # robots of the largest team by default
 
 
-def families() -> dict[str, list[str]]:
-    """Return the rules of each family, with lengths in separations."""
+def families(up_to: int = UP_TO) -> dict[str, list[str]]:
+    """Return the rules of each family, with lengths in separations.
+
+    :param up_to: number of robots of the largest team; with more than twelve, there are also rules that ask for most of
+        the plans
+    """
     product = itertools.product
     cpas = [f"cpa:{d}s:{t}" for d, t in product((1.0, 1.05, 1.1, 1.15, 1.2, 1.3), (1, 1.5, 2, 3))]
     far = [f"cpa:{d}s:{t}" for d, t in product((1.0, 1.1, 1.2), (1.5, 2, 3))]
     plans = [f"plan:{d}s" for d in (0.9, 0.95, 1.0, 1.05, 1.1, 1.15, 1.2, 1.25, 1.3, 1.4, 1.5)]
-    return {
+    generous = {
+        "distance": [f"distance:{d}s" for d in (2, 2.5, 3, 3.5, 4, 5, 6, 8)],
+        "wide": [f"cpa:{d}s:{t}" for d, t in product((2, 2.5, 3), (2, 3))] + [f"plan:{d}s" for d in (1.8, 2, 2.5, 3)],
+    }
+    return (generous if up_to > UP_TO else {}) | {
         "cpa": [f"cpa:{d}s:{t}" for d, t in product((1.0, 1.04, 1.08, 1.12, 1.18, 1.25, 1.35, 1.5), (1, 1.5, 2, 3))],
         "plan and stale": [f"{plan}&stale:{k}" for plan, k in product(plans, range(1, 9))],
         "plan, soon and stale": [
@@ -233,10 +241,12 @@ def fly_full(pool: Executor, path: Path, stages: Sequence[int], aim: Aim = AIMS[
     return {cell: [{"collided": letter == "1"} for letter in known[cell]] for cell in aim.cells}
 
 
-def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool) -> list[Setting]:
+def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool, up_to: int = UP_TO) -> list[Setting]:
     """Return the rules by increasing number of requests in both swaps of eight robots, without rules with identical
     flights."""
-    rules = [Setting(family, rule) for family, rules in families().items() for rule in rules[:: 12 if quick else 1]]
+    rules = [
+        Setting(family, rule) for family, rules in families(up_to).items() for rule in rules[:: 12 if quick else 1]
+    ]
     known: dict[str, list[dict[str, Any]]] = {}
     for row in read_rows(path):
         if (row["n_robots"], row["scenario"]) in OWN_SWAPS:
@@ -338,7 +348,7 @@ def main() -> None:
     with workers(args) as pool:
         full = fly_full(pool, path, stages, aim)
         if args.what == "rules":
-            ladders = [by_requests(pool, path, stages, args.quick)]
+            ladders = [by_requests(pool, path, stages, args.quick, args.up_to)]
         else:
             ladders = [[Setting(model, f"{model}@{t:g}") for t in aim.thresholds] for model in args.models]
         tune(pool, args.jobs, ladders, full, stages, path, aim)

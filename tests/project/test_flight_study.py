@@ -29,9 +29,9 @@ def test_sets_of_episodes_are_apart():
     assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS}) == 7
 
 
-@pytest.mark.parametrize("family", tune_flight.families())
+@pytest.mark.parametrize("family", tune_flight.families(16))
 def test_every_rule_can_be_read(family):
-    rules = tune_flight.families()[family]
+    rules = tune_flight.families(16)[family]
     assert len(set(rules)) == len(rules) > 3
     for rule in rules:
         parse_rule(rule)
