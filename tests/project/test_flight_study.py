@@ -118,7 +118,7 @@ def settings(path: Path) -> dict[str, bool | None]:
 
 def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypatch, tmp_path):
     families = {"one": ["good 0.4", "bad 0.1", "good 0.3"], "two": ["bad 0.35", "good 0.2"]}
-    monkeypatch.setattr(tune_flight, "families", lambda: families)
+    monkeypatch.setattr(tune_flight, "families", lambda up_to: families)
     path, stages = tmp_path / "tuning.json", tune_flight.STAGES
     rules = tune_flight.by_requests(Inline(), path, stages, quick=False)
     assert [rule.name for rule in rules] == ["bad 0.1", "good 0.2", "good 0.3", "bad 0.35", "good 0.4"]
