@@ -59,6 +59,14 @@ inline void steady(const double* pos, const double* vel, const std::vector<doubl
     for (int i = 0; i < 3; i++) to[k + i] = vel[i] * times[k + i] + pos[i];
 }
 
+// The record of `STATISTICS` in pairs.py
+struct Statistics {
+  Integer steps, steps_counted, requests, possible_requests, peak_requests, plans_used, plan_ages, requests_flown;
+  Integer planner_failures;
+  double path_length, min_separation, min_separation_continuous, solve_seconds;
+  Flag at_goals, reached, arrived, collided, collided_at_steps, collided_continuous;
+};
+
 }  // namespace
 
 #if defined(_WIN32)
@@ -245,5 +253,46 @@ EXPORT void quad_swarm_separations(Integer n_parts, Integer n_swarms, Integer n_
         apart_during[k] = during[n_robots * robot + other];
       }
     }
+  }
+}
+
+EXPORT void quad_swarm_count(Integer n_swarms, Integer n_robots, Integer n_places, Integer failed, double seconds,
+                             const Integer* n_requests, const Flag* collided, const Flag* collision,
+                             const Flag* collision_continuous, const Flag* at_goal, const Integer* source,
+                             const Integer* age, const Integer* status, const Integer* others, const double* moved,
+                             const double* least, const double* least_during, Statistics* statistics) {
+  const Integer n_pairs = n_robots * n_places;
+  for (Integer swarm = 0; swarm < n_swarms; swarm++) {
+    Statistics& sum = statistics[swarm];
+    if (!sum.reached && !sum.collided) {
+      Integer used = 0, ages = 0, possible = others ? 0 : n_pairs;
+      for (Integer pair = n_pairs * swarm; pair < n_pairs * (swarm + 1); pair++) {
+        used += source[pair] != 0;
+        ages += source[pair] != 0 ? age[pair] : 0;
+        possible += others && others[pair] >= 0;
+      }
+      sum.steps_counted++;
+      sum.requests += n_requests[swarm];
+      sum.possible_requests += possible;
+      sum.peak_requests = std::max(sum.peak_requests, n_requests[swarm]);
+      sum.plans_used += used;
+      sum.plan_ages += ages;
+      sum.path_length += moved[swarm];
+    }
+    sum.steps++;
+    sum.requests_flown += n_requests[swarm];
+    sum.collided |= collided[swarm];
+    sum.collided_at_steps |= collision[swarm];
+    sum.collided_continuous |= collision_continuous[swarm];
+    sum.at_goals = 1;
+    for (Integer robot = n_robots * swarm; robot < n_robots * (swarm + 1); robot++) {
+      sum.at_goals &= at_goal[robot];
+      sum.planner_failures += status[robot] >= failed;
+    }
+    sum.arrived |= sum.at_goals && !sum.collided;
+    sum.reached |= sum.at_goals;
+    sum.min_separation = std::min(sum.min_separation, least[swarm]);
+    sum.min_separation_continuous = std::min(sum.min_separation_continuous, least_during[swarm]);
+    sum.solve_seconds += seconds / static_cast<double>(n_swarms);
   }
 }

@@ -1,4 +1,5 @@
-"""Computations for every pair of robots in every step, in compiled code if there is a compiler, otherwise in NumPy.
+"""Computations for every pair of robots in every step, in compiled code if there is a compiler, otherwise in NumPy,
+and the counting of steps.
 
 Both give bit-identical results. ``pairs`` stands for any leading axes that end with the robots and their others; N is
 the number of stages of a plan.
@@ -10,6 +11,7 @@ import ctypes
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +28,20 @@ _FUNCTIONS = {
     "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
     "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 5],
     "quad_swarm_separations": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, *[_ARRAY] * 6],
+    "quad_swarm_count": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 13],
 }
+# Record of what is counted of an episode, see `quad_swarm.task.episode_statistics`; pairs.cpp has the same
+STATISTICS = np.dtype(
+    [
+        *((name, np.int64) for name in ("steps", "steps_counted", "requests", "possible_requests", "peak_requests")),
+        *((name, np.int64) for name in ("plans_used", "plan_ages", "requests_flown", "planner_failures")),
+        *((name, np.float64) for name in ("path_length", "min_separation", "min_separation_continuous")),
+        ("solve_seconds", np.float64),
+        *((name, np.bool_) for name in ("at_goals", "reached", "arrived")),
+        *((name, np.bool_) for name in ("collided", "collided_at_steps", "collided_continuous")),
+    ],
+    align=True,
+)
 
 
 @functools.cache
@@ -270,6 +285,80 @@ def separations(
     else:
         apart, apart_during = (np.take_along_axis(one, others, axis=2) for one in (after, during))
     return after.min(axis=(1, 2)), during.min(axis=(1, 2)), apart, apart_during
+
+
+class Step(NamedTuple):
+    """What is counted of one step of E swarms, with the names of `quad_swarm.world.swarm.StepReport`.
+
+    :param n_requests: number of requests, (E,) int64
+    :param collided: whether two robots collided, in the sense that ends episodes, (E,) bool
+    :param collision: whether two robots collided after the step, (E,) bool
+    :param collision_continuous: whether two robots collided during the step, (E,) bool
+    :param at_goal: (E, n) bool
+    :param source: origin of the believed trajectories, 0 without a plan, (E, n, m) int64
+    :param age: ages of the believed plans, (E, n, m) int64
+    :param status: status of the plans, (E, n) int64
+    :param others: indices of the others, -1 for an empty slot, (E, n, m) int64; None without empty slots
+    :param moved: mean distance that a robot flew, (E,) (m)
+    :param least: smallest distance of two robots after the step, (E,) (m)
+    :param least_during: smallest distance during the step, (E,) (m)
+    """
+
+    n_requests: np.ndarray
+    collided: np.ndarray
+    collision: np.ndarray
+    collision_continuous: np.ndarray
+    at_goal: np.ndarray
+    source: np.ndarray
+    age: np.ndarray
+    status: np.ndarray
+    others: np.ndarray | None
+    moved: np.ndarray
+    least: np.ndarray
+    least_during: np.ndarray
+
+
+# Types of the fields
+_OF_STEP = tuple(map(np.dtype, (np.int64, *[np.bool_] * 4, *[np.int64] * 4, *[np.float64] * 3)))
+
+
+def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> None:
+    """Add a step to the statistics of E swarms.
+
+    :param statistics: the statistics, changed in place, (E,) `STATISTICS`
+    :param step: the step
+    :param failed: smallest status of a plan without a successful solve
+    :param seconds: time of the planner for all swarms (s)
+    """
+    if (library := compiled()) is not None:
+        arrays = [
+            None if one is None else np.ascontiguousarray(one, kind) for one, kind in zip(step, _OF_STEP, strict=True)
+        ]
+        library.quad_swarm_count(*step.source.shape, failed, seconds, *addresses(*arrays, statistics))
+        return
+    s, used = statistics, step.source != 0
+    counted = ~(s["reached"] | s["collided"])
+    requests = counted * step.n_requests
+    possible = used[:1].size if step.others is None else (step.others >= 0).sum(axis=(1, 2))
+    s["steps"] += 1
+    s["steps_counted"] += counted
+    s["requests"] += requests
+    s["possible_requests"] += counted * possible
+    s["peak_requests"] = np.maximum(s["peak_requests"], requests)
+    s["plans_used"] += counted * used.sum(axis=(1, 2))
+    s["plan_ages"] += counted * (used * step.age).sum(axis=(1, 2))
+    s["requests_flown"] += step.n_requests
+    s["path_length"] += counted * step.moved
+    s["collided"] |= step.collided
+    s["collided_at_steps"] |= step.collision
+    s["collided_continuous"] |= step.collision_continuous
+    s["at_goals"] = step.at_goal.all(axis=1)
+    s["arrived"] |= s["at_goals"] & ~s["collided"]
+    s["reached"] |= s["at_goals"]
+    s["min_separation"] = np.minimum(s["min_separation"], step.least)
+    s["min_separation_continuous"] = np.minimum(s["min_separation_continuous"], step.least_during)
+    s["planner_failures"] += (step.status >= failed).sum(axis=1)
+    s["solve_seconds"] += seconds / max(len(s), 1)
 
 
 def _swarms_last(shape: tuple[int, ...]) -> np.ndarray:

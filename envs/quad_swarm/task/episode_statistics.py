@@ -6,14 +6,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from quad_swarm.native.pairs import STATISTICS, Step, count
 from quad_swarm.planner import PlanStatus
 from quad_swarm.states import like
-from quad_swarm.world.beliefs import BeliefSource
 from quad_swarm.world.messages import REQUEST_BYTES, plan_bytes
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.swarm import StepReport
 
-_NO_PLAN, _SHIFTED = int(BeliefSource.CONSTANT_VELOCITY), int(PlanStatus.SHIFTED)  # NumPy is slow with enumerations
+_SHIFTED = int(PlanStatus.SHIFTED)
+_NAMES = STATISTICS.names or ()
+_STATE = [name for name in _NAMES if name != "at_goals"]
 
 
 def exchange_bytes(config: SwarmConfig) -> int:
@@ -53,28 +55,6 @@ class EpisodeStatistics:
     :ivar solve_seconds: wall-clock time of the planner, as this swarm's share of each batch call (s)
     """
 
-    _START = {  # noqa: RUF012 - never changed
-        "steps": 0,
-        "steps_counted": 0,
-        "requests": 0,
-        "possible_requests": 0,
-        "peak_requests": 0,
-        "plans_used": 0,
-        "plan_ages": 0,
-        "requests_flown": 0,
-        "path_length": 0.0,
-        "reached": False,
-        "arrived": False,
-        "collided": False,
-        "collided_at_steps": False,
-        "collided_continuous": False,
-        "min_separation": np.inf,
-        "min_separation_continuous": np.inf,
-        "planner_failures": 0,
-        "solve_seconds": 0.0,
-    }
-
-    at_goals: np.ndarray
     steps: np.ndarray
     steps_counted: np.ndarray
     requests: np.ndarray
@@ -84,6 +64,7 @@ class EpisodeStatistics:
     plan_ages: np.ndarray
     requests_flown: np.ndarray
     path_length: np.ndarray
+    at_goals: np.ndarray
     reached: np.ndarray
     arrived: np.ndarray
     collided: np.ndarray
@@ -96,28 +77,32 @@ class EpisodeStatistics:
 
     def __init__(self, n_swarms: int, config: SwarmConfig):
         self.config = config
-        self.at_goals = np.zeros(n_swarms, dtype=bool)
-        for name, value in self._START.items():
-            setattr(self, name, np.full(n_swarms, value))
+        self._records = np.zeros(n_swarms, dtype=STATISTICS)
+        self.reset(slice(None))
 
-    def reset(self, swarm: int) -> None:
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name not in _NAMES:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return self._records[name]
+
+    def reset(self, swarm: int | slice) -> None:
         """Start a new episode in one swarm."""
-        for name, value in self._START.items():
-            getattr(self, name)[swarm] = value
+        self._records[swarm] = np.zeros((), dtype=STATISTICS)
+        for name in ("min_separation", "min_separation_continuous"):
+            self._records[name][swarm] = np.inf
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
-        for name in self._START:
-            setattr(self, name, getattr(self, name)[swarms])
+        self._records = self._records[swarms]
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return all statistics by name."""
-        return {name: getattr(self, name).copy() for name in self._START}
+        return {name: self._records[name].copy() for name in _STATE}
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore a state from `state_dict`."""
-        for name in self._START:
-            setattr(self, name, like(getattr(self, name), state[name], name))
+        for name in _STATE:
+            self._records[name] = like(self._records[name], state[name], name)
 
     def add(self, report: StepReport, n_requests: np.ndarray, collided: np.ndarray) -> None:
         """Add one step.
@@ -126,30 +111,21 @@ class EpisodeStatistics:
         :param n_requests: number of requests in the step, (E,)
         :param collided: whether two robots collided in the step, in the sense that ends episodes, (E,) bool
         """
-        counted = ~(self.reached | self.collided)
-        requests = counted * n_requests
-        used = report.belief_source != _NO_PLAN
-        self.steps += 1
-        self.steps_counted += counted
-        self.requests += requests
-        # Only a limited neighbourhood has empty slots
-        possible = used[0].size if report.changed is None else (report.others >= 0).sum(axis=(1, 2))
-        self.possible_requests += counted * possible
-        self.peak_requests = np.maximum(self.peak_requests, requests)
-        self.plans_used += counted * used.sum(axis=(1, 2))
-        self.plan_ages += counted * (used * report.plan_age).sum(axis=(1, 2))
-        self.requests_flown += n_requests
-        self.path_length += counted * report.moved.sum(axis=1) / report.moved.shape[1]
-        self.collided |= collided
-        self.collided_at_steps |= report.collision
-        self.collided_continuous |= report.collision_continuous
-        self.at_goals = np.logical_and.reduce(report.at_goal, axis=1)
-        self.arrived |= self.at_goals & ~self.collided
-        self.reached |= self.at_goals
-        self.min_separation = np.minimum(self.min_separation, report.min_separation)
-        self.min_separation_continuous = np.minimum(self.min_separation_continuous, report.min_separation_continuous)
-        self.planner_failures += (report.plan_status >= _SHIFTED).sum(axis=1)
-        self.solve_seconds += report.solve_seconds / len(self.steps)
+        step = Step(
+            n_requests=n_requests,
+            collided=collided,
+            collision=report.collision,
+            collision_continuous=report.collision_continuous,
+            at_goal=report.at_goal,
+            source=report.belief_source,
+            age=report.plan_age,
+            status=report.plan_status,
+            others=None if report.changed is None else report.others,  # then there may be empty slots
+            moved=report.moved.sum(axis=1) / report.moved.shape[1],
+            least=report.min_separation,
+            least_during=report.min_separation_continuous,
+        )
+        count(self._records, step, _SHIFTED, report.solve_seconds)
 
     @property
     def success(self) -> np.ndarray:
@@ -158,7 +134,7 @@ class EpisodeStatistics:
 
     def row(self, swarm: int) -> dict[str, float]:
         """Return one swarm's statistics by name."""
-        return {name: getattr(self, name)[swarm].item() for name in self._START}
+        return {name: getattr(self, name)[swarm].item() for name in _STATE}
 
     def metrics(self) -> dict[str, np.ndarray]:
         """Return metrics of the episodes so far by the names under which they are logged, each (E,)."""
