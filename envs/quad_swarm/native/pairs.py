@@ -379,5 +379,7 @@ def _einsum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def advance(trajectory: np.ndarray) -> np.ndarray:
     """Advance trajectories (..., K, 3) by a step; the last segment continues in a straight line."""
-    end = 2 * trajectory[..., -1:, :] - trajectory[..., -2:-1, :]
-    return np.concatenate([trajectory[..., 1:, :], end], axis=-2)
+    later = np.empty_like(trajectory)
+    later[..., :-1, :] = trajectory[..., 1:, :]
+    later[..., -1, :] = 2 * trajectory[..., -1, :] - trajectory[..., -2, :]
+    return later

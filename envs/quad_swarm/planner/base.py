@@ -184,4 +184,6 @@ class Planner:
 
 def shift(trajectory: np.ndarray) -> np.ndarray:
     """Shift trajectories (B, K, ...) by one step, repeating the last entry."""
-    return np.concatenate([trajectory[:, 1:], trajectory[:, -1:]], axis=1)
+    later = np.empty_like(trajectory)
+    later[:, :-1], later[:, -1] = trajectory[:, 1:], trajectory[:, -1]
+    return later

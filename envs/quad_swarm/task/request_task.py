@@ -242,18 +242,20 @@ class RequestTask:
             (E, n, n - 1); by default the requests
         :param n_requests: number of requests to report, (E,); by default that of ``requests``
         """
-        if messages is None:
-            messages = requests
         report = self.swarm.step(requests)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
         if n_requests is None:
             n_requests = requests.sum(axis=(1, 2))
+        if messages is None:
+            messages, n_messages = requests, n_requests
+        else:
+            n_messages = messages.sum(axis=(1, 2))
         self.statistics.add(report, n_requests, collided)
         terms = {
             "goal": self.reward.goal * self.statistics.at_goals,
             "collision": -self.reward.collision * collided,
-            "requests": -self.reward.request * messages.sum(axis=(1, 2)),
+            "requests": -self.reward.request * n_messages,
         }
         near_misses: np.ndarray | float = 0.0
         if self.reward.near_miss:

@@ -352,7 +352,7 @@ class Swarm:
         return positions
 
     def _report(self, positions: list[np.ndarray], source: np.ndarray, solve_seconds: float) -> StepReport:
-        before, pos = positions[0], positions[-1]
+        moved, to_goal = positions[-1] - positions[0], positions[-1] - self.goal
         others = self.neighbours.others if self.neighbours.limited else None
         # Of all pairs, including those that do not perceive each other
         least, least_continuous, separation, separation_continuous = separations(np.array(positions), others)
@@ -368,8 +368,8 @@ class Swarm:
             collision=least < limit,
             collision_continuous=least_continuous < limit,
             changed=None,
-            moved=np.sqrt(_dot(pos - before, pos - before)),
-            at_goal=_dot(pos - self.goal, pos - self.goal) <= self.config.goal_radius**2,
+            moved=np.sqrt(_dot(moved, moved)),
+            at_goal=_dot(to_goal, to_goal) <= self.config.goal_radius**2,
             belief_source=source,
             plan_age=self.beliefs.age.copy(),  # a later reset writes into it
             plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
