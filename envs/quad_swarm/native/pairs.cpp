@@ -225,10 +225,11 @@ EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_
   }
 }
 
-// Without `others`, the swarms' results lie next to each other.
-EXPORT void quad_swarm_separations(Integer n_parts, Integer n_swarms, Integer n_robots, Integer n_places,
-                                   const double* positions, const Integer* others, double* least, double* least_during,
-                                   double* apart, double* apart_during) {
+// Without `others`, the swarms' results for pairs lie next to each other.
+EXPORT void quad_swarm_measure(Integer n_parts, Integer n_swarms, Integer n_robots, Integer n_places, double contact,
+                               double goal_radius, const double* positions, const double* goals, const Integer* others,
+                               double* least, double* least_during, double* apart, double* apart_during, Flag* colliding,
+                               Flag* colliding_during, double* moved, Flag* at_goal) {
   const double infinity = std::numeric_limits<double>::infinity();
   const Integer stride = 3 * n_robots * n_swarms, last = stride * n_parts;
   std::vector<double> after(n_robots * n_robots, infinity), during(n_robots * n_robots, infinity);
@@ -251,7 +252,13 @@ EXPORT void quad_swarm_separations(Integer n_parts, Integer n_swarms, Integer n_
         const Integer k = others ? pairs * swarm + pair : n_swarms * pair + swarm;
         apart[k] = after[n_robots * robot + other];
         apart_during[k] = during[n_robots * robot + other];
+        colliding[k] = apart[k] < contact;
+        colliding_during[k] = apart_during[k] < contact;
       }
+      const Integer number = n_robots * swarm + robot;
+      const double* now = pos + last + 3 * robot;
+      moved[number] = std::sqrt(squared_distance(now, pos + 3 * robot));
+      at_goal[number] = squared_distance(now, goals + 3 * number) <= goal_radius * goal_radius;
     }
   }
 }

@@ -27,7 +27,7 @@ _FUNCTIONS = {
     "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
     "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
     "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 5],
-    "quad_swarm_separations": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, *[_ARRAY] * 6],
+    "quad_swarm_measure": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 11],
     "quad_swarm_count": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 13],
 }
 # Record of what is counted of an episode, see `quad_swarm.task.episode_statistics`; pairs.cpp has the same
@@ -246,31 +246,56 @@ def neighbours(
     return others, present, reverse
 
 
-def separations(
-    positions: np.ndarray, others: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the distances between robots after a step and the smallest distances during it, with straight motion
-    between sub-steps.
+class Measured(NamedTuple):
+    """What is measured of one step of E swarms.
+
+    :param least: smallest distance of all pairs after the step, (E,) (m)
+    :param least_during: smallest distance of all pairs during the step, (E,) (m)
+    :param apart: distance of each robot to each of its ``others`` after the step, infinity for none, (E, n, m) (m)
+    :param apart_during: smallest distance to each of them during the step, (E, n, m) (m)
+    :param colliding: where ``apart`` is less than the distance of contact, (E, n, m) bool
+    :param colliding_during: where ``apart_during`` is less, (E, n, m) bool
+    :param moved: distance between the positions before and after the step, (E, n) (m)
+    :param at_goal: whether each robot is within the goal radius, (E, n) bool
+    """
+
+    least: np.ndarray
+    least_during: np.ndarray
+    apart: np.ndarray
+    apart_during: np.ndarray
+    colliding: np.ndarray
+    colliding_during: np.ndarray
+    moved: np.ndarray
+    at_goal: np.ndarray
+
+
+def measure(
+    positions: np.ndarray, goals: np.ndarray, contact: float, goal_radius: float, others: np.ndarray | None = None
+) -> Measured:
+    """Measure a step, with straight motion between sub-steps.
 
     :param positions: positions before the step and after each of the S sub-steps, (S + 1, E, n, 3) (m)
+    :param goals: goals, (E, n, 3) (m)
+    :param contact: distance below which two robots collide (m)
+    :param goal_radius: distance within which a robot is at its goal (m)
     :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m); None for
         all n - 1 others in ascending order
-    :return: smallest distance of all pairs after and during the step, (E,) each (m), and distance of each robot to each
-        of its ``others`` after and during the step, (E, n, m) each (m), infinity for none
     """
-    n_swarms, n = positions.shape[1:3]
+    n_swarms, n = goals.shape[:2]
+    shape = (n_swarms, n, n - 1) if others is None else others.shape
+    empty = np.empty if others is not None else _swarms_last
     if (library := compiled()) is not None:
-        positions = np.ascontiguousarray(positions)
+        positions, goals = np.ascontiguousarray(positions), np.ascontiguousarray(goals)
         others = None if others is None else np.ascontiguousarray(others)
-        shape = (n_swarms, n, n - 1) if others is None else others.shape
-        least, least_during = np.empty(n_swarms), np.empty(n_swarms)
-        apart, apart_during = (_swarms_last(shape) if others is None else np.empty(shape) for _ in range(2))
-        library.quad_swarm_separations(
-            len(positions) - 1,
-            *shape,
-            *addresses(positions, others, least, least_during, apart, apart_during),
+        measured = Measured(
+            *(np.empty(n_swarms), np.empty(n_swarms)),
+            *(empty(shape), empty(shape), empty(shape, bool), empty(shape, bool)),
+            *(np.empty((n_swarms, n)), np.empty((n_swarms, n), dtype=bool)),
         )
-        return least, least_during, apart, apart_during
+        library.quad_swarm_measure(
+            len(positions) - 1, *shape, contact, goal_radius, *addresses(positions, goals, others, *measured)
+        )
+        return measured
     between = positions[:, :, :, None] - positions[:, :, None]
     start, change = between[:-1], np.diff(between, axis=0)
     along = -_einsum(start, change) / np.maximum(_einsum(change, change), 1e-12)
@@ -278,13 +303,18 @@ def separations(
     after, during = np.sqrt(_einsum(between[-1], between[-1])), np.sqrt(_einsum(closest, closest).min(axis=0))
     own = np.arange(n)
     after[:, own, own] = during[:, own, own] = np.inf
+    apart, apart_during = empty(shape), empty(shape)
     if others is None:
-        apart, apart_during = _swarms_last((n_swarms, n, n - 1)), _swarms_last((n_swarms, n, n - 1))
-        apart[...] = after[:, ~np.eye(n, dtype=bool)].reshape(apart.shape)
-        apart_during[...] = during[:, ~np.eye(n, dtype=bool)].reshape(apart.shape)
+        apart[...] = after[:, ~np.eye(n, dtype=bool)].reshape(shape)
+        apart_during[...] = during[:, ~np.eye(n, dtype=bool)].reshape(shape)
     else:
         apart, apart_during = (np.take_along_axis(one, others, axis=2) for one in (after, during))
-    return after.min(axis=(1, 2)), during.min(axis=(1, 2)), apart, apart_during
+    moved, to_goal = positions[-1] - positions[0], positions[-1] - goals
+    return Measured(
+        *(after.min(axis=(1, 2)), during.min(axis=(1, 2))),
+        *(apart, apart_during, apart < contact, apart_during < contact),
+        *(np.sqrt(_einsum(moved, moved)), _einsum(to_goal, to_goal) <= goal_radius * goal_radius),
+    )
 
 
 class Step(NamedTuple):
@@ -361,10 +391,10 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     s["solve_seconds"] += seconds / max(len(s), 1)
 
 
-def _swarms_last(shape: tuple[int, ...]) -> np.ndarray:
+def _swarms_last(shape: tuple[int, ...], dtype: type = float) -> np.ndarray:
     """Return an empty array (E, n, n - 1) in which the values of a pair in all swarms are adjacent. The layout decides
     in which order NumPy sums rewards over pairs, and this one keeps them as they have always been."""
-    return np.empty((shape[1] * shape[2], shape[0])).T.reshape(shape)
+    return np.empty((shape[1] * shape[2], shape[0]), dtype).T.reshape(shape)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

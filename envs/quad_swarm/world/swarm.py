@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown
-from quad_swarm.native.pairs import advance, resample, separations
+from quad_swarm.native.pairs import advance, measure, resample
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
@@ -352,24 +352,23 @@ class Swarm:
         return positions
 
     def _report(self, positions: list[np.ndarray], source: np.ndarray, solve_seconds: float) -> StepReport:
-        moved, to_goal = positions[-1] - positions[0], positions[-1] - self.goal
         others = self.neighbours.others if self.neighbours.limited else None
+        contact = 2 * self.config.radius - self.config.collision_tolerance
         # Of all pairs, including those that do not perceive each other
-        least, least_continuous, separation, separation_continuous = separations(np.array(positions), others)
-        limit = 2 * self.config.radius - self.config.collision_tolerance
+        measured = measure(np.array(positions), self.goal, contact, self.config.goal_radius, others)
         shape = self.state.shape[:2]
         return StepReport(
-            min_separation=least,
-            min_separation_continuous=least_continuous,
+            min_separation=measured.least,
+            min_separation_continuous=measured.least_during,
             others=self.neighbours.numbers(),
-            separation=separation,
-            colliding=separation < limit,
-            colliding_continuous=separation_continuous < limit,
-            collision=least < limit,
-            collision_continuous=least_continuous < limit,
+            separation=measured.apart,
+            colliding=measured.colliding,
+            colliding_continuous=measured.colliding_during,
+            collision=measured.least < contact,
+            collision_continuous=measured.least_during < contact,
             changed=None,
-            moved=np.sqrt(_dot(moved, moved)),
-            at_goal=_dot(to_goal, to_goal) <= self.config.goal_radius**2,
+            moved=measured.moved,
+            at_goal=measured.at_goal,
             belief_source=source,
             plan_age=self.beliefs.age.copy(),  # a later reset writes into it
             plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans

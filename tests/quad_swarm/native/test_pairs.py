@@ -94,7 +94,9 @@ def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
         "approach": list(pairs.approach(s.own, s.plan, *belief, DT)),
         "resample": [resampled],
         "neighbours": [array for step in near for array in step],
-        "separations": [*pairs.separations(s.path, near[-1][0]), *pairs.separations(s.path)],
+        "measure": [
+            array for others in (near[-1][0], None) for array in pairs.measure(s.path, s.own, 0.5, 1.0, others)
+        ],
         "count": [counted(s.steps)[name] for name in pairs.STATISTICS.names],
         "keep_right": list(pairs.keep_right(s.x, others, s.remembers.reshape(others.shape[:2]), 0.3, DT, 1.0, 0.5)),
     }
