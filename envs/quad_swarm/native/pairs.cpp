@@ -106,6 +106,38 @@ EXPORT void quad_swarm_believe(Integer n_pairs, Integer n_stages, Integer n_chos
   }
 }
 
+// `ages` null: all answers are as old as `age`. `remembered` null: without memory. `believed` null: not needed.
+EXPORT void quad_swarm_receive(Integer n_pairs, Integer n_stages, Integer age, double dt, const Flag* arriving,
+                               const double* received, const Integer* ages, const double* pos, const double* vel,
+                               const Flag* remembers, const Integer* known_age, const double* known, double* remembered,
+                               Integer* next_age, double* believed, Integer* source) {
+  const Integer row = 3 * n_stages;
+  std::vector<double> times(row);
+  for (Integer k = 0; k < row; k++) times[k] = dt * static_cast<double>(k / 3 + 1);
+  Integer answer = 0;
+  for (Integer pair = 0; pair < n_pairs; pair++) {
+    bool arrives = arriving[pair];
+    const double* plan = known + (row + 3) * pair;
+    next_age[pair] = known_age[pair];
+    if (arrives) {
+      const Integer made = ages ? ages[answer] : age;
+      arrives = !ages || made <= known_age[pair];  // otherwise a newer one has arrived before
+      if (arrives) {
+        plan = received + (row + 3) * answer;
+        next_age[pair] = made;
+        if (remembered) std::memcpy(remembered + (row + 3) * pair, plan, (row + 3) * sizeof(double));
+      }
+      answer++;
+    }
+    if (!believed) continue;
+    source[pair] = arrives ? 2 : remembers[pair] ? 1 : 0;
+    if (source[pair])
+      std::memcpy(believed + row * pair, plan + 3, row * sizeof(double));
+    else
+      steady(pos + 3 * pair, vel + 3 * pair, times, believed + row * pair);
+  }
+}
+
 EXPORT void quad_swarm_approach(Integer n_robots, Integer n_others, Integer n_stages, double dt, const double* own,
                                 const double* plan, const double* pos, const double* vel, const double* remembered,
                                 const Flag* remembers, double* least, Integer* nearest, double* last) {

@@ -23,6 +23,7 @@ _INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 _FUNCTIONS = {
     "quad_swarm_remember": [_INTEGER, _INTEGER, _REAL, *[_ARRAY] * 7],
     "quad_swarm_believe": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 6],
+    "quad_swarm_receive": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 12],
     "quad_swarm_approach": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 9],
     "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
     "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
@@ -111,6 +112,66 @@ def believe(
         remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *addresses(chosen, *arrays, believed)
     )
     return believed
+
+
+class Known(NamedTuple):
+    """What robots know about the others before answers arrive, with the shapes of `believe` and `remember`."""
+
+    pos: np.ndarray
+    vel: np.ndarray
+    remembers: np.ndarray
+    age: np.ndarray
+    remembered: np.ndarray
+
+
+def receive(
+    known: Known,
+    arriving: np.ndarray,
+    received: np.ndarray,
+    age: np.ndarray | int,
+    dt: float,
+    memory: bool,
+    predicts: bool = True,
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Take received plans instead of older ones.
+
+    :param known: what is known; received plans are written into ``known.remembered``, which is contiguous, if there is
+        a memory
+    :param arriving: whose plans arrive, (pairs) bool
+    :param received: these plans in the order of ``arriving``, (number of answers, N + 1, 3) (m)
+    :param age: steps since each of them was made, (number of answers,), of which those that are older than the known
+        plan are ignored; or one number for all
+    :param dt: length of a stage (s)
+    :param memory: whether received plans are remembered
+    :param predicts: whether to return more than the ages
+    :return: ages of the newest plans, believed positions at the next N steps, (pairs, N, 3) (m), and where they come
+        from, (pairs): 2 for a plan that arrives now, 1 for a remembered one, 0 for a constant velocity
+    """
+    ages = age if isinstance(age, np.ndarray) else None
+    if (library := compiled()) is not None:
+        arrays = [arriving, received if len(received) else None, None if ages is None or not len(ages) else ages]
+        arrays = [None if one is None else np.ascontiguousarray(one) for one in (*arrays, *known)]
+        next_age = np.empty(arriving.shape, dtype=np.int64)
+        believed = np.empty((*arriving.shape, received.shape[-2] - 1, 3)) if predicts else None
+        source = np.empty(arriving.shape, dtype=np.int64) if predicts else None
+        library.quad_swarm_receive(
+            *(arriving.size, received.shape[-2] - 1, 0 if ages is not None else age, dt),
+            *addresses(*arrays, known.remembered if memory else None, next_age, believed, source),
+        )
+        return next_age, believed, source
+    if ages is not None:
+        newer = ages <= known.age[arriving]
+        arriving, received, age = arriving.copy(), received[newer], ages[newer]
+        arriving[arriving] = newer
+    if memory:
+        known.remembered[arriving] = received
+    next_age = known.age.copy()
+    next_age[arriving] = age
+    if not predicts:
+        return next_age, None, None
+    believed = believe(known.pos, known.vel, known.remembered, known.remembers, dt)
+    believed[arriving] = received[:, 1:]
+    return next_age, believed, np.where(arriving, 2, np.where(known.remembers, 1, 0))
 
 
 @functools.cache

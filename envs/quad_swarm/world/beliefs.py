@@ -28,9 +28,6 @@ class BeliefSource(IntEnum):
     REQUESTED = 2
 
 
-_CONSTANT_VELOCITY, _REMEMBERED, _REQUESTED = map(int, BeliefSource)  # NumPy is slow with enumerations
-
-
 @cache
 def other_indices(n_robots: int) -> np.ndarray:
     """Return the indices of each robot's others in ascending order, (n, n - 1), read-only."""
@@ -226,15 +223,14 @@ class Beliefs:
         :return: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), and their `BeliefSource`,
             (E, n, n - 1)
         """
-        prediction = self.predict(pos, vel)
-        believed = prediction.believed()
-        arriving, received = self._receive(prediction, arriving, received, age)
-        believed[arriving] = received[:, 1:]
-        return believed, np.where(arriving, _REQUESTED, np.where(prediction.remembers, _REMEMBERED, _CONSTANT_VELOCITY))
+        believed, source = self._receive(arriving, pos, vel, received, age, predicts=True)
+        assert believed is not None
+        assert source is not None
+        return believed, source
 
     def receive(
         self, arriving: np.ndarray, pos: np.ndarray, vel: np.ndarray, received: np.ndarray, age: np.ndarray | int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> None:
         """Remember received plans and advance the memory by a step.
 
         :param arriving: whose plans each robot receives, (E, n, n - 1) bool
@@ -242,32 +238,24 @@ class Beliefs:
         :param vel: current velocities of the others, (E, n, n - 1, 3), world frame (m/s)
         :param received: received plans as positions now and at the next N steps, (number of answers, N + 1, 3) (m),
             see `answered`
-        :param age: steps since each of these plans was made, (number of answers,), or one number for all
-        :return: ``arriving`` and ``received``, without plans that are older than a known one
+        :param age: steps since each of these plans was made, (number of answers,), of which those that are older than
+            the known plan are ignored; or one number for all
         """
-        return self._receive(self.predict(pos, vel), arriving, received, age)
+        self._receive(arriving, pos, vel, received, age, predicts=False)
 
     def _receive(
-        self, prediction: Prediction, arriving: np.ndarray, received: np.ndarray, age: np.ndarray | int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        if isinstance(age, np.ndarray):
-            # An answer may arrive after a newer one
-            newer = age <= prediction.age[arriving]
-            arriving, received, age = arriving.copy(), received[newer], age[newer]
-            arriving[arriving] = newer
-        if self.memory:
-            self._remembered = prediction.remembered  # no one else uses it any more
-            self._remembered[arriving] = received
-            self._age = prediction.age.copy()
-            self._age[arriving] = age
-        else:
-            self._age = np.where(arriving, _filled(arriving, age), self.horizon)
+        self,
+        arriving: np.ndarray,
+        pos: np.ndarray,
+        vel: np.ndarray,
+        received: np.ndarray,
+        age: np.ndarray | int,
+        predicts: bool,
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        now = self.predict(pos, vel)
+        known = pairs.Known(now.pos, now.vel, now.remembers, now.age, now.remembered)
+        arguments = (arriving, received, age, self.dt, bool(self.memory), predicts)
+        self._age, believed, source = pairs.receive(known, *arguments)
+        self._remembered = now.remembered  # no one else uses it any more
         self._known = None
-        return arriving, received
-
-
-def _filled(where: np.ndarray, values: np.ndarray | int) -> np.ndarray:
-    """Return an array with the values where a mask is true, in its order, and zeros elsewhere."""
-    filled = np.zeros(where.shape, dtype=np.int64)
-    filled[where] = values
-    return filled
+        return believed, source

@@ -33,6 +33,9 @@ def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace
         remembered=remembered,
         age=rng.integers(0, horizon + 2, shape),
         remembers=rng.random(shape) < 0.5,
+        arriving=(arriving := rng.random(shape) < 0.4),
+        received=rng.normal(size=(arriving.sum(), horizon + 1, 3)),
+        ages=rng.integers(1, horizon + 2, arriving.sum()),
         x=rng.normal(size=(n_swarms * n, 9)),
         own=rng.normal(size=(n_swarms, n, 3)),
         plan=rng.normal(size=(n_swarms, n, horizon, 3)).cumsum(axis=-2),
@@ -88,7 +91,15 @@ def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
     others = resampled.reshape(s.x.shape[0], *resampled.shape[2:]).copy()
     pairs.resample(resampled, s.later)
     near = neighbourhoods(s)
+    answers = []
+    for k, ages in enumerate((s.ages, 2, s.ages[:0])):
+        arriving = s.arriving if k < 2 else np.zeros_like(s.arriving)
+        known = pairs.Known(s.pos, s.vel, s.remembers, s.age, np.array(s.remembered, order="C"))
+        plans = s.received[: arriving.sum()]
+        found = pairs.receive(known, arriving, plans, ages, DT, memory=k != 1, predicts=k < 2)
+        answers += [one for one in (*found, known.remembered) if one is not None]
     return {
+        "receive": answers,
         "remember": list(pairs.remember(s.remembered, s.age, s.pos, 0.03)),
         "believe": [pairs.believe(*belief, DT), pairs.believe(*belief, DT, [2, 0])],
         "approach": list(pairs.approach(s.own, s.plan, *belief, DT)),
