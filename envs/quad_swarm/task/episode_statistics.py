@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from quad_swarm.native.pairs import STATISTICS, Step, count
+from quad_swarm.native.steps import STATISTICS, Step, count
 from quad_swarm.planner import PlanStatus
 from quad_swarm.states import like
 from quad_swarm.world.messages import REQUEST_BYTES, plan_bytes

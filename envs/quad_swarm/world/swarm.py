@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown
-from quad_swarm.native.pairs import advance, measure, resample
+from quad_swarm.native.pairs import advance, resample
+from quad_swarm.native.steps import measure
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL

@@ -41,35 +41,8 @@ def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace
         plan=rng.normal(size=(n_swarms, n, horizon, 3)).cumsum(axis=-2),
         later=rng.random((n_swarms, n)),
         vels=rng.normal(size=(n_swarms, n, 3)),
-        steps=[step(rng, shape, empty) for empty in (False, True) * 3],
         path=rng.normal(size=(1, n_swarms, n, 3)) + 0.2 * rng.normal(size=(4, n_swarms, n, 3)).cumsum(axis=0),
     )
-
-
-def step(rng: np.random.Generator, shape: tuple[int, ...], empty: bool) -> pairs.Step:
-    """What is counted of a step, in which there may be empty slots."""
-    n_swarms, n, _ = shape
-    return pairs.Step(
-        rng.integers(0, 9, n_swarms),
-        *(rng.random((3, n_swarms)) < 0.2),
-        at_goal=rng.random((n_swarms, n)) < 0.8,
-        source=rng.integers(0, 3, shape),
-        age=rng.integers(0, 9, shape),
-        status=rng.integers(0, 4, (n_swarms, n)),
-        others=rng.integers(-1, n, shape) if empty else None,
-        moved=rng.random(n_swarms),
-        least=rng.random(n_swarms),
-        least_during=rng.random(n_swarms),
-    )
-
-
-def counted(steps: list[pairs.Step]) -> np.ndarray:
-    """Return the statistics of an episode."""
-    statistics = np.zeros(len(steps[0].n_requests), dtype=pairs.STATISTICS)
-    statistics["min_separation"] = statistics["min_separation_continuous"] = np.inf
-    for one in steps:
-        pairs.count(statistics, one, failed=2, seconds=0.1)
-    return statistics
 
 
 def neighbourhoods(s: SimpleNamespace) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -105,10 +78,6 @@ def everything(s: SimpleNamespace) -> dict[str, list[np.ndarray]]:
         "approach": list(pairs.approach(s.own, s.plan, *belief, DT)),
         "resample": [resampled],
         "neighbours": [array for step in near for array in step],
-        "measure": [
-            array for others in (near[-1][0], None) for array in pairs.measure(s.path, s.own, 0.5, 1.0, others)
-        ],
-        "count": [counted(s.steps)[name] for name in pairs.STATISTICS.names],
         "keep_right": list(pairs.keep_right(s.x, others, s.remembers.reshape(others.shape[:2]), 0.3, DT, 1.0, 0.5)),
     }
 
@@ -126,18 +95,12 @@ def test_compiled_and_numpy_agree_to_the_last_bit(sizes, monkeypatch):
 def test_what_is_given_stays_as_it_is_and_may_lie_anyhow(either):
     s = scene(2, 4, 5)
     expected = everything(s)
-    strided = SimpleNamespace(
-        **{key: np.asfortranarray(value) for key, value in vars(s).items() if key != "steps"},
-        steps=[pairs.Step(*(one if one is None else np.asfortranarray(one) for one in step)) for step in s.steps],
-    )
+    strided = SimpleNamespace(**{key: np.asfortranarray(value) for key, value in vars(s).items()})
     before = deepcopy(vars(strided))
     for name, arrays in everything(strided).items():
         for mine, reference in zip(arrays, expected[name], strict=True):
             assert np.array_equal(mine, reference), name
-    steps, before_them = vars(strided).pop("steps"), before.pop("steps")
     assert all(np.array_equal(value, before[key]) for key, value in vars(strided).items())
-    for one, copied in zip(steps, before_them, strict=True):
-        assert all(np.array_equal(mine, other) for mine, other in zip(one, copied, strict=True))
 
 
 def test_advance_goes_on_straight():

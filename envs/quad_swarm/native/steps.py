@@ -1,0 +1,183 @@
+"""What is measured and counted of every step, in compiled code if there is a compiler, otherwise in NumPy.
+
+Both give bit-identical results. The compiled functions are those of `pairs`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from quad_swarm.native import pairs
+from quad_swarm.native.build import addresses
+
+# Record of what is counted of an episode, see `quad_swarm.task.episode_statistics`; pairs.cpp has the same
+STATISTICS = np.dtype(
+    [
+        *((name, np.int64) for name in ("steps", "steps_counted", "requests", "possible_requests", "peak_requests")),
+        *((name, np.int64) for name in ("plans_used", "plan_ages", "requests_flown", "planner_failures")),
+        *((name, np.float64) for name in ("path_length", "min_separation", "min_separation_continuous")),
+        ("solve_seconds", np.float64),
+        *((name, np.bool_) for name in ("at_goals", "reached", "arrived")),
+        *((name, np.bool_) for name in ("collided", "collided_at_steps", "collided_continuous")),
+    ],
+    align=True,
+)
+
+
+class Measured(NamedTuple):
+    """What is measured of one step of E swarms.
+
+    :param least: smallest distance of all pairs after the step, (E,) (m)
+    :param least_during: smallest distance of all pairs during the step, (E,) (m)
+    :param apart: distance of each robot to each of its ``others`` after the step, infinity for none, (E, n, m) (m)
+    :param apart_during: smallest distance to each of them during the step, (E, n, m) (m)
+    :param colliding: where ``apart`` is less than the distance of contact, (E, n, m) bool
+    :param colliding_during: where ``apart_during`` is less, (E, n, m) bool
+    :param moved: distance between the positions before and after the step, (E, n) (m)
+    :param at_goal: whether each robot is within the goal radius, (E, n) bool
+    """
+
+    least: np.ndarray
+    least_during: np.ndarray
+    apart: np.ndarray
+    apart_during: np.ndarray
+    colliding: np.ndarray
+    colliding_during: np.ndarray
+    moved: np.ndarray
+    at_goal: np.ndarray
+
+
+def measure(
+    positions: np.ndarray, goals: np.ndarray, contact: float, goal_radius: float, others: np.ndarray | None = None
+) -> Measured:
+    """Measure a step, with straight motion between sub-steps.
+
+    :param positions: positions before the step and after each of the S sub-steps, (S + 1, E, n, 3) (m)
+    :param goals: goals, (E, n, 3) (m)
+    :param contact: distance below which two robots collide (m)
+    :param goal_radius: distance within which a robot is at its goal (m)
+    :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m); None for
+        all n - 1 others in ascending order
+    """
+    n_swarms, n = goals.shape[:2]
+    shape = (n_swarms, n, n - 1) if others is None else others.shape
+    empty = np.empty if others is not None else _swarms_last
+    if (library := pairs.compiled()) is not None:
+        positions, goals = np.ascontiguousarray(positions), np.ascontiguousarray(goals)
+        others = None if others is None else np.ascontiguousarray(others)
+        measured = Measured(
+            *(np.empty(n_swarms), np.empty(n_swarms)),
+            *(empty(shape), empty(shape), empty(shape, bool), empty(shape, bool)),
+            *(np.empty((n_swarms, n)), np.empty((n_swarms, n), dtype=bool)),
+        )
+        library.quad_swarm_measure(
+            len(positions) - 1, *shape, contact, goal_radius, *addresses(positions, goals, others, *measured)
+        )
+        return measured
+    between = positions[:, :, :, None] - positions[:, :, None]
+    start, change = between[:-1], np.diff(between, axis=0)
+    along = -_einsum(start, change) / np.maximum(_einsum(change, change), 1e-12)
+    closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
+    after, during = np.sqrt(_einsum(between[-1], between[-1])), np.sqrt(_einsum(closest, closest).min(axis=0))
+    own = np.arange(n)
+    after[:, own, own] = during[:, own, own] = np.inf
+    apart, apart_during = empty(shape), empty(shape)
+    if others is None:
+        apart[...] = after[:, ~np.eye(n, dtype=bool)].reshape(shape)
+        apart_during[...] = during[:, ~np.eye(n, dtype=bool)].reshape(shape)
+    else:
+        apart, apart_during = (np.take_along_axis(one, others, axis=2) for one in (after, during))
+    moved, to_goal = positions[-1] - positions[0], positions[-1] - goals
+    return Measured(
+        *(after.min(axis=(1, 2)), during.min(axis=(1, 2))),
+        *(apart, apart_during, apart < contact, apart_during < contact),
+        *(np.sqrt(_einsum(moved, moved)), _einsum(to_goal, to_goal) <= goal_radius * goal_radius),
+    )
+
+
+class Step(NamedTuple):
+    """What is counted of one step of E swarms, with the names of `quad_swarm.world.swarm.StepReport`.
+
+    :param n_requests: number of requests, (E,) int64
+    :param collided: whether two robots collided, in the sense that ends episodes, (E,) bool
+    :param collision: whether two robots collided after the step, (E,) bool
+    :param collision_continuous: whether two robots collided during the step, (E,) bool
+    :param at_goal: (E, n) bool
+    :param source: origin of the believed trajectories, 0 without a plan, (E, n, m) int64
+    :param age: ages of the believed plans, (E, n, m) int64
+    :param status: status of the plans, (E, n) int64
+    :param others: indices of the others, -1 for an empty slot, (E, n, m) int64; None without empty slots
+    :param moved: mean distance that a robot flew, (E,) (m)
+    :param least: smallest distance of two robots after the step, (E,) (m)
+    :param least_during: smallest distance during the step, (E,) (m)
+    """
+
+    n_requests: np.ndarray
+    collided: np.ndarray
+    collision: np.ndarray
+    collision_continuous: np.ndarray
+    at_goal: np.ndarray
+    source: np.ndarray
+    age: np.ndarray
+    status: np.ndarray
+    others: np.ndarray | None
+    moved: np.ndarray
+    least: np.ndarray
+    least_during: np.ndarray
+
+
+# Types of the fields
+_OF_STEP = tuple(map(np.dtype, (np.int64, *[np.bool_] * 4, *[np.int64] * 4, *[np.float64] * 3)))
+
+
+def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> None:
+    """Add a step to the statistics of E swarms.
+
+    :param statistics: the statistics, changed in place, (E,) `STATISTICS`
+    :param step: the step
+    :param failed: smallest status of a plan without a successful solve
+    :param seconds: time of the planner for all swarms (s)
+    """
+    if (library := pairs.compiled()) is not None:
+        arrays = [
+            None if one is None else np.ascontiguousarray(one, kind) for one, kind in zip(step, _OF_STEP, strict=True)
+        ]
+        library.quad_swarm_count(*step.source.shape, failed, seconds, *addresses(*arrays, statistics))
+        return
+    s, used = statistics, step.source != 0
+    counted = ~(s["reached"] | s["collided"])
+    requests = counted * step.n_requests
+    possible = used[:1].size if step.others is None else (step.others >= 0).sum(axis=(1, 2))
+    s["steps"] += 1
+    s["steps_counted"] += counted
+    s["requests"] += requests
+    s["possible_requests"] += counted * possible
+    s["peak_requests"] = np.maximum(s["peak_requests"], requests)
+    s["plans_used"] += counted * used.sum(axis=(1, 2))
+    s["plan_ages"] += counted * (used * step.age).sum(axis=(1, 2))
+    s["requests_flown"] += step.n_requests
+    s["path_length"] += counted * step.moved
+    s["collided"] |= step.collided
+    s["collided_at_steps"] |= step.collision
+    s["collided_continuous"] |= step.collision_continuous
+    s["at_goals"] = step.at_goal.all(axis=1)
+    s["arrived"] |= s["at_goals"] & ~s["collided"]
+    s["reached"] |= s["at_goals"]
+    s["min_separation"] = np.minimum(s["min_separation"], step.least)
+    s["min_separation_continuous"] = np.minimum(s["min_separation_continuous"], step.least_during)
+    s["planner_failures"] += (step.status >= failed).sum(axis=1)
+    s["solve_seconds"] += seconds / max(len(s), 1)
+
+
+def _swarms_last(shape: tuple[int, ...], dtype: type = float) -> np.ndarray:
+    """Return an empty array (E, n, n - 1) in which the values of a pair in all swarms are adjacent. The layout decides
+    in which order NumPy sums rewards over pairs, and this one keeps them as they have always been."""
+    return np.empty((shape[1] * shape[2], shape[0]), dtype).T.reshape(shape)
+
+
+def _einsum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return dot products in the order of operations of `numpy.einsum`, in which the presets' separations were first
+    computed."""
+    return (a[..., 0] * b[..., 0] + a[..., 2] * b[..., 2]) + a[..., 1] * b[..., 1]
