@@ -5,6 +5,7 @@ import importlib
 import os
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -374,7 +375,7 @@ def main(argv: list[str] | None = None) -> int:
     Run a command.
 
     :param argv: arguments, by default those of the command line
-    :return: exit status, 2 for an error in the user's input
+    :return: exit status, 2 for an error in the user's input, 130 after Ctrl-C
     """
     with nearest_options():
         arguments = _parser().parse_args(argv)
@@ -389,6 +390,11 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with _present_folder(rest), _trust() if trusts else nullcontext(), nearest_options():
             return COMMANDS[command].run(rest)
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        print("Interrupted.", file=sys.stderr)
+        return 128 + signal.SIGINT
     except USER_ERRORS as error:
         if debug:
             raise

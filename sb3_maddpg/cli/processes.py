@@ -44,7 +44,7 @@ class Job(Protocol):
 
 def run_all(jobs: Sequence[Job], parallel: int, engine: str = "local", address: str | None = None) -> int:
     """
-    Run commands to their end. SIGTERM and SIGHUP end all of them.
+    Run commands to their end. SIGINT, SIGTERM and SIGHUP end all of them.
 
     :param jobs: the commands
     :param parallel: number of processes at a time
@@ -74,9 +74,12 @@ def run_all(jobs: Sequence[Job], parallel: int, engine: str = "local", address: 
             try:
                 for future in as_completed(futures):
                     failed = failed or future.result()
-            except BaseException:
+            except BaseException as error:
                 runs.stop()
-                raise
+                if not isinstance(error, KeyboardInterrupt):
+                    raise
+                print("Interrupted; repeat the command to continue.", flush=True)
+                failed = 128 + signal.SIGINT
     finally:
         runs.close()
         for number, handler in handlers.items():

@@ -141,3 +141,14 @@ def test_modules_of_the_command_line_import_each_other_in_one_direction():
         imported[path.stem] = {name.split(".")[2] for name in names if name.startswith("sb3_maddpg.cli.")}
     order = list(TopologicalSorter(imported).static_order())
     assert order.index("options") < order.index("experiment") < order.index("zoo") < order.index("commands")
+
+
+def test_ctrl_c_ends_any_command_with_one_line(monkeypatch, capsys):
+    def interrupted(argv: list[str]) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(COMMANDS, "bench", COMMANDS["bench"]._replace(run=interrupted))
+    assert main(["bench"]) == 130
+    assert capsys.readouterr().err == "Interrupted.\n"
+    with pytest.raises(KeyboardInterrupt):
+        main(["bench", "--debug"])

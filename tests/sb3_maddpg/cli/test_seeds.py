@@ -123,6 +123,17 @@ def test_a_cluster_trains_the_same_whatever_dies(tmp_path):
     assert weights(there) == weights(alone)
 
 
+def test_ctrl_c_ends_all_trainings_with_one_line(tmp_path):
+    process = start(tmp_path, "--seeds", "1-2", "--jobs", "2", steps=100_000)
+    wait_for_checkpoints(tmp_path, process)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=100)
+    assert process.returncode == 128 + signal.SIGINT
+    assert "Interrupted; repeat the command to continue." in output
+    assert "Traceback" not in output
+    assert not weights(tmp_path)
+
+
 def test_a_training_that_fails_is_told(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "batch_size": -1}}))
