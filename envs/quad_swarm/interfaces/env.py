@@ -176,8 +176,9 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         if not self._is_reset:
             raise need_reset()
         bits = checked_bits(action, (self._n_bits,), self.config.n_others, self.task.n_bits)[None]
-        neighbours = self.task.swarm.neighbours
-        self._requests = spread(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
+        if self.render_mode is not None:
+            neighbours = self.task.swarm.neighbours
+            self._requests = spread(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
         outcome = self.task.act(bits)
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = info_of(self.task.info(outcome), 0)

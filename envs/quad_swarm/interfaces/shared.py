@@ -118,7 +118,7 @@ def checked_bits(
             f"{n_bits * n_others} bits per robot, {n_bits} for each of the others."
         )
     asked = bits == 1
-    if not (asked | (bits == 0)).all():
+    if np.count_nonzero(asked) + np.count_nonzero(bits == 0) < bits.size:
         wrong = bits[~(asked | (bits == 0))].ravel()[0]
         raise ValueError(
             f"{whose} contains {shown(wrong)}; every entry must be 0 or 1. Threshold scores before acting."

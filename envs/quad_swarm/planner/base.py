@@ -116,11 +116,11 @@ class Planner:
         if self.config.right_of_way:
             problems = keep_right(problems, self.config.right_of_way, self.config.dt)
         x, u, success, iterations = self._solve(problems, x_guess, u_guess)
-        status = np.where(success, _SOLVED, _BRAKING)
-        age = np.zeros(len(status), dtype=np.int64)
-
-        failed = np.flatnonzero(~success)
-        if failed.size:
+        age = np.zeros(len(success), dtype=np.int64)
+        status = age + _SOLVED
+        if not success.all():
+            failed = np.flatnonzero(~success)
+            status[failed] = _BRAKING
             # Cold initial guess: constant state and no input
             cold = Plans.hover(problems.x[failed], self.config.horizon)
             retry = self._solve(problems.part(failed), cold.x, cold.u)

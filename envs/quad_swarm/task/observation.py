@@ -55,9 +55,9 @@ class PaperObservation:
         self.config = config
         self._numbers = 6 * (config.n_others + 1)  # first column of the others' numbers, if there are any
         self.size = self._numbers + (config.n_others if config.is_limited else 0)
-        distance, velocity = (_POSITION_SCALE, _VELOCITY_SCALE) if scaled else (1.0, 1.0)
         others = 3 * config.n_others
-        self._scale = np.repeat([velocity, distance, distance, velocity], [3, 3, others, others])
+        units = [_VELOCITY_SCALE, _POSITION_SCALE, _POSITION_SCALE, _VELOCITY_SCALE]
+        self._scale = np.repeat(units, [3, 3, others, others]) if scaled else None
 
     @property
     def layout(self) -> dict[str, Any]:
@@ -75,7 +75,10 @@ class PaperObservation:
         if present is not None:
             relative_pos[~present], relative_vel[~present] = 0.0, 0.0
         parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
-        observed = (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
+        if self._scale is None:
+            observed = np.concatenate(parts, axis=-1, dtype=np.float32)
+        else:
+            observed = (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
         if present is None:
             return observed
         return np.concatenate([observed, swarm.neighbours.numbers() + 1], axis=-1, dtype=np.float32)

@@ -257,10 +257,12 @@ class RequestTask:
             "collision": -self.reward.collision * collided,
             "requests": -self.reward.request * n_messages,
         }
+        reward = terms["goal"] + terms["collision"] + terms["requests"]
         near_misses: np.ndarray | float = 0.0
         if self.reward.near_miss:
             near_misses = self.reward.near_miss * self._near_misses(report)
             terms["near_miss"] = -np.sum(near_misses, axis=(1, 2)) / 2
+            reward = reward + terms["near_miss"]
         terminated = collided if self.end_at_collision else np.zeros_like(collided)
         if self.end_at_arrival:
             terminated = terminated | self.statistics.arrived
@@ -269,7 +271,7 @@ class RequestTask:
             present = report.others >= 0
             share = present * (terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1))[..., None]
         return Outcome(
-            reward=sum(terms.values(), start=np.zeros(len(n_requests))),
+            reward=reward,
             pair_rewards=(
                 share - self.reward.collision * colliding - self.reward.request * messages - near_misses
             ).astype(np.float32),

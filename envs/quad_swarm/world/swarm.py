@@ -337,14 +337,15 @@ class Swarm:
         others = believed.reshape(-1, *believed.shape[2:])
         return Problems(x.reshape(-1, 9), self.goal.reshape(-1, 3), others, announced=announced)
 
-    def _fly(self) -> list[np.ndarray]:
-        """Move the robots by a step. Returns positions before it and after each sub-step, (E, n, 3) each (m)."""
+    def _fly(self) -> np.ndarray:
+        """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""
         chance, before, planned = self.chance, self._u, self._plans.u[:, 0].reshape(self._u.shape)
-        positions = [self.pos.copy()]
+        positions = np.empty((self.config.substeps + 1, *self.pos.shape))
+        positions[0] = self.pos
         for k in range(self.config.substeps):
             self._u = planned if chance.start is None else np.where((chance.start <= k)[..., None], planned, before)
             self.state = self._plant.step(self.state, self._u, chance.air, chance.factors)
-            positions.append(self.pos)
+            positions[k + 1] = self.pos
         if self.config.is_random:
             kicks = chance.advance()
             if kicks is not None:
@@ -352,11 +353,11 @@ class Swarm:
                 positions[-1] = self.pos
         return positions
 
-    def _report(self, positions: list[np.ndarray], source: np.ndarray, solve_seconds: float) -> StepReport:
+    def _report(self, positions: np.ndarray, source: np.ndarray, solve_seconds: float) -> StepReport:
         others = self.neighbours.others if self.neighbours.limited else None
         contact = 2 * self.config.radius - self.config.collision_tolerance
         # Of all pairs, including those that do not perceive each other
-        measured = measure(np.array(positions), self.goal, contact, self.config.goal_radius, others)
+        measured = measure(positions, self.goal, contact, self.config.goal_radius, others)
         shape = self.state.shape[:2]
         return StepReport(
             min_separation=measured.least,

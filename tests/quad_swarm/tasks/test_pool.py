@@ -21,9 +21,9 @@ def square(x: int) -> int:
     return x * x
 
 
-def slow(k: int) -> tuple[int, str]:
+def slow(k: int) -> tuple[int, int, str]:
     time.sleep(0.02)
-    return k, "x" * 100_000
+    return k, os.getpid(), "x" * 100_000
 
 
 def die() -> None:
@@ -121,14 +121,16 @@ def test_processes_may_be_killed_at_any_moment():
 
     def killer() -> None:
         while not over.wait(0.3 + 0.5 * rng.random()):
-            for pid in rng.sample(workers(), k=min(1, len(workers()))):
-                os.kill(pid, signal.SIGKILL)
-                kills.append(pid)
+            # Not one that is still starting: on a busy machine, the same piece would be lost until the pool gives up
+            done = {future.result()[1] for future in futures if future.done()}
+            if ready := sorted(done & set(workers())):
+                kills.append(rng.choice(ready))
+                os.kill(kills[-1], signal.SIGKILL)
 
     with Pool(2) as pool:
+        futures = [pool.submit(slow, k) for k in range(300)]
         thread = threading.Thread(target=killer)
         thread.start()
-        futures = [pool.submit(slow, k) for k in range(300)]
         try:
             results = [future.result(timeout=120)[0] for future in futures]
         finally:

@@ -232,7 +232,7 @@ def test_robots_that_do_not_perceive_each_other_collide_all_the_same():
     before = swarm.pos.copy()
     assert swarm.neighbours.numbers()[0].tolist() == [[1], [0], [3], [2]]
     swarm.state[0, 2:, 0] = 0.5
-    report = swarm._report([before, swarm.pos], np.zeros((1, 4, 1)), 0.0)
+    report = swarm._report(np.array([before, swarm.pos]), np.zeros((1, 4, 1)), 0.0)
     assert report.min_separation[0] == pytest.approx(0.5)
     assert report.collision[0]
     assert report.collision_continuous[0]

@@ -85,7 +85,7 @@ def test_separation_at_and_between_steps(start, end, at_step, between):
     swarm = make_swarm(1, n_robots=2)
     before = np.array([[[0, 0, 1.0], np.add([0, 0, 1.0], start)]])
     swarm.state[0, :, :3] = [[0, 0, 1.0], np.add([0, 0, 1.0], end)]
-    report = swarm._report([before, swarm.pos], np.zeros((1, 2, 1)), 0.0)
+    report = swarm._report(np.array([before, swarm.pos]), np.zeros((1, 2, 1)), 0.0)
     assert report.min_separation[0] == pytest.approx(at_step)
     assert report.min_separation_continuous[0] == pytest.approx(between)
     assert report.collision[0] == (at_step < 0.599)
@@ -96,7 +96,7 @@ def test_separation_at_and_between_steps(start, end, at_step, between):
 def test_collision_tolerance_is_one_millimetre(distance, collides):
     swarm = make_swarm(1, n_robots=2)
     swarm.state[0, :, :3] = [[0, 0, 1], [distance, 0, 1]]
-    report = swarm._report([swarm.pos, swarm.pos], np.zeros((1, 2, 1)), 0.0)
+    report = swarm._report(np.array([swarm.pos, swarm.pos]), np.zeros((1, 2, 1)), 0.0)
     assert report.collision[0] == collides
 
 
