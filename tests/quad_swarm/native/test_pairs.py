@@ -11,15 +11,6 @@ from quad_swarm.native import pairs
 DT = 0.1
 
 
-@pytest.fixture(params=["compiled", "numpy"])
-def either(request, monkeypatch) -> None:
-    """Both ways of computing, one after the other."""
-    if request.param == "numpy":
-        monkeypatch.setattr(pairs, "compiled", lambda: None)
-    else:
-        assert pairs.compiled() is not None
-
-
 def scene(n_swarms: int, n: int, horizon: int, seed: int = 0) -> SimpleNamespace:
     """Robots near each other, about half of which remember a plan of each other."""
     rng = np.random.default_rng(seed)

@@ -6,15 +6,6 @@ import pytest
 from quad_swarm.native import pairs, steps
 
 
-@pytest.fixture(params=["compiled", "numpy"])
-def either(request, monkeypatch) -> None:
-    """Both ways of computing, one after the other."""
-    if request.param == "numpy":
-        monkeypatch.setattr(pairs, "compiled", lambda: None)
-    else:
-        assert pairs.compiled() is not None
-
-
 def random_step(rng: np.random.Generator, shape: tuple[int, ...], empty: bool) -> steps.Step:
     """What is counted of a step, in which there may be empty slots."""
     n_swarms, n, _ = shape
