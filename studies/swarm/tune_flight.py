@@ -294,10 +294,9 @@ def tune(
         busy = {setting.name for setting in running.values()}
         ladders.sort(key=lambda ladder: len(busy & {setting.name for setting in ladder}))
         for ladder in ladders:
-            if not any(decided.get(setting.name) for setting in ladder):
-                for setting in ladder:
-                    if setting.name not in decided and setting.name not in busy:
-                        return setting
+            for setting in itertools.takewhile(lambda one: not decided.get(one.name), ladder):
+                if setting.name not in decided and setting.name not in busy:
+                    return setting
         return None
 
     while True:

@@ -133,6 +133,11 @@ def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypat
     tune_flight.tune(Inline(), 1, [rules], FULL, stages, path)
     assert not flown
     assert settings(path) == expected
+    # A cheaper rule that is undecided is tried although a dearer one is known to be safe
+    rows = [row for row in read_rows(path) if row["setting"] != "good 0.2"]
+    write_rows(path, [*rows, {"setting": "good 0.3", "safe": True, "n_robots": 8, "scenario": "random"}])
+    tune_flight.tune(Inline(), 1, [rules], FULL, stages, path)
+    assert settings(path)["good 0.2"]
 
 
 def test_thresholds_are_tried_from_the_highest_on_each_model_by_itself(flown, tmp_path):

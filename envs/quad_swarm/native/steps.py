@@ -174,6 +174,8 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
 def _swarms_last(shape: tuple[int, ...], dtype: type = float) -> np.ndarray:
     """Return an empty array (E, n, n - 1) in which the values of a pair in all swarms are adjacent. The layout decides
     in which order NumPy sums rewards over pairs, and this one keeps them as they have always been."""
+    if shape[0] == 1:
+        return np.empty(shape, dtype)
     return np.empty((shape[1] * shape[2], shape[0]), dtype).T.reshape(shape)
 
 

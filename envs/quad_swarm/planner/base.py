@@ -146,7 +146,8 @@ class Planner:
             warnings.warn(message, RuntimeWarning, stacklevel=3)
             hover, none = Plans.hover(problems.x, self.config.horizon), np.zeros(len(problems.x), dtype=np.int64)
             return Solution(hover.x, hover.u, none.astype(bool), none)
-        if np.isfinite(solution.x).all() and np.isfinite(solution.u).all():
+        # Sums of squares are not finite if an entry is not, and cheaper than a test of each
+        if np.isfinite(np.vdot(solution.x, solution.x) + np.vdot(solution.u, solution.u)):
             return solution
         finite = np.isfinite(solution.x).all(axis=(1, 2)) & np.isfinite(solution.u).all(axis=(1, 2))
         return solution._replace(success=solution.success & finite)

@@ -52,7 +52,7 @@ def of_others(field: np.ndarray, others: np.ndarray) -> np.ndarray:
     :param field: values of all robots, (E, n, ...)
     :param others: see `other_indices` or `Neighbours.others`
     """
-    return field[:, others] if others.ndim == 2 else field[np.arange(len(others))[:, None, None], others]
+    return field.take(others, axis=1) if others.ndim == 2 else field[np.arange(len(others))[:, None, None], others]
 
 
 def resampled(trajectory: np.ndarray, later: np.ndarray) -> np.ndarray:
