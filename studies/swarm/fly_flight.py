@@ -13,12 +13,10 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from quad_swarm.evaluation.command import add_worker_arguments, workers
 from quad_swarm.evaluation.evaluation import summarise
-from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
     DATA,
@@ -34,7 +32,7 @@ from studies.swarm.protocol import (
     replace_rows,
     world,
 )
-from studies.swarm.tune_flight import AIMS, FILES, FULL, OWN_SWAPS, PRESET, UP_TO
+from studies.swarm.tune_flight import AIMS, FILES, PRESET, SWAPS, UP_TO, cheapest_rule
 
 # Number of episodes per condition by the number of robots
 EPISODES = {8: 12000, 4: 4000, 12: 4000, 16: 4000}
@@ -56,48 +54,35 @@ class Job(NamedTuple):
     episodes: int
 
 
-def tuned(up_to: int = UP_TO) -> Iterator[dict[str, Any]]:
-    """Return the rows of all safe settings for teams of up to so many robots, except full communication."""
-    return (row for row in known_rows(DATA / FILES[up_to]) if row["safe"] and row["family"] != FULL)
-
-
 def best_rule(up_to: int = UP_TO) -> str:
-    """Return the rule that is safe everywhere and makes the fewest requests in both swaps of eight robots."""
-    return _cheapest("rule", up_to, lambda setting: not is_model(setting))
+    """Return the rule that is safe everywhere and makes the fewest requests in both swaps of eight robots.
 
-
-def best_model() -> str:
-    """Return the model with its threshold that is safe everywhere and makes the fewest requests in both swaps of eight
-    robots. This model is shipped."""
-    return _cheapest("model", UP_TO, is_model)
-
-
-def _cheapest(what: str, up_to: int, is_one: Callable[[str], bool]) -> str:
-    shares: dict[str, list[float]] = {}
-    for row in tuned(up_to):
-        if is_one(row["setting"]) and (row["n_robots"], row["scenario"]) in OWN_SWAPS:
-            shares.setdefault(row["setting"], []).append(row["request_share"])
-    if not shares:
-        raise ValueError(f"{DATA / FILES[up_to]} holds no safe {what}: run `studies.swarm.tune_flight` first.")
-    return min(shares, key=lambda setting: sum(shares[setting]))
+    :param up_to: number of robots of the largest team that it was tuned for
+    :raises ValueError: if no rule is safe
+    """
+    if (rule := cheapest_rule(known_rows(DATA / FILES[up_to]))) is None:
+        raise ValueError(f"{DATA / FILES[up_to]} holds no safe rule: run `studies.swarm.tune_flight` first.")
+    return rule
 
 
 def tuned_models(up_to: int = UP_TO) -> list[str]:
-    """Return the models with their tuned thresholds. Models without a safe threshold keep their own."""
-    safe = {row["family"]: row["setting"] for row in tuned(up_to)}
-    return [safe.get(path, path) for path in models("flight")]
+    """Return the models with their tuned thresholds. Models without one keep their own."""
+    rows = known_rows(DATA / FILES[up_to])
+    tuned = {row["family"]: row["setting"] for row in rows if row.get("chosen", row["safe"])}
+    return [tuned.get(path, path) for path in models("flight")]
 
 
 def jobs(sizes: list[int], quick: bool, up_to: int = UP_TO) -> list[Job]:
-    """Return all conditions, by increasing number of robots."""
+    """Return all conditions: first the swaps, in which most collisions occur, and the largest teams."""
     first = up_to == UP_TO  # the policies without a setting have flown with this one
     everywhere = ["full", *(["none"] if first else []), best_rule(up_to), *tuned_models(up_to)]
-    return [
+    work = [
         Job(FLIGHT_TESTS[up_to], n, name, policy, QUICK if quick else EPISODES[n])
-        for n in sorted(sizes)
+        for n in sizes
         for policy in (*everywhere, *(models(PAPERS) if n == 4 and first else ()))
         for name in NAMES
     ]
+    return sorted(work, key=lambda job: (job.scenario not in SWAPS, -job.n_robots))
 
 
 def fly(job: Job) -> dict[str, Any]:

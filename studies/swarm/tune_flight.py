@@ -8,7 +8,9 @@ All rules first fly a few episodes of both swaps with eight robots to measure th
 flights, only one is kept. The rules are then tried by increasing number of requests, in stages of more and more
 episodes, until one is safe. A rule that can no longer be safe is dropped. To find this out early, each rule first flies
 those episodes of the hardest cell in which most other rules collided (rows with ``selected``). The thresholds of a
-model are tried in decreasing order.
+model are tried in decreasing order. With ``--up-to 16``, its threshold is instead the lowest of those with which it
+makes no more requests than the best rule in both swaps of the largest team, whether it is safe or not (rows with
+``chosen``): the sealed flights then compare the safety of models and rule at the same price.
 
 JSON: one row per setting, number of robots and scenario with the keys of `summarise` over the episodes flown, and
 family, setting, safe (None if only the requests are known). Results that the file already contains are reused.
@@ -20,7 +22,7 @@ import argparse
 import itertools
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +31,7 @@ from quad_swarm.evaluation.command import add_worker_arguments, workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.flight import first_episode, run_episodes
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
+from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from studies.swarm.protocol import (
     DATA,
@@ -71,11 +74,13 @@ class Aim(NamedTuple):
     :param sizes: number of episodes for a decision by the number of robots, hardest first
     :param margin: limit for the upper bound of the difference to full communication
     :param thresholds: thresholds of models to try, in decreasing order
+    :param same_price: whether models are to make no more requests than the best rule, instead of being safe
     """
 
     sizes: dict[int, int]
     margin: float
     thresholds: tuple[float, ...]
+    same_price: bool = False
 
     @property
     def cells(self) -> list[Cell]:
@@ -93,10 +98,11 @@ AIMS = {
         SAFETY_MARGIN,
         (0.9, 0.85, *(round(0.8 - 0.025 * k, 3) for k in range(23)), 0.2, 0.15, 0.1, 0.05, 0.02),
     ),
-    16: Aim({16: 4000, 12: 4000, 8: 4000, 4: 4000}, 0.002, tuple(round(0.5 - 0.05 * k, 2) for k in range(10))),
+    16: Aim({16: 4000, 12: 4000, 8: 4000, 4: 4000}, 0.002, (0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1, 0.05, 0.02), True),
 }
 FILES = {12: "flight_tuning.json", 16: "flight_sixteen.json"}
 UP_TO = 12  # robots of the largest team by default
+PRICED_ON = 100  # episodes of each swap in which the requests of a threshold are measured
 
 
 def families(up_to: int = UP_TO) -> dict[str, list[str]]:
@@ -231,7 +237,7 @@ def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected
 
 def fly_full(pool: Executor, path: Path, stages: Sequence[int], aim: Aim = AIMS[12]) -> Flown:
     """Return the collisions with full communication in all episodes for a decision. Known results are reused."""
-    known = {(row["n_robots"], row["scenario"]): row["outcomes"] for row in read_rows(path) if row["family"] == FULL}
+    known = {cell_of(row): row["outcomes"] for row in read_rows(path) if row["family"] == FULL}
     missing = [cell for cell in aim.cells if len(known.get(cell, "")) < last(aim, cell, stages)]
     work = pool.map(fly, [FULL] * len(missing), missing, [last(aim, cell, stages) for cell in missing])
     for cell, rows in zip(missing, progress(work, FULL, len(missing)), strict=True):
@@ -249,7 +255,7 @@ def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool, 
     ]
     known: dict[str, list[dict[str, Any]]] = {}
     for row in read_rows(path):
-        if (row["n_robots"], row["scenario"]) in OWN_SWAPS:
+        if cell_of(row) in OWN_SWAPS:
             known.setdefault(row["setting"], []).append(row)
     work = [(rule, cell) for rule in rules if len(known.get(rule.name, [])) < len(OWN_SWAPS) for cell in OWN_SWAPS]
     flown = pool.map(fly, [rule.name for rule, _ in work], [cell for _, cell in work], [stages[0]] * len(work))
@@ -262,6 +268,54 @@ def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool, 
     figures = ("request_share", "requests_flown", "path_length", "min_separation")
     alike = {repr([[row.get(key) for key in figures] for row in known[rule.name]]): rule for rule in reversed(rules)}
     return [rule for rule in rules if rule in alike.values()]
+
+
+def cheapest_rule(rows: Iterable[Mapping[str, Any]]) -> str | None:
+    """Return the safe rule that makes the fewest requests in both swaps of eight robots, None if no rule is safe."""
+    shares: Counter[str] = Counter()
+    for row in rows:
+        if row["safe"] and not is_model(row["setting"]) and row["family"] != FULL:
+            shares[row["setting"]] += row["request_share"] if cell_of(row) in OWN_SWAPS else 0
+    return min(shares, key=lambda rule: shares[rule], default=None)
+
+
+def at_the_price_of(
+    rule: str, pool: Executor, path: Path, models: Sequence[str], aim: Aim, episodes: int = PRICED_ON
+) -> None:
+    """Choose the lowest threshold of each model with which it makes no more requests than a rule in both swaps of the
+    largest team, and write its rows.
+
+    :param rule: the rule, whose rows the file contains
+    :param pool: executor of the flights
+    :param path: file of the table
+    :param models: the models
+    :param aim: whose thresholds to try
+    :param episodes: number of episodes of each swap
+    :raises ValueError: if a model makes more requests even with the highest threshold
+    """
+    largest = {cell for cell in aim.cells if cell[0] == max(aim.sizes)}
+    known = read_rows(path)
+    price = {
+        cell: row["request_share"] for row in known if row["setting"] == rule and (cell := cell_of(row)) in largest
+    }
+    for model in models:
+        chosen: list[dict[str, Any]] = []
+        for threshold in aim.thresholds:
+            setting = f"{model}@{threshold:g}"
+            flown = dict(zip(price, pool.map(fly, [setting] * 2, price, [episodes] * 2), strict=True))
+            rows = rows_of(model, setting, flown, None)
+            if any(row["request_share"] > price[cell_of(row)] for row in rows):
+                break
+            chosen = [row | {"chosen": True} for row in rows]
+        if not chosen:
+            raise ValueError(f"{model} makes more requests than {rule} with each threshold of {aim.thresholds}.")
+        replace_rows(path, chosen, ("family", "chosen", "n_robots", "scenario"))
+        print(chosen[0]["setting"], *(f"{row['request_share']:.2%}" for row in chosen), flush=True)
+
+
+def cell_of(row: Mapping[str, Any]) -> Cell:
+    """Return the number of robots and the scenario of a row."""
+    return row["n_robots"], row["scenario"]
 
 
 def tune(
@@ -286,9 +340,7 @@ def tune(
     hardest = aim.cells[0]
     decided = {row["setting"]: row["safe"] for row in read_rows(path) if row["safe"] is not None}
     running: dict[Future[Trial], Setting] = {}
-    collisions = Counter(
-        k for row in read_rows(path) if (row["n_robots"], row["scenario"]) == hardest for k in row.get("collided", [])
-    )
+    collisions = Counter(k for row in read_rows(path) if cell_of(row) == hardest for k in row.get("collided", []))
 
     def following() -> Setting | None:
         busy = {setting.name for setting in running.values()}
@@ -312,7 +364,7 @@ def tune(
             collisions.update(trial.collided)
             rows = rows_of(*setting, trial.flown, trial.safe, trial.selected)
             for row in rows:
-                row |= {"collided": trial.collided} if (row["n_robots"], row["scenario"]) == hardest else {}
+                row |= {"collided": trial.collided} if cell_of(row) == hardest else {}
             replace_rows(path, rows, ("preset", "setting", "n_robots", "scenario"))
             print(f"{setting.name:50} {verdict(trial, full, hardest)}", flush=True)
 
@@ -346,6 +398,10 @@ def main() -> None:
     stages = QUICK_STAGES if args.quick else STAGES
     with workers(args) as pool:
         full = fly_full(pool, path, stages, aim)
+        if args.what == "thresholds" and aim.same_price:
+            rule = cheapest_rule(read_rows(path)) or parser.error(f"{path} holds no safe rule: tune the rules first")
+            at_the_price_of(rule, pool, path, args.models, aim, stages[0] if args.quick else PRICED_ON)
+            return
         if args.what == "rules":
             ladders = [by_requests(pool, path, stages, args.quick, args.up_to)]
         else:

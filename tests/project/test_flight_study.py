@@ -65,7 +65,7 @@ def flown(monkeypatch):
         (policy,) = policies
         flown.append((policy, (n_robots, scenario), skip, episodes))
         collides = policy.startswith("bad") and (n_robots, scenario) == (12, "asymmetric_swap")
-        requests = float(policy.split()[-1]) if " " in policy else 1.0
+        requests = float(policy.split()[-1].partition("@")[0]) if " " in policy else 1.0
         return {policy: [{"collided": collides and k % 5 == 0, "requests": requests} for k in range(skip, episodes)]}
 
     monkeypatch.setattr(tune_flight, "fly_validation", fly)
@@ -146,6 +146,29 @@ def test_thresholds_are_tried_from_the_highest_on_each_model_by_itself(flown, tm
     ]
     tune_flight.tune(Inline(), 1, ladders, FULL, tune_flight.STAGES, tmp_path / "t.json")
     assert settings(tmp_path / "t.json") == {"a.zip@0.9": True, "bad.zip@0.9": False, "bad.zip@0.8": False}
+
+
+def test_models_fly_at_the_price_of_the_best_rule(flown, tmp_path):
+    path, aim = tmp_path / "tuning.json", tune_flight.AIMS[16]
+    cells = [(16, name) for name in tune_flight.SWAPS]
+    rules = [("dear", True, 0.5), ("rule", True, 0.25), ("bad", False, 0.1)]
+    rows = [
+        {"family": "cpa", "setting": rule, "safe": safe, "n_robots": n, "scenario": name, "request_share": share}
+        for rule, safe, share in rules
+        for n, name in [*cells, *tune_flight.OWN_SWAPS]
+    ]
+    write_rows(path, rows)
+    assert tune_flight.cheapest_rule(read_rows(path)) == "rule"
+    assert tune_flight.cheapest_rule(rows[-4:]) is None
+    thresholds = aim._replace(thresholds=(0.3, 0.2, 0.1))
+    # The stand-in makes as many requests as the last word of a policy's name says
+    tune_flight.at_the_price_of("rule", Inline(), path, ["model 0.2"], thresholds)
+    tune_flight.at_the_price_of("rule", Inline(), path, ["model 0.2"], thresholds)
+    chosen = [row for row in read_rows(path) if row.get("chosen")]
+    assert [(row["setting"], tune_flight.cell_of(row)) for row in chosen] == [("model 0.2@0.1", cell) for cell in cells]
+    assert {episodes for _, _, _, episodes in flown} == {tune_flight.PRICED_ON}
+    with pytest.raises(ValueError, match=r"model 0\.3 makes more requests than rule with each threshold"):
+        tune_flight.at_the_price_of("rule", Inline(), path, ["model 0.3"], thresholds)
 
 
 def test_full_communication_is_flown_once(flown, tmp_path):
@@ -254,8 +277,6 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
     ]
     write_rows(tmp_path / "flight_tuning.json", rules)
     assert fly_flight.best_rule() == "cpa:0.8:1"
-    with pytest.raises(ValueError, match="holds no safe model"):
-        fly_flight.best_model()
     assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
     with pytest.raises(ValueError, match=r"flight_sixteen\.json holds no safe rule"):
         fly_flight.jobs([16], quick=False, up_to=16)
@@ -264,6 +285,8 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
     assert {(job.set, job.episodes) for job in work} == {(FLIGHT_TESTS[16], 4000)}
     assert {"full", "plan:0.8"} <= {job.policy for job in work}
     assert "none" not in {job.policy for job in work}
+    assert [job.scenario in tune_flight.SWAPS for job in work] == [True] * (len(work) // 2) + [False] * (len(work) // 2)
+    assert [job.n_robots for job in fly_flight.jobs([4, 16], quick=True, up_to=16)][:: len(work) // 2] == [16, 4] * 2
     monkeypatch.setattr(fly_flight, "NAMES", NAMES[:1])
     monkeypatch.setattr(fly_flight, "models", lambda recipe: [])
     monkeypatch.setattr("sys.argv", ["", "--quick", "--jobs", "1", "--n-robots", "4", "--json", f"{tmp_path}/f.json"])
