@@ -93,6 +93,8 @@ def train(argv: list[str]) -> int:
         raise ValueError(
             f"--checkpoint-every {asked.checkpoint_every}: pass a number of steps, or 0 for no checkpoints."
         )
+    if name == "tune" and asked.jobs == 1:  # a single worker has no one to share a study with
+        asked.jobs = None
     processes = asked.jobs is not None or asked.engine != "local" or asked.address is not None
     if asked.seeds is not None or processes:
         return _in_processes(name, asked, argv)

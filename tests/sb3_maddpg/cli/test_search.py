@@ -124,6 +124,10 @@ def test_workers_of_a_command_share_its_trials_whatever_dies(engine, tmp_path, m
 def test_workers_need_a_study_to_share(capsys):
     assert main(["tune", "--env", "OwnBit-v0", "--jobs", "2"]) == 2
     assert "--jobs and --engine ray need --storage and --study-name" in capsys.readouterr().err
+    # A single one does not: the search gets as far as its sampler
+    assert main(["tune", "--env", "OwnBit-v0", "--jobs", "1", "--sampler", "tpee"]) == 2
+    assert "--storage" not in (error := capsys.readouterr().err)
+    assert "tpee" in error
 
 
 def test_a_worker_that_a_cluster_restarts_elsewhere_repeats_its_trial(study, monkeypatch):
