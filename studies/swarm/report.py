@@ -23,7 +23,7 @@ from quad_swarm.world.beliefs import other_indices
 from studies.swarm.figures import NAMES, draw_asking, draw_fronts, draw_trajectories, flights, rate_of
 from studies.swarm.fly_flight import PAPERS, best_rule
 from studies.swarm.protocol import DATA, OF_TEAM, ROOT, absolute_path, best_rules, models
-from studies.swarm.tune_flight import FULL, families
+from studies.swarm.tune_flight import FULL, SWAPS, families
 
 APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
@@ -392,6 +392,23 @@ def flight_table(rows: Rows) -> str:
     return table([*head, "of the rule's", "B/s", "arrived", "steps"], lines)
 
 
+def swaps_table(rows: Rows) -> str:
+    """Format the flights of both swaps at the price of the best rule, one row per number of robots and policy."""
+    lines: dict[tuple[int, str], list[str]] = {}
+    for n_robots, name, here in flight_groups(rows):
+        if name in SWAPS:
+            for policy, row in here.items():
+                difference = against(row, here["full"])
+                low, high = (f"{100 * end:+.2f}" for end in difference.interval)
+                sign = "**" if difference.as_safe() else ""
+                texts = [f"{row['collisions']}/{row['episodes']}", f"{sign}[{low}, {high}]{sign}"]
+                texts[1] = "-" if policy == FULL else texts[1]
+                lines.setdefault((n_robots, policy), []).extend([*texts, f"{row['request_share']:.2%}"])
+    names = [name.replace("_", " ") for name in SWAPS]
+    head = [text for name in names for text in (f"{name}: collisions", "against full (points)", "requests")]
+    return table(["robots", "policy", *head], [[str(n), label(one), *texts] for (n, one), texts in lines.items()])
+
+
 def flight_targets(rows: Rows) -> str:
     """Format in how many scenarios of `flight` each policy is as safe as full communication, and its requests."""
     lines: dict[tuple[int, str], list[Any]] = {}
@@ -552,7 +569,7 @@ def main() -> None:
     names = "rules test sweep robustness unseen teams asking interventions ppo counterfactual training counts quadrants"
     rows = {
         name: read_rows(args.data / f"{name}.json")
-        for name in [*names.split(), "checkpoints", "flight", "flight_tuning", "flight_world"]
+        for name in [*names.split(), "checkpoints", "flight", "flight_tuning", "flight_sixteen_sealed", "flight_world"]
     }
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))
     blocks = {
@@ -582,6 +599,7 @@ def main() -> None:
         "flight": flight_table(rows["flight"]),
         "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),
+        "flight sixteen": swaps_table(rows["flight_sixteen_sealed"]),
         "world": worlds_table(rows["flight_world"], "world"),
         "delays": worlds_table(rows["flight_world"], "delays"),
         "delay check": worlds_table(rows["flight_world"], "delay_check"),

@@ -229,7 +229,13 @@ def test_the_tables_of_the_sealed_flights_compare_with_full_and_the_rule():
     summary = report.flight_targets(rows).splitlines()[2:]
     assert len(summary) == 2
     assert "x, seed 1, δ = 0.9 | 1 of 1 | - | - | - | 1.00% (50%)" in summary[1]
-    assert report.flight_table([]) == report.flight_targets([]) == "Not flown yet."
+    assert report.flight_table([]) == report.flight_targets([]) == report.swaps_table([]) == "Not flown yet."
+    swaps = [one | {"scenario": name} for one in rows for name in tune_flight.SWAPS]
+    cells = [line.split(" | ") for line in report.swaps_table(swaps).splitlines()[2:]]
+    assert [line[2:5] for line in cells] == [[*line[5:7], line[7].removesuffix(" |")] for line in cells]
+    assert [line[3].startswith("**") for line in cells] == [False, False, True, True]
+    assert cells[0][3] == "-"
+    assert cells[3][2:3] + cells[3][4:5] == ["3/4000", "1.00%"]
 
 
 def test_settings_that_are_safe_are_tabled_with_their_validation_figures():
