@@ -64,6 +64,9 @@ results: install  ## fly everything that docs/results.md says again: tuned rules
 	$(STUDY).tune_flight rules --jobs $(JOBS)
 	$(STUDY).tune_flight thresholds studies/swarm/data/flight_seed*.zip --jobs $(JOBS)
 	$(STUDY).fly_flight --jobs $(JOBS)
+	$(STUDY).tune_flight rules --up-to 16 --jobs $(JOBS)
+	$(STUDY).tune_flight thresholds studies/swarm/data/flight_seed*.zip --up-to 16 --jobs $(JOBS)
+	$(STUDY).fly_flight --up-to 16 --jobs $(JOBS)
 	$(STUDY).flight_world --jobs $(JOBS)
 	$(STUDY).ppo --models $(LOGS) --json studies/swarm/data/ppo.json
 	$(STUDY).counterfactual --models $(LOGS) --json studies/swarm/data/counterfactual.json

@@ -8,9 +8,9 @@ All rules first fly a few episodes of both swaps with eight robots to measure th
 flights, only one is kept. The rules are then tried by increasing number of requests, in stages of more and more
 episodes, until one is safe. A rule that can no longer be safe is dropped. To find this out early, each rule first flies
 those episodes of the hardest cell in which most other rules collided (rows with ``selected``). The thresholds of a
-model are tried in decreasing order. With ``--up-to 16``, its threshold is instead the lowest of those with which it
-makes no more requests than the best rule in both swaps of the largest team, whether it is safe or not (rows with
-``chosen``): the sealed flights then compare the safety of models and rule at the same price.
+model are tried in decreasing order. With ``--up-to 16``, its threshold is instead the lowest with which it makes less
+than half of the best rule's requests in each swap, whether it is safe or not (rows with ``chosen``): the sealed flights
+then show how safe models are at half the price.
 
 JSON: one row per setting, number of robots and scenario with the keys of `summarise` over the episodes flown, and
 family, setting, safe (None if only the requests are known). Results that the file already contains are reused.
@@ -73,14 +73,14 @@ class Aim(NamedTuple):
 
     :param sizes: number of episodes for a decision by the number of robots, hardest first
     :param margin: limit for the upper bound of the difference to full communication
-    :param thresholds: thresholds of models to try, in decreasing order
-    :param same_price: whether models are to make no more requests than the best rule, instead of being safe
+    :param thresholds: thresholds of models to try in this order
+    :param price: if given, models are not tuned to be safe, but to make at most this share of the best rule's requests
     """
 
     sizes: dict[int, int]
     margin: float
     thresholds: tuple[float, ...]
-    same_price: bool = False
+    price: float | None = None
 
     @property
     def cells(self) -> list[Cell]:
@@ -98,7 +98,7 @@ AIMS = {
         SAFETY_MARGIN,
         (0.9, 0.85, *(round(0.8 - 0.025 * k, 3) for k in range(23)), 0.2, 0.15, 0.1, 0.05, 0.02),
     ),
-    16: Aim({16: 4000, 12: 4000, 8: 4000, 4: 4000}, 0.002, (0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1, 0.05, 0.02), True),
+    16: Aim({16: 4000, 12: 4000, 8: 4000, 4: 4000}, 0.002, (0.02, *(round(0.05 * k, 2) for k in range(1, 17))), 0.45),
 }
 FILES = {12: "flight_tuning.json", 16: "flight_sixteen.json"}
 UP_TO = 12  # robots of the largest team by default
@@ -282,35 +282,32 @@ def cheapest_rule(rows: Iterable[Mapping[str, Any]]) -> str | None:
 def at_the_price_of(
     rule: str, pool: Executor, path: Path, models: Sequence[str], aim: Aim, episodes: int = PRICED_ON
 ) -> None:
-    """Choose the lowest threshold of each model with which it makes no more requests than a rule in both swaps of the
-    largest team, and write its rows.
+    """Choose the first threshold of each model with which it makes few enough requests in each swap, and write its
+    rows.
 
-    :param rule: the rule, whose rows the file contains
+    :param rule: the rule whose requests are the measure; the file contains its rows
     :param pool: executor of the flights
     :param path: file of the table
     :param models: the models
-    :param aim: whose thresholds to try
+    :param aim: thresholds and price
     :param episodes: number of episodes of each swap
-    :raises ValueError: if a model makes more requests even with the highest threshold
+    :raises ValueError: if a model makes too many requests with all thresholds
     """
-    largest = {cell for cell in aim.cells if cell[0] == max(aim.sizes)}
-    known = read_rows(path)
-    price = {
-        cell: row["request_share"] for row in known if row["setting"] == rule and (cell := cell_of(row)) in largest
-    }
+    assert aim.price is not None
+    known = {cell_of(row): row["request_share"] for row in read_rows(path) if row["setting"] == rule}
+    limits = {cell: aim.price * known[cell] for cell in aim.cells if cell[1] in SWAPS}
     for model in models:
-        chosen: list[dict[str, Any]] = []
         for threshold in aim.thresholds:
             setting = f"{model}@{threshold:g}"
-            flown = dict(zip(price, pool.map(fly, [setting] * 2, price, [episodes] * 2), strict=True))
-            rows = rows_of(model, setting, flown, None)
-            if any(row["request_share"] > price[cell_of(row)] for row in rows):
+            count = len(limits)
+            flown = dict(zip(limits, pool.map(fly, [setting] * count, limits, [episodes] * count), strict=True))
+            rows = [row | {"chosen": True} for row in rows_of(model, setting, flown, None)]
+            if all(row["request_share"] <= limits[cell_of(row)] for row in rows):
                 break
-            chosen = [row | {"chosen": True} for row in rows]
-        if not chosen:
-            raise ValueError(f"{model} makes more requests than {rule} with each threshold of {aim.thresholds}.")
-        replace_rows(path, chosen, ("family", "chosen", "n_robots", "scenario"))
-        print(chosen[0]["setting"], *(f"{row['request_share']:.2%}" for row in chosen), flush=True)
+        else:
+            raise ValueError(f"{model} makes more than {aim.price:.0%} of the requests of {rule} with all thresholds.")
+        replace_rows(path, rows, ("family", "chosen", "n_robots", "scenario"))
+        print(setting, *(f"{row['request_share']:.2%}" for row in rows), flush=True)
 
 
 def cell_of(row: Mapping[str, Any]) -> Cell:
@@ -398,7 +395,7 @@ def main() -> None:
     stages = QUICK_STAGES if args.quick else STAGES
     with workers(args) as pool:
         full = fly_full(pool, path, stages, aim)
-        if args.what == "thresholds" and aim.same_price:
+        if args.what == "thresholds" and aim.price is not None:
             rule = cheapest_rule(read_rows(path)) or parser.error(f"{path} holds no safe rule: tune the rules first")
             at_the_price_of(rule, pool, path, args.models, aim, stages[0] if args.quick else PRICED_ON)
             return

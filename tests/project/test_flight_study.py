@@ -65,7 +65,7 @@ def flown(monkeypatch):
         (policy,) = policies
         flown.append((policy, (n_robots, scenario), skip, episodes))
         collides = policy.startswith("bad") and (n_robots, scenario) == (12, "asymmetric_swap")
-        requests = float(policy.split()[-1].partition("@")[0]) if " " in policy else 1.0
+        requests = float(policy.split()[-1]) if " " in policy else 1.0
         return {policy: [{"collided": collides and k % 5 == 0, "requests": requests} for k in range(skip, episodes)]}
 
     monkeypatch.setattr(tune_flight, "fly_validation", fly)
@@ -148,27 +148,31 @@ def test_thresholds_are_tried_from_the_highest_on_each_model_by_itself(flown, tm
     assert settings(tmp_path / "t.json") == {"a.zip@0.9": True, "bad.zip@0.9": False, "bad.zip@0.8": False}
 
 
-def test_models_fly_at_the_price_of_the_best_rule(flown, tmp_path):
+def test_models_fly_at_half_the_price_of_the_best_rule(flown, monkeypatch, tmp_path):
     path, aim = tmp_path / "tuning.json", tune_flight.AIMS[16]
-    cells = [(16, name) for name in tune_flight.SWAPS]
-    rules = [("dear", True, 0.5), ("rule", True, 0.25), ("bad", False, 0.1)]
+    cells = [cell for cell in aim.cells if cell[1] in tune_flight.SWAPS]
+    assert {n for n, _ in cells} == {4, 8, 12, 16}
     rows = [
         {"family": "cpa", "setting": rule, "safe": safe, "n_robots": n, "scenario": name, "request_share": share}
-        for rule, safe, share in rules
-        for n, name in [*cells, *tune_flight.OWN_SWAPS]
+        for rule, safe, share in [("dear", True, 0.5), ("rule", True, 0.25), ("bad", False, 0.1)]
+        for n, name in cells
     ]
     write_rows(path, rows)
     assert tune_flight.cheapest_rule(read_rows(path)) == "rule"
     assert tune_flight.cheapest_rule(rows[-4:]) is None
-    thresholds = aim._replace(thresholds=(0.3, 0.2, 0.1))
-    # The stand-in makes as many requests as the last word of a policy's name says
-    tune_flight.at_the_price_of("rule", Inline(), path, ["model 0.2"], thresholds)
-    tune_flight.at_the_price_of("rule", Inline(), path, ["model 0.2"], thresholds)
+    shares = {"m@0.02": 0.15, "m@0.05": 0.12, "m@0.1": 0.11, "m@0.15": 0.1}
+
+    def fly(policy, cell, episodes):
+        assert episodes == tune_flight.PRICED_ON
+        return [{"requests": shares.get(policy, 1.0) + (policy == "m@0.1" and cell == (4, "asymmetric_swap")) * 0.1}]
+
+    monkeypatch.setattr(tune_flight, "fly", fly)
+    tune_flight.at_the_price_of("rule", Inline(), path, ["m"], aim)
+    tune_flight.at_the_price_of("rule", Inline(), path, ["m"], aim)  # replaces its rows
     chosen = [row for row in read_rows(path) if row.get("chosen")]
-    assert [(row["setting"], tune_flight.cell_of(row)) for row in chosen] == [("model 0.2@0.1", cell) for cell in cells]
-    assert {episodes for _, _, _, episodes in flown} == {tune_flight.PRICED_ON}
-    with pytest.raises(ValueError, match=r"model 0\.3 makes more requests than rule with each threshold"):
-        tune_flight.at_the_price_of("rule", Inline(), path, ["model 0.3"], thresholds)
+    assert [(row["setting"], tune_flight.cell_of(row)) for row in chosen] == [("m@0.15", cell) for cell in cells]
+    with pytest.raises(ValueError, match="more than 45% of the requests of rule"):
+        tune_flight.at_the_price_of("rule", Inline(), path, ["other"], aim)
 
 
 def test_full_communication_is_flown_once(flown, tmp_path):
