@@ -123,6 +123,8 @@ def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
     :return: the dicts
     """
     rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+    last_mask: Any = None
+    everywhere = True
     for name, value in infos.items():
         if name.startswith("_"):
             continue
@@ -131,8 +133,10 @@ def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
             parts = unbatch(value, num_envs)
         else:
             parts = value.tolist() if value.ndim == 1 and value.dtype != object else value
-        mask = infos.get(f"_{name}")
-        if mask is None or mask.all():
+        mask: Any = infos.get(f"_{name}")
+        if mask is not last_mask:  # most infos share one, and testing it takes longer than the rest
+            last_mask, everywhere = mask, mask is None or mask.all()
+        if everywhere:
             for row, part in zip(rows, parts, strict=True):
                 row[name] = part
         else:
