@@ -2,9 +2,10 @@
 
 ``python benchmarks/env.py [--json F]`` steps the swarm through Gymnasium (one swarm) and through Stable-Baselines3's
 VecEnv (many swarms) with random requests, including rewards, infos and automatic resets. The face "render" also renders
-an image of 640 x 480 in each step. Each cell runs one process per core, pinned to it if possible; rates of two cores
+an image of 640 x 480 in each step. The world `flight` is also stepped without its disturbances, and without the right
+of way. Each cell runs one process per core, pinned to it if possible; rates of two cores
 are sums. The shares are measured afterwards, since timers take time themselves. JSON: one row per cell with the keys
-face, preset, n_robots, n_envs, cores, steps_per_s, and the share of each part.
+face, world, n_robots, n_envs, cores, steps_per_s, and the share of each part.
 """
 
 from __future__ import annotations
@@ -28,16 +29,33 @@ from quad_swarm.task.request_task import RequestTask
 from sb3_maddpg.cli.bench import timed
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
-CELLS = [(face, preset, 1) for face in ("gym", "render") for preset in ("paper", "dense")] + [
-    ("vecenv", preset, n_envs) for preset in ("paper", "dense") for n_envs in (1, 16, 64, 256)
+EXACT = {
+    "sensing": dict.fromkeys(("pos", "vel", "attitude", "others_pos", "others_vel"), 0.0),
+    "noise": dict.fromkeys(("vel", "attitude", "wind", "gust"), 0.0),
+    "radio": {"loss": 0.0, "delay": 0, "jitter": 0},
+    "mismatch": 0.0,
+    "clock_skew": 0.0,
+}
+# Arguments of the environment by the names of the worlds
+WORLDS: dict[str, dict[str, Any]] = {
+    "paper": {"preset": "paper"},
+    "dense": {"preset": "dense"},
+    "flight": {"preset": "flight"},
+    "flight, no disturbances": {"preset": "flight", "world": EXACT},
+    "flight, no right of way": {"preset": "flight", "planner": {"right_of_way": 0.0}},
+}
+CELLS = [
+    *((face, world, 1) for face in ("gym", "render") for world in ("paper", "dense")),
+    *(("vecenv", world, n_envs) for world in ("paper", "dense") for n_envs in (1, 16, 64, 256)),
+    *(("vecenv", world, 64) for world in WORLDS if world.startswith("flight")),
 ]
 
 
-def measure(face: str, preset: str, n_envs: int, core: int, seconds: float, solver: str) -> dict[str, Any]:
+def measure(face: str, world: str, n_envs: int, core: int, seconds: float, solver: str) -> dict[str, Any]:
     """Measure the steps per second of one process, and the share of each part."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {core % (os.cpu_count() or 1)})
-    kwargs: dict[str, Any] = {"preset": preset, "scenario": "mixed", "solver": solver}
+    kwargs: dict[str, Any] = {**WORLDS[world], "scenario": "mixed", "solver": solver}
     step: Callable[[np.ndarray], Any]
     if face in ("gym", "render"):
         env = gymnasium.make("QuadSwarm-v0", **kwargs, render_mode="rgb_array" if face == "render" else None)
@@ -101,18 +119,18 @@ def main() -> None:
     parser.add_argument("--solver", default="auto", help="planner's solver (default auto)")
     args = parser.parse_args()
     rows = []
-    print(f"{'face':7} {'preset':6} {'envs':>5} {'cores':>5} {'steps/s':>9}   shares of the time")
-    for face, preset, n_envs in CELLS:
+    print(f"{'face':7} {'world':23} {'envs':>5} {'cores':>5} {'steps/s':>9}   shares of the time")
+    for face, world, n_envs in CELLS:
         for cores in (1, 2):
-            work = [(face, preset, n_envs, core, args.seconds, args.solver) for core in range(cores)]
+            work = [(face, world, n_envs, core, args.seconds, args.solver) for core in range(cores)]
             with multiprocessing.get_context("spawn").Pool(cores) as pool:
                 parts = pool.starmap(measure, work)
             total = sum(part.pop("steps_per_s") for part in parts)
-            n_robots = quad_swarm.PRESETS[preset].n_robots
-            row = {"face": face, "preset": preset, "n_robots": n_robots, "n_envs": n_envs, "cores": cores}
+            n_robots = quad_swarm.PRESETS[WORLDS[world]["preset"]].n_robots
+            row = {"face": face, "world": world, "n_robots": n_robots, "n_envs": n_envs, "cores": cores}
             rows.append({**row, "steps_per_s": total, **parts[0]})
             shares = "  ".join(f"{name} {share:.0%}" for name, share in parts[0].items())
-            print(f"{face:7} {preset:6} {n_envs:5} {cores:5} {total:9.0f}   {shares}", flush=True)
+            print(f"{face:7} {world:23} {n_envs:5} {cores:5} {total:9.0f}   {shares}", flush=True)
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text("".join(json.dumps(row) + "\n" for row in rows))

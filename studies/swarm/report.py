@@ -41,12 +41,23 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+# What models are called in tables, by the names of their files; others by these names
+CALLED = {
+    "faithful": "the paper's settings",
+    "faithful_flight": "the paper's settings",
+    "ablation_approach": "without approach features",
+    "ablation_credit": "without pair credit",
+    "ablation_structure": "without pair networks",
+}
+
+
 def label(policy: str) -> str:
     """Return the name of a policy in tables."""
     if not is_model(policy):
         return f"`{policy}`".replace("|", "\\|")
     path, _, threshold = policy.partition("@")
-    return Path(path).stem.replace("_seed", ", seed ") + (f", δ = {threshold}" if threshold else "")
+    recipe, _, seed = Path(path).stem.partition("_seed")
+    return CALLED.get(recipe, recipe) + f", seed {seed}" * bool(seed) + f", δ = {threshold}" * bool(threshold)
 
 
 def rate(row: dict[str, Any]) -> str:
@@ -442,7 +453,7 @@ def tuned_table(rows: Rows) -> str:
 
 def headline_table(rows: Rows, best: str) -> str:
     """Format the sealed flights of `flight` in five rows: eight robots, except for the paper's settings; seeds as
-    ranges.
+    ranges. Plans and bytes are those of all four scenarios.
 
     :param rows: rows of the sealed flights
     :param best: the tuned rule
@@ -466,8 +477,8 @@ def headline_table(rows: Rows, best: str) -> str:
         line.append(spread([f"{share:.2%}" for share in sorted(map(pooled, by_seed))]) if chosen else "-")
         sent = sorted(float(np.mean([row["bytes_per_second"] for row in one])) for one in by_seed)
         lines.append([*line, spread([f"{value:,.0f}" for value in sent]) if chosen else "-"])
-    head = ["", "collisions, symmetric swap", "collisions, asymmetric swap", "plans sent, of all possible"]
-    return table([*head, "bytes/s a robot sends"], lines)
+    head = ["", "collisions, symmetric swap", "collisions, asymmetric swap"]
+    return table([*head, "plans sent, of all possible, all scenarios", "bytes/s a robot sends, all scenarios"], lines)
 
 
 def seeds_rate(rows: Rows) -> str:

@@ -34,7 +34,7 @@ def test_runs_from_top_to_bottom(path, tmp_path):
 def test_is_kept_without_outputs_and_installs_itself(path):
     cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
     assert not any(cell.outputs or cell.execution_count for cell in cells), "clear the outputs"
-    assert '%pip install --quiet "sb3-maddpg[' in cells[0].source
+    assert '%pip install --quiet -e "../..[' in cells[0].source
 
 
 def test_there_are_notebooks_and_the_site_links_them():
