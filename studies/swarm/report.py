@@ -404,17 +404,21 @@ def flight_table(rows: Rows) -> str:
 
 
 def swaps_table(rows: Rows) -> str:
-    """Format the flights of both swaps at the price of the best rule, one row per number of robots and policy."""
+    """Format the collisions and requests in both swaps, one row per number of robots and policy."""
     lines: dict[tuple[int, str], list[str]] = {}
     for n_robots, name, here in flight_groups(rows):
         if name in SWAPS:
+            rule = rule_of(here)
             for policy, row in here.items():
                 difference = against(row, here["full"])
                 low, high = (f"{100 * end:+.2f}" for end in difference.interval)
                 sign = "**" if difference.as_safe() else ""
                 texts = [f"{row['collisions']}/{row['episodes']}", f"{sign}[{low}, {high}]{sign}"]
                 texts[1] = "-" if policy == FULL else texts[1]
-                lines.setdefault((n_robots, policy), []).extend([*texts, f"{row['request_share']:.2%}"])
+                requests = f"{row['request_share']:.2%}"
+                if rule is not None and policy != FULL:
+                    requests += f" ({row['request_share'] / rule['request_share']:.0%})"
+                lines.setdefault((n_robots, policy), []).extend([*texts, requests])
     names = [name.replace("_", " ") for name in SWAPS]
     head = [text for name in names for text in (f"{name}: collisions", "against full (points)", "requests")]
     return table(["robots", "policy", *head], [[str(n), label(one), *texts] for (n, one), texts in lines.items()])
@@ -611,6 +615,8 @@ def main() -> None:
         "flight tuning": tuned_table(rows["flight_tuning"]),
         "flight targets": flight_targets(rows["flight"]),
         "flight sixteen": swaps_table(rows["flight_sixteen_sealed"]),
+        "flight sixteen targets": flight_targets(rows["flight_sixteen_sealed"]),
+        "flight sixteen all": flight_table(rows["flight_sixteen_sealed"]),
         "world": worlds_table(rows["flight_world"], "world"),
         "delays": worlds_table(rows["flight_world"], "delays"),
         "delay check": worlds_table(rows["flight_world"], "delay_check"),

@@ -239,7 +239,7 @@ def test_the_tables_of_the_sealed_flights_compare_with_full_and_the_rule():
     assert [line[2:5] for line in cells] == [[*line[5:7], line[7].removesuffix(" |")] for line in cells]
     assert [line[3].startswith("**") for line in cells] == [False, False, True, True]
     assert cells[0][3] == "-"
-    assert cells[3][2:3] + cells[3][4:5] == ["3/4000", "1.00%"]
+    assert cells[3][2:3] + cells[3][4:5] == ["3/4000", "1.00% (50%)"]
 
 
 def test_settings_that_are_safe_are_tabled_with_their_validation_figures():
