@@ -16,7 +16,7 @@ from gymnasium.spaces.utils import flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint_action_space
-from sb3_maddpg.utils import as_seed, not_finite_at, shown
+from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
 MASK = "action_mask"
@@ -38,7 +38,7 @@ class TeamEnv(gymnasium.Env):
     Wrapper that turns a PettingZoo environment into a single environment for the whole team, see "The team convention"
     in CONTRIBUTING.md.
 
-    The observation space, ``TeamObservation``, has a row per possible agent with its observation, flattened by
+    The observation space, ``TeamObservation``, has a row per possible agent with its observation, flattened as by
     Gymnasium's ``flatten``. The action space is that of ``joint_action_space``. The reward is the mean over all
     possible agents, where inactive agents count as 0, so the return is the mean of the agents' returns. When an agent
     is terminated or truncated, its row holds its final observation once. From then on the row is zero, and the agent
@@ -341,8 +341,7 @@ class TeamEnv(gymnasium.Env):
             try:
                 fits = _fits(space, observation)
                 if fits:
-                    flat = observation if isinstance(space, spaces.Box) else flatten(space, observation)
-                    matrix[row, :length] = np.asarray(flat).reshape(-1)
+                    matrix[row, :length] = _flat(space, observation)
             except (TypeError, ValueError, LookupError, OverflowError):
                 fits = False
             if not fits:
@@ -381,10 +380,10 @@ class TeamEnv(gymnasium.Env):
 
     def _state(self, size: int) -> np.ndarray:
         try:
-            state = np.asarray(flatten(self._state_space, self.parallel_env.state()))
+            state = _flat(self._state_space, self.parallel_env.state())
         except NotImplementedError as error:
             raise ValueError(f"{self.parallel_env} has a state_space but no state(): set state=False.") from error
-        except (TypeError, ValueError, LookupError) as error:
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
             raise ValueError(f"state() of {self.parallel_env} does not fit its state_space: {error}.") from error
         if state.size != size:
             raise ValueError(
@@ -562,6 +561,23 @@ def _fits(space: spaces.Space, value: Any) -> bool:
         index = array.ravel() - np.ravel(getattr(space, "start", 0))
         return bool(((index == np.rint(index)) & (index >= 0) & (index < sizes)).all())
     return bool(space.contains(value))
+
+
+def _flat(space: spaces.Space, value: Any) -> np.ndarray:
+    """
+    Flatten a value like Gymnasium's ``flatten``, but without casting numbers to the type of a ``Box``: NaN, infinity
+    and numbers out of an integer type's range would pass for others.
+
+    :raises ValueError: if the value does not hold real numbers
+    """
+    if isinstance(space, spaces.Box):
+        real = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+        return np.ravel(value if real else as_numbers(value))
+    if isinstance(space, spaces.Dict):
+        return np.concatenate([_flat(part, value[name]) for name, part in space.items()])
+    if isinstance(space, spaces.Tuple):
+        return np.concatenate([*map(_flat, space, value)])
+    return np.asarray(flatten(space, value))
 
 
 def _possible_agents(env: Any) -> tuple[Any, ...]:

@@ -322,6 +322,32 @@ def test_an_environment_need_not_say_anything_about_agents():
     assert len(play(TeamEnv(script))) == 2
 
 
+BYTES = spaces.Box(0, 255, (2,), np.uint8)
+
+
+class Watcher(Script):
+    """
+    One agent that sees what it is given.
+
+    :param space: its observation space
+    :param seen: its observation
+    """
+
+    def __init__(self, space: spaces.Space, seen):
+        super().__init__({"a": (2, TRUNCATED)})
+        self.space, self.seen = space, seen
+        self.state_space = BYTES
+
+    def observation_space(self, agent):
+        return self.space
+
+    def observe(self, agents):
+        return dict.fromkeys(agents, self.seen)
+
+    def state(self):
+        return self.seen
+
+
 @pytest.mark.parametrize(
     ("space", "wrong"),
     [
@@ -337,17 +363,52 @@ def test_an_environment_need_not_say_anything_about_agents():
     ],
 )
 def test_observations_outside_of_their_space_are_refused(space, wrong):
-    class Watcher(Script):
-        def observation_space(self, agent):
-            return space
-
-        def observe(self, agents):
-            return dict.fromkeys(agents, wrong if self.time else space.sample())
-
-    env = TeamEnv(Watcher({"a": (3, TRUNCATED)}))
+    env = TeamEnv(Watcher(space, space.sample()))
     env.reset()
+    env.parallel_env.seen = wrong
     with pytest.raises(ValueError, match=r"observation of agent 'a' .*, but its space is .*in step 1 of the episode"):
         env.step(np.zeros(1))
+
+
+@pytest.mark.parametrize("whole", [BYTES, spaces.Dict(x=BYTES, y=spaces.Discrete(2)), spaces.Tuple([BYTES, BYTES])])
+def test_numbers_are_not_cast_to_the_type_of_their_space(whole):
+    def seen(*numbers):
+        if isinstance(whole, spaces.Dict):
+            return {"x": np.array(numbers), "y": 1}
+        return np.array(numbers) if whole is BYTES else (np.array(numbers), np.zeros(2))
+
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(ValueError, match=f"observation of agent 'a' is {wrong} in column 0 after reset.*finite"):
+            TeamEnv(Watcher(whole, seen(wrong, 1.0))).reset()
+    assert TeamEnv(Watcher(whole, seen(300, -1))).reset()[0][0, :2].tolist() == [300, -1]
+
+
+@pytest.mark.parametrize("wrong", [np.array([1j, 2]), np.array(["1", "2"]), [1j, 2]])
+def test_observations_are_real_numbers(wrong):
+    with pytest.raises(ValueError, match=r"observation of agent 'a' is .*but its space is Box"):
+        TeamEnv(Watcher(SHORT, wrong)).reset()
+    env = TeamEnv(Watcher(SHORT, np.zeros(2)), state=True)
+    env.parallel_env.state = lambda: wrong
+    with pytest.raises(ValueError, match=r"state\(\) of script does not fit its state_space: no real numbers"):
+        env.reset()
+
+
+def test_a_state_is_not_cast_to_the_type_of_its_space():
+    env = TeamEnv(Watcher(SHORT, np.array([np.nan, 300.0])), state=True)
+    env.parallel_env.observe = lambda agents: dict.fromkeys(agents, np.zeros(2))
+    with pytest.raises(ValueError, match="The state is nan in column 2"):
+        env.reset()
+    env.parallel_env.state = lambda: np.array([7.0, 300.0])
+    assert env.reset()[0].tolist() == [[0, 0, 7, 300]]
+
+
+def test_an_action_mask_of_fractions_is_not_rounded():
+    masked = spaces.Dict(action_mask=spaces.Box(0, 1, (3,), np.int8), observation=SHORT)
+    seen = {"observation": np.zeros(2), "action_mask": np.array([0.25, 0, 0])}
+    assert TeamEnv(Watcher(masked, seen)).reset()[0][0].tolist() == [0.25, 0, 0, 0, 0]
+    seen["action_mask"] = np.full(3, np.nan)
+    with pytest.raises(ValueError, match="observation of agent 'a' is nan in column 0"):
+        TeamEnv(Watcher(masked, seen)).reset()
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "x", np.float64(3.0)])
