@@ -19,6 +19,7 @@ from sb3_maddpg.utils import shown, suggest
 
 AtLeastZero = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
+Limit = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 # Outside these bounds, a price becomes 0 or infinite in single precision
 Price = Annotated[float, Field(ge=1e-12, le=1e12)]
 LARGEST = 2**63  # larger integers do not fit into an array
@@ -178,6 +179,19 @@ class PriorityArguments(Arguments):
     epsilon: float = Field(
         gt=0, description="positive and finite: with 0, transitions without TD error would never be sampled"
     )
+
+
+class NormalizationArguments(Arguments):
+    """Arguments of ``SafeVecNormalize`` in its files."""
+
+    training: bool = Field(description="True or False")
+    norm_obs: bool = Field(description="True or False")
+    norm_reward: bool = Field(description="True or False")
+    clip_obs: Limit = Field(description="a positive number, or infinity")
+    clip_reward: Limit = Field(description="a positive number, or infinity")
+    gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
+    epsilon: float = Field(gt=0, description="positive and finite")
+    norm_obs_keys: list[str] | None = Field(description="a list of keys of the observation, or None")
 
 
 class CurriculumArguments(Arguments):
