@@ -451,10 +451,13 @@ class TeamReplayBuffer(ReplayBuffer):
             array = getattr(self._new_columns, key)
             for index in np.argwhere(~np.isfinite(array)):
                 env, agent = index[0], index[1 if key != "rewards" else 0]
-                source = "The team's reward"
+                source, value = "The team's reward", array[tuple(index)]
                 if key in infos[env]:
                     source = f"info['{key}'] of agent {agent} ({self.team.names[agent]})"
-                raise ValueError(f"{source} is {array[tuple(index)]} {self._where(env)}: it must be finite. {_REMEDY}")
+                    value = np.asarray(infos[env][key])[tuple(index[1:])]
+                raise ValueError(
+                    f"{source} is {value} {self._where(env)}: it must be finite in single precision. {_REMEDY}"
+                )
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
@@ -633,7 +636,8 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
                 f"The replay buffer's largest_priority is {self.largest_priority}: the priorities of all its rows must "
                 "have a positive and finite sum."
             )
-        total = given.sum() + self.largest_priority * self.new_rows * self.n_envs
+        with np.errstate(over="ignore"):
+            total = given.sum() + self.largest_priority * self.new_rows * self.n_envs
         if self.size() and not 0 < total < math.inf:
             raise ValueError(f"The replay buffer's priorities add up to {total}: the sum must be positive and finite.")
         self.priorities.set(np.arange(len(given)), given)
