@@ -38,7 +38,7 @@ from sb3_maddpg.actions import Continuous
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
-from sb3_maddpg.callbacks import record_metrics
+from sb3_maddpg.callbacks import check_success, record_metrics
 from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
@@ -817,6 +817,7 @@ class MADDPG(OffPolicyAlgorithm):
         return self
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        check_success(infos)
         super()._update_info_buffer(infos, dones)
         record_metrics(self.logger, infos)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from mpe2 import simple_spread_v3
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
@@ -191,6 +191,14 @@ def forgotten(env, observations, rewards, terminations, truncations, infos):
             "reward of nan for agent 'b' in step 1 of the episode: rewards must be finite",
         ),
         (lambda env, _, rewards, *__: rewards.update(a=-np.inf, b=np.inf), "-inf for agent 'a', inf for agent 'b'"),
+        (
+            lambda env, _, rewards, *__: rewards.update(a=1e39, b=-1e39),
+            "reward of 1e\\+39 for agent 'a', -1e\\+39 for agent 'b' in step 1 .* in single precision",
+        ),
+        (
+            lambda env, _, rewards, *__: rewards.update(a=1.7e308, b=1.7e308),
+            "reward of 1.7e\\+308 for agent 'a', 1.7e\\+308 for agent 'b'",
+        ),
         (lambda env, _, rewards, *__: rewards.pop("a"), "left out reward, termination or truncation of agent 'a'"),
         (lambda env, _, __, terminations, *___: terminations.pop("b"), "truncation of agent 'b'"),
     ],
@@ -287,6 +295,14 @@ def changed(where, agent, value):
         (changed("observations", "b", np.array(["x", "y"])), "observation of agent 'b' is array.*but its space is Box"),
         (changed("observations", "a", None), "observation of agent 'a' is None, but its space is Box"),
         (changed("infos", "a", "x"), "'x' as info of agent 'a'.*must be a dict"),
+        (
+            lambda env, *given: env.time == 4 and given[4].update(b={"is_success": np.array([True, False])}),
+            r"array\(\[ True, False\]\) as is_success of agent 'b' in step 4.*True or False",
+        ),
+        (
+            lambda env, *given: env.time == 4 and given[4].update(b={"is_success": "x"}),
+            "'x' as is_success of agent 'b' in step 4",
+        ),
         (lambda env, *_: setattr(env, "agents", None), "`agents` of script is None in step 1"),
     ],
 )
@@ -456,3 +472,61 @@ def test_stable_baselines3_evaluates_on_an_adapted_environment():
     model = MADDPG("MlpPolicy", simple_spread_v3.parallel_env(), seed=0)
     mean, _ = evaluate_policy(model, Monitor(TeamEnv(simple_spread_v3.parallel_env())), n_eval_episodes=2)
     assert np.isfinite(mean)
+
+
+class Turns(AECEnv):
+    """
+    Three agents move in turn, six moves in all.
+
+    :param reward: of each agent in each move
+    :param dead: agents that have ended when an episode begins
+    """
+
+    metadata = {"name": "turns"}  # noqa: RUF012
+
+    def __init__(self, reward=1.0, dead: tuple = ()):
+        super().__init__()
+        self.possible_agents = ["a", "b", "c"]
+        self.reward, self.dead = reward, dead
+
+    def observation_space(self, agent):
+        return SHORT
+
+    def action_space(self, agent):
+        return spaces.Discrete(3)
+
+    def observe(self, agent):
+        return np.full(2, self.moves / 10, np.float32)
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.moves = list(self.possible_agents), 0
+        self.rewards, self._cumulative_rewards = dict.fromkeys(self.agents, 0.0), dict.fromkeys(self.agents, 0.0)
+        self.terminations = {agent: agent in self.dead for agent in self.agents}
+        self.truncations, self.infos = dict.fromkeys(self.agents, False), {agent: {} for agent in self.agents}
+        self.agent_selection = "a"
+
+    def step(self, action):
+        mover = self.agent_selection
+        self.agent_selection = self.agents[(self.agents.index(mover) + 1) % len(self.agents)]
+        if self.terminations[mover] or self.truncations[mover]:
+            self.agents.remove(mover)
+            return
+        self.moves += 1
+        self.rewards = dict.fromkeys(self.agents, self.reward)
+        self.truncations = dict.fromkeys(self.agents, self.moves == 6)
+
+
+@pytest.mark.parametrize("dead", [(), ("a",), ("a", "b")])
+def test_who_has_ended_before_the_first_turn_takes_no_part(dead):
+    steps = play(TeamEnv(Turns(dead=dead)))
+    assert [step[4]["agent_active"].tolist() for step in steps] == 6 * [[agent not in dead for agent in "abc"]]
+
+
+def test_somebody_has_to_be_left_for_the_first_turn():
+    with pytest.raises(ValueError, match=r"After reset\(\), `agents` of .* is empty"):
+        TeamEnv(Turns(dead=("a", "b", "c"))).reset()
+
+
+def test_a_reward_of_a_game_with_turns_is_a_number():
+    with pytest.raises(ValueError, match=r"reward of None for agent 'a' in step 1 .*must be a number"):
+        play(TeamEnv(Turns(reward=None)))
