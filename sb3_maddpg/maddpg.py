@@ -393,12 +393,12 @@ class MADDPG(OffPolicyAlgorithm):
         length = len(self.policy.actions.is_continuous)
         state = np.random.get_state()  # noqa: NPY002 - what SB3's noise draws from
         try:
-            noise, shape = self.action_noise, (n_envs, length)
-            if not isinstance(noise, VectorizedActionNoise):
-                shape = shape if n_envs == 1 else (length,)  # learn() vectorises it
-            elif noise.n_envs != n_envs:
+            noise = self.action_noise
+            vectorised = isinstance(noise, VectorizedActionNoise) or n_envs == 1  # or else learn() vectorises it
+            if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
                 noise = VectorizedActionNoise(noise.base_noise, n_envs)
-            if not np.isfinite(np.broadcast_to(deepcopy(noise)(), shape)).all():
+            numbers = np.broadcast_to(deepcopy(noise)(), (n_envs, length) if vectorised else (length,))
+            if not np.isfinite(numbers).all():
                 raise ValueError("it returned NaN or infinity")
         except Exception as error:  # from foreign code
             raise ValueError(

@@ -218,7 +218,7 @@ class TeamEnv(gymnasium.Env):
             successes = [
                 self._flag(agent, "is_success", one["is_success"])
                 for agent, one in infos.items()
-                if one and "is_success" in one
+                if one and one.get("is_success") is not None
             ]
             if successes:
                 info["is_success"] = all(successes)
@@ -518,7 +518,14 @@ class TurnBased(ParallelEnv):
     def _remove_ended(self) -> None:
         """Remove agents that have ended, up to the next agent that can move."""
         env = self.env
-        while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
+        while env.agents:
+            if (mover := env.agent_selection) not in env.agents:
+                raise ValueError(
+                    f"agent_selection of {env} is {mover!r}, but its agents are {env.agents}: it must name the agent "
+                    "whose turn it is."
+                )
+            if not (env.terminations[mover] or env.truncations[mover]):
+                return
             env.step(None)  # PettingZoo's way to remove an agent that has ended
 
     def _observe(self) -> dict[Any, Any]:

@@ -527,6 +527,13 @@ def test_somebody_has_to_be_left_for_the_first_turn():
         TeamEnv(Turns(dead=("a", "b", "c"))).reset()
 
 
+def test_the_mover_is_among_the_agents():
+    env = Turns(dead=("a",))
+    env.step = lambda action: env.agents.remove("a")
+    with pytest.raises(ValueError, match=r"agent_selection of .* is 'a', but its agents are \['b', 'c'\]"):
+        TeamEnv(env).reset()
+
+
 def test_a_reward_of_a_game_with_turns_is_a_number():
     with pytest.raises(ValueError, match=r"reward of None for agent 'a' in step 1 .*must be a number"):
         play(TeamEnv(Turns(reward=None)))
