@@ -254,7 +254,8 @@ class TeamReplayBuffer(ReplayBuffer):
 
         :param counters: see ``contents``
         :param arrays: see ``contents``
-        :raises ValueError: if they do not fit this buffer's arguments, or hold numbers that are not finite
+        :raises ValueError: if they do not fit this buffer's arguments, or hold actions outside of their space or
+            numbers that are not finite
         """
         if set(counters) != set(self._COUNTERS):
             raise ValueError(f"A {type(self).__name__} has the counters {self._COUNTERS}, not {tuple(counters)}.")
@@ -267,6 +268,8 @@ class TeamReplayBuffer(ReplayBuffer):
         rows = self.size() + int(self.optimize_memory_usage)
         if self.pos >= self.buffer_size:
             raise ValueError(f"The replay buffer's pos is {self.pos}, but it has {self.buffer_size} rows.")
+        if self.n_added < self.size():
+            raise ValueError(f"The replay buffer's n_added is {self.n_added}, but it holds {self.size()} rows.")
         for name in names:
             array, own = arrays.get(name), self.records[name][:rows]
             if array is None or (array.shape, array.dtype) != (own.shape, own.dtype):
@@ -275,6 +278,28 @@ class TeamReplayBuffer(ReplayBuffer):
             if not all_finite(array):
                 raise ValueError(f"The replay buffer's {name} hold NaN or infinity.")
             own[...] = array
+        if rows:
+            self._check_stored_actions(arrays["actions"])
+
+    def _check_stored_actions(self, actions: np.ndarray) -> None:
+        """
+        :param actions: stored joint actions, (rows, n_envs, length)
+        :raises ValueError: if one lies outside of its space
+        """
+        sizes = np.concatenate([heads_of(space) for space in self.team.action_spaces])
+        continuous = sizes == 0
+        low, high = np.where(continuous, -1, 0), np.where(continuous, 1, sizes - 1)
+        slack = 1e-3 * continuous  # scaling to [-1, 1] rounds
+        least, most = actions.min(axis=(0, 1)), actions.max(axis=(0, 1))
+        wrong = (least < low - slack) | (most > high + slack)
+        wrong |= ~continuous & (actions != np.rint(actions)).any(axis=(0, 1))
+        if wrong.any():
+            agent, column = self._place_of_action(place := int(np.argmax(wrong)))
+            kind = "numbers" if continuous[place] else "integers"
+            raise ValueError(
+                f"The replay buffer's actions of agent {agent} ({self.team.names[agent]}) lie between {least[place]} "
+                f"and {most[place]} in column {column}: they must be {kind} from {low[place]} to {high[place]}."
+            )
 
     def reset(self) -> None:
         super().reset()
@@ -426,10 +451,13 @@ class TeamReplayBuffer(ReplayBuffer):
             array = getattr(self._new_columns, key)
             for index in np.argwhere(~np.isfinite(array)):
                 env, agent = index[0], index[1 if key != "rewards" else 0]
-                source = "The team's reward"
+                source, value = "The team's reward", array[tuple(index)]
                 if key in infos[env]:
                     source = f"info['{key}'] of agent {agent} ({self.team.names[agent]})"
-                raise ValueError(f"{source} is {array[tuple(index)]} {self._where(env)}: it must be finite. {_REMEDY}")
+                    value = np.asarray(infos[env][key])[tuple(index[1:])]
+                raise ValueError(
+                    f"{source} is {value} {self._where(env)}: it must be finite in single precision. {_REMEDY}"
+                )
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
@@ -601,6 +629,17 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
             )
         if not (np.isfinite(given).all() and (given >= 0).all()):
             raise ValueError("The replay buffer has priorities that are negative, NaN or infinite.")
+        if self.new_rows > self.size():
+            raise ValueError(f"The replay buffer's new_rows is {self.new_rows}, but it holds {self.size()} rows.")
+        if not 0 < self.largest_priority * self.buffer_size * self.n_envs < math.inf:
+            raise ValueError(
+                f"The replay buffer's largest_priority is {self.largest_priority}: the priorities of all its rows must "
+                "have a positive and finite sum."
+            )
+        with np.errstate(over="ignore"):
+            total = given.sum() + self.largest_priority * self.new_rows * self.n_envs
+        if self.size() and not 0 < total < math.inf:
+            raise ValueError(f"The replay buffer's priorities add up to {total}: the sum must be positive and finite.")
         self.priorities.set(np.arange(len(given)), given)
 
     def add(self, *args: Any, **kwargs: Any) -> None:

@@ -1,5 +1,6 @@
 """Callbacks for MADDPG and for any other Stable-Baselines3 algorithm."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -21,15 +22,37 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
 
     :param logger: the algorithm's logger
     :param infos: infos of one step, one per environment, see ``TeamInfo``
-    :raises ValueError: if a metric is not a number
+    :raises ValueError: if a metric is not a finite number
     """
     for info in infos:
-        for name, value in info.get("metrics", {}).items():
+        metrics = info.get("metrics", {})
+        if not isinstance(metrics, Mapping):
+            raise ValueError(f"info['metrics'] is {shown(metrics)}: it must be a dict of numbers by name.")
+        for name, value in metrics.items():
             try:
                 number = float(value)
-            except (TypeError, ValueError):
-                raise ValueError(f"info['metrics'][{name!r}] is {shown(value)}: a metric must be a number.") from None
+            except (TypeError, ValueError, OverflowError):
+                number = math.nan
+            if not math.isfinite(number):
+                raise ValueError(f"info['metrics'][{name!r}] is {shown(value)}: a metric must be a finite number.")
             logger.record_mean(name, number)
+
+
+def check_success(infos: list[dict[str, Any]]) -> None:
+    """
+    Check the entries ``info["is_success"]``, if there are any.
+
+    :param infos: infos of one step, one per environment, see ``TeamInfo``
+    :raises ValueError: if an entry is neither True nor False
+    """
+    for info in infos:
+        success = info.get("is_success")
+        try:
+            known = success in (None, True, False)
+        except ValueError:  # from an array
+            known = False
+        if not known:
+            raise ValueError(f"info['is_success'] is {shown(success)}: it must be True or False.")
 
 
 class MetricsCallback(BaseCallback):
@@ -84,6 +107,7 @@ class CurriculumCallback(BaseCallback):
             if done:
                 if "is_success" not in info:
                     raise ValueError('CurriculumCallback needs info["is_success"] at the end of every episode.')
+                check_success([info])
                 self.successes.append(bool(info["is_success"]))
         full = len(self.successes) == self.successes.maxlen
         if (

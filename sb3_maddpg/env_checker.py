@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import gymnasium
@@ -10,6 +9,7 @@ import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.env_checker import check_env
 
+from sb3_maddpg.callbacks import check_success
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.relational import NeighbourViews
 from sb3_maddpg.team import Team, TeamInfo
@@ -79,8 +79,8 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         if (index := not_finite_at(np.asarray(obs))) is not None:
             raise ValueError(f"The observation of agent {team.names[index[0]]} {where} holds NaN or infinity.")
         _check_numbers_of_neighbours(env, np.asarray(obs), team, where)
-        if not math.isfinite(reward):
-            raise ValueError(f"The team's reward {where} is {reward}: it must be finite.")
+        if not all_finite(np.asarray(reward, float)):
+            raise ValueError(f"The team's reward {where} is {reward}: it must be finite, also in single precision.")
         _check_info(info, team, where)
         acts = np.asarray(info.get("agent_active", ~gone), bool)
         if (acts & gone).any():
@@ -126,9 +126,10 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
             raise ValueError(f"info['{name}'] {where} is {value.tolist()}: it must hold True or False for each agent.")
     metrics = info.get("metrics", {})
     if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
-        raise ValueError(f"info['metrics'] {where} is {shown(metrics)}: it must be a flat dict of numbers.")
+        raise ValueError(f"info['metrics'] {where} is {shown(metrics)}: it must be a flat dict of finite numbers.")
+    check_success([info])
 
 
 def _is_number(value: Any) -> bool:
     array = np.asarray(value)
-    return array.ndim == 0 and array.dtype.kind in "biuf"
+    return array.ndim == 0 and array.dtype.kind in "biuf" and bool(np.isfinite(array))

@@ -20,11 +20,12 @@ import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import (
     VecEnv,
     VecFrameStack,
@@ -37,7 +38,7 @@ from sb3_maddpg.actions import Continuous
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
-from sb3_maddpg.callbacks import record_metrics
+from sb3_maddpg.callbacks import check_success, record_metrics
 from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
@@ -58,8 +59,15 @@ from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
 from sb3_maddpg.typed_json import encode
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, shown, suggest
-from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TrainingArguments, validated
+from sb3_maddpg.utils import arguments_of, as_numbers, atomic_write, describe_env, shown, suggest
+from sb3_maddpg.validation import (
+    LEAST_TEMPERATURE,
+    Arguments,
+    LearnArguments,
+    RunArguments,
+    TrainingArguments,
+    validated,
+)
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
@@ -80,6 +88,8 @@ NOT_BUFFER_KWARGS = {
 OWN_BUFFER_KWARGS = ("n_steps", "gamma")
 # Arguments that a model resized to another team does not inherit
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
+# Arguments that may be schedules, and the smallest value that each may have
+LEAST_OF_SCHEDULES = {"learning_rate": 0.0, "temperature": LEAST_TEMPERATURE}
 # Limit for the alternative actions that ``expected`` evaluates in one update; the critics' layers need at least as much
 MOST_BYTES_OF_ALTERNATIVES = 4 * 2**30
 # Fragments of PyTorch's and NumPy's messages about arrays that exceed the memory, which are not all MemoryErrors
@@ -254,7 +264,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.policy_delay = policy_delay
         self.max_grad_norm = max_grad_norm
         self.policy_regularization = policy_regularization
-        self.action_cost: np.ndarray | None = None
+        self.action_cost: float | np.ndarray | None = None
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
         self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
@@ -304,11 +314,12 @@ class MADDPG(OffPolicyAlgorithm):
                 f"{self.action_space}. Leave it out: binary actions explore with a random threshold, categorical ones "
                 "by sampling."
             )
-        self._spread_action_cost()
+        self.action_noise = self._action_noise_for(self.n_envs)
+        self._cost_of_encoded = self._spread(self.action_cost)
 
     def _read_env(self, env: VecEnv) -> None:
         """Read what the environment tells about itself beyond its spaces."""
-        self._read_task(env)
+        self.env_spec, self.action_cost = describe_env(env), self._action_cost_of(env)
         self.policy_kwargs = dict(self.policy_kwargs)
         for name in self.policy_class.env_attributes:
             if name not in self.policy_kwargs and env.has_attr(name):
@@ -333,27 +344,36 @@ class MADDPG(OffPolicyAlgorithm):
                 "neighbour is always present, set `complete: True` in the environment's observation_layout."
             )
 
-    def _read_task(self, env: VecEnv) -> None:
-        self.env_spec = describe_env(env)
-        self.action_cost = None
-        if self.use_action_cost:
-            if not env.has_attr("action_cost"):
-                raise ValueError("use_action_cost=True, but the environment has no attribute `action_cost`.")
-            self.action_cost = env.get_attr("action_cost", indices=0)[0]
+    def _action_cost_of(self, env: VecEnv) -> Any:
+        """:return: the environment's ``action_cost``, None if it is not used"""
+        if not self.use_action_cost:
+            return None
+        cost = env.get_attr("action_cost", indices=0)[0] if env.has_attr("action_cost") else None
+        if cost is None:
+            raise ValueError("use_action_cost=True, but the environment has no attribute `action_cost`.")
+        return cost
 
-    def _spread_action_cost(self) -> None:
-        """Broadcast the action cost to the encoded action, (n_agents, width)."""
-        self._cost_of_encoded: th.Tensor | None = None
-        if self.action_cost is None:
-            return
+    def _spread(self, action_cost: Any) -> th.Tensor | None:
+        """:return: the action cost of the encoded action, (n_agents, width), None if it is unknown"""
+        if action_cost is None:
+            return None
         shape = (self.policy.team.n_agents, self.policy.actions.width)
         try:
-            cost = np.broadcast_to(np.asarray(self.action_cost, np.float32), shape)
+            cost = as_numbers(action_cost)
+        except ValueError:
+            cost = np.full((), np.nan)
+        if not np.isfinite(cost).all():
+            raise ValueError(
+                f"action_cost={shown(action_cost)} of the environment must be a finite number, or finite numbers of "
+                f"shape (n_agents, width) = {shape}."
+            )
+        try:
+            cost = np.broadcast_to(cost, shape)
         except ValueError as error:
             raise ValueError(
-                f"action_cost of shape {np.shape(self.action_cost)} cannot be broadcast to (n_agents, width) = {shape}."
+                f"action_cost of shape {np.shape(action_cost)} cannot be broadcast to (n_agents, width) = {shape}."
             ) from error
-        self._cost_of_encoded = th.as_tensor(cost.copy(), device=self.device)
+        return th.as_tensor(cost.copy(), device=self.device)
 
     def _scaled_action_cost(self) -> th.Tensor | None:
         """:return: the action cost on the scale of the normalised rewards, (n_agents, width), None if unknown"""
@@ -361,6 +381,55 @@ class MADDPG(OffPolicyAlgorithm):
         if self._cost_of_encoded is None or env is None or not env.norm_reward:
             return self._cost_of_encoded
         return self._cost_of_encoded / float(np.sqrt(env.ret_rms.var + env.epsilon))
+
+    def _action_noise_for(self, n_envs: int) -> ActionNoise | None:
+        """
+        :param n_envs: number of parallel environments
+        :return: the action noise for them
+        :raises ValueError: if it cannot be added to their actions, which would show only after ``learning_starts``
+        """
+        if self.action_noise is None:
+            return None
+        length = len(self.policy.actions.is_continuous)
+        state = np.random.get_state()  # noqa: NPY002 - what SB3's noise draws from
+        try:
+            noise = self.action_noise
+            vectorised = isinstance(noise, VectorizedActionNoise) or n_envs == 1  # or else learn() vectorises it
+            if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
+                noise = VectorizedActionNoise(noise.base_noise, n_envs)
+            numbers = np.broadcast_to(deepcopy(noise)(), (n_envs, length) if vectorised else (length,))
+            if not np.isfinite(numbers).all():
+                raise ValueError("it returned NaN or infinity")
+        except Exception as error:  # from foreign code
+            raise ValueError(
+                f"action_noise={shown(self.action_noise)} cannot be added to the {length} numbers of a joint action "
+                f"({' '.join(str(error).split())[:200]}): it must return finite numbers, as "
+                f"NormalActionNoise(np.zeros({length}), np.full({length}, 0.1)) does."
+            ) from error
+        finally:
+            np.random.set_state(state)  # noqa: NPY002
+        return noise
+
+    def _at_present(self, name: str) -> float:
+        """
+        :param name: of an argument that may be a schedule
+        :return: the present value
+        :raises ValueError: if the schedule does not return a number that the argument may have
+        """
+        value, least = getattr(self, name), LEAST_OF_SCHEDULES[name]
+        if not callable(value):
+            return value
+        given = value(self._current_progress_remaining)
+        try:
+            number = float(given)
+        except (TypeError, ValueError, OverflowError):
+            number = math.nan
+        if not least <= number < math.inf:
+            raise ValueError(
+                f"The schedule {name}={shown(value)} returned {shown(given)} for the remaining progress "
+                f"{self._current_progress_remaining}: it must return a finite number of at least {least:g}."
+            )
+        return number
 
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
@@ -371,16 +440,9 @@ class MADDPG(OffPolicyAlgorithm):
         names = self.arguments.model_fields
         for name, value in validated(self.arguments, **{name: getattr(self, name) for name in names}).items():
             setattr(self, name, value)
-        if self.batch_size > self.buffer_size:
-            raise ValueError(
-                f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}, from which batches are "
-                "sampled. Lower batch_size or raise buffer_size."
-            )
-        if self.n_steps > self.buffer_size // self.n_envs:
-            raise ValueError(
-                f"n_steps={self.n_steps} is more than buffer_size={self.buffer_size} stores of each of the "
-                f"{self.n_envs} environment(s): lower n_steps or raise buffer_size."
-            )
+        for name in LEAST_OF_SCHEDULES:
+            self._at_present(name)
+        self._check_buffer_size()
         if self.threshold_price is not None and not isinstance(self.action_space, spaces.MultiBinary):
             raise ValueError(
                 f"threshold_price is for binary actions (MultiBinary), but the action space is {self.action_space}."
@@ -395,6 +457,23 @@ class MADDPG(OffPolicyAlgorithm):
                     encode(getattr(self, name), name)
                 except ValueError as error:
                     warnings.warn(str(error), stacklevel=2)
+
+    def _check_buffer_size(self) -> None:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(
+                f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}, from which batches are "
+                "sampled. Lower batch_size or raise buffer_size."
+            )
+        if self.optimize_memory_usage and self.buffer_size // self.n_envs < 2:
+            raise ValueError(
+                f"buffer_size={self.buffer_size} must hold two transitions of each of the {self.n_envs} environment(s) "
+                "with optimize_memory_usage=True, which never samples one of them. Raise buffer_size."
+            )
+        if self.n_steps > self.buffer_size // self.n_envs:
+            raise ValueError(
+                f"n_steps={self.n_steps} is more than buffer_size={self.buffer_size} stores of each of the "
+                f"{self.n_envs} environment(s): lower n_steps or raise buffer_size."
+            )
 
     def _check_replay_buffer_arguments(self) -> None:
         buffer = self.replay_buffer_class
@@ -495,6 +574,7 @@ class MADDPG(OffPolicyAlgorithm):
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         # Update learning rate according to lr schedule
+        self._at_present("learning_rate")
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
 
         actor_losses, critic_losses, q_values, outputs = [], [], [], []
@@ -592,9 +672,7 @@ class MADDPG(OffPolicyAlgorithm):
             return q_values - (own * (cost if factors is None else cost[factors]).unsqueeze(1)).sum(dim=-1)
 
         logits = self.actor.logits(obs)
-        temperature = self.temperature
-        if callable(temperature):
-            temperature = temperature(self._current_progress_remaining)
+        temperature = self._at_present("temperature")
         with _no_gradients(critic):
             objective = critic.factors.objective(ESTIMATORS[self.estimator], critic.factored(logits), q, temperature)
         joint = self.policy.actions
@@ -739,6 +817,7 @@ class MADDPG(OffPolicyAlgorithm):
         return self
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        check_success(infos)
         super()._update_info_buffer(infos, dones)
         record_metrics(self.logger, infos)
 
@@ -752,18 +831,22 @@ class MADDPG(OffPolicyAlgorithm):
                 f"cannot store those of {n_envs}: pass as many environments, or empty the buffer with "
                 "`model.replay_buffer.reset()`."
             )
+        with _remedy_for_other_team():
+            check_for_correct_spaces(env, self.observation_space, self.action_space)
+        action_noise = self._action_noise_for(n_envs)
+        action_cost = self._action_cost_of(env)
+        cost_of_encoded = self._spread(action_cost)
         self.n_envs = n_envs  # SB3 would refuse another number even if the replay buffer is empty
         try:
-            with _remedy_for_other_team():
-                super().set_env(env, force_reset)
+            super().set_env(env, force_reset)
         except BaseException:
             self.n_envs = before
             raise
         assert self.env is not None
         assert self.replay_buffer_class is not None
         assert issubclass(self.replay_buffer_class, TeamReplayBuffer)
-        self._read_task(self.env)
-        self._spread_action_cost()
+        self.env_spec, self.action_noise = describe_env(self.env), action_noise
+        self.action_cost, self._cost_of_encoded = action_cost, cost_of_encoded
         rows = max(self.buffer_size // self.n_envs, 1)
         if self.replay_buffer.size() == 0 and (self.replay_buffer.buffer_size, self.replay_buffer.n_envs) != (
             rows,

@@ -13,18 +13,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_maddpg.model_files import as_damage, trusted
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import atomic_write
+from sb3_maddpg.validation import NormalizationArguments, validated_as
 
 _FORMAT = "VecNormalize 1"
-_SETTINGS = (
-    "training",
-    "norm_obs",
-    "norm_reward",
-    "clip_obs",
-    "clip_reward",
-    "gamma",
-    "epsilon",
-    "norm_obs_keys",
-)
+_SETTINGS = tuple(NormalizationArguments.model_fields)
 _MOST_BYTES = 2**28
 
 
@@ -85,7 +77,8 @@ class SafeVecNormalize(VecNormalize):
                     f"{path} has format {data.get('format')}, but this version of sb3-maddpg reads {_FORMAT}."
                 )
             settings = decode(data["settings"], f"{path}: settings")
-            found = SafeVecNormalize(venv, **{name: settings[name] for name in _SETTINGS})
+            given = validated_as(NormalizationArguments, settings, lambda name: f"{path}: {name}")
+            found = SafeVecNormalize(venv, **given)
             if isinstance(found.obs_rms if found.norm_obs else None, dict):
                 for key, one in found.obs_rms.items():
                     _set_moments(one, data["obs_rms"][key], f"{path}: {key}")

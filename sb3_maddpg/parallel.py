@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from types import ModuleType
@@ -16,10 +15,11 @@ from gymnasium.spaces.utils import flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint_action_space
-from sb3_maddpg.utils import as_seed, not_finite_at, shown
+from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
 MASK = "action_mask"
+_LARGEST_REWARD = float(np.finfo(np.float32).max)
 
 
 class _Action(NamedTuple):
@@ -38,7 +38,7 @@ class TeamEnv(gymnasium.Env):
     Wrapper that turns a PettingZoo environment into a single environment for the whole team, see "The team convention"
     in CONTRIBUTING.md.
 
-    The observation space, ``TeamObservation``, has a row per possible agent with its observation, flattened by
+    The observation space, ``TeamObservation``, has a row per possible agent with its observation, flattened as by
     Gymnasium's ``flatten``. The action space is that of ``joint_action_space``. The reward is the mean over all
     possible agents, where inactive agents count as 0, so the return is the mean of the agents' returns. When an agent
     is terminated or truncated, its row holds its final observation once. From then on the row is zero, and the agent
@@ -178,7 +178,7 @@ class TeamEnv(gymnasium.Env):
         rewards, active = [0.0] * n_agents, [False] * n_agents
         terminated, truncated = [False] * n_agents, [False] * n_agents
         left = self._present()
-        seen, live = [], []
+        seen, live, finite = [], [], True
         for row in acted:
             agent = agents[row]
             try:
@@ -193,6 +193,7 @@ class TeamEnv(gymnasium.Env):
             if type(ends) is not bool or type(cut) is not bool:
                 ends, cut = self._flag(agent, "termination", ends), self._flag(agent, "truncation", cut)
             rewards[row] = reward
+            finite = finite and -_LARGEST_REWARD <= reward <= _LARGEST_REWARD
             active[row], terminated[row], truncated[row] = True, ends, cut
             self._returns[row] += reward
             if not (ends or cut):
@@ -202,8 +203,7 @@ class TeamEnv(gymnasium.Env):
                 seen.append(row)
         if len(left) != len(live) or not all(agents[row] in left for row in live):
             self._check_left(left, live, acted, terminations, truncations)
-        total = sum(rewards)
-        if not math.isfinite(total):
+        if not finite:
             self._refuse_rewards(rewards)
         self._live = live
         info = _agent_infos(infos)
@@ -215,10 +215,15 @@ class TeamEnv(gymnasium.Env):
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
         if over:
             info["metrics"] = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
-            successes = [agent["is_success"] for agent in infos.values() if agent and "is_success" in agent]
+            successes = [
+                self._flag(agent, "is_success", one["is_success"])
+                for agent, one in infos.items()
+                if one and one.get("is_success") is not None
+            ]
             if successes:
                 info["is_success"] = all(successes)
-        return self._observe(self._with_masks(observations, infos), seen), total / n_agents, over and not cut, cut, info
+        reward = sum(rewards) / n_agents
+        return self._observe(self._with_masks(observations, infos), seen), reward, over and not cut, cut, info
 
     def render(self) -> Any:
         """Render the environment."""
@@ -277,6 +282,8 @@ class TeamEnv(gymnasium.Env):
 
     def _flag(self, agent: Any, name: str, value: Any) -> bool:
         if isinstance(value, (bool, np.bool_, int, np.integer)) or getattr(value, "shape", None) == ():
+            return bool(value)
+        if isinstance(value, float) and value in (0.0, 1.0):
             return bool(value)
         raise ValueError(
             f"{self.parallel_env} returned {shown(value)} as {name} of agent {agent!r} {self._when}: it must be True "
@@ -341,8 +348,7 @@ class TeamEnv(gymnasium.Env):
             try:
                 fits = _fits(space, observation)
                 if fits:
-                    flat = observation if isinstance(space, spaces.Box) else flatten(space, observation)
-                    matrix[row, :length] = np.asarray(flat).reshape(-1)
+                    matrix[row, :length] = _flat(space, observation)
             except (TypeError, ValueError, LookupError, OverflowError):
                 fits = False
             if not fits:
@@ -381,10 +387,10 @@ class TeamEnv(gymnasium.Env):
 
     def _state(self, size: int) -> np.ndarray:
         try:
-            state = np.asarray(flatten(self._state_space, self.parallel_env.state()))
+            state = _flat(self._state_space, self.parallel_env.state())
         except NotImplementedError as error:
             raise ValueError(f"{self.parallel_env} has a state_space but no state(): set state=False.") from error
-        except (TypeError, ValueError, LookupError) as error:
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
             raise ValueError(f"state() of {self.parallel_env} does not fit its state_space: {error}.") from error
         if state.size != size:
             raise ValueError(
@@ -426,11 +432,15 @@ class TeamEnv(gymnasium.Env):
         )
 
     def _refuse_rewards(self, rewards: list[float]) -> None:
-        found = {
-            name: reward for name, reward in zip(self.agent_names, rewards, strict=True) if not math.isfinite(reward)
-        }
-        wrong = ", ".join(f"{reward} for agent {name!r}" for name, reward in found.items())
-        raise ValueError(f"{self.parallel_env} returned a reward of {wrong} {self._when}: rewards must be finite.")
+        wrong = ", ".join(
+            f"{reward} for agent {name!r}"
+            for name, reward in zip(self.agent_names, rewards, strict=True)
+            if not -_LARGEST_REWARD <= reward <= _LARGEST_REWARD
+        )
+        raise ValueError(
+            f"{self.parallel_env} returned a reward of {wrong} {self._when}: rewards must be finite, also in single "
+            "precision."
+        )
 
 
 class TurnBased(ParallelEnv):
@@ -485,6 +495,7 @@ class TurnBased(ParallelEnv):
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """:return: observations and infos by agent"""
         self.env.reset(seed=seed, options=options)
+        self._remove_ended()
         self.agents = list(self.env.agents)
         return self._observe(), {agent: dict(self.env.infos.get(agent) or {}) for agent in self.agents}
 
@@ -495,15 +506,27 @@ class TurnBased(ParallelEnv):
         """
         env, agents = self.env, self.agents
         env.step(actions[env.agent_selection])
-        rewards = {agent: float(env.rewards.get(agent, 0.0)) for agent in agents}
+        rewards = {agent: env.rewards.get(agent, 0.0) for agent in agents}
         ended = {agent: bool(env.terminations.get(agent, True)) for agent in agents}
         cut = {agent: bool(env.truncations.get(agent, False)) for agent in agents}
         infos = {agent: dict(env.infos.get(agent) or {}) for agent in agents}
         observations = self._observe()
-        while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
-            env.step(None)  # PettingZoo's way to remove an agent that has ended
+        self._remove_ended()
         self.agents = [agent for agent in agents if not (ended[agent] or cut[agent])]
         return observations, rewards, ended, cut, infos
+
+    def _remove_ended(self) -> None:
+        """Remove agents that have ended, up to the next agent that can move."""
+        env = self.env
+        while env.agents:
+            if (mover := env.agent_selection) not in env.agents:
+                raise ValueError(
+                    f"agent_selection of {env} is {mover!r}, but its agents are {env.agents}: it must name the agent "
+                    "whose turn it is."
+                )
+            if not (env.terminations[mover] or env.truncations[mover]):
+                return
+            env.step(None)  # PettingZoo's way to remove an agent that has ended
 
     def _observe(self) -> dict[Any, Any]:
         observations = {}
@@ -562,6 +585,23 @@ def _fits(space: spaces.Space, value: Any) -> bool:
         index = array.ravel() - np.ravel(getattr(space, "start", 0))
         return bool(((index == np.rint(index)) & (index >= 0) & (index < sizes)).all())
     return bool(space.contains(value))
+
+
+def _flat(space: spaces.Space, value: Any) -> np.ndarray:
+    """
+    Flatten a value like Gymnasium's ``flatten``, but without casting numbers to the type of a ``Box``: NaN, infinity
+    and numbers out of an integer type's range would pass for others.
+
+    :raises ValueError: if the value does not hold real numbers
+    """
+    if isinstance(space, spaces.Box):
+        real = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+        return np.ravel(value if real else as_numbers(value))
+    if isinstance(space, spaces.Dict):
+        return np.concatenate([_flat(part, value[name]) for name, part in space.items()])
+    if isinstance(space, spaces.Tuple):
+        return np.concatenate([*map(_flat, space, value)])
+    return np.asarray(flatten(space, value))
 
 
 def _possible_agents(env: Any) -> tuple[Any, ...]:

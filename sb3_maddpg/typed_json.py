@@ -199,6 +199,16 @@ def _read_box(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> spaces.
     return spaces.Box(low, high, dtype=low.dtype.type)
 
 
+def _read_discrete(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> spaces.Discrete:
+    dtype = {} if entry.get("dtype", "int64") == "int64" else {"dtype": entry["dtype"]}  # older files have none
+    return spaces.Discrete(entry["n"], start=entry["start"], **dtype)
+
+
+def _read_multi_discrete(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> spaces.MultiDiscrete:
+    nvec = part(entry["nvec"])
+    return spaces.MultiDiscrete(nvec, nvec.dtype, start=part(entry["start"]))
+
+
 def _write_team(space: TeamObservation, part: Callable[[Any], Json]) -> dict[str, Json]:
     names = {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim}
     masks: dict[str, Json] = {"masks": [list(mask) for mask in space.masks]} if any(space.masks) else {}
@@ -265,13 +275,13 @@ _CODECS: dict[str, _Codec] = {
     "Box": _Codec(spaces.Box, _write_box, _read_box),
     "Discrete": _Codec(
         spaces.Discrete,
-        lambda v, part: {"n": int(v.n), "start": int(v.start)},
-        lambda e, part: spaces.Discrete(e["n"], start=e["start"]),
+        lambda v, part: {"n": int(v.n), "start": int(v.start), "dtype": str(v.dtype)},
+        _read_discrete,
     ),
     "MultiDiscrete": _Codec(
         spaces.MultiDiscrete,
         lambda v, part: {"nvec": part(v.nvec), "start": part(v.start)},
-        lambda e, part: spaces.MultiDiscrete(part(e["nvec"]), start=part(e["start"])),
+        _read_multi_discrete,
     ),
     "MultiBinary": _Codec(
         spaces.MultiBinary,

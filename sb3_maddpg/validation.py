@@ -19,8 +19,10 @@ from sb3_maddpg.utils import shown, suggest
 
 AtLeastZero = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
+Limit = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 # Outside these bounds, a price becomes 0 or infinite in single precision
 Price = Annotated[float, Field(ge=1e-12, le=1e12)]
+LEAST_TEMPERATURE = 1e-6
 LARGEST = 2**63  # larger integers do not fit into an array
 Natural = Annotated[int, Field(ge=1, lt=LARGEST)]
 NaturalOrZero = Annotated[int, Field(ge=0, lt=LARGEST)]
@@ -68,7 +70,7 @@ class LearnArguments(Arguments):
     callback: InstanceOf[BaseCallback] | list[InstanceOf[BaseCallback]] | Callable[..., Any] | None = Field(
         description="a callback of Stable-Baselines3, a list of them, a function (not a class), or None"
     )
-    log_interval: int | None = Field(description="a number of episodes, or None")
+    log_interval: Natural | None = Field(description="a number of episodes, at least 1, or None")
 
     @field_validator("callback")
     @classmethod
@@ -107,8 +109,8 @@ class TrainingArguments(Arguments):
         description="a standard deviation of at least 0, or two of them, the first and the last"
     )
     estimator: str = Field(description="a name of sb3_maddpg.estimators.ESTIMATORS")
-    temperature: Annotated[float, Field(ge=1e-6)] | Schedule = Field(
-        description="positive, at least 1e-6, or a schedule"
+    temperature: Annotated[float, Field(ge=LEAST_TEMPERATURE)] | Schedule = Field(
+        description=f"positive, at least {LEAST_TEMPERATURE:g}, or a schedule"
     )
     policy_delay: Natural = Field(description="at least 1, a number of critic updates")
     max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
@@ -178,6 +180,19 @@ class PriorityArguments(Arguments):
     epsilon: float = Field(
         gt=0, description="positive and finite: with 0, transitions without TD error would never be sampled"
     )
+
+
+class NormalizationArguments(Arguments):
+    """Arguments of ``SafeVecNormalize`` in its files."""
+
+    training: bool = Field(description="True or False")
+    norm_obs: bool = Field(description="True or False")
+    norm_reward: bool = Field(description="True or False")
+    clip_obs: Limit = Field(description="a positive number, or infinity")
+    clip_reward: Limit = Field(description="a positive number, or infinity")
+    gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
+    epsilon: float = Field(gt=0, description="positive and finite")
+    norm_obs_keys: list[str] | None = Field(description="a list of keys of the observation, or None")
 
 
 class CurriculumArguments(Arguments):

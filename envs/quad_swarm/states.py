@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -40,3 +42,18 @@ def like(present: np.ndarray, given: Any, name: str) -> np.ndarray:
             f"shape {present.shape}. A state fits only an environment with the same arguments."
         )
     return array
+
+
+@contextmanager
+def as_other_state() -> Iterator[None]:
+    """Replace errors about missing or misshapen parts of a state by one about the state.
+
+    :raises ValueError: instead of the original error
+    """
+    try:
+        yield
+    except (TypeError, LookupError, AttributeError) as error:
+        raise ValueError(
+            f"This is not a state of this environment ({type(error).__name__}: {error}): pass what `state_dict` of an "
+            "environment with the same arguments returned."
+        ) from error

@@ -84,6 +84,16 @@ def test_a_state_of_something_else_is_refused():
         like(np.zeros(3), np.zeros(3, np.float32), "x")
 
 
+@pytest.mark.parametrize("make", [QuadSwarmEnv, QuadSwarmParallelEnv, lambda: QuadSwarmVectorEnv(2)])
+def test_what_is_no_state_is_refused(make):
+    env = make()
+    env.reset(seed=0)
+    state = env.state_dict()
+    for wrong in (None, {}, [], 5, dict.fromkeys(state), {**state, next(iter(state)): {}}):
+        with pytest.raises(ValueError, match=r"not a state of this environment \(\w+Error: .*`state_dict`"):
+            env.load_state_dict(wrong)
+
+
 def test_a_foreign_simulator_has_no_state_to_tell():
     env = gymnasium.make("QuadSwarm-v0").unwrapped
     object.__setattr__(env.task.swarm.config, "plant", "rotorpy:hummingbird")

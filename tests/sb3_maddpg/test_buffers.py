@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import SumTree
+from sb3_maddpg.team import MixedActions
 from sb3_maddpg.team_tasks import OwnBit
 
 N, D, K = 3, 2, 2
@@ -416,6 +417,61 @@ def test_priorities_are_saved_with_the_buffer(through):
     first = memory.sample(32).indices
     set_random_seed(0)
     assert again.sample(32).indices.tolist() == first.tolist()
+
+
+def restored(memory: TeamReplayBuffer, counters: dict, **arrays: np.ndarray) -> TeamReplayBuffer:
+    """:return: a buffer with the contents of another and a few others"""
+    arguments, own_counters, own_arrays = memory.contents()
+    again = type(memory)(**arguments, device="cpu")
+    again.restore(own_counters | counters, own_arrays | arrays)
+    return again
+
+
+@pytest.mark.parametrize(
+    ("counters", "message"),
+    [
+        ({"n_added": 2}, "n_added is 2, but it holds 3 rows"),
+        ({"new_rows": 10**10}, "new_rows is 10000000000, but it holds 3 rows"),
+        ({"largest_priority": 0.0}, r"largest_priority is 0.0: .* positive and finite sum"),
+        ({"largest_priority": 1e308}, r"largest_priority is 1e\+308: .* positive and finite sum"),
+    ],
+)
+def test_counters_that_no_buffer_has_are_refused(counters, message):
+    memory = prioritized()
+    for index in range(3):
+        add(memory, index)
+    memory.sample(2)
+    assert restored(memory, {}).sample(2).weights.isfinite().all()
+    with pytest.raises(ValueError, match=message):
+        restored(memory, counters)
+    for wrong in (0.0, 1e308):
+        with pytest.raises(ValueError, match=r"priorities add up to (0\.0|inf)"):
+            restored(memory, {}, priorities=np.full(3, wrong))
+
+
+CHOICES = MixedActions([spaces.Discrete(3), spaces.MultiBinary(1), spaces.Box(-5, 5, (1,))])
+
+
+@pytest.mark.parametrize(
+    ("column", "wrong", "message"),
+    [
+        (0, 3, r"agent 0 \(agent_0\) lie between 0.0 and 3.0 in column 0: they must be integers from 0 to 2"),
+        (0, -1, "integers from 0 to 2"),
+        (0, 0.5, "integers from 0 to 2"),
+        (1, 2, r"agent 1 \(agent_1\) .* integers from 0 to 1"),
+        (2, 1e30, r"agent 2 \(agent_2\) .* numbers from -1 to 1"),
+    ],
+)
+def test_actions_outside_of_their_space_are_not_restored(column, wrong, message):
+    memory = TeamReplayBuffer(4, BOX, CHOICES, device="cpu")
+    for action in ([0, 0, -1.0], [2, 1, 1.00001]):
+        obs = np.zeros((1, N, D), np.float32)
+        memory.add(obs, obs, np.array([action]), np.zeros(1), np.zeros(1), [{}])
+    assert np.array_equal(restored(memory, {}).actions, memory.actions)
+    actions = memory.contents()[2]["actions"].copy()
+    actions[1, 0, column] = wrong
+    with pytest.raises(ValueError, match=message):
+        restored(memory, {}, actions=actions)
 
 
 @pytest.mark.parametrize(

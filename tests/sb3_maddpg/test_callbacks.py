@@ -1,5 +1,7 @@
 """The curriculum and the metrics, with MADDPG and with another algorithm."""
 
+import re
+
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
@@ -10,8 +12,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_maddpg import MADDPG, CurriculumCallback, MetricsCallback
-from sb3_maddpg.callbacks import record_metrics
+from sb3_maddpg.callbacks import check_success, record_metrics
 from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.utils import shown
 
 SMALL = {"learning_starts": 50, "batch_size": 16, "train_freq": 10, "buffer_size": 500, "seed": 0}
 
@@ -128,6 +131,29 @@ def test_metrics_of_another_algorithm(tmp_path):
     assert np.diff([values["task/mean_action"] for values in logged]) != 0
 
 
-def test_a_metric_that_is_no_number_is_refused():
-    with pytest.raises(ValueError, match=r"info\['metrics'\]\['task/x'\] is None: a metric must be a number"):
-        record_metrics(Logger(None, []), [{"metrics": {"task/x": None}}])
+@pytest.mark.parametrize("wrong", [None, "x", np.nan, -np.inf, [1.0, 2.0], 10**400])
+def test_a_metric_that_is_no_finite_number_is_refused(wrong):
+    message = rf"info\['metrics'\]\['task/x'\] is {re.escape(shown(wrong))}: a metric must be a finite number"
+    with pytest.raises(ValueError, match=message):
+        record_metrics(Logger(None, []), [{"metrics": {"task/x": wrong}}])
+
+
+@pytest.mark.parametrize("wrong", [None, [1.0], 5])
+def test_metrics_have_names(wrong):
+    with pytest.raises(ValueError, match=r"info\['metrics'\] is .*: it must be a dict of numbers by name"):
+        record_metrics(Logger(None, []), [{}, {"metrics": wrong}])
+
+
+@pytest.mark.parametrize("wrong", ["x", np.nan, 0.5, np.array([True, False])])
+@pytest.mark.parametrize("algorithm", [MADDPG, PPO])
+def test_success_is_true_or_false(wrong, algorithm):
+    class Unsure(Levelled):
+        def step(self, action):
+            *rest, info = super().step(action)
+            return *rest, {**info, "is_success": wrong}
+
+    small = SMALL if algorithm is MADDPG else {"n_steps": 10, "batch_size": 10}
+    callback = None if algorithm is MADDPG else CurriculumCallback()
+    with pytest.raises(ValueError, match=r"info\['is_success'\] is .*: it must be True or False"):
+        algorithm("MlpPolicy", Unsure(), **small).learn(20, callback)
+    check_success([{}, *({"is_success": right} for right in (None, True, np.False_, 1, 0.0, np.array(1.0)))])

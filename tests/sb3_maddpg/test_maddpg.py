@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
@@ -22,6 +22,8 @@ from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.team_tasks import BINARY_TASKS, FollowTarget, OwnBit
 from toys import SMALL, Neighbours, Toy
+
+NAN, INF = float("nan"), float("inf")
 
 
 def learned(env="OwnBit-v0", steps: int = 120, **kwargs) -> MADDPG:
@@ -202,6 +204,28 @@ def test_a_cost_of_another_shape_is_refused():
         MADDPG("MlpPolicy", env, use_action_cost=True)
 
 
+@pytest.mark.parametrize("wrong", [NAN, 1e39, "x", [[1.0], [1.0, 2.0]], np.full((3, 3), 1j)])
+def test_a_cost_that_is_no_number_is_refused(wrong):
+    env = OwnBit()
+    env.action_cost = wrong
+    with pytest.raises(ValueError, match=r"action_cost=.* must be a finite number, .* width\) = \(3, 3\)"):
+        MADDPG("MlpPolicy", env, use_action_cost=True)
+
+
+def test_an_environment_with_a_wrong_cost_is_not_set():
+    env = OwnBit()
+    env.action_cost = 0.4
+    model = MADDPG("MlpPolicy", env, use_action_cost=True)
+    before = model.get_env()
+    for wrong, message in ((None, "no attribute `action_cost`"), (NAN, "action_cost=nan"), (np.ones(2), "broadcast")):
+        other = OwnBit()
+        other.action_cost = wrong
+        with pytest.raises(ValueError, match=message):
+            model.set_env(other)
+        assert model.get_env() is before
+        assert (model.action_cost, model._cost_of_encoded.unique().tolist()) == (0.4, [np.float32(0.4)])
+
+
 def test_a_cost_is_known_only_if_wanted():
     env = OwnBit()
     env.action_cost = 0.4
@@ -234,9 +258,6 @@ def test_stacked_frames_are_refused():
     env = VecFrameStack(DummyVecEnv([OwnBit]), 2)
     with pytest.raises(ValueError, match=r"supersuit\.frame_stack_v2"):
         MADDPG("MlpPolicy", env)
-
-
-NAN, INF = float("nan"), float("inf")
 
 
 @pytest.mark.parametrize(
@@ -285,6 +306,66 @@ def test_schedules_end_with_the_training_even_if_its_last_rollout_does_not():
     assert model.noise_std == 0.0
     assert seen[-1] == 0.0
     assert model.actor.optimizer.param_groups[0]["lr"] == 0.0
+
+
+@pytest.mark.parametrize(("name", "least"), [("learning_rate", "0"), ("temperature", "1e-06")])
+@pytest.mark.parametrize("wrong", [NAN, INF, -1.0, "x", None])
+def test_schedules_return_what_numbers_may_be(name, least, wrong):
+    message = rf"schedule {name}=.* returned {wrong!r} for the remaining progress {{}}.*at least {least}"
+    kwargs = {"estimator": "gumbel_softmax", "steps": 40}
+    with pytest.raises(ValueError, match=message.format(r"1\.0")):
+        learned(**kwargs, **{name: lambda progress: wrong})
+    with pytest.raises(ValueError, match=message.format(r"0\.")):
+        learned(**kwargs, **{name: lambda progress: 0.1 if progress == 1 else wrong})
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        NormalActionNoise(np.zeros(3), np.ones(3)),
+        NormalActionNoise(np.zeros(6), np.full(6, NAN)),
+        NormalActionNoise(np.zeros(6), np.full(6, -1.0)),
+        NormalActionNoise(0, 1),
+        VectorizedActionNoise(NormalActionNoise(np.zeros((2, 6)), np.ones((2, 6))), 2),
+    ],
+)
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_noise_that_cannot_be_added_to_actions_is_refused(noise, n_envs):
+    env = make_vec_env(lambda: TeamEnv(Toy("continuous")), n_envs)
+    with pytest.raises(ValueError, match=r"action_noise=.* 6 numbers of a joint action .*np\.full\(6, 0\.1\)"):
+        MADDPG("MlpPolicy", env, action_noise=noise)
+
+
+def test_the_check_of_noise_leaves_the_noise_and_the_random_numbers_alone():
+    env, zeros = TeamEnv(Toy("continuous")), np.zeros(6)
+    plain = MADDPG("MlpPolicy", env, **SMALL)
+    expected = np.random.random(3)  # noqa: NPY002 - what SB3's noise draws from
+    noise = OrnsteinUhlenbeckActionNoise(zeros, zeros + 0.1)
+    model = MADDPG("MlpPolicy", env, **SMALL, action_noise=noise)
+    assert np.array_equal(np.random.random(3), expected)  # noqa: NPY002
+    assert model.action_noise is noise
+    assert not noise.noise_prev.any()
+    assert np.array_equal(parameters(model), parameters(plain))
+
+
+def test_noise_follows_the_number_of_environments(tmp_path):
+    def make(n_envs: int):
+        return make_vec_env(lambda: TeamEnv(Toy("continuous")), n_envs)
+
+    noise = NormalActionNoise(np.zeros(6), np.full(6, 0.1))
+    model = learned(make(2), 60, action_noise=noise)
+    model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model", env=make(1))
+    assert loaded.action_noise().shape == (1, 6)
+    loaded.set_env(make(3))
+    assert loaded.learn(60).action_noise().shape == (3, 6)
+
+
+def test_a_buffer_of_one_row_without_next_observations_is_refused():
+    buffer = {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "optimize_memory_usage": True}
+    with pytest.raises(ValueError, match="buffer_size=1 must hold two transitions of each of the 1 environment"):
+        MADDPG("MlpPolicy", OwnBit(), **{**SMALL, **buffer, "buffer_size": 1, "batch_size": 1})
+    assert learned(OwnBit(), 40, **buffer, buffer_size=2, batch_size=1).replay_buffer.full
 
 
 def test_numbers_of_numpy_are_numbers():
@@ -444,6 +525,8 @@ def test_arguments_of_a_wrong_type_are_refused_by_name(arguments, message):
         {"total_timesteps": 1e300},
         {"callback": 2},
         {"callback": MetricsCallback},
+        {"log_interval": 0},
+        {"log_interval": -1},
     ],
 )
 def test_learn_names_an_argument_of_a_wrong_type(arguments):

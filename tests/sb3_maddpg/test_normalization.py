@@ -1,6 +1,7 @@
 """Statistics of VecNormalize as JSON: they come back, and nothing else is read."""
 
 import json
+import math
 import pickle
 from unittest.mock import patch
 
@@ -22,7 +23,7 @@ def seen(env_class=OwnBit, **kwargs) -> SafeVecNormalize:
     return env
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"norm_obs": False}, {"norm_reward": False, "clip_obs": 5.0, "gamma": 0.9}])
+@pytest.mark.parametrize("kwargs", [{}, {"norm_obs": False}, {"norm_reward": False, "clip_obs": np.inf, "gamma": 0.9}])
 def test_statistics_come_back(tmp_path, kwargs):
     env = seen(**kwargs)
     env.save(str(tmp_path / "stats.pkl"))
@@ -67,7 +68,8 @@ def test_pickles_need_trust(tmp_path):
     ("change", "message"),
     [
         ({"format": "x"}, "has format x"),
-        ({"settings": {}}, "damaged"),
+        ({"settings": {}}, "training is missing"),
+        ({"settings": 5}, "damaged"),
         ({"settings": {"$": "class", "name": "os.system"}}, "Unknown class"),
         ({"obs_rms": 5}, "damaged"),
         ({"ret_rms": {"mean": 0.0, "var": 1.0, "count": 1.0}}, r"has shape|damaged"),
@@ -84,6 +86,28 @@ def test_spoilt_statistics_are_refused(tmp_path, change, message):
     plain = {key: value if "$" in str(value) else encode(value, key) for key, value in change.items()}
     path.write_text(json.dumps({**json.loads(path.read_text()), **plain}))
     with pytest.raises(ValueError, match=message):
+        SafeVecNormalize.load(str(path), DummyVecEnv([OwnBit]))
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("training", "x"),
+        ("clip_obs", math.nan),
+        ("clip_obs", "x"),
+        ("clip_reward", 0.0),
+        ("gamma", 1e300),
+        ("epsilon", -10.0),
+        ("epsilon", math.inf),
+        ("norm_obs_keys", [5]),
+    ],
+)
+def test_spoilt_settings_are_refused(tmp_path, name, wrong):
+    path = tmp_path / "stats{}.pkl"
+    env = seen()
+    setattr(env, name, wrong)
+    env.save(str(path))
+    with pytest.raises(ValueError, match=rf"stats{{}}\.pkl: {name}=.* must be"):
         SafeVecNormalize.load(str(path), DummyVecEnv([OwnBit]))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from mpe2 import simple_spread_v3
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
@@ -191,6 +191,14 @@ def forgotten(env, observations, rewards, terminations, truncations, infos):
             "reward of nan for agent 'b' in step 1 of the episode: rewards must be finite",
         ),
         (lambda env, _, rewards, *__: rewards.update(a=-np.inf, b=np.inf), "-inf for agent 'a', inf for agent 'b'"),
+        (
+            lambda env, _, rewards, *__: rewards.update(a=1e39, b=-1e39),
+            "reward of 1e\\+39 for agent 'a', -1e\\+39 for agent 'b' in step 1 .* in single precision",
+        ),
+        (
+            lambda env, _, rewards, *__: rewards.update(a=1.7e308, b=1.7e308),
+            "reward of 1.7e\\+308 for agent 'a', 1.7e\\+308 for agent 'b'",
+        ),
         (lambda env, _, rewards, *__: rewards.pop("a"), "left out reward, termination or truncation of agent 'a'"),
         (lambda env, _, __, terminations, *___: terminations.pop("b"), "truncation of agent 'b'"),
     ],
@@ -287,6 +295,14 @@ def changed(where, agent, value):
         (changed("observations", "b", np.array(["x", "y"])), "observation of agent 'b' is array.*but its space is Box"),
         (changed("observations", "a", None), "observation of agent 'a' is None, but its space is Box"),
         (changed("infos", "a", "x"), "'x' as info of agent 'a'.*must be a dict"),
+        (
+            lambda env, *given: env.time == 4 and given[4].update(b={"is_success": np.array([True, False])}),
+            r"array\(\[ True, False\]\) as is_success of agent 'b' in step 4.*True or False",
+        ),
+        (
+            lambda env, *given: env.time == 4 and given[4].update(b={"is_success": "x"}),
+            "'x' as is_success of agent 'b' in step 4",
+        ),
         (lambda env, *_: setattr(env, "agents", None), "`agents` of script is None in step 1"),
     ],
 )
@@ -322,6 +338,32 @@ def test_an_environment_need_not_say_anything_about_agents():
     assert len(play(TeamEnv(script))) == 2
 
 
+BYTES = spaces.Box(0, 255, (2,), np.uint8)
+
+
+class Watcher(Script):
+    """
+    One agent that sees what it is given.
+
+    :param space: its observation space
+    :param seen: its observation
+    """
+
+    def __init__(self, space: spaces.Space, seen):
+        super().__init__({"a": (2, TRUNCATED)})
+        self.space, self.seen = space, seen
+        self.state_space = BYTES
+
+    def observation_space(self, agent):
+        return self.space
+
+    def observe(self, agents):
+        return dict.fromkeys(agents, self.seen)
+
+    def state(self):
+        return self.seen
+
+
 @pytest.mark.parametrize(
     ("space", "wrong"),
     [
@@ -337,17 +379,52 @@ def test_an_environment_need_not_say_anything_about_agents():
     ],
 )
 def test_observations_outside_of_their_space_are_refused(space, wrong):
-    class Watcher(Script):
-        def observation_space(self, agent):
-            return space
-
-        def observe(self, agents):
-            return dict.fromkeys(agents, wrong if self.time else space.sample())
-
-    env = TeamEnv(Watcher({"a": (3, TRUNCATED)}))
+    env = TeamEnv(Watcher(space, space.sample()))
     env.reset()
+    env.parallel_env.seen = wrong
     with pytest.raises(ValueError, match=r"observation of agent 'a' .*, but its space is .*in step 1 of the episode"):
         env.step(np.zeros(1))
+
+
+@pytest.mark.parametrize("whole", [BYTES, spaces.Dict(x=BYTES, y=spaces.Discrete(2)), spaces.Tuple([BYTES, BYTES])])
+def test_numbers_are_not_cast_to_the_type_of_their_space(whole):
+    def seen(*numbers):
+        if isinstance(whole, spaces.Dict):
+            return {"x": np.array(numbers), "y": 1}
+        return np.array(numbers) if whole is BYTES else (np.array(numbers), np.zeros(2))
+
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(ValueError, match=f"observation of agent 'a' is {wrong} in column 0 after reset.*finite"):
+            TeamEnv(Watcher(whole, seen(wrong, 1.0))).reset()
+    assert TeamEnv(Watcher(whole, seen(300, -1))).reset()[0][0, :2].tolist() == [300, -1]
+
+
+@pytest.mark.parametrize("wrong", [np.array([1j, 2]), np.array(["1", "2"]), [1j, 2]])
+def test_observations_are_real_numbers(wrong):
+    with pytest.raises(ValueError, match=r"observation of agent 'a' is .*but its space is Box"):
+        TeamEnv(Watcher(SHORT, wrong)).reset()
+    env = TeamEnv(Watcher(SHORT, np.zeros(2)), state=True)
+    env.parallel_env.state = lambda: wrong
+    with pytest.raises(ValueError, match=r"state\(\) of script does not fit its state_space: no real numbers"):
+        env.reset()
+
+
+def test_a_state_is_not_cast_to_the_type_of_its_space():
+    env = TeamEnv(Watcher(SHORT, np.array([np.nan, 300.0])), state=True)
+    env.parallel_env.observe = lambda agents: dict.fromkeys(agents, np.zeros(2))
+    with pytest.raises(ValueError, match="The state is nan in column 2"):
+        env.reset()
+    env.parallel_env.state = lambda: np.array([7.0, 300.0])
+    assert env.reset()[0].tolist() == [[0, 0, 7, 300]]
+
+
+def test_an_action_mask_of_fractions_is_not_rounded():
+    masked = spaces.Dict(action_mask=spaces.Box(0, 1, (3,), np.int8), observation=SHORT)
+    seen = {"observation": np.zeros(2), "action_mask": np.array([0.25, 0, 0])}
+    assert TeamEnv(Watcher(masked, seen)).reset()[0][0].tolist() == [0.25, 0, 0, 0, 0]
+    seen["action_mask"] = np.full(3, np.nan)
+    with pytest.raises(ValueError, match="observation of agent 'a' is nan in column 0"):
+        TeamEnv(Watcher(masked, seen)).reset()
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "x", np.float64(3.0)])
@@ -395,3 +472,68 @@ def test_stable_baselines3_evaluates_on_an_adapted_environment():
     model = MADDPG("MlpPolicy", simple_spread_v3.parallel_env(), seed=0)
     mean, _ = evaluate_policy(model, Monitor(TeamEnv(simple_spread_v3.parallel_env())), n_eval_episodes=2)
     assert np.isfinite(mean)
+
+
+class Turns(AECEnv):
+    """
+    Three agents move in turn, six moves in all.
+
+    :param reward: of each agent in each move
+    :param dead: agents that have ended when an episode begins
+    """
+
+    metadata = {"name": "turns"}  # noqa: RUF012
+
+    def __init__(self, reward=1.0, dead: tuple = ()):
+        super().__init__()
+        self.possible_agents = ["a", "b", "c"]
+        self.reward, self.dead = reward, dead
+
+    def observation_space(self, agent):
+        return SHORT
+
+    def action_space(self, agent):
+        return spaces.Discrete(3)
+
+    def observe(self, agent):
+        return np.full(2, self.moves / 10, np.float32)
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.moves = list(self.possible_agents), 0
+        self.rewards, self._cumulative_rewards = dict.fromkeys(self.agents, 0.0), dict.fromkeys(self.agents, 0.0)
+        self.terminations = {agent: agent in self.dead for agent in self.agents}
+        self.truncations, self.infos = dict.fromkeys(self.agents, False), {agent: {} for agent in self.agents}
+        self.agent_selection = "a"
+
+    def step(self, action):
+        mover = self.agent_selection
+        self.agent_selection = self.agents[(self.agents.index(mover) + 1) % len(self.agents)]
+        if self.terminations[mover] or self.truncations[mover]:
+            self.agents.remove(mover)
+            return
+        self.moves += 1
+        self.rewards = dict.fromkeys(self.agents, self.reward)
+        self.truncations = dict.fromkeys(self.agents, self.moves == 6)
+
+
+@pytest.mark.parametrize("dead", [(), ("a",), ("a", "b")])
+def test_who_has_ended_before_the_first_turn_takes_no_part(dead):
+    steps = play(TeamEnv(Turns(dead=dead)))
+    assert [step[4]["agent_active"].tolist() for step in steps] == 6 * [[agent not in dead for agent in "abc"]]
+
+
+def test_somebody_has_to_be_left_for_the_first_turn():
+    with pytest.raises(ValueError, match=r"After reset\(\), `agents` of .* is empty"):
+        TeamEnv(Turns(dead=("a", "b", "c"))).reset()
+
+
+def test_the_mover_is_among_the_agents():
+    env = Turns(dead=("a",))
+    env.step = lambda action: env.agents.remove("a")
+    with pytest.raises(ValueError, match=r"agent_selection of .* is 'a', but its agents are \['b', 'c'\]"):
+        TeamEnv(env).reset()
+
+
+def test_a_reward_of_a_game_with_turns_is_a_number():
+    with pytest.raises(ValueError, match=r"reward of None for agent 'a' in step 1 .*must be a number"):
+        play(TeamEnv(Turns(reward=None)))

@@ -42,7 +42,9 @@ VALUES = [
     BOX,
     spaces.Box(0, 255, (4, 4, 3), np.uint8),
     spaces.Discrete(5, start=-2),
+    spaces.Discrete(3, dtype=np.int32),
     spaces.MultiDiscrete([2, 3], start=[1, -1]),
+    spaces.MultiDiscrete([2, 3], np.uint8, start=[1, 2]),
     spaces.MultiBinary(7),
     spaces.MultiBinary([2, 3]),
     spaces.Dict({"z": spaces.Discrete(2), "a": BOX}),
@@ -74,6 +76,10 @@ def same(a, b) -> bool:
 def test_what_is_written_comes_back(value):
     text = json.dumps(encode(value, "value"), allow_nan=False)
     assert same(decode(json.loads(text), "value"), value)
+
+
+def test_a_discrete_space_of_an_older_file_has_the_usual_type():
+    assert decode({"$": "Discrete", "n": 3, "start": 1}, "value") == spaces.Discrete(3, start=1)
 
 
 def test_numbers_that_json_does_not_know_come_back():
@@ -161,6 +167,8 @@ def test_only_what_can_be_imported_may_be_named():
         ({"$": "array", "dtype": "f4", "shape": [2], "base64": "AAAAAAAAAAA=", "repeated": True}, "too many values"),
         ({"$": "MultiBinary", "n": 10**12}, "bits"),
         ({"$": "Discrete", "n": 0, "start": 0}, ""),
+        ({"$": "Discrete", "n": 3, "start": 0, "dtype": "O"}, "integer dtype"),
+        ({"$": "Discrete", "n": 300, "start": 0, "dtype": "uint8"}, ""),
         ({"$": "Box", "low": 0, "high": 1}, ""),
         ({"$": "dtype", "name": "torch.save"}, "not a PyTorch dtype"),
         ({"$": "tuple"}, "KeyError"),

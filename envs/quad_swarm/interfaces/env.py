@@ -12,7 +12,7 @@ from pydantic import PositiveInt
 
 from quad_swarm.errors import unknown_name
 from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, checked_seed, need_reset
-from quad_swarm.states import generator_of, generator_state, like
+from quad_swarm.states import as_other_state, generator_of, generator_state, like
 from quad_swarm.task.request_task import make_task, requests_of
 from quad_swarm.validation import checked_arguments
 from quad_swarm.world.neighbours import spread
@@ -199,6 +199,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
             "generator": generator_state(self.np_random),
         }
 
+    @as_other_state()
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict` of an environment with the same arguments, bit for bit.
 

@@ -12,6 +12,7 @@ from pettingzoo import ParallelEnv
 from quad_swarm.errors import shown
 from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, need_reset
+from quad_swarm.states import as_other_state
 
 
 class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
@@ -62,6 +63,7 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         """See `QuadSwarmEnv.state_dict`."""
         return {"team": self.team.state_dict(), "agents": list(self.agents), "is_reset": self._is_reset}
 
+    @as_other_state()
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """See `QuadSwarmEnv.load_state_dict`."""
         self.team.load_state_dict(state["team"])

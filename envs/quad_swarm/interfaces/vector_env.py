@@ -14,7 +14,7 @@ from pydantic import Field
 
 from quad_swarm.errors import shown
 from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, checked_seed, need_reset
-from quad_swarm.states import generator_of, generator_state
+from quad_swarm.states import as_other_state, generator_of, generator_state
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import checked_arguments
 
@@ -103,6 +103,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """Return the complete state as plain values and arrays, see `load_state_dict`."""
         return {"task": self.task.state_dict(), "generators": [generator_state(rng) for rng in self._rngs]}
 
+    @as_other_state()
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict` of an environment with the same arguments, bit for bit.
 
