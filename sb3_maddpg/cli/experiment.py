@@ -336,13 +336,12 @@ class TeamExperimentManager(ExperimentManager):
         """:return: a logger of tables on the screen, unless there is a progress bar, and of curves for TensorBoard"""
         prints = self.verbose > 0 and not self.show_progress
         if self.checkpoint is not None and self.checkpoint.logger_folder and self.tensorboard_log:
-            logger = configure(self.checkpoint.logger_folder, [*(["stdout"] if prints else []), "tensorboard"])
+            curves = str(Path(self.tensorboard_log, Path(self.checkpoint.logger_folder).name))
+            logger = configure(curves, [*(["stdout"] if prints else []), "tensorboard"])
             for output in logger.output_formats:
                 if isinstance(output, TensorBoardOutputFormat):  # drop events after the checkpoint
                     output.writer.close()
-                    output.writer = SummaryWriter(
-                        self.checkpoint.logger_folder, purge_step=self.checkpoint.saved_at + 1
-                    )
+                    output.writer = SummaryWriter(curves, purge_step=self.checkpoint.saved_at + 1)
             return logger
         if not self.tensorboard_log or self.continue_training:
             return configure_logger(int(prints), self.tensorboard_log, name, not self.continue_training)
