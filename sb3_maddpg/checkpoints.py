@@ -526,8 +526,8 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
     else:
         load_vec_env_state(env, state["env"])
-        for name, value in state["last"].items():
-            setattr(model, name, value)
+        for name in _LAST:
+            setattr(model, name, _checked_last(model, name, state["last"][name]))
     model.action_noise = state["action_noise"]
     names = [type(one).__name__ for one in callbacks]
     if names != [one["class"] for one in state["callbacks"]]:
@@ -541,6 +541,16 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         getattr(model.logger, name).update(values)
     set_space_generators(model.action_space, state["spaces"])
     _set_random_state(state["random"])
+
+
+def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
+    """:return: an array of the last observations, or whether they begin episodes, if it fits the environment"""
+    present = model._last_episode_starts if name == "_last_episode_starts" else model._last_obs
+    if value is None and name == "_last_original_obs":  # before the first step
+        return value
+    if not isinstance(value, np.ndarray) or value.shape != np.shape(present):
+        raise ValueError(f"A checkpoint is damaged: its {name} is {shown(value)}.")
+    return value
 
 
 def _end_by(number: int) -> None:

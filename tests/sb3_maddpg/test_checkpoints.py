@@ -318,6 +318,24 @@ def test_other_callbacks_and_other_environments_are_refused(tmp_path):
             RunCheckpoint(tmp_path, **wrong)
 
 
+def edit(folder: Path, change) -> None:
+    """Change the state in the newest checkpoint, as somebody could who also knows its checksums."""
+    (path,) = list(folder.glob("checkpoint-*"))[-1:]
+    state = json.loads((path / "state.json").read_text())
+    change(state)
+    (path / "state.json").write_text(json.dumps(state))
+    (path / "manifest.json").write_text("{}")
+
+
+@pytest.mark.parametrize("value", [None, 1, {"$": "array", "dtype": "f4", "shape": [1], "base64": "AAAAAA=="}])
+def test_last_observations_that_do_not_fit_the_environment_are_refused(value, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    edit(tmp_path, lambda state: state["last"].update(_last_obs=value))
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    with pytest.raises(ValueError, match="A checkpoint is damaged: its _last_obs is"):
+        model.learn(100, [callback], reset_num_timesteps=False)
+
+
 def test_nothing_in_a_checkpoint_is_a_pickle(tmp_path):
     make("normalized").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
     state = json.loads((newest(tmp_path) / "state.json").read_text())
