@@ -545,7 +545,7 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
 
 def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
     """:return: an array of the last observations, or whether they begin episodes, if it fits the environment"""
-    present = model._last_episode_starts if name == "_last_episode_starts" else model._last_obs
+    present: Any = model._last_episode_starts if name == "_last_episode_starts" else model._last_obs
     if value is None and name == "_last_original_obs":  # before the first step
         return value
     if not isinstance(value, np.ndarray) or value.shape != np.shape(present):

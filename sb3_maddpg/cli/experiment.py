@@ -105,6 +105,7 @@ class TeamExperimentManager(ExperimentManager):
         check_options(args)
         self.checkpoints = checkpoints
         self.checkpoint: RunCheckpoint | None = None
+        self.lock = contextlib.ExitStack()  # of the run's folder of checkpoints, until learn() ends
         super().__init__(args, *rest, **{**kwargs, "uuid_str": uuid_str})
         self.uuid_str = uuid_str
         self.shares_parameters = shares_parameters(ALGOS[self.algo], self.env_name.gym_id)
@@ -186,6 +187,8 @@ class TeamExperimentManager(ExperimentManager):
             return
         if self.checkpoints is not None and self.checkpoints.run is not None:
             self.save_path, self.params_path = str(self.checkpoints.run), f"{self.checkpoints.run}/{self.env_name}"
+            # First of all, because a process that trains in this folder still writes its monitor files
+            self.lock.enter_context(locked(self.checkpoints.run / CHECKPOINTS))
             put_aside(self.checkpoints.run)
             return
         first = get_latest_run_id(self.log_path, self.env_name) + 1
@@ -195,6 +198,18 @@ class TeamExperimentManager(ExperimentManager):
         if self.checkpoints is not None:
             with atomic_write(f"{self.save_path}/{COMMAND_FILE}", "json") as file:
                 file.write(json.dumps(self.checkpoints.command).encode())
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        Create folder, environments, callbacks and model.
+
+        :return: the model and its hyperparameters, None for a search
+        """
+        try:
+            return super().setup_experiment()
+        except BaseException:
+            self.lock.close()
+            raise
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
@@ -298,6 +313,10 @@ class TeamExperimentManager(ExperimentManager):
 
         :param model: a new or a loaded model
         """
+        with self.lock:
+            self._learn(model)
+
+    def _learn(self, model: BaseAlgorithm) -> None:
         assert model.env is not None
         model.env_spec = describe_env(model.env)  # type: ignore[attr-defined]
         model.set_logger(self._logger(type(model).__name__))
@@ -308,14 +327,14 @@ class TeamExperimentManager(ExperimentManager):
             kwargs["log_interval"] = None
             total = self.n_timesteps + (model.num_timesteps if self.checkpoint is not None else 0)
             self.callbacks.append(RegularTables(max(total // TABLES, FEWEST_STEPS_PER_TABLE)))
-        locks: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         if self.checkpoints is not None and isinstance(model, MADDPG):
             folder = Path(self.save_path, CHECKPOINTS)
-            self.checkpoint = self.checkpoint or RunCheckpoint(folder, self.checkpoints.every)
+            if self.checkpoint is None:
+                self.checkpoint = RunCheckpoint(folder, self.checkpoints.every)
+                self.lock.enter_context(locked(folder))
             self.callbacks.append(self.checkpoint)
-            locks = locked(folder)
         try:
-            with locks, warnings.catch_warnings():
+            with warnings.catch_warnings():
                 # Evaluation runs episode by episode, with any kind of training environment
                 warnings.filterwarnings("ignore", "Training and eval env are not of the same type")
                 model.learn(

@@ -129,6 +129,23 @@ def test_a_copied_run_writes_into_the_copy_only(tmp_path):
         assert curves["timesteps"].tolist() == list(range(250, 6001, 250))
 
 
+def test_resuming_a_run_that_trains_does_not_touch_it(tmp_path):
+    (tmp_path / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3, "n_timesteps": 100_000}}))
+    argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "300"]
+    process = start([*argv, "--verbose", "0"], tmp_path)
+    wait_for(process, 1, tmp_path)
+    second = start(["--resume"], tmp_path)
+    output = second.communicate()[0]
+    assert second.returncode == 2, output
+    assert f"checkpoints is in use by process {process.pid}" in output
+    process.send_signal(signal.SIGINT)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    (run,) = tmp_path.glob("logs/maddpg/*_1")
+    assert [path.name for path in run.glob("*.csv*")] == ["0.monitor.csv"]
+    assert len((run / "0.monitor.csv").read_text().splitlines()) > 20
+
+
 def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for argv, message in (
