@@ -8,7 +8,6 @@ files are synced to disk, then a manifest with their checksums is written, and r
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
@@ -48,7 +47,7 @@ from sb3_maddpg.env_states import (
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.model_files import as_damage
 from sb3_maddpg.typed_json import decode, encode
-from sb3_maddpg.utils import shown, sync_folder
+from sb3_maddpg.utils import is_full_disk, shown, sync_folder
 
 _FORMAT = 2
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
@@ -217,13 +216,14 @@ class RunCheckpoint(BaseCallback):
             if self.verbose:
                 print(f"Checkpoint at step {writer.steps}: {writer.target}")
             return writer.target
-        if not isinstance(error, OSError) or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if not is_full_disk(error):
             raise error
         warnings.warn(
             f"No space left for a checkpoint at step {writer.steps}: the previous one stays ({error}).", stacklevel=2
         )
         for path in self.folder.glob(f"*{_UNFINISHED}"):
             shutil.rmtree(path, ignore_errors=True)
+        writer.tidy()  # its segment would take up space, and the next one holds the same rows
         return None
 
     def _root(self) -> BaseCallback:
@@ -322,7 +322,7 @@ class _Writer(threading.Thread):
         try:
             self._write_segment()
             _commit(self.target, self._write)
-            self._tidy()
+            self.tidy()
         except BaseException as error:  # raised in the training's thread
             self.error = error
         finally:
@@ -356,7 +356,7 @@ class _Writer(threading.Thread):
         for name, content in {**self._files, "state.json": json.dumps(state).encode()}.items():
             (path / name).write_bytes(content)
 
-    def _tidy(self) -> None:
+    def tidy(self) -> None:
         """Remove old checkpoints, and segments that no remaining checkpoint needs."""
         folders = _finished(self.folder)
         for path in folders[: -self.keep]:

@@ -141,6 +141,14 @@ def process_runs(process: int) -> bool:
     return True
 
 
+def is_full_disk(error: BaseException) -> bool:
+    """
+    :param error: any error
+    :return: whether a disk or the user's share of it is full
+    """
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
 def sync_folder(folder: Path) -> None:
     """Flush a folder to disk, so that the new name of a file survives a power loss."""
     if os.name == "nt":  # folders cannot be opened there

@@ -52,7 +52,7 @@ from sb3_maddpg.cli.search import (
 )
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.team import Team
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
+from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, is_full_disk, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 # Default number of log tables when training an off-policy algorithm. SB3's default of one every four episodes floods
@@ -314,7 +314,15 @@ class TeamExperimentManager(ExperimentManager):
         :param model: a new or a loaded model
         """
         with self.lock:
-            self._learn(model)
+            try:
+                self._learn(model)
+            except OSError as error:
+                if not is_full_disk(error):
+                    raise
+                told = f"{error.strerror}: free space"
+                if self.checkpoint is not None:
+                    told += f", then continue with `train --resume {self.save_path}`"
+                raise OSError(error.errno, told, error.filename or self.save_path) from error
 
     def _learn(self, model: BaseAlgorithm) -> None:
         assert model.env is not None

@@ -277,6 +277,9 @@ def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch):
         model = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
     assert digest(model) == expected, "the training goes on"
     assert not list(tmp_path.glob("*.unfinished"))
+    states = [json.loads((path / "state.json").read_text()) for path in tmp_path.glob("checkpoint-*")]
+    needed = {one["name"] for state in states for one in state["segments"]}
+    assert {path.name for path in (tmp_path / "segments").iterdir()} == needed
     monkeypatch.setattr(checkpoints, "fault", lambda point: None)
     assert digest(go_on("replayed", tmp_path)) == expected
 
