@@ -670,9 +670,12 @@ def _read_segments(
     buffer.pos, buffer.full = counters["pos"], counters["full"]
     size, stored = buffer.buffer_size, _stored(buffer)
     for one in segments:
+        path, first, end = _file_in(folder / _SEGMENTS, one["name"]), one["first"], one["end"]
+        if not 0 <= first < end <= counters["n_added"] or _size_of(buffer, first, end) > path.stat().st_size:
+            raise ValueError(f"{path} does not hold the rows {shown(first)} to {shown(end)}.")
         same = []  # rows and environments whose next observation is the next row's observation
-        with (folder / _SEGMENTS / one["name"]).open("rb") as file:
-            for rows in _blocks(buffer, one["first"], one["end"]):
+        with path.open("rb") as file:
+            for rows in _blocks(buffer, first, end):
                 shape = (len(rows), buffer.n_envs)
                 places = rows % size
                 block = np.fromfile(file, stored, math.prod(shape)).reshape(shape)
@@ -735,15 +738,25 @@ def _commit(target: Path, write: Callable[[Path], None]) -> Path:
 def _damage(path: Path) -> str | None:
     """:return: what is wrong with a checkpoint, None if it is complete"""
     try:
-        for name, expected in json.loads((path / _MANIFEST).read_text()).items():
-            if _sha256(path / name) != expected:
+        for name in ("model.zip", "arrays.npz"):
+            _file_in(path, name)
+        for name, expected in json.loads(_file_in(path, _MANIFEST).read_text()).items():
+            if _sha256(_file_in(path, name)) != expected:
                 return f"{name} is damaged"
-        for one in json.loads((path / "state.json").read_text())["segments"]:
-            if _sha256(path.parent / _SEGMENTS / one["name"]) != one["sha256"]:
+        for one in json.loads(_file_in(path, "state.json").read_text())["segments"]:
+            if _sha256(_file_in(path.parent / _SEGMENTS, one["name"])) != one["sha256"]:
                 return f"segment {one['name']} is damaged"
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return f"{type(error).__name__}: {error}"
     return None
+
+
+def _file_in(folder: Path, name: str) -> Path:
+    """:return: path of a file in a folder, which is not a device, and not in another folder"""
+    path = folder / name
+    if path.name != name or not path.is_file():
+        raise ValueError(f"there is no file {shown(name)} in {folder}")
+    return path
 
 
 def _finished(folder: Path) -> list[Path]:

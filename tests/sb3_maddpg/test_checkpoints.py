@@ -339,6 +339,26 @@ def test_last_observations_that_do_not_fit_the_environment_are_refused(value, tm
         model.learn(100, [callback], reset_num_timesteps=False)
 
 
+@pytest.mark.parametrize("name", ["/dev/zero", "../" * 20 + "dev/zero", "..", "segments"])
+@pytest.mark.parametrize("where", ["manifest", "segment"])
+def test_a_checkpoint_names_files_in_its_folder_only(where, name, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    if where == "segment":
+        edit(tmp_path, lambda state: state["segments"][0].update(name=name))
+    else:
+        (newest(tmp_path) / "manifest.json").write_text(json.dumps({name: "x"}))
+    with pytest.warns(UserWarning, match=r"is skipped: ValueError: there is no file .* in"):
+        assert newest(tmp_path) is None
+
+
+@pytest.mark.parametrize("rows", [{"end": 10**12}, {"first": -(10**12)}, {"first": 90, "end": 90}, {"end": 250}])
+def test_a_segment_holds_the_rows_that_it_claims(rows, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    edit(tmp_path, lambda state: state["segments"][0].update(rows))
+    with pytest.raises(ValueError, match=r"\.rows does not hold the rows"):
+        resume(tmp_path, Replayable(OwnBit()))
+
+
 def test_nothing_in_a_checkpoint_is_a_pickle(tmp_path):
     make("normalized").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
     state = json.loads((newest(tmp_path) / "state.json").read_text())
