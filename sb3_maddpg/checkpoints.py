@@ -45,7 +45,7 @@ from sb3_maddpg.env_states import (
     vec_env_state,
 )
 from sb3_maddpg.maddpg import MADDPG
-from sb3_maddpg.model_files import as_damage
+from sb3_maddpg.model_files import as_damage, check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import is_full_disk, shown, sync_folder
 
@@ -706,6 +706,8 @@ def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     state = json.loads((path / "state.json").read_text())
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise ValueError(f"{path} has format {shown(state.get('format'))}, but this version reads {_FORMAT}.")
+    with zipfile.ZipFile(path / "arrays.npz") as members:
+        check_not_compressed(path / "arrays.npz", members)
     with np.load(path / "arrays.npz", allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}, state
 

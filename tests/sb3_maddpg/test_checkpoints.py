@@ -359,6 +359,14 @@ def test_a_segment_holds_the_rows_that_it_claims(rows, tmp_path):
         resume(tmp_path, Replayable(OwnBit()))
 
 
+def test_compressed_arrays_are_refused(tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    np.savez_compressed(newest(tmp_path) / "arrays.npz", zeros=np.zeros(10**6))
+    edit(tmp_path, lambda state: None)
+    with pytest.raises(ValueError, match=r"arrays\.npz is damaged: it has members of \d+ bytes, more than the file"):
+        resume(tmp_path, Replayable(OwnBit()))
+
+
 def test_nothing_in_a_checkpoint_is_a_pickle(tmp_path):
     make("normalized").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
     state = json.loads((newest(tmp_path) / "state.json").read_text())
