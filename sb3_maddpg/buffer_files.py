@@ -14,6 +14,7 @@ import numpy as np
 import torch as th
 
 from sb3_maddpg.buffers import TeamReplayBuffer
+from sb3_maddpg.model_files import check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import shown
 
@@ -63,6 +64,7 @@ def read_buffer(path: str | pathlib.Path | io.BufferedIOBase, device: th.device 
         members = {member.filename: member for member in archive.infolist()}
         if _STATE not in members or len(members) < len(archive.infolist()) or members[_STATE].file_size > _MOST_JSON:
             raise ValueError(f"{path} holds no replay buffer of sb3-maddpg.")
+        check_not_compressed(path, archive)
         state = json.loads(archive.read(_STATE))
         if not isinstance(state, dict) or state.get("format") != _FORMAT:
             raise ValueError(f"{path} holds no replay buffer of format {_FORMAT}.")

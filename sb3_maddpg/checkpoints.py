@@ -8,7 +8,6 @@ files are synced to disk, then a manifest with their checksums is written, and r
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
@@ -46,9 +45,9 @@ from sb3_maddpg.env_states import (
     vec_env_state,
 )
 from sb3_maddpg.maddpg import MADDPG
-from sb3_maddpg.model_files import as_damage
+from sb3_maddpg.model_files import as_damage, check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
-from sb3_maddpg.utils import shown, sync_folder
+from sb3_maddpg.utils import is_full_disk, shown, sync_folder
 
 _FORMAT = 2
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
@@ -217,13 +216,14 @@ class RunCheckpoint(BaseCallback):
             if self.verbose:
                 print(f"Checkpoint at step {writer.steps}: {writer.target}")
             return writer.target
-        if not isinstance(error, OSError) or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if not is_full_disk(error):
             raise error
         warnings.warn(
             f"No space left for a checkpoint at step {writer.steps}: the previous one stays ({error}).", stacklevel=2
         )
         for path in self.folder.glob(f"*{_UNFINISHED}"):
             shutil.rmtree(path, ignore_errors=True)
+        writer.tidy()  # its segment would take up space, and the next one holds the same rows
         return None
 
     def _root(self) -> BaseCallback:
@@ -322,7 +322,7 @@ class _Writer(threading.Thread):
         try:
             self._write_segment()
             _commit(self.target, self._write)
-            self._tidy()
+            self.tidy()
         except BaseException as error:  # raised in the training's thread
             self.error = error
         finally:
@@ -356,7 +356,7 @@ class _Writer(threading.Thread):
         for name, content in {**self._files, "state.json": json.dumps(state).encode()}.items():
             (path / name).write_bytes(content)
 
-    def _tidy(self) -> None:
+    def tidy(self) -> None:
         """Remove old checkpoints, and segments that no remaining checkpoint needs."""
         folders = _finished(self.folder)
         for path in folders[: -self.keep]:
@@ -526,8 +526,8 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
     else:
         load_vec_env_state(env, state["env"])
-        for name, value in state["last"].items():
-            setattr(model, name, value)
+        for name in _LAST:
+            setattr(model, name, _checked_last(model, name, state["last"][name]))
     model.action_noise = state["action_noise"]
     names = [type(one).__name__ for one in callbacks]
     if names != [one["class"] for one in state["callbacks"]]:
@@ -541,6 +541,16 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         getattr(model.logger, name).update(values)
     set_space_generators(model.action_space, state["spaces"])
     _set_random_state(state["random"])
+
+
+def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
+    """:return: an array of the last observations, or whether they begin episodes, if it fits the environment"""
+    present: Any = model._last_episode_starts if name == "_last_episode_starts" else model._last_obs
+    if value is None and name == "_last_original_obs":  # before the first step
+        return value
+    if not isinstance(value, np.ndarray) or value.shape != np.shape(present):
+        raise ValueError(f"A checkpoint is damaged: its {name} is {shown(value)}.")
+    return value
 
 
 def _end_by(number: int) -> None:
@@ -660,9 +670,12 @@ def _read_segments(
     buffer.pos, buffer.full = counters["pos"], counters["full"]
     size, stored = buffer.buffer_size, _stored(buffer)
     for one in segments:
+        path, first, end = _file_in(folder / _SEGMENTS, one["name"]), one["first"], one["end"]
+        if not 0 <= first < end <= counters["n_added"] or _size_of(buffer, first, end) > path.stat().st_size:
+            raise ValueError(f"{path} does not hold the rows {shown(first)} to {shown(end)}.")
         same = []  # rows and environments whose next observation is the next row's observation
-        with (folder / _SEGMENTS / one["name"]).open("rb") as file:
-            for rows in _blocks(buffer, one["first"], one["end"]):
+        with path.open("rb") as file:
+            for rows in _blocks(buffer, first, end):
                 shape = (len(rows), buffer.n_envs)
                 places = rows % size
                 block = np.fromfile(file, stored, math.prod(shape)).reshape(shape)
@@ -693,6 +706,8 @@ def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     state = json.loads((path / "state.json").read_text())
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise ValueError(f"{path} has format {shown(state.get('format'))}, but this version reads {_FORMAT}.")
+    with zipfile.ZipFile(path / "arrays.npz") as members:
+        check_not_compressed(path / "arrays.npz", members)
     with np.load(path / "arrays.npz", allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}, state
 
@@ -725,15 +740,25 @@ def _commit(target: Path, write: Callable[[Path], None]) -> Path:
 def _damage(path: Path) -> str | None:
     """:return: what is wrong with a checkpoint, None if it is complete"""
     try:
-        for name, expected in json.loads((path / _MANIFEST).read_text()).items():
-            if _sha256(path / name) != expected:
+        for name in ("model.zip", "arrays.npz"):
+            _file_in(path, name)
+        for name, expected in json.loads(_file_in(path, _MANIFEST).read_text()).items():
+            if _sha256(_file_in(path, name)) != expected:
                 return f"{name} is damaged"
-        for one in json.loads((path / "state.json").read_text())["segments"]:
-            if _sha256(path.parent / _SEGMENTS / one["name"]) != one["sha256"]:
+        for one in json.loads(_file_in(path, "state.json").read_text())["segments"]:
+            if _sha256(_file_in(path.parent / _SEGMENTS, one["name"])) != one["sha256"]:
                 return f"segment {one['name']} is damaged"
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return f"{type(error).__name__}: {error}"
     return None
+
+
+def _file_in(folder: Path, name: str) -> Path:
+    """:return: path of a file in a folder, which is not a device, and not in another folder"""
+    path = folder / name
+    if path.name != name or not path.is_file():
+        raise ValueError(f"there is no file {shown(name)} in {folder}")
+    return path
 
 
 def _finished(folder: Path) -> list[Path]:

@@ -9,6 +9,7 @@ wrappers.
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
+from sb3_maddpg.utils import shown
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 _BEFORE = ".before"
@@ -199,6 +201,8 @@ def put_aside(folder: Path) -> None:
 # Attributes that are not state, or are saved elsewhere
 _NOT_STATE = {"metadata", "render_mode", "spec", "class_attributes", "t_start", "num_envs", "n_envs"}
 _NOT_STATE |= {"model", "parent", "locals", "globals", "logger", "training_env", "eval_env", "callback", "callbacks"}
+# Where files are written follows from the command, since a run may be moved or copied
+_NOT_STATE |= {"log_path", "best_model_save_path", "save_path", "name_prefix", "folder", "log_dir"}
 
 
 def plain_values(owner: Any) -> dict[str, Any]:
@@ -233,9 +237,24 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
 
     :param owner: a wrapper or a callback of the same class as the one that was saved
     :param values: see ``plain_values``
+    :raises ValueError: if a value would replace a method, a property, or a value of another kind
     """
+    of_class = type(owner)
     for name, value in values.items():
+        if name in _NOT_STATE:
+            continue
+        present = vars(owner).get(name)  # may be set only later in training
+        of_all = getattr(of_class, name, None)
+        if callable(of_all) or hasattr(of_all, "__set__") or not _same_kind(present, value):
+            raise ValueError(f"{shown(value)} cannot be the {name} of a {of_class.__name__}.")
         setattr(owner, name, value)
+
+
+def _same_kind(present: Any, value: Any) -> bool:
+    if present is None or value is None:
+        return True
+    kinds = ((bool, int, float, np.number, np.bool_), (list, tuple, deque, np.ndarray), dict, str)
+    return isinstance(value, next((kind for kind in kinds if isinstance(present, kind)), type(present)))
 
 
 def tells_state(env: gymnasium.Env) -> bool:

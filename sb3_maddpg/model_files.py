@@ -127,14 +127,32 @@ def check_members(
 
 def _check_sizes(path: Any, archive: zipfile.ZipFile) -> None:
     """Refuse members that would be much larger in memory than in the archive."""
-    file = cast("io.BufferedIOBase", archive.fp)
-    here = file.tell()
-    size = file.seek(0, os.SEEK_END)
-    file.seek(here)
+    size = _size_of(archive)
     for member in archive.infolist():
         most = _MOST_DATA if member.filename == "data" else _MOST_TIMES_LARGER * size
         if member.file_size > most or member.compress_size > size:
             raise ValueError(f"{path} is too large to be a model: its {member.filename} has {member.file_size} bytes.")
+
+
+def check_not_compressed(path: Any, archive: zipfile.ZipFile) -> None:
+    """
+    Check that an archive of arrays takes no more memory than its file has bytes.
+
+    :param path: path of the archive, for error messages
+    :param archive: the archive, whose members are stored without compression if this library wrote it
+    :raises ValueError: if the members are larger than the file
+    """
+    total = sum(member.file_size for member in archive.infolist())
+    if total > _size_of(archive):
+        raise ValueError(f"{path} is damaged: it has members of {total} bytes, more than the file has.")
+
+
+def _size_of(archive: zipfile.ZipFile) -> int:
+    file = cast("io.BufferedIOBase", archive.fp)
+    here = file.tell()
+    size = file.seek(0, os.SEEK_END)
+    file.seek(here)
+    return size
 
 
 def trusted(trust: bool | None) -> bool:

@@ -10,7 +10,7 @@ import operator
 import os
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -116,11 +116,12 @@ def _remove_left_over(target: Path) -> None:
     prefix = f".{target.name}."
     for path in target.parent.glob(f"{glob.escape(prefix)}*"):
         process = path.name.removeprefix(prefix)
-        # The process may run on another machine, but would not pause for that long
-        if not process.isdecimal() or time.time() - path.stat().st_mtime <= LEFT_OVER_SECONDS:
-            continue
-        if not process_runs(int(process)):
-            path.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # its process has just renamed it
+            # The process may run on another machine, but would not pause for that long
+            if not process.isdecimal() or time.time() - path.stat().st_mtime <= LEFT_OVER_SECONDS:
+                continue
+            if not process_runs(int(process)):
+                path.unlink(missing_ok=True)
 
 
 def process_runs(process: int) -> bool:
@@ -139,6 +140,14 @@ def process_runs(process: int) -> bool:
     except PermissionError:
         return True
     return True
+
+
+def is_full_disk(error: BaseException) -> bool:
+    """
+    :param error: any error
+    :return: whether a disk or the user's share of it is full
+    """
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def sync_folder(folder: Path) -> None:

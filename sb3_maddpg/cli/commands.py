@@ -32,7 +32,15 @@ from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.utils import suggest
 
 # Errors in the user's input and errors of the system. Their messages name the remedy, so no traceback is shown.
-USER_ERRORS = (ValueError, OSError, AssertionError, ImportError, gymnasium.error.Error, yaml.YAMLError)
+USER_ERRORS = (
+    ValueError,
+    OSError,
+    AssertionError,
+    ImportError,
+    MemoryError,
+    gymnasium.error.Error,
+    yaml.YAMLError,
+)
 
 DESCRIPTION = """\
 Multi-agent reinforcement learning with MADDPG and MATD3 for Stable-Baselines3.

@@ -52,7 +52,7 @@ from sb3_maddpg.cli.search import (
 )
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.team import Team
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, suggest
+from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, is_full_disk, suggest
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 # Default number of log tables when training an off-policy algorithm. SB3's default of one every four episodes floods
@@ -105,6 +105,7 @@ class TeamExperimentManager(ExperimentManager):
         check_options(args)
         self.checkpoints = checkpoints
         self.checkpoint: RunCheckpoint | None = None
+        self.lock = contextlib.ExitStack()  # of the run's folder of checkpoints, until learn() ends
         super().__init__(args, *rest, **{**kwargs, "uuid_str": uuid_str})
         self.uuid_str = uuid_str
         self.shares_parameters = shares_parameters(ALGOS[self.algo], self.env_name.gym_id)
@@ -186,6 +187,8 @@ class TeamExperimentManager(ExperimentManager):
             return
         if self.checkpoints is not None and self.checkpoints.run is not None:
             self.save_path, self.params_path = str(self.checkpoints.run), f"{self.checkpoints.run}/{self.env_name}"
+            # First of all, because a process that trains in this folder still writes its monitor files
+            self.lock.enter_context(locked(self.checkpoints.run / CHECKPOINTS))
             put_aside(self.checkpoints.run)
             return
         first = get_latest_run_id(self.log_path, self.env_name) + 1
@@ -195,6 +198,18 @@ class TeamExperimentManager(ExperimentManager):
         if self.checkpoints is not None:
             with atomic_write(f"{self.save_path}/{COMMAND_FILE}", "json") as file:
                 file.write(json.dumps(self.checkpoints.command).encode())
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        Create folder, environments, callbacks and model.
+
+        :return: the model and its hyperparameters, None for a search
+        """
+        try:
+            return super().setup_experiment()
+        except BaseException:
+            self.lock.close()
+            raise
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
@@ -298,6 +313,18 @@ class TeamExperimentManager(ExperimentManager):
 
         :param model: a new or a loaded model
         """
+        with self.lock:
+            try:
+                self._learn(model)
+            except OSError as error:
+                if not is_full_disk(error):
+                    raise
+                told = f"{error.strerror}: free space"
+                if self.checkpoint is not None:
+                    told += f", then continue with `train --resume {self.save_path}`"
+                raise OSError(error.errno, told, error.filename or self.save_path) from error
+
+    def _learn(self, model: BaseAlgorithm) -> None:
         assert model.env is not None
         model.env_spec = describe_env(model.env)  # type: ignore[attr-defined]
         model.set_logger(self._logger(type(model).__name__))
@@ -308,14 +335,14 @@ class TeamExperimentManager(ExperimentManager):
             kwargs["log_interval"] = None
             total = self.n_timesteps + (model.num_timesteps if self.checkpoint is not None else 0)
             self.callbacks.append(RegularTables(max(total // TABLES, FEWEST_STEPS_PER_TABLE)))
-        locks: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         if self.checkpoints is not None and isinstance(model, MADDPG):
             folder = Path(self.save_path, CHECKPOINTS)
-            self.checkpoint = self.checkpoint or RunCheckpoint(folder, self.checkpoints.every)
+            if self.checkpoint is None:
+                self.checkpoint = RunCheckpoint(folder, self.checkpoints.every)
+                self.lock.enter_context(locked(folder))
             self.callbacks.append(self.checkpoint)
-            locks = locked(folder)
         try:
-            with locks, warnings.catch_warnings():
+            with warnings.catch_warnings():
                 # Evaluation runs episode by episode, with any kind of training environment
                 warnings.filterwarnings("ignore", "Training and eval env are not of the same type")
                 model.learn(
@@ -336,13 +363,12 @@ class TeamExperimentManager(ExperimentManager):
         """:return: a logger of tables on the screen, unless there is a progress bar, and of curves for TensorBoard"""
         prints = self.verbose > 0 and not self.show_progress
         if self.checkpoint is not None and self.checkpoint.logger_folder and self.tensorboard_log:
-            logger = configure(self.checkpoint.logger_folder, [*(["stdout"] if prints else []), "tensorboard"])
+            curves = str(Path(self.tensorboard_log, Path(self.checkpoint.logger_folder).name))
+            logger = configure(curves, [*(["stdout"] if prints else []), "tensorboard"])
             for output in logger.output_formats:
                 if isinstance(output, TensorBoardOutputFormat):  # drop events after the checkpoint
                     output.writer.close()
-                    output.writer = SummaryWriter(
-                        self.checkpoint.logger_folder, purge_step=self.checkpoint.saved_at + 1
-                    )
+                    output.writer = SummaryWriter(curves, purge_step=self.checkpoint.saved_at + 1)
             return logger
         if not self.tensorboard_log or self.continue_training:
             return configure_logger(int(prints), self.tensorboard_log, name, not self.continue_training)

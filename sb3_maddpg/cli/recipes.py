@@ -35,6 +35,7 @@ from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.literals import parse_literal
 from sb3_maddpg.cli.options import did_you_mean, files_beside
 from sb3_maddpg.cli.overview import packaged_recipes
+from sb3_maddpg.cli.safety import BoundedLoader
 from sb3_maddpg.utils import arguments_of, shown, suggest
 from sb3_maddpg.validation import Arguments, validated_as
 
@@ -229,7 +230,8 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
         hint = did_you_mean(path, [*files_beside(path, "*.y*ml"), *packaged_recipes()])
         raise FileNotFoundError(f"There is no recipe {path}: --conf-file must name a YAML file.{hint}")
     try:
-        recipes = yaml.safe_load(Path(path).read_text())
+        with Path(path).open() as file:
+            recipes = yaml.load(file, BoundedLoader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+import itertools
+import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, cast
@@ -16,8 +18,31 @@ from sb3_maddpg.cli.literals import parse_literal
 from sb3_maddpg.model_files import refuse_pickled, refuse_pickled_file, trusted
 from sb3_maddpg.normalization import SafeVecNormalize
 
+# Maximum number of values in a YAML file after replacing its aliases by what they stand for
+_MOST_VALUES = 100_000
 
-class RunLoader(yaml.SafeLoader):
+
+class BoundedLoader(yaml.SafeLoader):
+    """YAML loader that refuses files whose aliases stand for more values than fit into memory."""
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None and _count(node, {}) > _MOST_VALUES:
+            raise ValueError(f"{self.name} holds more than {_MOST_VALUES} values: shorten it, and use fewer aliases.")
+        return node
+
+
+def _count(node: yaml.Node, counted: dict[int, float]) -> float:
+    """:return: the number of values in a node, infinite for a node inside itself"""
+    if id(node) not in counted:
+        counted[id(node)] = math.inf
+        pairs = isinstance(node, yaml.MappingNode)
+        parts = itertools.chain.from_iterable(node.value) if pairs else node.value
+        counted[id(node)] = 1 + sum(_count(one, counted) for one in parts if isinstance(one, yaml.Node))
+    return counted[id(node)]
+
+
+class RunLoader(BoundedLoader):
     """YAML loader for run folders, which accepts plain values and the Python types that rl_zoo3 writes."""
 
     def get_single_data(self) -> Any:

@@ -75,3 +75,14 @@ def test_a_spoilt_file_of_a_buffer_is_refused(member, change, message):
             new.writestr(name, content)
     with pytest.raises(ValueError, match=message):
         read_buffer(spoilt, "cpu")
+
+
+def test_a_compressed_file_of_a_buffer_is_refused_before_its_arrays_are_read(monkeypatch):
+    original, compressed = io.BytesIO(), io.BytesIO()
+    write_buffer(filled(), original)
+    with zipfile.ZipFile(original) as old, zipfile.ZipFile(compressed, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name) + bytes(10**6) * (name == "observations.npy"))
+    monkeypatch.setattr(np.lib.format, "read_array", None)
+    with pytest.raises(ValueError, match=r"it has members of \d+ bytes, more than the file has"):
+        read_buffer(compressed, "cpu")

@@ -277,6 +277,9 @@ def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch):
         model = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
     assert digest(model) == expected, "the training goes on"
     assert not list(tmp_path.glob("*.unfinished"))
+    states = [json.loads((path / "state.json").read_text()) for path in tmp_path.glob("checkpoint-*")]
+    needed = {one["name"] for state in states for one in state["segments"]}
+    assert {path.name for path in (tmp_path / "segments").iterdir()} == needed
     monkeypatch.setattr(checkpoints, "fault", lambda point: None)
     assert digest(go_on("replayed", tmp_path)) == expected
 
@@ -316,6 +319,52 @@ def test_other_callbacks_and_other_environments_are_refused(tmp_path):
     for wrong in ({"every": 0}, {"every": 5, "keep": 0}):
         with pytest.raises(ValueError, match="both must be at least 1"):
             RunCheckpoint(tmp_path, **wrong)
+
+
+def edit(folder: Path, change) -> None:
+    """Change the state in the newest checkpoint, as somebody could who also knows its checksums."""
+    (path,) = list(folder.glob("checkpoint-*"))[-1:]
+    state = json.loads((path / "state.json").read_text())
+    change(state)
+    (path / "state.json").write_text(json.dumps(state))
+    (path / "manifest.json").write_text("{}")
+
+
+@pytest.mark.parametrize("value", [None, 1, {"$": "array", "dtype": "f4", "shape": [1], "base64": "AAAAAA=="}])
+def test_last_observations_that_do_not_fit_the_environment_are_refused(value, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    edit(tmp_path, lambda state: state["last"].update(_last_obs=value))
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    with pytest.raises(ValueError, match="A checkpoint is damaged: its _last_obs is"):
+        model.learn(100, [callback], reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "../" * 20 + "dev/zero", "..", "segments"])
+@pytest.mark.parametrize("where", ["manifest", "segment"])
+def test_a_checkpoint_names_files_in_its_folder_only(where, name, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    if where == "segment":
+        edit(tmp_path, lambda state: state["segments"][0].update(name=name))
+    else:
+        (newest(tmp_path) / "manifest.json").write_text(json.dumps({name: "x"}))
+    with pytest.warns(UserWarning, match=r"is skipped: ValueError: there is no file .* in"):
+        assert newest(tmp_path) is None
+
+
+@pytest.mark.parametrize("rows", [{"end": 10**12}, {"first": -(10**12)}, {"first": 90, "end": 90}, {"end": 250}])
+def test_a_segment_holds_the_rows_that_it_claims(rows, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    edit(tmp_path, lambda state: state["segments"][0].update(rows))
+    with pytest.raises(ValueError, match=r"\.rows does not hold the rows"):
+        resume(tmp_path, Replayable(OwnBit()))
+
+
+def test_compressed_arrays_are_refused(tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    np.savez_compressed(newest(tmp_path) / "arrays.npz", zeros=np.zeros(10**6))
+    edit(tmp_path, lambda state: None)
+    with pytest.raises(ValueError, match=r"arrays\.npz is damaged: it has members of \d+ bytes, more than the file"):
+        resume(tmp_path, Replayable(OwnBit()))
 
 
 def test_nothing_in_a_checkpoint_is_a_pickle(tmp_path):

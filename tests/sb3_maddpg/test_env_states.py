@@ -15,6 +15,7 @@ from sb3_maddpg.env_states import (
     Replayable,
     load_vec_env_state,
     plain_values,
+    set_plain_values,
     set_space_generators,
     space_generators,
     vec_env_state,
@@ -82,6 +83,36 @@ def test_plain_values_are_those_that_can_be_written():
     values = plain_values(callback)
     assert {"best_mean_reward", "n_calls", "evaluations_results", "eval_freq"} <= set(values)
     assert not {"eval_env", "callback", "locals", "logger", "model"} & set(values)
+
+
+def test_where_files_are_written_is_no_state(tmp_path):
+    before = EvalCallback(DummyVecEnv([OwnBit]), log_path=str(tmp_path), best_model_save_path=str(tmp_path))
+    values = plain_values(before)
+    moved = EvalCallback(DummyVecEnv([OwnBit]), log_path="moved", best_model_save_path="moved")
+    paths = {"log_path": "elsewhere", "best_model_save_path": "elsewhere"}  # as in older checkpoints
+    set_plain_values(moved, {**values, **paths, "n_calls": 7})
+    assert (moved.log_path, moved.best_model_save_path, moved.n_calls) == ("moved/evaluations", "moved", 7)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("on_step", "x"), ("_on_training_end", None), ("logger", 1), ("training_env", 2), ("n_calls", "x")],
+)
+def test_plain_values_replace_neither_methods_nor_values_of_another_kind(name, value):
+    callback = EvalCallback(DummyVecEnv([OwnBit]))
+    before = vars(callback).copy()
+    if name in ("logger", "training_env"):  # saved elsewhere
+        set_plain_values(callback, {name: value})
+    else:
+        with pytest.raises(ValueError, match=rf"{value!r} cannot be the {name} of a EvalCallback"):
+            set_plain_values(callback, {name: value})
+    assert vars(callback) == before
+
+
+def test_values_that_training_sets_later_or_that_were_none_are_restored():
+    callback = EvalCallback(DummyVecEnv([OwnBit]))
+    set_plain_values(callback, {"set_later": 3, "log_path": "x", "parent": None, "best_mean_reward": np.float64(1)})
+    assert (callback.set_later, callback.best_mean_reward) == (3, 1)
 
 
 def test_generators_of_spaces_and_of_their_parts_go_on():

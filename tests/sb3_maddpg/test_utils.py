@@ -107,3 +107,11 @@ def test_what_killed_processes_left_of_a_file_is_removed(tmp_path):
     with atomic_write(tmp_path / "m", suffix="zip") as file:
         file.write(b"x")
     assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "m.zip", writing, other, recent])
+
+
+def test_a_temporary_file_that_disappears_meanwhile_does_no_harm(tmp_path):
+    gone = tmp_path / ".m.zip.999999998"
+    gone.symlink_to(tmp_path / "renamed")  # is listed, but has no status, like a file that was renamed in between
+    with atomic_write(tmp_path / "m", suffix="zip") as file:
+        file.write(b"x")
+    assert (tmp_path / "m.zip").read_bytes() == b"x"

@@ -1,5 +1,6 @@
 """Trainings from the command line: folders, logs, schedules."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 import yaml
 
@@ -69,6 +71,19 @@ def test_a_folder_that_cannot_be_made_is_one_line(capsys):
     error = capsys.readouterr().err
     assert error.startswith("error: logs")
     assert error.count("\n") == 1
+
+
+def test_a_full_disk_is_named_with_the_remedy(monkeypatch, capsys):
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(np, "savez", full)  # of evaluations
+    assert train("--eval-freq", "100", "--verbose", "0") == 2
+    run = "logs/maddpg/OwnBit-v0_1"
+    remedy = f"error: {run}: No space left on device: free space, then continue with `train --resume {run}`"
+    assert remedy in capsys.readouterr().err
+    assert train("--eval-freq", "100", "--verbose", "0", "--checkpoint-every", "0") == 2
+    assert "OwnBit-v0_2: No space left on device: free space (" in capsys.readouterr().err
 
 
 def test_tables_come_at_a_readable_rate_and_short_trainings_log_their_rewards(capsys):

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -108,6 +109,41 @@ def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tm
     for name, value in expected.items():
         assert found[name] == value, name
     assert not any("checkpoint" in name or "before" in name for name in found["files"])
+
+
+def test_a_copied_run_writes_into_the_copy_only(tmp_path):
+    (tmp_path / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3}}))
+    argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--checkpoint-every", "300", "--verbose", "0"]
+    process = start([*argv, "--eval-freq", "250", "--eval-episodes", "1"], tmp_path)
+    wait_for(process, 2, tmp_path)
+    process.kill()
+    process.wait()
+    run, copy = tmp_path / "logs/maddpg/OwnBit-v0_1", tmp_path / "copy"
+    shutil.copytree(run, copy)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    process = start(["--resume", "copy"], tmp_path)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    with np.load(copy / "evaluations.npz") as curves:
+        assert curves["timesteps"].tolist() == list(range(250, 6001, 250))
+
+
+def test_resuming_a_run_that_trains_does_not_touch_it(tmp_path):
+    (tmp_path / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3, "n_timesteps": 100_000}}))
+    argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "300"]
+    process = start([*argv, "--verbose", "0"], tmp_path)
+    wait_for(process, 1, tmp_path)
+    second = start(["--resume"], tmp_path)
+    output = second.communicate()[0]
+    assert second.returncode == 2, output
+    assert f"checkpoints is in use by process {process.pid}" in output
+    process.send_signal(signal.SIGINT)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    (run,) = tmp_path.glob("logs/maddpg/*_1")
+    assert [path.name for path in run.glob("*.csv*")] == ["0.monitor.csv"]
+    assert len((run / "0.monitor.csv").read_text().splitlines()) > 20
 
 
 def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):

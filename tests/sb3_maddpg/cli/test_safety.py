@@ -60,6 +60,24 @@ def test_yaml_without_end_is_refused():
         yaml.load("[" * 3000, RunLoader)
 
 
+LAUGHS = "\n".join(
+    [f"a{0}: &a0 [lol]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 9)), "env_kwargs: *a8"]
+)
+
+
+@pytest.mark.parametrize("text", [LAUGHS, "a: &a [*a]", "a: &a {b: 1, c: *a}"])
+def test_aliases_that_stand_for_too_many_values_are_refused(run, capsys, text):
+    with pytest.raises(ValueError, match="holds more than 100000 values: shorten it"):
+        yaml.load(text, RunLoader)
+    assert yaml.load("a: &a [1, 2]\nb: *a", RunLoader) == {"a": [1, 2], "b": [1, 2]}
+    (run / "config.yml").write_text(text)
+    assert main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]) == 2
+    assert "config.yml holds more than 100000 values" in capsys.readouterr().err
+    Path("r.yml").write_text(text)
+    assert main(["train", "--env", "OwnBit-v0", "--conf-file", "r.yml"]) == 2
+    assert "r.yml holds more than 100000 values" in capsys.readouterr().err
+
+
 def test_text_in_a_recipe_of_a_run_is_not_evaluated(run, capsys):
     config = yaml.load((run / "config.yml").read_text(), RunLoader)
     config["normalize"] = "__import__('pathlib').Path('caught').touch()"
