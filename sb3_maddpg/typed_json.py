@@ -139,7 +139,11 @@ def _load_entry_points() -> None:
         offer.load()
 
 
-def _known_class(cls: type) -> bool:
+def known_class(cls: type) -> bool:
+    """
+    :param cls: a class
+    :return: whether files may name it, see ``allow_in_files``
+    """
     _load_entry_points()
     return cls in (_built_in().get(_name(cls)), _allowed.get(_name(cls)))
 
@@ -322,7 +326,7 @@ def _encode_special(value: Any, arrays: dict[str, np.ndarray] | None) -> Json:
         return {_TYPE: "outside", "key": key}
     if isinstance(value, TrainFreq):
         return {_TYPE: "TrainFreq", "frequency": value.frequency, "unit": value.unit.value}
-    if isinstance(value, type) and _known_class(value):
+    if isinstance(value, type) and known_class(value):
         return {_TYPE: "class", "name": _name(value)}
     return None
 
@@ -350,7 +354,7 @@ def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | N
     for kind, codec in _CODECS.items():
         if isinstance(value, codec.type):
             return {_TYPE: kind} | codec.write(value, part)
-    if _known_class(type(value)) and not isinstance(value, (th.nn.Module, th.optim.Optimizer)):
+    if known_class(type(value)) and not isinstance(value, (th.nn.Module, th.optim.Optimizer)):
         return {_TYPE: "object"} | _attributes_of(value, part)
     raise ValueError(
         f"{name}={shown(value)} cannot be saved: a {type(value).__name__} is neither a number, an array, a space nor "

@@ -24,6 +24,7 @@ from sb3_maddpg.cli.options import (
     helps,
     import_packages,
     nearest_options,
+    present_folder,
 )
 from sb3_maddpg.cli.overview import ALGORITHMS, overview
 from sb3_maddpg.maddpg import MADDPG, Lean
@@ -345,24 +346,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-@contextmanager
-def _present_folder(words: list[str]) -> Iterator[None]:
+def _asks_for_present_folder(words: list[str]) -> bool:
     """
-    Import from the current folder only if ``--gym-packages`` or ``--env`` names a module in it, so that names in a
-    recipe are never imported from there by accident.
-
     :param words: arguments of the command
+    :return: whether ``--gym-packages`` or ``--env`` names a module in the current folder. Otherwise nothing is imported
+        from there, so that names in a recipe never are by accident.
     """
     known, _ = common_options().parse_known_args(words)
-    here = Path.cwd()
     tops = {re.split(r"[./]", name)[0] for name in (*known.gym_packages, known.env or "")} - {""}
-    asked = any((here / f"{top}.py").is_file() or (here / top).is_dir() for top in tops)
-    before = sys.path.copy()
-    sys.path[:] = [path for path in before if path not in ("", str(here))] + [str(here)] * asked
-    try:
-        yield
-    finally:
-        sys.path[:] = before
+    return any(Path(f"{top}.py").is_file() or Path(top).is_dir() for top in tops)
 
 
 @contextmanager
@@ -396,7 +388,7 @@ def main(argv: list[str] | None = None) -> int:
     if helps(rest):
         print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
     try:
-        with _present_folder(rest), _trust() if trusts else nullcontext(), nearest_options():
+        with present_folder(_asks_for_present_folder(rest)), _trust() if trusts else nullcontext(), nearest_options():
             return COMMANDS[command].run(rest)
     except KeyboardInterrupt:
         if debug:

@@ -56,6 +56,21 @@ def import_packages(names: Iterable[str]) -> None:
             ) from None
 
 
+@contextmanager
+def present_folder(asked: bool) -> Iterator[None]:
+    """
+    Import modules of the current folder, after all others, or not at all.
+
+    :param asked: whether to import them
+    """
+    here, before = Path.cwd(), sys.path.copy()
+    sys.path[:] = [path for path in before if Path(path).resolve() != here] + [str(here)] * asked
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
 def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.7) -> str:
     """
     :param name: an unknown name

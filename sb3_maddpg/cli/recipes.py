@@ -279,7 +279,7 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     check_policy_kwargs(algo, found)
     validated_as(MonitorArguments, found.get("monitor_kwargs") or {}, lambda name: f"{source}: monitor_kwargs: {name}")
     for key in ("env_wrapper", "vec_env_wrapper", "callback"):
-        for name in _names_of_classes(found.get(key)):
+        for name in names_of_classes(found.get(key)):
             _check_callable(key, name)
     if isinstance(buffer := found.get("replay_buffer_class"), str):
         found["replay_buffer_class"] = _replay_buffer(buffer)
@@ -367,10 +367,13 @@ def _replay_buffer(name: str) -> type[ReplayBuffer]:
         ) from error
 
 
-def _names_of_classes(value: Any) -> list[str]:
-    """:return: the names that rl_zoo3 imports: a name, the only key of a dict, or a list of both"""
+def names_of_classes(value: Any) -> list[str]:
+    """
+    :param value: value of a recipe: a name, a dict from names to arguments, or a list of both
+    :return: the names, which are imported
+    """
     if isinstance(value, list):
-        return [name for one in value for name in _names_of_classes(one)]
+        return [name for one in value for name in names_of_classes(one)]
     return [value] if isinstance(value, str) else [str(name) for name in value or ()]
 
 

@@ -3,20 +3,42 @@
 from __future__ import annotations
 
 import builtins
+import importlib
 import itertools
 import math
-from collections.abc import Iterator
+import re
+import sys
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import packages_distributions, requires
+from pathlib import Path
 from typing import Any, cast
 
+import gymnasium
 import rl_zoo3.exp_manager
 import rl_zoo3.utils
 import yaml
+from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common import base_class, off_policy_algorithm
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from sb3_maddpg import parallel
 from sb3_maddpg.cli.literals import parse_literal
+from sb3_maddpg.cli.options import present_folder
+from sb3_maddpg.cli.recipes import names_of_classes
 from sb3_maddpg.model_files import refuse_pickled, refuse_pickled_file, trusted
 from sb3_maddpg.normalization import SafeVecNormalize
+from sb3_maddpg.typed_json import known_class
+from sb3_maddpg.utils import shown
+
+# Keys of a recipe that name classes, and the base class of those that a file of someone else may name
+_BASES: dict[str, type] = {
+    "env_wrapper": gymnasium.Wrapper,
+    "vec_env_wrapper": VecEnvWrapper,
+    "wrappers": BaseParallelWrapper,
+}
+_OF_SUPERSUIT = r"supersuit\.\w+_v\d+"  # functions, which only wrap
+_ENVIRONMENT_LIBRARIES = {"gymnasium", "pettingzoo", "stable-baselines3"}
 
 # Maximum number of values in a YAML file after replacing its aliases by what they stand for
 _MOST_VALUES = 100_000
@@ -116,3 +138,88 @@ def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
             delattr(module, name)
         else:
             setattr(module, name, before)
+
+
+def check_run(folder: Path, env_id: str) -> None:
+    """
+    Check the names that ``enjoy`` and ``record`` would import because the files of a run hold them.
+
+    :param folder: folder of ``config.yml`` and ``args.yml``
+    :param env_id: Gymnasium id, which is registered
+    :raises ValueError: if a file is not trusted and may run code
+    """
+    for path in (folder / "config.yml", folder / "args.yml"):
+        if trusted(None) or not path.is_file():
+            continue
+        with path.open() as file:
+            values = yaml.load(file, RunLoader)
+        if not isinstance(values, Mapping):
+            raise ValueError(f"{path} is damaged: it holds {shown(values)} instead of a run's settings.")
+        used = {key: values.get(key) for key in ("env_wrapper", "vec_env_wrapper", "env_kwargs")}
+        check_names(used, env_id, str(path))
+
+
+def check_names(hyperparams: Mapping[str, Any], env_id: str, source: str) -> None:
+    """
+    Check the names that a recipe from a file of someone else holds. Importing one runs its module, and rl_zoo3 then
+    calls it with any arguments.
+
+    :param hyperparams: the recipe
+    :param env_id: Gymnasium id, which is registered
+    :param source: the file, for error messages
+    :raises ValueError: if a name is not that of a class which files may name
+    """
+    named = {key: hyperparams.get(key) for key in _BASES}
+    kwargs = hyperparams.get("env_kwargs") or {}
+    if not isinstance(kwargs, Mapping):
+        raise ValueError(f"{source}: env_kwargs is {shown(kwargs)} instead of a dict.")
+    if gymnasium.spec(env_id).entry_point == parallel.ENTRY_POINT:
+        if "entry" in kwargs:  # another module
+            raise ValueError(f"{source}: env_kwargs cannot choose the module of {env_id}: remove `entry`.")
+        named["wrappers"] = kwargs.get("wrappers")
+    for key, value in named.items():
+        for name in names_of_classes(value):
+            if not _may_be_named(name, _BASES[key]):
+                raise ValueError(
+                    f"{source}: {key} names {shown(name)}, which may run any code. Files may name subclasses of "
+                    f"{_BASES[key].__name__} in installed libraries of environments and in modules of --gym-packages, "
+                    "wrappers of SuperSuit, and classes allowed by `sb3_maddpg.allow_in_files`. If you trust the "
+                    "file's author, pass --trust."
+                )
+
+
+def _may_be_named(name: str, base: type) -> bool:
+    module, _, attribute = name.rpartition(".")
+    if not may_import(module):
+        return False
+    found = getattr(sys.modules[module], attribute, None)
+    if re.fullmatch(_OF_SUPERSUIT, name):
+        return callable(found)
+    return isinstance(found, type) and (issubclass(found, base) or known_class(found))
+
+
+def may_import(module: str) -> bool:
+    """
+    Import a module that a file names if it is a public one of an installed library of environments: a package that
+    needs Gymnasium, PettingZoo or Stable-Baselines3.
+
+    :param module: dotted name of the module
+    :return: whether the module is imported now
+    """
+    if module in sys.modules:
+        return True
+    if not all(part.isidentifier() and not part.startswith("_") for part in module.split(".")):
+        return False
+    # A package in the current folder could pretend to be installed
+    with present_folder(asked=False):
+        if not _ENVIRONMENT_LIBRARIES.isdisjoint(_requirements(module.partition(".")[0])):
+            importlib.import_module(module)
+    return module in sys.modules
+
+
+def _requirements(package: str) -> set[str]:
+    """:return: the distributions that an installed package belongs to or needs, without those of extras"""
+    distributions = packages_distributions().get(package, [])
+    needed = [line for one in distributions for line in requires(one) or () if "extra ==" not in line]
+    names = [re.split(r"[^\w.-]", line.strip(), maxsplit=1)[0] for line in (*distributions, *needed)]
+    return {name.lower().replace("_", "-") for name in names}

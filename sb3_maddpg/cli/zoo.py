@@ -35,7 +35,7 @@ from sb3_maddpg.cli.overview import ALGORITHMS, load_environments, overview, pac
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.processes import ENGINES
 from sb3_maddpg.cli.recipes import LengthOption, check_options
-from sb3_maddpg.cli.safety import no_code_from_files
+from sb3_maddpg.cli.safety import check_run, no_code_from_files
 from sb3_maddpg.cli.search import search
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
@@ -195,6 +195,7 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
         name = EnvironmentName(known.env)
         exp_id = known.exp_id or get_latest_run_id(str(Path(known.folder, known.algo)), name)
         run = Path(known.folder, known.algo, f"{name}_{exp_id}" if exp_id > 0 else "")
+        check_run(run / name, known.env)
         with no_code_from_files():
             hyperparams, _ = get_saved_hyperparams(str(run / name))
         env_kwargs = {**hyperparams.get("env_kwargs", {}), **known.env_kwargs}

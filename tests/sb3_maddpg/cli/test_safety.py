@@ -1,8 +1,11 @@
 """Files of run folders that try to run code: none does, unless the user trusts them."""
 
 import base64
+import contextlib
 import json
+import os
 import pickle
+import sys
 import zipfile
 from pathlib import Path
 
@@ -10,10 +13,13 @@ import pytest
 import yaml
 
 from sb3_maddpg.cli.commands import main
-from sb3_maddpg.cli.safety import RunLoader
+from sb3_maddpg.cli.safety import RunLoader, check_names
 
 pytest.importorskip("rl_zoo3")
 SHORT = ["--env", "OwnBit-v0", "-n", "60", "-params", "learning_starts:20", "buffer_size:500", "--eval-freq", "-1"]
+SPREAD = "mpe2/simple_spread_v3"
+# Wrappers that together call os.mkdir("caught")
+CALLS = [{"unittest.mock.Mock": {"return_value": "caught"}}, "operator.call", "os.mkdir"]
 
 
 class Trap:
@@ -136,3 +142,110 @@ def test_a_recipe_names_nothing_of_the_present_folder_unless_asked(tmp_path, mon
     assert "--gym-packages" in told
     main([*argv, "--gym-packages", "lurking"])
     assert Path("caught").exists()
+
+
+@pytest.fixture
+def spread(tmp_path, monkeypatch) -> Path:
+    """:return: the folder of the config.yml of a run in a PettingZoo environment with a wrapper"""
+    pytest.importorskip("mpe2")
+    monkeypatch.chdir(tmp_path)
+    wrappers = "wrappers:[{supersuit.frame_stack_v2: {stack_size: 2}}]"
+    argv = ["train", "--env", SPREAD, "--env-kwargs", wrappers, "--verbose", "0", *SHORT[2:7], "batch_size:16"]
+    assert main(argv) == 0
+    (config,) = Path("logs").rglob("config.yml")
+    return config.parent
+
+
+def change(path: Path, **values) -> None:
+    path.write_text(yaml.safe_dump({**yaml.load(path.read_text(), RunLoader), **values}))
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="operator.call is new")
+@pytest.mark.parametrize("command", ["enjoy", "record"])
+@pytest.mark.parametrize("key", ["env_wrapper", "vec_env_wrapper"])
+def test_wrappers_of_a_run_call_nothing_unless_it_is_trusted(run, capsys, key, command):
+    change(run / "config.yml", **{key: CALLS})
+    argv = [command, "--env", "OwnBit-v0", "-n", "20", *(["--no-render"] if command == "enjoy" else [])]
+    assert main(argv) == 2
+    assert not Path("caught").exists()
+    told = capsys.readouterr().err
+    assert f"config.yml: {key} names 'unittest.mock.Mock'" in told
+    assert "--trust" in told
+    if key == "env_wrapper":
+        with contextlib.suppress(AttributeError):  # os.mkdir does not return an environment
+            main([*argv, "--trust"])
+        assert Path("caught").exists()
+
+
+@pytest.mark.parametrize("name", ["config.yml", "args.yml"])
+def test_wrappers_of_a_parallel_environment_call_nothing(spread, capsys, name):
+    argv = ["enjoy", "--env", SPREAD, "-n", "20", "--no-render"]
+    assert main(argv) == 0
+    change(spread / name, env_kwargs={"wrappers": CALLS})
+    assert main(argv) == 2
+    assert not Path("caught").exists()
+    assert f"{name}: wrappers names 'unittest.mock.Mock'" in capsys.readouterr().err
+    Path("lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
+    change(spread / name, env_kwargs={"entry": "lurking"})
+    assert main(argv) == 2
+    assert not Path("caught").exists()
+    assert "remove `entry`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["[]", "1", "env_kwargs: [1]"])
+def test_a_damaged_config_is_named(run, capsys, text):
+    (run / "config.yml").write_text(text)
+    assert main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]) == 2
+    assert "config.yml" in capsys.readouterr().err
+
+
+def test_a_run_with_a_wrapper_of_the_users_package_is_read(run, monkeypatch):
+    monkeypatch.setattr(sys, "modules", sys.modules.copy())
+    Path("own_wrappers.py").write_text(
+        "import gymnasium\nfrom pathlib import Path\nclass Own(gymnasium.Wrapper):\n    pass\nPath('caught').touch()\n"
+    )
+    change(run / "config.yml", env_wrapper="own_wrappers.Own")
+    argv = ["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]
+    assert main(argv) == 2
+    assert not Path("caught").exists()
+    assert main([*argv, "--gym-packages", "own_wrappers"]) == 0
+    assert Path("caught").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "allowed"),
+    [
+        ("env_wrapper", "gymnasium.wrappers.TimeLimit", True),
+        ("env_wrapper", "sb3_contrib.common.wrappers.TimeFeatureWrapper", True),
+        ("env_wrapper", "supersuit.frame_stack_v2", True),
+        ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecCheckNan", True),
+        ("env_wrapper", "stable_baselines3.common.vec_env.VecCheckNan", False),
+        ("env_wrapper", "supersuit.utils.make_defaultdict.make_defaultdict", False),
+        ("env_wrapper", "os.system", False),
+        ("env_wrapper", "this.s", False),
+        ("env_wrapper", "gymnasium.__main__.Wrapper", False),
+        ("env_wrapper", ".os.system", False),
+        ("env_wrapper", "system", False),
+    ],
+)
+def test_files_name_wrappers_of_installed_libraries(key, name, allowed, capsys):
+    pytest.importorskip("supersuit")
+    before = set(sys.modules)
+    if allowed:
+        check_names({key: [{name: {}}]}, "OwnBit-v0", "file")
+    else:
+        with pytest.raises(ValueError, match=f"file: {key} names '{name}'"):
+            check_names({key: name}, "OwnBit-v0", "file")
+        assert {"this", "gymnasium.__main__"}.isdisjoint(set(sys.modules) - before)
+
+
+def test_a_package_in_the_present_folder_does_not_count_as_installed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(os.getcwd())
+    Path("posing.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
+    Path("posing-1.0.dist-info").mkdir()
+    Path("posing-1.0.dist-info/METADATA").write_text("Name: posing\nVersion: 1.0\nRequires-Dist: gymnasium\n")
+    Path("posing-1.0.dist-info/top_level.txt").write_text("posing\n")
+    with pytest.raises(ValueError, match=r"names 'posing\.Wrapper'"):
+        check_names({"env_wrapper": "posing.Wrapper"}, "OwnBit-v0", "file")
+    assert not Path("caught").exists()
