@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import itertools
 import math
 from typing import Any
 
@@ -19,6 +20,9 @@ CLASSES = {
     **{name: (torch.nn, torch.nn.Module) for name in ("nn", "th.nn", "torch.nn")},
     **{name: (torch.optim, torch.optim.Optimizer) for name in ("th.optim", "torch.optim")},
 }
+
+# Maximum number of values in a YAML file after replacing its aliases by what they stand for
+_MOST_VALUES = 100_000
 
 
 def parse_literal(text: str) -> Any:
@@ -156,3 +160,23 @@ class StoreValues(argparse.Action):
         except ValueError as error:
             raise ValueError(f"{option_string} {' '.join(values)}: {error}. Write key:value.") from error
         setattr(namespace, self.dest, pairs)
+
+
+class BoundedLoader(yaml.SafeLoader):
+    """YAML loader that refuses files whose aliases stand for more values than fit into memory."""
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None and _count(node, {}) > _MOST_VALUES:
+            raise ValueError(f"{self.name} holds more than {_MOST_VALUES} values: shorten it, and use fewer aliases.")
+        return node
+
+
+def _count(node: yaml.Node, counted: dict[int, float]) -> float:
+    """:return: the number of values in a node, infinite for a node inside itself"""
+    if id(node) not in counted:
+        counted[id(node)] = math.inf
+        pairs = isinstance(node, yaml.MappingNode)
+        parts = itertools.chain.from_iterable(node.value) if pairs else node.value
+        counted[id(node)] = 1 + sum(_count(one, counted) for one in parts if isinstance(one, yaml.Node))
+    return counted[id(node)]

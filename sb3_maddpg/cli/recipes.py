@@ -32,10 +32,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
-from sb3_maddpg.cli.literals import parse_literal
+from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
 from sb3_maddpg.cli.options import did_you_mean, files_beside
 from sb3_maddpg.cli.overview import packaged_recipes
-from sb3_maddpg.cli.safety import BoundedLoader
 from sb3_maddpg.utils import arguments_of, shown, suggest
 from sb3_maddpg.validation import Arguments, validated_as
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import builtins
 import importlib
-import itertools
-import math
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -23,7 +21,7 @@ from stable_baselines3.common import base_class, off_policy_algorithm
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_maddpg import parallel
-from sb3_maddpg.cli.literals import parse_literal
+from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
 from sb3_maddpg.cli.options import present_folder
 from sb3_maddpg.cli.recipes import names_of_classes
 from sb3_maddpg.model_files import refuse_pickled, refuse_pickled_file, trusted
@@ -39,29 +37,6 @@ _BASES: dict[str, type] = {
 }
 _OF_SUPERSUIT = r"supersuit\.\w+_v\d+"  # functions, which only wrap
 _ENVIRONMENT_LIBRARIES = {"gymnasium", "pettingzoo", "stable-baselines3"}
-
-# Maximum number of values in a YAML file after replacing its aliases by what they stand for
-_MOST_VALUES = 100_000
-
-
-class BoundedLoader(yaml.SafeLoader):
-    """YAML loader that refuses files whose aliases stand for more values than fit into memory."""
-
-    def get_single_node(self) -> yaml.Node | None:
-        node = super().get_single_node()
-        if node is not None and _count(node, {}) > _MOST_VALUES:
-            raise ValueError(f"{self.name} holds more than {_MOST_VALUES} values: shorten it, and use fewer aliases.")
-        return node
-
-
-def _count(node: yaml.Node, counted: dict[int, float]) -> float:
-    """:return: the number of values in a node, infinite for a node inside itself"""
-    if id(node) not in counted:
-        counted[id(node)] = math.inf
-        pairs = isinstance(node, yaml.MappingNode)
-        parts = itertools.chain.from_iterable(node.value) if pairs else node.value
-        counted[id(node)] = 1 + sum(_count(one, counted) for one in parts if isinstance(one, yaml.Node))
-    return counted[id(node)]
 
 
 class RunLoader(BoundedLoader):
