@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_maddpg.checkpoints import locked, newest
-from sb3_maddpg.cli.experiment import CHECKPOINTS, COMMAND_FILE
+from sb3_maddpg.cli.command_files import COMMAND_FILE, read_command, resumable, write_command
+from sb3_maddpg.cli.experiment import CHECKPOINTS
 from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all
 from sb3_maddpg.utils import shown
 
@@ -84,10 +84,13 @@ class _Training:
 
     def command(self) -> tuple[list[str], str]:
         argv = [*self.argv, "--seed", str(self.seed), "--log-folder", str(self.log_folder)]
-        run = self._run_of(argv)
+        run = self._run_of(resumable(argv))
         if run is not None:
             _wait_until_free(run / CHECKPOINTS)
             if newest(run / CHECKPOINTS) is not None:
+                command = read_command(run)
+                if command.folder is None:  # started elsewhere, but the user gives the same command here
+                    write_command(run, command.argv, command.every)
                 return ["train", "--resume", str(run)], f"resumes {run}"
             if not (run / CHECKPOINTS).exists() and any(run.glob("*.zip")):
                 return [], f"finished before, {run}"
@@ -98,8 +101,8 @@ class _Training:
         """:return: the newest run that this command started, if there is one"""
         found = []
         for path in self.log_folder.glob(f"*/*/{COMMAND_FILE}"):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                if json.loads(path.read_text())["argv"] == argv:
+            with contextlib.suppress(ValueError):
+                if resumable(read_command(path.parent).argv) == argv:
                     found.append(path.parent)
         return max(found, key=lambda run: (run / COMMAND_FILE).stat().st_mtime, default=None)
 
