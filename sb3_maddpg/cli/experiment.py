@@ -100,6 +100,7 @@ class TeamExperimentManager(ExperimentManager):
     """
 
     study: optuna.Study | None = None  # the study of the search
+    interrupted = False  # whether the user ended the training
     continues = False  # whether the study has trials of other workers or of an earlier command
 
     def __init__(
@@ -335,6 +336,7 @@ class TeamExperimentManager(ExperimentManager):
                     **kwargs,
                 )
         except KeyboardInterrupt:
+            self.interrupted = True
             print("Interrupted: saving what has been learned so far.")
             for callback in self.callbacks:  # closes the progress bar
                 callback.on_training_end()
@@ -492,6 +494,7 @@ class TeamExperimentManager(ExperimentManager):
         Save the model and remove checkpoints that are no longer needed.
 
         :param model: the trained model
+        :raises KeyboardInterrupt: after that, if the training was interrupted
         """
         super().save_trained_model(model)
         if self.checkpoint is not None and model.num_timesteps >= model._total_timesteps:  # not interrupted
@@ -503,6 +506,8 @@ class TeamExperimentManager(ExperimentManager):
         print(f"Logs:        {self.save_path}")
         if self.tensorboard_log:
             print(f"TensorBoard: tensorboard --logdir {self.tensorboard_log}")
+        if self.interrupted:
+            raise KeyboardInterrupt
 
 
 class _Replaying:

@@ -144,6 +144,7 @@ def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
     wait_for(process, 1, tmp_path)
     process.send_signal(signal.SIGINT)
     output = process.communicate()[0]
+    assert process.returncode == 130, output
     assert "Interrupted: saving" in output
     assert checkpoints(tmp_path)
     process = start(["--resume"], tmp_path)
