@@ -408,14 +408,15 @@ class TeamExperimentManager(ExperimentManager):
         return tuple(getattr(self, name) for name in (*names, "n_eval_episodes", "n_eval_envs", "sampler", "pruner"))
 
     def _bring_back(self) -> optuna.Study | None:
-        """Open the study if it has a name, and queue trials of killed processes again."""
+        """Open the storage and, if it has a name, the study, and queue trials of killed processes again."""
         assert self.storage is not None
-        if self.study_name is None:  # Optuna will generate one
-            return None
         if self.storage.endswith(".log"):
             Path(self.storage).parent.mkdir(parents=True, exist_ok=True)
+        storage = open_storage(self.storage)
+        if self.study_name is None:  # Optuna will generate one
+            return None
         study = optuna.create_study(
-            storage=open_storage(self.storage), study_name=self.study_name, direction="maximize", load_if_exists=True
+            storage=storage, study_name=self.study_name, direction="maximize", load_if_exists=True
         )
         count, finished = bring_back(study), _finished(study)
         enlist(study)
