@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import re
 import time
@@ -14,6 +15,8 @@ from sb3_maddpg.cli.experiment import CHECKPOINTS
 from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all
 from sb3_maddpg.utils import shown
 
+MOST_SEEDS = 10_000  # of a range
+
 
 def parse_seeds(text: str) -> list[int]:
     """
@@ -23,13 +26,16 @@ def parse_seeds(text: str) -> list[int]:
     :return: the seeds without duplicates
     :raises ValueError: if the text is anything else
     """
-    seeds: list[int] = []
+    seeds: dict[int, None] = {}
     for part in text.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
         if match is None or (match[2] and int(match[2]) < int(match[1])):
             raise ValueError(f"--seeds {shown(text)}: write numbers and ranges, such as 0-4 or 0,3,7-9.")
-        seeds += range(int(match[1]), int(match[2] or match[1]) + 1)
-    return list(dict.fromkeys(seeds))
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last - first >= MOST_SEEDS:
+            raise ValueError(f"--seeds {shown(text)}: a range holds at most {MOST_SEEDS} seeds.")
+        seeds |= dict.fromkeys(range(first, last + 1))
+    return list(seeds)
 
 
 def train_seeds(
@@ -54,7 +60,9 @@ def train_seeds(
     :return: exit status of the first training that failed, 0 if none did
     :raises ValueError: if arguments are invalid
     """
-    if "--seed" in argv:
+    options = argparse.ArgumentParser(add_help=False)  # rl_zoo3 accepts abbreviations
+    options.add_argument("--seed")
+    if options.parse_known_args(argv)[0].seed is not None:
         raise ValueError("--seeds and --seed exclude each other: pass only one of them.")
     folder = Path(log_folder)
     folder.mkdir(parents=True, exist_ok=True)

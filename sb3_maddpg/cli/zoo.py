@@ -98,6 +98,8 @@ def train(argv: list[str]) -> int:
     if helps(argv):
         import_packages(common_options().parse_known_args(argv)[0].gym_packages)
         print(f"{overview()}\n\n{resuming.format_help()}\nrl_zoo3's options:\n")
+    if not asked.log_folder:
+        raise ValueError("--log-folder is empty: name a folder, or leave it out for `logs`.")
     if asked.checkpoint_every is not None and asked.checkpoint_every < 0:
         raise ValueError(
             f"--checkpoint-every {asked.checkpoint_every}: pass a number of steps, or 0 for no checkpoints."

@@ -119,6 +119,7 @@ def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
         (["--resume"], "no run in logs has checkpoints"),
         (["--resume", "nowhere"], "nowhere is not the folder of a run with checkpoints"),
         (["--resume", "nowhere", "--seed", "3"], "leave out --seed 3"),
+        (["--env", "OwnBit-v0", "-f", ""], "--log-folder is empty"),
         (["--env", "OwnBit-v0", "--checkpoint-every", "-5"], "--checkpoint-every -5: pass a number of steps, or 0"),
     ):
         assert main(["train", *argv]) == 2

@@ -32,6 +32,18 @@ def test_anything_else_is_refused(text):
         parse_seeds(text)
 
 
+def test_too_many_seeds_are_refused():
+    with pytest.raises(ValueError, match="a range holds at most 10000 seeds"):
+        parse_seeds("0-99999999999")
+
+
+@pytest.mark.parametrize("words", [["--seed", "3"], ["--seed=3"], ["--see=3"]])
+def test_a_seed_beside_the_seeds_is_refused(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--env", "OwnBit-v0", "--seeds", "0", *words]) == 2
+    assert "--seeds and --seed exclude each other" in capsys.readouterr().err
+
+
 def weights(folder: Path) -> dict[str, bytes]:
     """Of each run by its seed."""
     found = {}
