@@ -140,4 +140,4 @@ def check_writable(path: Path) -> None:
     exists = path.exists()
     path.open("ab").close()
     if not exists:
-        path.unlink()
+        path.unlink(missing_ok=True)  # another process may have done so
