@@ -99,7 +99,7 @@ def check_members(
     :raises ValueError: if the file is not a zip file, or a member is unexpected or too large
     """
     check_path(path)
-    file = open_path(path, "r", verbose=0, suffix="zip")
+    file = _open(path)
     try:
         if not zipfile.is_zipfile(file):
             raise ValueError(f"{path} is not a model: models are zip files.")
@@ -123,6 +123,12 @@ def check_members(
         else:
             file.seek(0)
     return data
+
+
+def _open(path: str | pathlib.Path | io.BufferedIOBase) -> io.BufferedIOBase:
+    """Open a model file, whose path may lack the suffix, as in Stable-Baselines3."""
+    named = not isinstance(path, (str, os.PathLike)) or pathlib.Path(path).suffix == ".zip"
+    return open_path(path, "r", verbose=0, suffix=None if named else "zip")
 
 
 def _check_sizes(path: Any, archive: zipfile.ZipFile) -> None:
@@ -202,7 +208,7 @@ def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[
     :param given: values that replace the file's
     :raises ValueError: if any other value is pickled
     """
-    file = open_path(path, "r", verbose=0, suffix="zip")
+    file = _open(path)
     try:
         with zipfile.ZipFile(file) as archive:
             data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}

@@ -23,8 +23,8 @@ from sb3_maddpg.cli.options import (
     did_you_mean,
     helps,
     import_packages,
+    importing_from,
     nearest_options,
-    present_folder,
 )
 from sb3_maddpg.cli.overview import ALGORITHMS, overview
 from sb3_maddpg.maddpg import MADDPG, Lean
@@ -346,17 +346,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _asks_for_present_folder(words: list[str]) -> bool:
-    """
-    :param words: arguments of the command
-    :return: whether ``--gym-packages`` or ``--env`` names a module in the current folder. Otherwise nothing is imported
-        from there, so that names in a recipe never are by accident.
-    """
-    known, _ = common_options().parse_known_args(words)
-    tops = {re.split(r"[./]", name)[0] for name in (*known.gym_packages, known.env or "")} - {""}
-    return any(Path(f"{top}.py").is_file() or Path(top).is_dir() for top in tops)
-
-
 @contextmanager
 def _trust() -> Iterator[None]:
     """Allow files to run code, in this process and its subprocesses."""
@@ -388,7 +377,7 @@ def main(argv: list[str] | None = None) -> int:
     if helps(rest):
         print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
     try:
-        with present_folder(_asks_for_present_folder(rest)), _trust() if trusts else nullcontext(), nearest_options():
+        with importing_from(Path.cwd(), rest), _trust() if trusts else nullcontext(), nearest_options():
             return COMMANDS[command].run(rest)
     except KeyboardInterrupt:
         if debug:

@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import itertools
-import json
 import shutil
 import time
 import warnings
@@ -35,10 +34,12 @@ from torch.utils.tensorboard import SummaryWriter
 from sb3_maddpg import MADDPG
 from sb3_maddpg.callbacks import DashboardCallback
 from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
+from sb3_maddpg.cli.command_files import write_command
 from sb3_maddpg.cli.literals import format_literal, parse_literal
 from sb3_maddpg.cli.options import check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
+from sb3_maddpg.cli.safety import check_names
 from sb3_maddpg.cli.search import (
     STUDY,
     as_absolute,
@@ -61,7 +62,7 @@ TABLES = 100
 FEWEST_STEPS_PER_TABLE = 1000
 
 
-COMMAND_FILE, CHECKPOINTS = "command.json", "checkpoints"
+CHECKPOINTS = "checkpoints"
 
 
 class Checkpoints(NamedTuple):
@@ -69,10 +70,12 @@ class Checkpoints(NamedTuple):
 
     every: int | None
     """Number of steps between checkpoints, None for checkpoints by time"""
-    command: dict[str, Any]
-    """Command that started the run"""
+    argv: list[str]
+    """Arguments of the command that starts the run"""
     run: Path | None = None
     """Folder of the run to resume"""
+    foreign: bool = False
+    """Whether the run to resume may be someone else's, so that it must not run code"""
 
 
 class TeamExperimentManager(ExperimentManager):
@@ -97,6 +100,7 @@ class TeamExperimentManager(ExperimentManager):
     """
 
     study: optuna.Study | None = None  # the study of the search
+    interrupted = False  # whether the user ended the training
     continues = False  # whether the study has trials of other workers or of an earlier command
 
     def __init__(
@@ -114,6 +118,10 @@ class TeamExperimentManager(ExperimentManager):
         # rl_zoo3 would replace the recipe's arguments with these, and would ignore trial 0
         given, self.env_kwargs = self.env_kwargs, {}
         trial_id, self.trial_id = self.trial_id, None
+        foreign = self.checkpoints.run if self.checkpoints is not None and self.checkpoints.foreign else None
+        # Recipes can be programs, and samplers come from the internet
+        if foreign and (self.optimize_hyperparameters or not self.config.endswith((".yml", ".yaml"))):
+            raise ValueError(f"{foreign} with {self.config} may run any code. If you trust its author, pass --trust.")
         read_recipe(self.config, self.algo, self.env_name.gym_id)
         hyperparams, _ = super().read_hyperparameters()
         if trial_id is not None:
@@ -125,6 +133,10 @@ class TeamExperimentManager(ExperimentManager):
         if hyperparams.get("noise_type") is None:
             hyperparams.pop("noise_type", None)
             hyperparams.pop("noise_std", None)
+        if foreign:
+            kwargs = {"env_kwargs": given, "eval_env_kwargs": self._eval_env_kwargs_args}
+            for named in (hyperparams, kwargs):
+                check_names(named, self.env_name.gym_id, f"{foreign} with {self.config}")
         as_written = dict(hyperparams)
         hyperparams = check_recipe(self.algo, hyperparams, f"recipe for {self.algo} in {self.config}")
         self.own_vec_env = self._read_vec_env(hyperparams)
@@ -196,8 +208,7 @@ class TeamExperimentManager(ExperimentManager):
         self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
         if self.checkpoints is not None:
-            with atomic_write(f"{self.save_path}/{COMMAND_FILE}", "json") as file:
-                file.write(json.dumps(self.checkpoints.command).encode())
+            write_command(Path(self.save_path), self.checkpoints.argv, self.checkpoints.every)
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
@@ -352,6 +363,7 @@ class TeamExperimentManager(ExperimentManager):
                     **kwargs,
                 )
         except KeyboardInterrupt:
+            self.interrupted = True
             print("Interrupted: saving what has been learned so far.")
             for callback in self.callbacks:  # closes the progress bar
                 callback.on_training_end()
@@ -422,14 +434,15 @@ class TeamExperimentManager(ExperimentManager):
         return tuple(getattr(self, name) for name in (*names, "n_eval_episodes", "n_eval_envs", "sampler", "pruner"))
 
     def _bring_back(self) -> optuna.Study | None:
-        """Open the study if it has a name, and queue trials of killed processes again."""
+        """Open the storage and, if it has a name, the study, and queue trials of killed processes again."""
         assert self.storage is not None
-        if self.study_name is None:  # Optuna will generate one
-            return None
         if self.storage.endswith(".log"):
             Path(self.storage).parent.mkdir(parents=True, exist_ok=True)
+        storage = open_storage(self.storage)
+        if self.study_name is None:  # Optuna will generate one
+            return None
         study = optuna.create_study(
-            storage=open_storage(self.storage), study_name=self.study_name, direction="maximize", load_if_exists=True
+            storage=storage, study_name=self.study_name, direction="maximize", load_if_exists=True
         )
         count, finished = bring_back(study), _finished(study)
         enlist(study)
@@ -508,6 +521,7 @@ class TeamExperimentManager(ExperimentManager):
         Save the model and remove checkpoints that are no longer needed.
 
         :param model: the trained model
+        :raises KeyboardInterrupt: after that, if the training was interrupted
         """
         super().save_trained_model(model)
         if self.checkpoint is not None and model.num_timesteps >= model._total_timesteps:  # not interrupted
@@ -519,6 +533,8 @@ class TeamExperimentManager(ExperimentManager):
         print(f"Logs:        {self.save_path}")
         if self.tensorboard_log:
             print(f"TensorBoard: tensorboard --logdir {self.tensorboard_log}")
+        if self.interrupted:
+            raise KeyboardInterrupt
 
 
 class _Replaying:

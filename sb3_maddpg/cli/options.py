@@ -6,7 +6,7 @@ import importlib
 import pkgutil
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
@@ -57,14 +57,19 @@ def import_packages(names: Iterable[str]) -> None:
 
 
 @contextmanager
-def present_folder(asked: bool) -> Iterator[None]:
+def importing_from(folder: Path | None, words: Sequence[str] = ()) -> Iterator[None]:
     """
-    Import modules of the current folder, after all others, or not at all.
+    Import the modules of a folder, after all others, only if ``--gym-packages`` or ``--env`` names one of them, so that
+    names in a recipe are never imported from there by accident. Nothing else is imported from the current folder.
 
-    :param asked: whether to import them
+    :param folder: the folder
+    :param words: arguments of a command
     """
+    known, _ = common_options().parse_known_args(words)
+    tops = {re.split(r"[./]", name)[0] for name in (*known.gym_packages, known.env or "")} - {""}
+    asked = folder is not None and any((folder / f"{top}.py").is_file() or (folder / top).is_dir() for top in tops)
     here, before = Path.cwd(), sys.path.copy()
-    sys.path[:] = [path for path in before if Path(path).resolve() != here] + [str(here)] * asked
+    sys.path[:] = [path for path in before if Path(path).resolve() != here] + [str(folder)] * asked
     try:
         yield
     finally:
@@ -135,4 +140,4 @@ def check_writable(path: Path) -> None:
     exists = path.exists()
     path.open("ab").close()
     if not exists:
-        path.unlink()
+        path.unlink(missing_ok=True)  # another process may have done so

@@ -20,7 +20,7 @@ def register(env_id: str) -> bool:
     """
     if env_id in gymnasium.registry:
         return True
-    entry = env_id.removesuffix("/parallel_env").replace("/", ".")
+    entry = module_of(env_id)
     if not all(part.isidentifier() for part in entry.split(".")):
         return False
     if not callable(getattr(find_module(entry), "parallel_env", None)):
@@ -28,6 +28,14 @@ def register(env_id: str) -> bool:
     # Gymnasium's checker would warn about padding, whose bounds are both zero
     gymnasium.register(env_id, entry_point=ENTRY_POINT, kwargs={"entry": entry}, disable_env_checker=True)
     return True
+
+
+def module_of(env_id: str) -> str:
+    """
+    :param env_id: see ``register``
+    :return: the dotted name of the module that it stands for
+    """
+    return env_id.removesuffix("/parallel_env").replace("/", ".")
 
 
 def siblings(env_id: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import builtins
 import importlib
 import re
@@ -18,11 +19,15 @@ import rl_zoo3.utils
 import yaml
 from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common import base_class, off_policy_algorithm
+from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_maddpg import parallel
+from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
-from sb3_maddpg.cli.options import present_folder
+from sb3_maddpg.cli.options import common_options, importing_from
 from sb3_maddpg.cli.recipes import names_of_classes
 from sb3_maddpg.model_files import refuse_pickled, refuse_pickled_file, trusted
 from sb3_maddpg.normalization import SafeVecNormalize
@@ -31,10 +36,14 @@ from sb3_maddpg.utils import shown
 
 # Keys of a recipe that name classes, and the base class of those that a file of someone else may name
 _BASES: dict[str, type] = {
+    "callback": BaseCallback,
+    "policy": BasePolicy,
+    "replay_buffer_class": BaseBuffer,
     "env_wrapper": gymnasium.Wrapper,
     "vec_env_wrapper": VecEnvWrapper,
     "wrappers": BaseParallelWrapper,
 }
+_ALIASED = ("policy", "replay_buffer_class")  # may also be names without a dot, which are looked up
 _OF_SUPERSUIT = r"supersuit\.\w+_v\d+"  # functions, which only wrap
 _ENVIRONMENT_LIBRARIES = {"gymnasium", "pettingzoo", "stable-baselines3"}
 
@@ -134,6 +143,28 @@ def check_run(folder: Path, env_id: str) -> None:
         check_names(used, env_id, str(path))
 
 
+def check_words(argv: list[str], source: str) -> None:
+    """
+    Check the modules that a command from a file of someone else would import.
+
+    :param argv: arguments of ``train``
+    :param source: the file, for error messages
+    :raises ValueError: if a module may run code
+    """
+    options = argparse.ArgumentParser(add_help=False)  # rl_zoo3 accepts abbreviations
+    options.add_argument("--gym-packages", nargs="+", action="extend", default=[])
+    modules = list(options.parse_known_args(argv)[0].gym_packages)
+    env_id = common_options().parse_known_args(argv)[0].env
+    if env_id is not None and env_id not in gymnasium.registry:
+        modules.append(pettingzoo_ids.module_of(env_id))
+    for module in modules:
+        if not may_import(module):
+            raise ValueError(
+                f"{source} imports {shown(module)}, which may run any code: you did not start this run here, and "
+                "it is not an installed library of environments. If you trust its author, pass --trust."
+            )
+
+
 def check_names(hyperparams: Mapping[str, Any], env_id: str, source: str) -> None:
     """
     Check the names that a recipe from a file of someone else holds. Importing one runs its module, and rl_zoo3 then
@@ -144,17 +175,19 @@ def check_names(hyperparams: Mapping[str, Any], env_id: str, source: str) -> Non
     :param source: the file, for error messages
     :raises ValueError: if a name is not that of a class which files may name
     """
-    named = {key: hyperparams.get(key) for key in _BASES}
-    kwargs = hyperparams.get("env_kwargs") or {}
-    if not isinstance(kwargs, Mapping):
-        raise ValueError(f"{source}: env_kwargs is {shown(kwargs)} instead of a dict.")
-    if gymnasium.spec(env_id).entry_point == parallel.ENTRY_POINT:
-        if "entry" in kwargs:  # another module
-            raise ValueError(f"{source}: env_kwargs cannot choose the module of {env_id}: remove `entry`.")
-        named["wrappers"] = kwargs.get("wrappers")
-    for key, value in named.items():
+    named = [(key, hyperparams.get(key)) for key in _BASES]
+    for key in ("env_kwargs", "eval_env_kwargs"):
+        kwargs = hyperparams.get(key) or {}
+        kwargs = parse_literal(kwargs) if isinstance(kwargs, str) else kwargs
+        if not isinstance(kwargs, Mapping):
+            raise ValueError(f"{source}: {key} is {shown(kwargs)} instead of a dict.")
+        if gymnasium.spec(env_id).entry_point == parallel.ENTRY_POINT:
+            if "entry" in kwargs:  # another module
+                raise ValueError(f"{source}: {key} cannot choose the module of {env_id}: remove `entry`.")
+            named.append(("wrappers", kwargs.get("wrappers")))
+    for key, value in named:
         for name in names_of_classes(value):
-            if not _may_be_named(name, _BASES[key]):
+            if not (_may_be_named(name, _BASES[key]) or (key in _ALIASED and "." not in name)):
                 raise ValueError(
                     f"{source}: {key} names {shown(name)}, which may run any code. Files may name subclasses of "
                     f"{_BASES[key].__name__} in installed libraries of environments and in modules of --gym-packages, "
@@ -186,7 +219,7 @@ def may_import(module: str) -> bool:
     if not all(part.isidentifier() and not part.startswith("_") for part in module.split(".")):
         return False
     # A package in the current folder could pretend to be installed
-    with present_folder(asked=False):
+    with importing_from(None):
         if not _ENVIRONMENT_LIBRARIES.isdisjoint(_requirements(module.partition(".")[0])):
             importlib.import_module(module)
     return module in sys.modules

@@ -2,7 +2,9 @@
 
 import argparse
 import hashlib
+import json
 import os
+import shlex
 import socket
 import uuid
 from dataclasses import dataclass, field
@@ -17,7 +19,7 @@ from optuna.trial import TrialState
 
 from sb3_maddpg.cli.options import PROG
 from sb3_maddpg.cli.processes import run_all
-from sb3_maddpg.utils import process_runs
+from sb3_maddpg.utils import process_runs, shown
 
 STUDY = "search"
 _IDENTITY = "SB3_MADDPG_WORKER"  # environment variable with the identity that a worker keeps when it is restarted
@@ -40,8 +42,21 @@ def open_storage(storage: str) -> BaseStorage | str:
     """
     :param storage: value of ``--storage``
     :return: storage for Optuna; a file with the suffix .log is a journal
+    :raises ValueError: if such a file is not a journal; Optuna would append to it
     """
-    return JournalStorage(JournalFileBackend(as_absolute(storage))) if storage.endswith(".log") else storage
+    if not storage.endswith(".log"):
+        return storage
+    try:
+        if Path(storage).is_file():
+            with Path(storage).open("rb") as file:
+                first = file.readline()
+            # A line without end may be one that another worker is writing
+            if first and (first.endswith(b"\n") or not first.startswith(b"{")):
+                json.loads(first)["op_code"]
+        return JournalStorage(JournalFileBackend(as_absolute(storage)))
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        told = shown(f"{type(error).__name__}: {error}")
+        raise ValueError(f"--storage {storage} is not a journal of Optuna ({told}): name another file.") from error
 
 
 def as_absolute(storage: str) -> str:
@@ -141,7 +156,7 @@ def best_recipe(folder: Path, env_name: str) -> Path:
 def tell_best(algo: str, env_id: str, best: Path) -> None:
     """Print where the recipe of the best trial is, and how to train with it."""
     print(f"Recipe of the best trial: {best}. To train with it:")
-    print(f"  {PROG} train --algo {algo} --env {env_id} --conf-file {best}")
+    print(f"  {shlex.join([PROG, 'train', '--algo', algo, '--env', env_id, '--conf-file', str(best)])}")
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
-import json
 import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_maddpg.checkpoints import locked, newest
-from sb3_maddpg.cli.experiment import CHECKPOINTS, COMMAND_FILE
+from sb3_maddpg.cli.command_files import COMMAND_FILE, read_command, resumable, write_command
+from sb3_maddpg.cli.experiment import CHECKPOINTS
 from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all
 from sb3_maddpg.utils import shown
+
+MOST_SEEDS = 10_000  # of a range
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -23,13 +26,16 @@ def parse_seeds(text: str) -> list[int]:
     :return: the seeds without duplicates
     :raises ValueError: if the text is anything else
     """
-    seeds: list[int] = []
+    seeds: dict[int, None] = {}
     for part in text.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
         if match is None or (match[2] and int(match[2]) < int(match[1])):
             raise ValueError(f"--seeds {shown(text)}: write numbers and ranges, such as 0-4 or 0,3,7-9.")
-        seeds += range(int(match[1]), int(match[2] or match[1]) + 1)
-    return list(dict.fromkeys(seeds))
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last - first >= MOST_SEEDS:
+            raise ValueError(f"--seeds {shown(text)}: a range holds at most {MOST_SEEDS} seeds.")
+        seeds |= dict.fromkeys(range(first, last + 1))
+    return list(seeds)
 
 
 def train_seeds(
@@ -54,7 +60,9 @@ def train_seeds(
     :return: exit status of the first training that failed, 0 if none did
     :raises ValueError: if arguments are invalid
     """
-    if "--seed" in argv:
+    options = argparse.ArgumentParser(add_help=False)  # rl_zoo3 accepts abbreviations
+    options.add_argument("--seed")
+    if options.parse_known_args(argv)[0].seed is not None:
         raise ValueError("--seeds and --seed exclude each other: pass only one of them.")
     folder = Path(log_folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -84,10 +92,13 @@ class _Training:
 
     def command(self) -> tuple[list[str], str]:
         argv = [*self.argv, "--seed", str(self.seed), "--log-folder", str(self.log_folder)]
-        run = self._run_of(argv)
+        run = self._run_of(resumable(argv))
         if run is not None:
             _wait_until_free(run / CHECKPOINTS)
             if newest(run / CHECKPOINTS) is not None:
+                command = read_command(run)
+                if command.folder is None:  # started elsewhere, but the user gives the same command here
+                    write_command(run, command.argv, command.every)
                 return ["train", "--resume", str(run)], f"resumes {run}"
             if not (run / CHECKPOINTS).exists() and any(run.glob("*.zip")):
                 return [], f"finished before, {run}"
@@ -98,8 +109,8 @@ class _Training:
         """:return: the newest run that this command started, if there is one"""
         found = []
         for path in self.log_folder.glob(f"*/*/{COMMAND_FILE}"):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                if json.loads(path.read_text())["argv"] == argv:
+            with contextlib.suppress(ValueError):
+                if resumable(read_command(path.parent).argv) == argv:
                     found.append(path.parent)
         return max(found, key=lambda run: (run / COMMAND_FILE).stat().st_mtime, default=None)
 

@@ -3,7 +3,6 @@
 import argparse
 import difflib
 import functools
-import json
 import os
 import runpy
 import sys
@@ -28,17 +27,27 @@ from rl_zoo3.utils import ALGOS, get_latest_run_id, get_saved_hyperparams
 from sb3_maddpg import parallel
 from sb3_maddpg.checkpoints import newest
 from sb3_maddpg.cli import pettingzoo_ids
-from sb3_maddpg.cli.experiment import CHECKPOINTS, COMMAND_FILE, Checkpoints, TeamExperimentManager
+from sb3_maddpg.cli.command_files import COMMAND_FILE, read_command, recipe_of, resumable
+from sb3_maddpg.cli.experiment import CHECKPOINTS, Checkpoints, TeamExperimentManager
 from sb3_maddpg.cli.literals import StoreValues
-from sb3_maddpg.cli.options import PROG, common_options, did_you_mean, helps, import_packages, modules_beside
+from sb3_maddpg.cli.options import (
+    PROG,
+    common_options,
+    did_you_mean,
+    helps,
+    import_packages,
+    importing_from,
+    modules_beside,
+)
 from sb3_maddpg.cli.overview import ALGORITHMS, load_environments, overview, packaged_recipes
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.processes import ENGINES
 from sb3_maddpg.cli.recipes import LengthOption, check_options
-from sb3_maddpg.cli.safety import check_run, no_code_from_files
+from sb3_maddpg.cli.safety import check_run, check_words, no_code_from_files
 from sb3_maddpg.cli.search import search
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
+from sb3_maddpg.model_files import trusted
 from sb3_maddpg.utils import suggest
 
 
@@ -89,6 +98,8 @@ def train(argv: list[str]) -> int:
     if helps(argv):
         import_packages(common_options().parse_known_args(argv)[0].gym_packages)
         print(f"{overview()}\n\n{resuming.format_help()}\nrl_zoo3's options:\n")
+    if not asked.log_folder:
+        raise ValueError("--log-folder is empty: name a folder, or leave it out for `logs`.")
     if asked.checkpoint_every is not None and asked.checkpoint_every < 0:
         raise ValueError(
             f"--checkpoint-every {asked.checkpoint_every}: pass a number of steps, or 0 for no checkpoints."
@@ -98,24 +109,28 @@ def train(argv: list[str]) -> int:
     processes = asked.jobs is not None or asked.engine != "local" or asked.address is not None
     if asked.seeds is not None or processes:
         return _in_processes(name, asked, argv)
-    if asked.resume is None:
-        argv += ["--log-folder", asked.log_folder]
     checkpoints: Checkpoints | None = None
-    if asked.checkpoint_every != 0:
-        checkpoints = Checkpoints(asked.checkpoint_every, {"argv": argv, "every": asked.checkpoint_every})
     if asked.resume is not None:
-        checkpoints, argv = _resumed(asked, argv)
-    parser = common_options()
-    parser.add_argument("-conf", "--conf-file")
-    known, rest = parser.parse_known_args(argv)
+        checkpoints, argv, folder = _resumed(asked, argv)
+        with importing_from(folder, argv):
+            return _train(name, argv, checkpoints)
+    argv = [*argv, "--log-folder", asked.log_folder]
+    if asked.checkpoint_every != 0:
+        checkpoints = Checkpoints(asked.checkpoint_every, resumable(argv))
+    return _train(name, argv, checkpoints)
+
+
+def _train(name: str, argv: list[str], checkpoints: Checkpoints | None) -> int:
+    """Train in this process."""
+    known, rest = common_options().parse_known_args(argv)
     if not helps(rest):
         _check(known)
     # One thread by default: a second does not speed up small networks, and slows them down if the core is not idle
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
-    if known.conf_file is not None and not Path(known.conf_file).is_file():
-        packaged = packaged_recipes().get(known.conf_file)
-        argv += ["--conf-file", str(packaged)] if packaged is not None else []
-    if known.env is not None and known.conf_file is None:
+    recipe = recipe_of(argv)
+    if recipe is not None and not recipe.is_file():
+        argv += _packaged(recipe)
+    if known.env is not None and recipe is None:
         path = packaged_config(known.algo, known.env)
         argv += ["--conf-file", path] if path is not None else []
     manager = rl_zoo3.train.ExperimentManager
@@ -126,6 +141,12 @@ def train(argv: list[str]) -> int:
     finally:
         rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
     return 0
+
+
+def _packaged(recipe: Path) -> list[str]:
+    """:return: the option for a packaged recipe, given its name; empty if there is none"""
+    packaged = packaged_recipes().get(str(recipe))
+    return ["--conf-file", str(packaged)] if packaged is not None else []
 
 
 def _in_processes(name: str, asked: argparse.Namespace, argv: list[str]) -> int:
@@ -158,8 +179,11 @@ def _resuming(name: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, list[str]]:
-    """:return: the checkpoints of the run that ``--resume`` names, by default the newest, and the run's command"""
+def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, list[str], Path | None]:
+    """
+    :return: the checkpoints of the run that ``--resume`` names, by default the newest; the run's command; and the
+        folder from which that may import modules
+    """
     if argv:
         raise ValueError(f"--resume uses the command of the run: leave out {' '.join(argv)}.")
     run = Path(asked.resume)
@@ -168,15 +192,18 @@ def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, l
         if not runs:
             raise ValueError(f"--resume: no run in {asked.log_folder} has checkpoints; pass the folder of a run.")
         run = max(runs, key=lambda path: path.stat().st_mtime)
-    try:
-        command = json.loads((run / COMMAND_FILE).read_text())
-        argv, every = [str(word) for word in command["argv"]], command["every"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{run} is not the folder of a run with checkpoints ({error}).") from error
+    command = read_command(run)
     path = newest(run / CHECKPOINTS)
     if path is None:
         raise ValueError(f"{run} has no complete checkpoint.")
-    return Checkpoints(asked.checkpoint_every or every, command, run), [*argv, "-i", str(path / "model.zip")]
+    folder = Path.cwd() if command.folder is None and trusted(None) else command.folder
+    if folder is None:
+        check_words(command.argv, str(run / COMMAND_FILE))
+    words = [*command.argv, "-i", str(path / "model.zip")]
+    if command.folder is not None and (recipe := recipe_of(words)) is not None:
+        words += _packaged(recipe)  # a file of this name in the current folder is not the one that was meant
+    checkpoints = Checkpoints(asked.checkpoint_every or command.every, command.argv, run, foreign=folder is None)
+    return checkpoints, words, folder
 
 
 def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:

@@ -32,6 +32,13 @@ def test_what_is_no_archive_is_refused(tmp_path):
         MADDPG.load(path)
 
 
+def test_a_missing_file_is_named_as_it_was_given(tmp_path):
+    for name in ("nothing.zip", "nothing"):
+        with pytest.raises(FileNotFoundError) as caught:
+            MADDPG.load(tmp_path / name)
+        assert str(caught.value.filename) == str(tmp_path / "nothing.zip")
+
+
 def test_a_stream_can_be_read_after_the_check(tmp_path):
     learned().save(tmp_path / "model.zip")
     stream = io.BytesIO((tmp_path / "model.zip").read_bytes())

@@ -1,6 +1,7 @@
 """What all commands share: their options, and the check of files that they are going to write."""
 
 import argparse
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -71,3 +72,8 @@ def test_a_file_that_cannot_be_written_is_told_before_the_work(tmp_path, path):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=path.partition("/")[0]):
         check_writable(tmp_path / path)
+
+
+def test_processes_that_start_together_check_the_same_file(tmp_path):
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(check_writable, [tmp_path / "best.yml"] * 2000))

@@ -1,5 +1,6 @@
 """Runs of the command line that are killed and resumed end as if nothing had happened."""
 
+import contextlib
 import csv
 import json
 import os
@@ -16,6 +17,7 @@ import pytest
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sb3_maddpg.cli.command_files import write_command
 from sb3_maddpg.cli.commands import main
 
 pytest.importorskip("rl_zoo3")
@@ -152,6 +154,7 @@ def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
         (["--resume"], "no run in logs has checkpoints"),
         (["--resume", "nowhere"], "nowhere is not the folder of a run with checkpoints"),
         (["--resume", "nowhere", "--seed", "3"], "leave out --seed 3"),
+        (["--env", "OwnBit-v0", "-f", ""], "--log-folder is empty"),
         (["--env", "OwnBit-v0", "--checkpoint-every", "-5"], "--checkpoint-every -5: pass a number of steps, or 0"),
     ):
         assert main(["train", *argv]) == 2
@@ -177,9 +180,114 @@ def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
     wait_for(process, 1, tmp_path)
     process.send_signal(signal.SIGINT)
     output = process.communicate()[0]
+    assert process.returncode == 130, output
     assert "Interrupted: saving" in output
     assert checkpoints(tmp_path)
     process = start(["--resume"], tmp_path)
     output = process.communicate()[0]
     assert process.returncode == 0, output
     assert not checkpoints(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> Path:
+    """:return: a folder with a killed run"""
+    folder = tmp_path_factory.mktemp("killed")
+    (folder / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3}}))
+    argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "300"]
+    process = start([*argv, "--verbose", "0"], folder)
+    wait_for(process, 1, folder)
+    process.kill()
+    process.wait()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["-params", "callback:[{os.mkdir: {path: caught}}]"], "callback names 'os.mkdir'"),
+        (["-params", "policy:lurking.Policy"], "policy names 'lurking.Policy'"),
+        (["-params", "replay_buffer_class:lurking.Buffer"], "replay_buffer_class names 'lurking.Buffer'"),
+        (["-params", "env_wrapper:lurking.Wrapper"], "env_wrapper names 'lurking.Wrapper'"),
+        (["--gym-packages", "lurking"], "command.json imports 'lurking'"),
+        (["--gym-pack=lurking"], "command.json imports 'lurking'"),
+        (["--gym-packages", "lurking", "--gym-pack", "sys"], "command.json imports 'lurking'"),
+        (["--env", "lurking"], "command.json imports 'lurking'"),
+        (["--conf-file", "lurking"], "with lurking may run any code"),
+        (["--conf", "lurking.py"], "with lurking.py may run any code"),
+        (["--conf-file", "evil.yml"], "callback names 'lurking.Callback'"),
+        (["-optimize", "--sampler", "auto"], "may run any code"),
+    ],
+)
+def test_the_command_of_someone_elses_run_runs_no_code(killed, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(killed)
+    monkeypatch.syspath_prepend("")  # as `python -m` does
+    (killed / "lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
+    (killed / "evil.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"callback": "lurking.Callback"}}))
+    (path,) = killed.rglob("command.json")
+    own = path.read_text()
+    command = json.loads(own)
+    try:
+        path.write_text(json.dumps({**command, "argv": [*command["argv"], *words]}))
+        assert main(["train", "--resume"]) == 2
+        assert told in (error := capsys.readouterr().err)
+        assert "pass --trust" in error
+        assert not (killed / "caught").exists()
+    finally:
+        path.write_text(own)
+
+
+def test_someone_elses_run_is_resumed_if_its_command_runs_no_code(killed, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(shutil.copytree(killed, tmp_path / "copy"))
+    (path,) = Path("logs").rglob("command.json")
+    argv = json.loads(path.read_text())["argv"]
+    words = ["-params", "n_timesteps:700", "policy:sb3_maddpg.policies.MADDPGPolicy"]
+    path.write_text(json.dumps({"argv": [*argv, *words], "every": 300}))
+    assert main(["train", "--resume"]) == 0
+    assert "Resuming logs" in capsys.readouterr().out
+
+    monkeypatch.chdir(shutil.copytree(killed, tmp_path / "trusted"))
+    words = ["-params", "callback:[{os.mkdir: {path: caught}}]"]
+    path.write_text(json.dumps({"argv": [*argv, *words], "every": 300}))
+    with contextlib.suppress(AttributeError):  # None is not a callback
+        main(["train", "--resume", "--trust"])
+    assert Path("caught").exists()
+
+
+def test_a_packaged_recipe_is_not_replaced_by_a_file_of_the_present_folder(killed, tmp_path, monkeypatch):
+    folder = shutil.copytree(killed, tmp_path / "copy")
+    (run,) = folder.glob("logs/maddpg/*")
+    monkeypatch.chdir(folder)
+    words = ["--env", "OwnBit-v0", "--conf-file", "maddpg.yml", "-n", "700", "--eval-freq", "-1", "--verbose", "0"]
+    write_command(run, words, 300)
+    monkeypatch.chdir(tmp_path)
+    Path("maddpg.yml").write_text(yaml.safe_dump({"default": OWN | {"callback": [{"os.mkdir": {"path": "caught"}}]}}))
+    assert main(["train", "--resume", str(run)]) == 0
+    assert not Path("caught").exists()
+
+
+def test_a_run_in_an_environment_of_the_present_folder_is_resumed_from_any_folder(tmp_path):
+    pytest.importorskip("mpe2")
+    project, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
+    project.mkdir()
+    elsewhere.mkdir()
+    (project / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
+    (project / "my_callbacks.py").write_text(
+        "from stable_baselines3.common.callbacks import CallbackList\nclass Own(CallbackList):\n"
+        "    def __init__(self):\n        super().__init__([])\n"
+    )
+    recipe = {**OWN, "n_timesteps": 3000, "callback": "my_callbacks.Own"}
+    (project / "r.yml").write_text(yaml.safe_dump({"default": recipe}))
+    argv = ["--env", "my_team/parallel_env", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "200"]
+    process = start([*argv, "--gym-packages", "my_callbacks", "--verbose", "0"], project)
+    for folder, words in (
+        (project, ["--resume"]),
+        (elsewhere, ["--resume", "../project/logs/maddpg/my_team-parallel_env_1"]),
+    ):
+        wait_for(process, 1, project, (checkpoints(project) or [Path()])[-1].name)
+        process.kill()
+        process.wait()
+        process = start(words, folder)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    assert "Resuming ../project/logs/maddpg" in output

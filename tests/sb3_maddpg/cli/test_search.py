@@ -17,7 +17,7 @@ from processes import children, descendants
 
 from sb3_maddpg.cli import zoo
 from sb3_maddpg.cli.commands import main
-from sb3_maddpg.cli.search import bring_back, enlist, kept_search, open_storage, sign
+from sb3_maddpg.cli.search import bring_back, enlist, kept_search, open_storage, sign, tell_best
 
 pytest.importorskip("rl_zoo3")
 RECIPE = {"n_timesteps": 400, "policy": "MlpPolicy", "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
@@ -197,6 +197,22 @@ def test_a_lock_that_a_killed_process_left_is_released(tmp_path, monkeypatch):
     monkeypatch.setattr(backend._lock, "grace_period", 0.2)
     backend._lock.acquire()
     backend._lock.release()
+
+
+@pytest.mark.parametrize("text", ["not json\n", "hello", "[]\n", '{"op_code":0,"worker_id":"x"}\n'])
+@pytest.mark.parametrize("words", [[], ["--study-name", "s"]])
+def test_a_file_that_is_no_journal_is_named_and_left_alone(text, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("notes.log").write_text(text)
+    argv = ["tune", "--env", "OwnBit-v0", "-n", "100", "--n-trials", "1", "--storage", "notes.log"]
+    assert main([*argv, *words]) == 2
+    assert "notes.log is not a journal of Optuna" in capsys.readouterr().err
+    assert Path("notes.log").read_text() == text
+
+
+def test_the_command_for_the_best_recipe_can_be_pasted(capsys):
+    tell_best("maddpg", "OwnBit-v0", Path("my logs/best.yml"))
+    assert "--conf-file 'my logs/best.yml'" in capsys.readouterr().out
 
 
 def test_the_same_settings_name_the_same_search(tmp_path):

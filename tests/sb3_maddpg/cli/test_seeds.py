@@ -1,5 +1,6 @@
 """Many trainings by one command, some of which are killed."""
 
+import json
 import os
 import signal
 import subprocess
@@ -29,6 +30,18 @@ def test_seeds_are_numbers_and_ranges(text, seeds):
 def test_anything_else_is_refused(text):
     with pytest.raises(ValueError, match="write numbers and ranges, such as 0-4"):
         parse_seeds(text)
+
+
+def test_too_many_seeds_are_refused():
+    with pytest.raises(ValueError, match="a range holds at most 10000 seeds"):
+        parse_seeds("0-99999999999")
+
+
+@pytest.mark.parametrize("words", [["--seed", "3"], ["--seed=3"], ["--see=3"]])
+def test_a_seed_beside_the_seeds_is_refused(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--env", "OwnBit-v0", "--seeds", "0", *words]) == 2
+    assert "--seeds and --seed exclude each other" in capsys.readouterr().err
 
 
 def weights(folder: Path) -> dict[str, bytes]:
@@ -159,3 +172,24 @@ def test_what_does_not_go_together_is_refused(words, message, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     assert main([*ARGV, *words]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_command_with_an_environment_of_the_present_folder_resumes_its_runs(tmp_path):
+    pytest.importorskip("mpe2")
+    (tmp_path / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
+    (tmp_path / "r.yml").write_text(yaml.safe_dump({"default": RECIPE}))
+    words = [*ARGV, "--env", "my_team/parallel_env", "--seeds", "0", "--jobs", "1"]
+    for last in (False, True):
+        command = [sys.executable, "-m", "sb3_maddpg", *words]
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        if not last:
+            wait_for_checkpoints(tmp_path, process)
+            process.send_signal(signal.SIGTERM)
+            process.communicate()
+            # As if this user had not started it here: the same command vouches for it
+            (path,) = tmp_path.rglob("command.json")
+            path.write_text(json.dumps({**json.loads(path.read_text()), "signature": None}))
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    assert "seed 0: resumes logs" in output
+    assert "Resuming logs" in (tmp_path / "logs" / "seed_0.log").read_text()
