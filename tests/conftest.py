@@ -1,11 +1,15 @@
-"""One thread per process: the networks are small and the tests run in parallel."""
+"""One thread per process, since the networks are small and the tests run in parallel, and no traces in the home."""
 
 import os
 import shutil
+import tempfile
 
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# The key that signs commands of runs does not belong into the home of whoever runs the tests
+_STATE = tempfile.TemporaryDirectory(prefix="sb3-maddpg-state-")
+os.environ["XDG_STATE_HOME"] = _STATE.name
 
 
 @pytest.fixture(scope="session")
