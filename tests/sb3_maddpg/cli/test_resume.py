@@ -142,7 +142,7 @@ def test_resuming_a_run_that_trains_does_not_touch_it(tmp_path):
     assert f"checkpoints is in use by process {process.pid}" in output
     process.send_signal(signal.SIGINT)
     output = process.communicate()[0]
-    assert process.returncode == 0, output
+    assert process.returncode == 130, output
     (run,) = tmp_path.glob("logs/maddpg/*_1")
     assert [path.name for path in run.glob("*.csv*")] == ["0.monitor.csv"]
     assert len((run / "0.monitor.csv").read_text().splitlines()) > 20
@@ -221,6 +221,7 @@ def killed(tmp_path_factory) -> Path:
 )
 def test_the_command_of_someone_elses_run_runs_no_code(killed, monkeypatch, capsys, words, told):
     monkeypatch.chdir(killed)
+    monkeypatch.delitem(sys.modules, "lurking", raising=False)  # a module of this name is imported by other tests
     monkeypatch.syspath_prepend("")  # as `python -m` does
     (killed / "lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
     (killed / "evil.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"callback": "lurking.Callback"}}))
