@@ -29,7 +29,7 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
         if address is not None and (found := re.fullmatch(r"([^/]+):(\d+)", address)):
             socket.create_connection((found[1], int(found[2])), timeout=5.0).close()  # Ray would wait for minutes
         ray.init(
-            address=address,
+            address=address or "local",  # None would follow RAY_ADDRESS or a cluster found here
             num_cpus=None if address else cpus,
             include_dashboard=None if address else False,
             log_to_driver=False,

@@ -15,15 +15,18 @@ def test_without_ray_the_message_says_how_to_install_it(monkeypatch):
         RayVecEnv([OwnBit])
 
 
-def test_an_address_where_nobody_answers():
+def test_an_address_where_nobody_answers(monkeypatch):
     pytest.importorskip("ray")
+    # "auto" must not find the clusters of tests that run at the same time
+    monkeypatch.setattr("ray._private.services._find_address_from_flag", lambda flag: set())
     for address in ("auto", "127.0.0.1:1", "127.0.0.1:99999"):
         with pytest.raises(ValueError, match=f"address='{address}': no Ray cluster responds there"):
             connect(address, 1)
 
 
-def test_only_the_first_call_connects():
+def test_only_the_first_call_connects(monkeypatch):
     pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # of another cluster, as in any job of Ray
     ray, connected = connect(None, 1)
     try:
         assert connected

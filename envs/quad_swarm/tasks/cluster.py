@@ -52,7 +52,7 @@ class Cluster(Executor):
                     # Ray would wait for minutes
                     socket.create_connection((found[1], int(found[2])), timeout=5.0).close()
                 ray.init(
-                    address=address,
+                    address=address or "local",  # None would follow RAY_ADDRESS or a cluster found here
                     num_cpus=None if address else jobs,
                     include_dashboard=None if address else False,
                     log_to_driver=False,

@@ -184,7 +184,20 @@ def test_a_machine_may_be_lost(tmp_path):
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
 
 
-def test_an_address_where_nobody_answers():
+def test_without_an_address_a_cluster_starts_here(monkeypatch):
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # of another cluster, as in any job of Ray
+    ray.shutdown()
+    try:
+        with Cluster(1) as executor:
+            assert executor.submit(square, 3).result(timeout=60) == 9
+    finally:
+        monkeypatch.undo()
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
+
+
+def test_an_address_where_nobody_answers(monkeypatch):
+    # "auto" must not find the clusters of tests that run at the same time
+    monkeypatch.setattr("ray._private.services._find_address_from_flag", lambda flag: set())
     ray.shutdown()
     try:
         for address in ("auto", "127.0.0.1:1", "127.0.0.1:99999"):
