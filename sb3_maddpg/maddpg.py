@@ -48,6 +48,7 @@ from sb3_maddpg.model_files import (
     check_attributes,
     check_members,
     check_path,
+    limited_networks,
     optimizer_not_finite,
     optimizer_problem,
     read_data,
@@ -887,8 +888,8 @@ class MADDPG(OffPolicyAlgorithm):
             env = cls._wrap_env(env)
         with as_damage(path):
             data = read_data(path, cls.__name__, {base.__name__ for base in algorithms})
-            values = attributes(data, path, trust, custom_objects or {})
-            with _remedy_for_other_team():
+            values = attributes(data, cls, path, trust, custom_objects or {})
+            with _remedy_for_other_team(), limited_networks(path, trust):
                 model = super().load(path, env, device, values, print_system_info, force_reset, **kwargs)
             check_attributes(model, path)
         model.file_format = FILE_FORMAT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import math
@@ -16,8 +17,9 @@ from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.save_util import open_path
+from torch.overrides import TorchFunctionMode
 
-from sb3_maddpg.typed_json import decode
+from sb3_maddpg.typed_json import check_size, decode
 from sb3_maddpg.utils import shown
 
 # Incremented when older versions cannot read new files
@@ -27,6 +29,10 @@ _WEIGHTS = ("policy.pth", "actor.optimizer.pth", "critic.optimizer.pth", "pytorc
 _MEMBERS = {"data", *_WEIGHTS, "_stable_baselines3_version", "system_info.txt"}
 _MOST_DATA = 2**24  # bytes of the member `data`
 _MOST_TIMES_LARGER = 50  # limit of a member's size relative to the file's, since members are not compressed
+# Memory of the networks that a file may ask for: files with the actors only are much smaller than the model
+_LEAST_LIMIT = 2**28
+_MOST_TIMES_WEIGHTS = 100
+_ALLOCATING = {th.empty, th.zeros, th.ones, th.full, th.eye, th.stack, th.cat, th.Tensor.repeat}
 _PICKLED = ":serialized:"
 # Environment variable that --trust on the command line sets, also for subprocesses
 TRUST_VARIABLE = "SB3_MADDPG_TRUST"
@@ -50,6 +56,10 @@ _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
     (dict, type(None)): ("env_spec",),
     (deque, type(None)): ("ep_info_buffer", "ep_success_buffer"),
 }
+
+
+# Attributes of the process, which files cannot hold
+_RUNTIME = ("policy", "device", "env", "_vec_normalize_env", "_logger", "_custom_logger")
 
 
 def check_path(path: Any) -> None:
@@ -99,8 +109,7 @@ def check_members(
     :raises ValueError: if the file is not a zip file, or a member is unexpected or too large
     """
     check_path(path)
-    file = _open(path)
-    try:
+    with _opened(path) as file:
         if not zipfile.is_zipfile(file):
             raise ValueError(f"{path} is not a model: models are zip files.")
         with zipfile.ZipFile(file) as archive:
@@ -117,18 +126,21 @@ def check_members(
             for name in {*_WEIGHTS} & {*names}:
                 with archive.open(name) as member, zipfile.ZipFile(member) as weights:
                     _check_sizes(f"{path}: {name}", weights)
+    return data
+
+
+@contextmanager
+def _opened(path: str | pathlib.Path | io.BufferedIOBase) -> Iterator[io.BufferedIOBase]:
+    """Open a model file, whose path may lack the suffix, as in SB3; rewind a file that is open already."""
+    named = not isinstance(path, (str, os.PathLike)) or pathlib.Path(path).suffix == ".zip"
+    file = open_path(path, "r", verbose=0, suffix=None if named else "zip")
+    try:
+        yield file
     finally:
         if isinstance(path, (str, os.PathLike)):
             file.close()
         else:
             file.seek(0)
-    return data
-
-
-def _open(path: str | pathlib.Path | io.BufferedIOBase) -> io.BufferedIOBase:
-    """Open a model file, whose path may lack the suffix, as in Stable-Baselines3."""
-    named = not isinstance(path, (str, os.PathLike)) or pathlib.Path(path).suffix == ".zip"
-    return open_path(path, "r", verbose=0, suffix=None if named else "zip")
 
 
 def _check_sizes(path: Any, archive: zipfile.ZipFile) -> None:
@@ -161,6 +173,36 @@ def _size_of(archive: zipfile.ZipFile) -> int:
     return size
 
 
+class limited_networks(TorchFunctionMode):
+    """
+    Refuse to build networks that need much more memory than the weights in a model's file.
+
+    :param path: path of the file, or the open file
+    :param trust: whether the author of the file is trusted, see ``trusted``; nothing is limited then
+    :raises ValueError: if the networks are larger
+    """
+
+    def __init__(self, path: str | pathlib.Path | io.BufferedIOBase, trust: bool | None):
+        super().__init__()
+        self.path = path
+        with _opened(path) as file, zipfile.ZipFile(file) as archive:
+            weights = sum(member.file_size for member in archive.infolist() if member.filename == "policy.pth")
+        self.limit: float = math.inf if trusted(trust) else _LEAST_LIMIT + _MOST_TIMES_WEIGHTS * weights
+        self.allocated = 0
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if func in _ALLOCATING:
+            self.allocated += result.numel() * result.element_size()
+            if self.allocated > self.limit:
+                raise ValueError(
+                    f"{self.path} is damaged or asks for too much memory: its networks need more than "
+                    f"{int(self.limit) >> 20} MB, many times its weights. If you trust its author, load it with "
+                    "`trust=True` (on the command line `--trust`)."
+                )
+        return result
+
+
 def trusted(trust: bool | None) -> bool:
     """
     :param trust: whether files may run code; by default, the environment variable ``SB3_MADDPG_TRUST`` decides (1
@@ -170,17 +212,21 @@ def trusted(trust: bool | None) -> bool:
     return os.environ.get(TRUST_VARIABLE) == "1" if trust is None else trust
 
 
-def attributes(data: dict[str, Any], path: Any, trust: bool | None, given: Mapping[str, Any]) -> dict[str, Any]:
+def attributes(
+    data: dict[str, Any], algorithm: type, path: Any, trust: bool | None, given: Mapping[str, Any]
+) -> dict[str, Any]:
     """
     Decode the attributes of a model.
 
     :param data: see ``read_data``
+    :param algorithm: class of the model
     :param path: path of the file, for error messages
     :param trust: leave pickled values to Stable-Baselines3, which may run their code, see ``trusted``
     :param given: values that replace the file's
     :return: values by name, except pickled ones
-    :raises ValueError: if a value is pickled and not trusted, or cannot be decoded
+    :raises ValueError: if a value is pickled and not trusted, cannot be decoded, or would replace a method
     """
+    check_size(data, path)
     pickled = _pickled(data) - set(given)
     if pickled and not trusted(trust):
         raise ValueError(
@@ -188,11 +234,19 @@ def attributes(data: dict[str, Any], path: Any, trust: bool | None, given: Mappi
             "If you trust their author, load the file with `trust=True` (on the command line `--trust`), or convert it "
             f"to a file without pickled values: `sb3-maddpg convert {path} NEW.zip --trust`."
         )
-    return {
+    values = {
         key: given[key] if key in given else decode(value, f"{path}: {key}")
         for key, value in data.items()
         if key not in pickled
     }
+    if wrong := sorted(key for key in set(values) - set(given) if key in _RUNTIME or _is_method(algorithm, key)):
+        raise ValueError(f"{path} is damaged: it has values for {', '.join(wrong)}, which models do not save.")
+    return values
+
+
+def _is_method(cls: type, name: str) -> bool:
+    defined = inspect.getattr_static(cls, name, None)
+    return isinstance(defined, (property, classmethod, staticmethod)) or inspect.isroutine(defined)
 
 
 def _pickled(data: dict[str, Any]) -> set[str]:
@@ -208,15 +262,8 @@ def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[
     :param given: values that replace the file's
     :raises ValueError: if any other value is pickled
     """
-    file = _open(path)
-    try:
-        with zipfile.ZipFile(file) as archive:
-            data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
-    finally:
-        if isinstance(path, (str, os.PathLike)):
-            file.close()
-        else:
-            file.seek(0)
+    with _opened(path) as file, zipfile.ZipFile(file) as archive:
+        data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
     if pickled := _pickled(data) - set(given):
         raise ValueError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), as the files of most algorithms do. They may "

@@ -373,6 +373,8 @@ class MLPCritic(StackedCritic):
         n_critics: int = 1,
     ):
         n = team.n_agents
+        # Fails at once if the tables below exceed the memory
+        th.empty(n, team.state_dim + n * ((0 if team.state_dim else team.obs_dim) + actions.width), dtype=th.long)
         groups = list(groups or range(n))
         shared = len(set(groups)) < n
         parts = [team.obs_dim, actions.width] if team.state_dim == 0 else [actions.width]

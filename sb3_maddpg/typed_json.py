@@ -27,6 +27,7 @@ _TYPE = "$"
 _DEEPEST = 50
 _SMALL = 64  # arrays with more numbers may be stored outside the JSON
 _LARGEST_ARRAY = 10**7  # maximum number of values in an array, e.g. the bounds of a space
+_MOST_REPEATED = 2 * _LARGEST_ARRAY  # maximum number of values in all arrays of which only one value is written
 
 _Class = TypeVar("_Class", bound=type)
 _allowed: dict[str, type] = {}
@@ -82,8 +83,10 @@ def decode(value: Json, name: str, arrays: Mapping[str, np.ndarray] | None = Non
     :param name: name of the value, for error messages
     :param arrays: arrays that ``encode`` stored outside the JSON
     :return: the value
-    :raises ValueError: if the JSON names an unknown type or class, or does not fit its type
+    :raises ValueError: if the JSON names an unknown type or class, does not fit its type, or would be much larger in
+        memory
     """
+    check_size(value, name)
     try:
         return _decode(value, 0, arrays or {})
     except (
@@ -98,6 +101,28 @@ def decode(value: Json, name: str, arrays: Mapping[str, np.ndarray] | None = Non
         raise ValueError(f"{name} is damaged ({type(error).__name__}: {shown(str(error))}).") from error
     except ValueError as error:
         raise ValueError(f"{name} is damaged: {error}") from error
+
+
+def check_size(value: Json, name: str) -> None:
+    """
+    Check the size in memory of arrays of which only one value is written.
+
+    :param value: JSON, or a collection of JSON
+    :param name: name of the value, for error messages
+    :raises ValueError: if these arrays are larger than those of any model
+    """
+    repeated, parts = 0, [value]
+    while parts:
+        part = parts.pop()
+        if isinstance(part, dict):
+            shape = part.get("shape")
+            if part.get("repeated") and isinstance(shape, list) and all(isinstance(one, int) for one in shape):
+                repeated += abs(math.prod(shape))
+            parts.extend(part.values())
+        elif isinstance(part, list):
+            parts.extend(part)
+    if repeated > _MOST_REPEATED:
+        raise ValueError(f"{name} is damaged: it has arrays of {repeated} repeated numbers.")
 
 
 def _name(cls: type) -> str:

@@ -146,10 +146,20 @@ class PolicyArguments(ThresholdArgument):
     random_thresholds: float = Field(gt=0, le=1, description="a fraction above 0 and up to 1 (0 would not explore)")
     n_critics: Natural = Field(description="at least 1")
     activation_fn: type[nn.Module] = Field(description="a class of torch.nn, such as torch.nn.ReLU")
-    optimizer_class: type[th.optim.Optimizer] = Field(description="a class of torch.optim, such as torch.optim.Adam")
+    optimizer_class: type[th.optim.Optimizer] = Field(
+        description="a class of torch.optim, such as torch.optim.Adam, but neither LBFGS, which needs a closure, nor "
+        "SparseAdam, which needs sparse gradients"
+    )
     optimizer_kwargs: dict[str, Any] | None = Field(description="a dict of the optimizer's arguments, or None")
     agent_names: list[str] | tuple[str, ...] | None = Field(description="a list of names, one per agent, or None")
     normalize_images: bool = Field(description="True or False")
+
+    @field_validator("optimizer_class")
+    @classmethod
+    def _of_dense_gradients(cls, optimizer_class: type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:
+        if issubclass(optimizer_class, (th.optim.LBFGS, th.optim.SparseAdam)):
+            raise ValueError
+        return optimizer_class
 
     @field_validator("net_arch")
     @classmethod

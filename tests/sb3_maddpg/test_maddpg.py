@@ -493,6 +493,10 @@ def test_a_short_training_logs_its_episodes_once():
         ({"estimator": {}}, "Unknown estimator '{}'"),
         ({"policy_kwargs": {"activation_fn": 0.5}}, "activation_fn=0.5 must be a class of torch.nn"),
         ({"policy_kwargs": {"optimizer_class": int}}, "optimizer_class=<class 'int'> must be a class of torch.optim"),
+        (
+            {"policy_kwargs": {"optimizer_class": th.optim.LBFGS}},
+            "neither LBFGS, which needs a closure, nor SparseAdam",
+        ),
         ({"policy_kwargs": {"optimizer_kwargs": 5}}, "optimizer_kwargs=5 must be a dict"),
         ({"policy_kwargs": {"optimizer_kwargs": {"x": 1}}}, "cannot be passed to Adam: .*'x'"),
         ({"policy_kwargs": {"share_actor": 0.5}}, "share_actor=0.5 must be True, False or a list of lists of agents"),

@@ -1,5 +1,6 @@
 """Model files: whose they are, which format they have, and numbers that are not finite."""
 
+import base64
 import io
 import json
 import zipfile
@@ -108,3 +109,72 @@ def test_counters_that_no_training_wrote_are_refused(tmp_path, changes):
     learned().save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=f"its {next(iter(changes))} is"):
         MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes))
+
+
+@pytest.mark.parametrize("name", ["predict", "train", "logger", "load", "_logger", "device"])
+def test_values_that_would_replace_methods_or_what_belongs_to_the_process_are_refused(tmp_path, name):
+    learned().save(tmp_path / "model.zip")
+    path = rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **{name: 3})
+    with pytest.raises(ValueError, match=f"it has values for {name}, which models do not save"):
+        MADDPG.load(path)
+    if name == "device":
+        assert MADDPG.load(path, custom_objects={"device": th.device("cpu")}).device.type == "cpu"
+
+
+def zeros(*shape: int) -> dict:
+    """:return: the JSON of an array of zeros"""
+    zero = base64.b64encode(bytes(4)).decode()
+    return {"$": "array", "dtype": "f4", "shape": shape, "base64": zero, "repeated": True}
+
+
+def team_of(n_agents: int, length: int) -> dict:
+    """:return: the JSON of the observations of a team"""
+    names, bounds = [str(agent) for agent in range(n_agents)], zeros(n_agents, length)
+    return {
+        "$": "TeamObservation",
+        "names": names,
+        "lengths": [length] * n_agents,
+        "state": 0,
+        "low": bounds,
+        "high": bounds,
+    }
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"policy_kwargs": {"net_arch": [12_000, 12_000]}}, "asks for too much memory: its networks need more than 2"),
+        ({"policy_kwargs": {"net_arch": [64] * 20_000}}, "asks for too much memory"),
+        ({"policy_kwargs": {"n_critics": 10**6}}, "asks for too much memory"),
+        (
+            {"action_space": {"$": "CategoricalActions", "agents": [{"$": "Discrete", "n": 10**8, "start": 0}] * 3}},
+            "asks",
+        ),
+        ({"observation_space": team_of(3, 10**5)}, "asks for too much memory"),
+        ({"observation_space": team_of(4000, 2), "action_space": {"$": "MultiBinary", "n": 4000}}, "asks"),
+        ({"something": [zeros(10**7)] * 3}, "is damaged: it has arrays of 300000"),
+        ({f"something_{k}": zeros(10**7) for k in range(3)}, "is damaged: it has arrays of 300000"),
+    ],
+)
+def test_files_that_ask_for_much_more_memory_than_their_weights_take_are_refused(tmp_path, changes, message):
+    learned().save(tmp_path / "model.zip")
+    path = rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes)
+    with pytest.raises(ValueError, match=message):
+        MADDPG.load(path)
+
+
+class LargeTeam(OwnBit):
+    """Critics read 24 * 65 numbers, actors 64: with one wide layer, critics are 24 times as large as actors."""
+
+    n_agents, action_dim, obs_dim = 24, 1, 64
+
+
+def test_models_of_large_teams_are_loaded_from_files_without_the_critics(tmp_path):
+    kwargs = {"policy_kwargs": {"net_arch": [256]}, "buffer_size": 20, "batch_size": 10}
+    model = MADDPG("MlpPolicy", LargeTeam(), **kwargs)
+    model.save(tmp_path / "lean.zip", lean="actor")
+    critics = sum(one.numel() * one.element_size() for one in model.critic.parameters())
+    assert critics > 15 * (tmp_path / "lean.zip").stat().st_size
+    obs = model.observation_space.sample()
+    loaded = MADDPG.load(tmp_path / "lean.zip")
+    assert (loaded.predict(obs, deterministic=True)[0] == model.predict(obs, deterministic=True)[0]).all()
