@@ -126,7 +126,7 @@ def _train(name: str, argv: list[str], checkpoints: Checkpoints | None) -> int:
     known, rest = common_options().parse_known_args(argv)
     if not helps(rest):
         _check(known)
-    # One thread by default: a second does not speed up small networks, and slows them down if the core is not idle
+    # One thread by default: a second speeds up small networks little, and slows them down if the core is not idle
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
     recipe = recipe_of(argv)
     if recipe is not None and not recipe.is_file():
