@@ -1,8 +1,9 @@
-"""Measure gradient updates per second for larger batches and larger teams, on any device.
+"""Measure gradient updates per second for larger batches, larger teams and several threads, on any device.
 
-``python benchmarks/scaling.py [--device cuda] [--json F]``: networks of 2x64, observations of 18 numbers, five
-continuous actions per agent, random transitions. Updates are those of ``benchmarks/training.py``. Rates are per second
-of wall time, the best of all rounds. The ratio compares transitions per second with those of the smallest batch.
+``python benchmarks/scaling.py [--device cuda] [--threads 1 2] [--json F]``: networks of 2x64, observations of 18
+numbers, five continuous actions per agent, random transitions. Updates are those of ``benchmarks/training.py``. Rates
+are per second of wall time, the best of all rounds, in which the numbers of threads take turns. The ratio compares
+transitions per second with those of the smallest batch with the first number of threads.
 """
 
 import argparse
@@ -93,26 +94,33 @@ def main() -> None:
     parser.add_argument("--networks", choices=("separate", "shared"), default="separate")
     parser.add_argument("--seconds", type=float, default=2.0, help="seconds per measurement (default 2)")
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--threads", type=int, default=1, help="processor threads (default 1)")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1], help="numbers of processor threads (default 1)")
     parser.add_argument("--json", help="write the rows to this file")
     arguments = parser.parse_args()
-    th.set_num_threads(arguments.threads)
     on_gpu = arguments.device.startswith("cuda")
     sizes = arguments.agents or ([3, 8, 16, 32, 64] if on_gpu else [3, 8, 16])
     batch_sizes = arguments.batch_sizes or ([1024, 4096, 16384, 65536] if on_gpu else [1024, 4096])
     device = th.cuda.get_device_name(arguments.device) if on_gpu else platform.processor() or "cpu"
     print(f"{device}, torch {version('torch')}, {arguments.networks} networks")
-    print(f"{'agents':>6}  {'batch':>6}  {'updates/s':>10}  {'transitions/s':>14}  {'ratio':>6}")
+    print(f"{'agents':>6}  {'batch':>6}  {'threads':>7}  {'updates/s':>10}  {'transitions/s':>14}  {'ratio':>6}")
     rows = []
     for n_agents in sizes:
         model = filled_model(n_agents, arguments.device, arguments.networks)
         first = None
         for batch_size in tqdm(batch_sizes, desc=f"{n_agents} agents", leave=False):
-            rate = max(updates_per_second(model, batch_size, arguments.seconds) for _ in range(arguments.rounds))
-            first = first or rate * batch_size
-            ratio = rate * batch_size / first
-            tqdm.write(f"{n_agents:6d}  {batch_size:6d}  {rate:10.2f}  {rate * batch_size:14,.0f}  {ratio:6.2f}")
-            rows.append({"n_agents": n_agents, "batch_size": batch_size, "updates_per_s": rate})
+            rounds: dict[int, list[float]] = {threads: [] for threads in arguments.threads}
+            for _ in range(arguments.rounds):
+                for threads, rates in rounds.items():
+                    th.set_num_threads(threads)
+                    rates.append(updates_per_second(model, batch_size, arguments.seconds))
+            for threads, rates in rounds.items():
+                rate = max(rates)
+                first = first or rate * batch_size
+                ratio = rate * batch_size / first
+                cells = f"{n_agents:6d}  {batch_size:6d}  {threads:7d}  {rate:10.2f}  {rate * batch_size:14,.0f}"
+                tqdm.write(f"{cells}  {ratio:6.2f}")
+                row = {"n_agents": n_agents, "batch_size": batch_size, "threads": threads}
+                rows.append({**row, "updates_per_s": rate, "rounds": rates})
         del model
     if arguments.json:
         with open(arguments.json, "w") as file:

@@ -389,7 +389,7 @@ def resume(
     :param keep: see ``RunCheckpoint``
     :param device: see ``MADDPG.load``
     :return: the model and the callback that continues its checkpoints, None if there is no complete checkpoint
-    :raises ValueError: if the environment differs from the run's
+    :raises ValueError: if the environment, or the number of its copies, differs from the run's
     """
     path = newest(folder)
     if path is None:
@@ -399,6 +399,12 @@ def resume(
         plain = decode(state, f"{path}: state", arrays)
         _compare_fingerprints(plain["fingerprint"])
         model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
+        n_envs = len(plain["last"]["_last_episode_starts"])
+        if model.n_envs != n_envs:
+            raise ValueError(
+                f"{path} has n_envs={n_envs}, but the recipe or env has n_envs={model.n_envs} now: set it to {n_envs} "
+                "to resume this run."
+            )
         callback = RunCheckpoint(folder, every or plain["every"], keep)
         callback.logger_folder = plain["logger_folder"]
         buffer = model.replay_buffer

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import itertools
 import shutil
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -35,6 +36,7 @@ from sb3_maddpg import MADDPG
 from sb3_maddpg.callbacks import DashboardCallback
 from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
 from sb3_maddpg.cli.command_files import write_command
+from sb3_maddpg.cli.interrupts import noticed_interrupts
 from sb3_maddpg.cli.literals import format_literal, parse_literal
 from sb3_maddpg.cli.options import check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
@@ -101,6 +103,7 @@ class TeamExperimentManager(ExperimentManager):
 
     study: optuna.Study | None = None  # the study of the search
     interrupted = False  # whether the user ended the training
+    learns = False  # whether a trial is training
     continues = False  # whether the study has trials of other workers or of an earlier command
 
     def __init__(
@@ -112,6 +115,7 @@ class TeamExperimentManager(ExperimentManager):
         self.lock = contextlib.ExitStack()  # of the run's folder of checkpoints, until learn() ends
         super().__init__(args, *rest, **{**kwargs, "uuid_str": uuid_str})
         self.uuid_str = uuid_str
+        self.pressed = threading.Event()  # whether the user ended the search
         self.shares_parameters = shares_parameters(ALGOS[self.algo], self.env_name.gym_id)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -404,7 +408,11 @@ class TeamExperimentManager(ExperimentManager):
         return sampler
 
     def hyperparameters_optimization(self) -> None:
-        """Search hyperparameters, alone or with other workers, and write the best trial as a recipe."""
+        """
+        Search hyperparameters, alone or with other workers, and write the best trial as a recipe.
+
+        :raises KeyboardInterrupt: after that, if the search was interrupted
+        """
         best = best_recipe(Path(self.log_path), self.env_name)
         check_writable(best)
         kept = None
@@ -419,15 +427,46 @@ class TeamExperimentManager(ExperimentManager):
         study = self._bring_back()
         if kept is not None:
             self.study = study  # may be complete except for its report
-        super().hyperparameters_optimization()
-        if self.study is None:  # no trial was left for this worker
-            return
-        params = HYPERPARAMS_CONVERTER[self.algo](self.study.best_params)
-        with atomic_write(best, "yml") as file:
-            file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
-        tell_best(self.algo, self.env_name.gym_id, best)
-        if kept is not None and self._over():
+        verbosity = optuna.logging.get_verbosity()
+        # Optuna's writing cannot be interrupted: a trial would remain unfinished
+        with noticed_interrupts(lambda: not self.learns) as self.pressed:
+            try:
+                super().hyperparameters_optimization()
+            except KeyboardInterrupt:
+                self.pressed.set()
+            except ValueError:  # without a complete trial, there is no best one
+                if not self.pressed.is_set() or self._has_best():
+                    raise
+            finally:
+                optuna.logging.set_verbosity(verbosity)
+        interrupted = self.pressed.is_set()
+        if self._has_best():
+            self._write_best(best)
+        if kept is not None and self.study is not None and _finished(self.study) >= cast(int, self.max_total_trials):
             kept.unlink(missing_ok=True)
+        elif interrupted or kept is not None:  # without an interruption, another process runs the same search
+            print(f"The search {'was interrupted' if interrupted else 'is not finished'}; {self._to_continue(kept)}")
+        if interrupted:
+            raise KeyboardInterrupt
+
+    def _to_continue(self, kept: Path | None) -> str:
+        """:return: how to continue the search"""
+        if kept is not None:
+            return f"repeat the command to continue. Its trials are in {kept}."
+        if self.study_name is None and self.study is not None:
+            return f"repeat the command with --study-name {self.study.study_name} to continue."
+        return "repeat the command to continue."
+
+    def _has_best(self) -> bool:
+        """:return: whether this worker tried something, and a trial is complete"""
+        return self.study is not None and bool(self.study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]))
+
+    def _write_best(self, path: Path) -> None:
+        assert self.study is not None
+        params = HYPERPARAMS_CONVERTER[self.algo](self.study.best_params)
+        with atomic_write(path, "yml") as file:
+            file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
+        tell_best(self.algo, self.env_name.gym_id, path)
 
     def _search_settings(self) -> tuple[Any, ...]:
         names = ("algo", "seed", "n_timesteps", "n_trials", "max_total_trials", "n_startup_trials", "n_evaluations")
@@ -450,15 +489,6 @@ class TeamExperimentManager(ExperimentManager):
             print(f"The search continues after {finished} finished trials; {count} killed trials are repeated.")
         return study
 
-    def _over(self) -> bool:
-        """:return: whether a search without ``--storage`` has finished all its trials; it may have been interrupted"""
-        assert self.study is not None
-        assert self.max_total_trials is not None
-        if _finished(self.study) < self.max_total_trials:
-            print(f"The search was interrupted; repeat the command to continue. Its trials are in {self.storage}.")
-            return False
-        return True
-
     def objective(self, trial: optuna.Trial) -> float:
         """
         Train with the hyperparameters of a trial.
@@ -466,6 +496,17 @@ class TeamExperimentManager(ExperimentManager):
         :param trial: trial to sample hyperparameters for
         :return: mean reward of the last evaluation
         """
+        try:
+            return self._value(trial)
+        except optuna.TrialPruned:
+            raise
+        except BaseException:
+            if not self.pressed.is_set():
+                raise
+            optuna.logging.set_verbosity(optuna.logging.ERROR)  # a warning would show the traceback
+            raise KeyboardInterrupt from None
+
+    def _value(self, trial: optuna.Trial) -> float:
         self.study = trial.study
         sign(trial)
         env = self.create_envs(self.n_envs, no_log=True)
@@ -489,12 +530,17 @@ class TeamExperimentManager(ExperimentManager):
             evaluation = self._trial_evaluation(trial, eval_env, env.num_envs)
             callbacks = get_callback_list({"callback": self.specified_callbacks})
             try:
+                self.learns = True
+                if self.pressed.is_set():
+                    raise KeyboardInterrupt
                 model.learn(self.n_timesteps, callback=[*callbacks, evaluation])
             except (AssertionError, ValueError) as error:
                 if not diverged(model):
                     raise
                 print(f"Trial {trial.number} diverged with {sampled}: {error}")
                 raise optuna.TrialPruned from error
+            finally:
+                self.learns = False
         finally:
             env.close()
             eval_env.close()

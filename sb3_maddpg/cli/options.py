@@ -6,6 +6,7 @@ import importlib
 import pkgutil
 import re
 import sys
+import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -137,7 +138,11 @@ def check_writable(path: Path) -> None:
     :raises OSError: if the file cannot be written
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    exists = path.exists()
-    path.open("ab").close()
-    if not exists:
-        path.unlink(missing_ok=True)  # another process may have done so
+    if path.exists():
+        path.open("ab").close()
+        return
+    try:
+        # Without a name, so that other processes never find an empty file under this one
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error

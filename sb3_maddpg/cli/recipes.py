@@ -278,8 +278,8 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     check_policy_kwargs(algo, found)
     validated_as(MonitorArguments, found.get("monitor_kwargs") or {}, lambda name: f"{source}: monitor_kwargs: {name}")
     for key in ("env_wrapper", "vec_env_wrapper", "callback"):
-        for name in names_of_classes(found.get(key)):
-            _check_callable(key, name)
+        for name, arguments in _classes(found.get(key)):
+            _check_call(key, name, arguments)
     if isinstance(buffer := found.get("replay_buffer_class"), str):
         found["replay_buffer_class"] = _replay_buffer(buffer)
     return found
@@ -371,18 +371,48 @@ def names_of_classes(value: Any) -> list[str]:
     :param value: value of a recipe: a name, a dict from names to arguments, or a list of both
     :return: the names, which are imported
     """
+    return [name for name, _ in _classes(value)]
+
+
+def _classes(value: Any) -> list[tuple[str, Any]]:
+    """:return: the names in a value of a recipe and their arguments, see ``names_of_classes``"""
     if isinstance(value, list):
-        return [name for one in value for name in names_of_classes(one)]
-    return [value] if isinstance(value, str) else [str(name) for name in value or ()]
+        return [found for one in value for found in _classes(one)]
+    if isinstance(value, dict):
+        return [(str(name), arguments) for name, arguments in value.items()]
+    return [(value, {})] if isinstance(value, str) else [(str(name), {}) for name in value or ()]
 
 
-def _check_callable(key: str, name: str) -> None:
+def _check_call(key: str, name: str, arguments: Any) -> None:
+    """Check that a class of a recipe exists and can be called with its arguments."""
+    where = f"{key}: {name} in the recipe"
     try:
         found = get_class_by_name(name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{key}: {name} in the recipe cannot be imported ({error}). {_OF_WHICH}") from error
+        raise ValueError(f"{where} cannot be imported ({error}). {_OF_WHICH}") from error
     if not callable(found):
-        raise ValueError(f"{key}: {name} in the recipe is not a class. Use the dotted path of one.")
+        raise ValueError(f"{where} is not a class. Use the dotted path of one.")
+    if not isinstance(arguments, dict):
+        raise ValueError(f"{where} has {_kind(arguments)} instead of arguments: write `{name}: {{ARGUMENT: VALUE}}`.")
+    try:
+        signature = inspect.signature(found)
+    except (TypeError, ValueError):  # compiled code may have none
+        return
+    positional = () if key == "callback" else (None,)  # the environment
+    try:
+        given = signature.bind_partial(*positional, **arguments).arguments
+    except TypeError as error:
+        names = ", ".join([*signature.parameters][len(positional) :]) or "none"
+        raise ValueError(f"{where}: {error}. Its arguments are: {names}.") from error
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    missing = [
+        parameter.name
+        for parameter in signature.parameters.values()
+        if parameter.default is parameter.empty and parameter.kind not in variadic and parameter.name not in given
+    ]
+    if missing:
+        form = ", ".join(f"{one}: VALUE" for one in missing)
+        raise ValueError(f"{where} needs {' and '.join(missing)}: write `{name}: {{{form}}}`.")
 
 
 def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:

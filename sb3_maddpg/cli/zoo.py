@@ -29,6 +29,7 @@ from sb3_maddpg.checkpoints import newest
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.command_files import COMMAND_FILE, read_command, recipe_of, resumable
 from sb3_maddpg.cli.experiment import CHECKPOINTS, Checkpoints, TeamExperimentManager
+from sb3_maddpg.cli.interrupts import noticed_interrupts
 from sb3_maddpg.cli.literals import StoreValues
 from sb3_maddpg.cli.options import (
     PROG,
@@ -125,7 +126,7 @@ def _train(name: str, argv: list[str], checkpoints: Checkpoints | None) -> int:
     known, rest = common_options().parse_known_args(argv)
     if not helps(rest):
         _check(known)
-    # One thread by default: a second does not speed up small networks, and slows them down if the core is not idle
+    # One thread by default: a second speeds up small networks little, and slows them down if the core is not idle
     argv = ["--algo", known.algo, "--num-threads", "1", *argv]
     recipe = recipe_of(argv)
     if recipe is not None and not recipe.is_file():
@@ -237,11 +238,15 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
         if shares_parameters(ALGOS[known.algo], known.env):
             algorithm = ALGOS[known.algo]
             ALGOS[known.algo] = SharedPolicy.loader(algorithm.load)
+    words = ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest]
     try:
-        _call(function, command, ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest])
+        with noticed_interrupts() as pressed:
+            _call(function, command, words)
     finally:
         if algorithm is not None:
             ALGOS[known.algo] = algorithm
+    if pressed.is_set():
+        raise KeyboardInterrupt
     return 0
 
 

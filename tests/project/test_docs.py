@@ -9,7 +9,9 @@ import gymnasium
 import pytest
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-import quad_swarm  # registered before the first page, so that it stays so after it
+# Registered before the first page, so that they stay so after it
+import quad_swarm
+import sb3_maddpg.team_tasks  # noqa: F401
 from quad_swarm.task.rules import RULES
 from sb3_maddpg import MADDPG, MATD3, MADDPGPolicy, PairPolicy
 from sb3_maddpg.estimators import ESTIMATORS

@@ -3,6 +3,7 @@
 import errno
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import textwrap
@@ -120,6 +121,42 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(name, tmp_path, monkeypatch
     with pytest.raises(Killed):
         go_on(name, tmp_path / "b")
     assert digest(go_on(name, tmp_path / "b")) == expected
+
+
+class Sends(BaseCallback):
+    """Sends this process a signal at a step, and again at a later one."""
+
+    def __init__(self, *steps: int):
+        super().__init__()
+        self.steps = steps
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps in self.steps:
+            signal.raise_signal(signal.SIGTERM)
+        return True
+
+
+@pytest.mark.parametrize(("steps", "ended_at"), [((120,), 150), ((120, 130), 130), ((620,), None)])
+def test_a_signal_ends_the_run_after_the_rollout_and_a_second_one_at_once(steps, ended_at, tmp_path, monkeypatch):
+    def end(number: int) -> None:
+        assert number == signal.SIGTERM
+        raise Killed
+
+    monkeypatch.setattr(checkpoints, "_end_by", end)
+    model = make("replayed", train_freq=50)
+    if ended_at is None:  # in the last rollout
+        model.learn(STEPS, callback=[Sends(*steps), RunCheckpoint(tmp_path, STEPS)])
+        assert model.num_timesteps == 650
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(Killed):
+            model.learn(STEPS, callback=[Sends(*steps), RunCheckpoint(tmp_path, STEPS)])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert model.num_timesteps == ended_at
+    path = newest(tmp_path)
+    assert (path.name if path else None) == ("checkpoint-000000000150" if len(steps) == 1 else None)
 
 
 POINTS = [
@@ -319,6 +356,16 @@ def test_other_callbacks_and_other_environments_are_refused(tmp_path):
     for wrong in ({"every": 0}, {"every": 5, "keep": 0}):
         with pytest.raises(ValueError, match="both must be at least 1"):
             RunCheckpoint(tmp_path, **wrong)
+
+
+def test_another_number_of_environments_is_named(tmp_path):
+    make("normalized").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
+    for n_envs in (1, 3):
+        env = SafeVecNormalize(DummyVecEnv([lambda: Monitor(Replayable(OwnBit()))] * n_envs))
+        told = rf"checkpoint-0+\d+ has n_envs=2, but the recipe or env has n_envs={n_envs} now: set it to 2 to resume"
+        with pytest.raises(ValueError, match=told):
+            resume(tmp_path, env)
+    assert resume(tmp_path, normalized())[0].n_envs == 2
 
 
 def edit(folder: Path, change) -> None:

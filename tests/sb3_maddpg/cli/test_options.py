@@ -1,7 +1,9 @@
 """What all commands share: their options, and the check of files that they are going to write."""
 
 import argparse
+import os
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -74,6 +76,29 @@ def test_a_file_that_cannot_be_written_is_told_before_the_work(tmp_path, path):
         check_writable(tmp_path / path)
 
 
+def test_other_processes_never_find_an_empty_file(tmp_path, monkeypatch):
+    opened, found = Path.open, []
+
+    def watched(path: Path, *args, **kwargs):
+        file = opened(path, *args, **kwargs)
+        found.extend(tmp_path.iterdir())
+        return file
+
+    monkeypatch.setattr(Path, "open", watched)
+    check_writable(tmp_path / "best.yml")
+    assert not found
+    assert not list(tmp_path.iterdir())
+
+
 def test_processes_that_start_together_check_the_same_file(tmp_path):
     with ThreadPoolExecutor(8) as threads:
         list(threads.map(check_writable, [tmp_path / "best.yml"] * 2000))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_with_the_file(tmp_path):
+    if os.geteuid() == 0:
+        pytest.skip("root may write anywhere")
+    tmp_path.chmod(0o500)
+    with pytest.raises(PermissionError, match=r"best\.yml"):
+        check_writable(tmp_path / "best.yml")

@@ -167,6 +167,43 @@ def test_a_wrapper_or_callback_that_is_no_class_is_refused(key, name):
             check_recipe("maddpg", {**recipe, key: value}, "recipe")
 
 
+LIMIT, STACK = "gymnasium.wrappers.TimeLimit", "stable_baselines3.common.vec_env.VecFrameStack"
+CHECKPOINT = "stable_baselines3.common.callbacks.CheckpointCallback"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("env_wrapper", LIMIT, f"needs max_episode_steps: write `{LIMIT}: {{max_episode_steps: VALUE}}`."),
+        ("env_wrapper", [{LIMIT: {}}], "needs max_episode_steps"),
+        ("env_wrapper", {LIMIT: None}, f"has nothing instead of arguments: write `{LIMIT}: {{ARGUMENT: VALUE}}`."),
+        (
+            "env_wrapper",
+            {LIMIT: {"max_steps": 5}},
+            "keyword argument 'max_steps'. Its arguments are: max_episode_steps.",
+        ),
+        ("env_wrapper", {LIMIT: {"env": 5}}, "multiple values for argument 'env'. Its arguments are: max_episode"),
+        ("vec_env_wrapper", STACK, "needs n_stack"),
+        (
+            "callback",
+            [CHECKPOINT],
+            f"needs save_freq and save_path: write `{CHECKPOINT}: {{save_freq: VALUE, save_path: VALUE}}`.",
+        ),
+    ],
+)
+def test_a_wrapper_or_callback_without_its_arguments_is_refused(capsys, key, value, message):
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, key: value}}))
+    error = refused(capsys, "--conf-file", "r.yml")
+    assert f"{key}: " in error
+    assert message in error
+
+
+def test_a_wrapper_with_its_arguments_is_accepted():
+    wrappers = ["gymnasium.wrappers.OrderEnforcing", {LIMIT: {"max_episode_steps": 7}}]
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "env_wrapper": wrappers}}))
+    assert main(["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--verbose", "0"]) == 0
+
+
 def test_a_recipe_that_is_neither_file_nor_module_is_refused(capsys):
     assert main(["train", "--env", "OwnBit-v0", "--conf-file", "../.."]) == 2
     assert "neither a YAML file nor a module" in capsys.readouterr().err

@@ -189,6 +189,32 @@ def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
     assert not checkpoints(tmp_path)
 
 
+def test_a_recipe_with_another_number_of_environments_is_refused_until_it_is_as_before(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    recipe = OWN | {"train_freq": 3, "n_envs": 2}
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": recipe}))
+    argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "300"]
+    process = start([*argv, "--verbose", "0"], tmp_path)
+    wait_for(process, 1, tmp_path)
+    process.kill()
+    process.wait()
+    (run,) = Path("logs/maddpg").glob("*_1")
+
+    def episodes() -> list[list[str]]:
+        return [row.split(",")[:2] for row in (run / "0.monitor.csv").read_text().splitlines()]
+
+    before = episodes()[1:15]
+    for n_envs in (1, 3):
+        Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": recipe | {"n_envs": n_envs}}))
+        assert main(["train", "--resume"]) == 2
+        error = capsys.readouterr().err
+        assert f"has n_envs=2, but the recipe or env has n_envs={n_envs} now: set it to 2 to resume this run" in error
+        assert error.count("\n") == 1
+    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": recipe}))
+    assert main(["train", "--resume"]) == 0
+    assert episodes()[1:15] == before
+
+
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory) -> Path:
     """:return: a folder with a killed run"""

@@ -77,8 +77,32 @@ def test_an_interrupted_search_is_kept(tmp_path, monkeypatch):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=120)
-    assert "The search was interrupted; repeat the command to continue" in output
+    assert process.returncode == 130, output
+    assert "The search was interrupted; repeat the command to continue. Its trials are in logs/maddpg/OwnBit" in output
+    assert output.endswith("Interrupted.\n")
     assert len(list(Path("logs/maddpg").glob("*_search_*.log"))) == 1
+    assert Path("logs/maddpg/OwnBit-v0_best.yml").exists()
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_search_interrupted_in_its_first_trial_says_how_to_continue(named, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    process = start("--n-trials", "3", "--storage", "s.log", *(["--study-name", "s"] if named else []), "-n", "1000000")
+    end = time.monotonic() + 300
+    while not Path("s.log").exists() or b"process" not in Path("s.log").read_bytes():  # a trial has been signed
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130, output
+    assert "Traceback" not in output
+    (name,) = optuna.get_all_study_names(open_storage("s.log"))
+    how = "the command" if named else f"the command with --study-name {name}"
+    assert f"The search was interrupted; repeat {how} to continue.\nInterrupted.\n" in output
+    assert not Path("logs/maddpg/OwnBit-v0_best.yml").exists()
+    (trial,) = optuna.load_study(storage=open_storage("s.log"), study_name=name).trials
+    assert trial.state is TrialState.FAIL
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -198,6 +199,23 @@ def test_watching_and_recording_use_the_training_environment(arena, tmp_path, ca
     assert video.stat().st_size > 500
     assert main(["enjoy", "--env", "Arena-v1"]) == 2
     assert "did you mean 'Arena-v0'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["enjoy", "record"])
+def test_ctrl_c_while_watching_ends_with_the_usual_status(arena, capsys, command):
+    assert train("--eval-freq", "-1") == 0
+    step, taken = arena.Arena.step, []
+
+    def interrupted(self, action):
+        taken.append(action)
+        if len(taken) == 15:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, action)
+
+    arena.Arena.step = interrupted
+    assert main([command, "--env", "Arena-v0", "-n", "1000"]) == 130
+    assert len(taken) == 15
+    assert capsys.readouterr().err.endswith("Interrupted.\n")
 
 
 def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
