@@ -39,6 +39,7 @@ class RowFunction:
     def __init__(self, function: ca.Function):
         self._lengths = [function.numel_in(k) for k in range(function.n_in())]
         self._n_out = function.numel_out(0)
+        self._inputs = ctypes.c_void_p * len(self._lengths)
         name = function.name()
         generator = ca.CodeGenerator("function", {"with_export": False, "cpp": True})
         generator.add(function)
@@ -66,5 +67,6 @@ class RowFunction:
             if array is not None and array.size != count * length:
                 raise ValueError(f"{array.size} numbers for {count} rows of {length}.")
         output = np.empty((count, self._n_out))
-        self._call(count, (ctypes.c_void_p * len(arrays))(*addresses(*arrays)), *addresses(output))
+        *inputs, result = addresses(*arrays, output)
+        self._call(count, self._inputs(*inputs), result)
         return output

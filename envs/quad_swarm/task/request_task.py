@@ -258,7 +258,7 @@ class RequestTask:
             "requests": -self.reward.request * n_messages,
         }
         reward = terms["goal"] + terms["collision"] + terms["requests"]
-        near_misses: np.ndarray | float = 0.0
+        near_misses = None
         if self.reward.near_miss:
             near_misses = self.reward.near_miss * self._near_misses(report)
             terms["near_miss"] = -np.sum(near_misses, axis=(1, 2)) / 2
@@ -270,11 +270,12 @@ class RequestTask:
         if report.changed is not None:  # there may be empty slots
             present = report.others >= 0
             share = present * (terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1))[..., None]
+        pair_rewards = share - self.reward.collision * colliding - self.reward.request * messages
+        if near_misses is not None:
+            pair_rewards -= near_misses
         return Outcome(
             reward=reward,
-            pair_rewards=(
-                share - self.reward.collision * colliding - self.reward.request * messages - near_misses
-            ).astype(np.float32),
+            pair_rewards=pair_rewards.astype(np.float32),
             reward_terms=terms,
             terminated=terminated,
             truncated=~terminated & (self.statistics.steps >= self.max_steps),

@@ -203,7 +203,7 @@ class Beliefs:
         :param vel: current velocities of the others, (E, n, n - 1, 3), world frame (m/s)
         """
         known = self._known
-        if known is None or not (np.array_equal(known.pos, pos) and np.array_equal(known.vel, vel)):
+        if known is None or np.count_nonzero(known.pos != pos) or np.count_nonzero(known.vel != vel):
             known = self._known = self._predict(pos.copy(), vel.copy())
         return known
 

@@ -5,6 +5,7 @@ Planners and policies do not know the disturbances. They only observe the conseq
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Annotated
@@ -68,12 +69,12 @@ class SensingError:
     others_vel: Disturbance = 0.0
     correlation_time: NonNegativeFloat = 0.2
 
-    @property
+    @functools.cached_property
     def own(self) -> bool:
         """Whether robots' estimates of their own states have errors."""
         return any((self.pos, self.vel, self.attitude))
 
-    @property
+    @functools.cached_property
     def others(self) -> bool:
         """Whether observers have additional errors about others."""
         return any((self.others_pos, self.others_vel))
@@ -106,7 +107,7 @@ class Radio:
     burst_length: Annotated[float, Field(ge=1)] = 10.0
     outage: Share = 0.0
 
-    @property
+    @functools.cached_property
     def is_random(self) -> bool:
         """Whether it is random which answers arrive, and when."""
         return any((self.loss, self.jitter, self.bursts, self.outage))

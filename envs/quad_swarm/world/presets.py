@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -126,7 +127,7 @@ class SwarmConfig:
         """Whether there may be others that a robot does not perceive."""
         return self.neighbourhood.limits(self.n_robots)
 
-    @property
+    @functools.cached_property
     def is_random(self) -> bool:
         """Whether the world draws random numbers during an episode."""
         return bool(self.noise or self.sensing or self.radio.is_random or self.mismatch or self.clock_skew)
