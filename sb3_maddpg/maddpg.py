@@ -27,6 +27,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_f
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
     VecEnv,
     VecFrameStack,
     VecNormalize,
@@ -69,6 +70,7 @@ from sb3_maddpg.validation import (
     TrainingArguments,
     validated,
 )
+from sb3_maddpg.vec_env import check_single_envs
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
@@ -268,6 +270,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.action_cost: float | np.ndarray | None = None
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
+        self.normalized_observations = False  # whether VecNormalize normalises the observations of the networks
         self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
         self.algorithm = type(self).__name__
         self.file_format = FILE_FORMAT
@@ -289,6 +292,7 @@ class MADDPG(OffPolicyAlgorithm):
                 )
             self._read_env(self.env)
             self._check_normalization(self.env)
+            self.normalized_observations |= _normalizer_of_observations(self.env) is not None
         # SB3 supports n_steps with its own buffer only. It would also allocate the full buffer for a model that is
         # loaded without an environment, just to predict.
         n_steps, buffer_size = self.n_steps, self.buffer_size
@@ -577,6 +581,8 @@ class MADDPG(OffPolicyAlgorithm):
         # Update learning rate according to lr schedule
         self._at_present("learning_rate")
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        assert isinstance(self.replay_buffer, TeamReplayBuffer)
+        self.replay_buffer.gamma = self.gamma  # read anew in every update, as in SB3
 
         actor_losses, critic_losses, q_values, outputs = [], [], [], []
         for _ in range(gradient_steps):
@@ -727,10 +733,10 @@ class MADDPG(OffPolicyAlgorithm):
         :return: the agent's policy
         :raises ValueError: if there is no such agent, or its parameters are not finite
         """
-        if _normalizer_of_observations(self.env) is not None:
+        if self.normalized_observations:
             warnings.warn(
-                "VecNormalize(norm_obs=True) normalises the environment's observations, but its statistics are not "
-                "part of the agent's policy: normalise observations in the same way before passing them to it.",
+                "The model was trained with VecNormalize(norm_obs=True), whose statistics are not part of the agent's "
+                "policy: normalise observations in the same way before passing them to it.",
                 stacklevel=2,
             )
         return AgentPolicy.of(self.policy, agent)
@@ -846,6 +852,7 @@ class MADDPG(OffPolicyAlgorithm):
         assert self.env is not None
         assert self.replay_buffer_class is not None
         assert issubclass(self.replay_buffer_class, TeamReplayBuffer)
+        self.normalized_observations |= _normalizer_of_observations(self.env) is not None
         self.env_spec, self.action_noise = describe_env(self.env), action_noise
         self.action_cost, self._cost_of_encoded = action_cost, cost_of_encoded
         rows = max(self.buffer_size // self.n_envs, 1)
@@ -889,6 +896,8 @@ class MADDPG(OffPolicyAlgorithm):
         with as_damage(path):
             data = read_data(path, cls.__name__, {base.__name__ for base in algorithms})
             values = attributes(data, cls, path, trust, custom_objects or {})
+            if "policy_kwargs" in kwargs:
+                _check_same_policy(kwargs.pop("policy_kwargs"), values.get("policy_kwargs"), values.get("policy_class"))
             with _remedy_for_other_team(), limited_networks(path, trust):
                 model = super().load(path, env, device, values, print_system_info, force_reset, **kwargs)
             check_attributes(model, path)
@@ -1026,11 +1035,12 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> None:
         """
         Load a replay buffer from a file, like SB3's ``load_replay_buffer``, without running code from the file unless
-        ``trust`` is set.
+        ``trust`` is set. The model's ``gamma`` and ``handle_timeout_termination`` apply from now on, whereas the
+        buffer keeps its size.
 
         :param trust: also load a pickled buffer, which can run code; older versions write such files, see ``load``
-        :raises ValueError: if the buffer is of another kind, team or number of environments, or is pickled and not
-            trusted; the model keeps its buffer then
+        :raises ValueError: if the buffer is of another class, team, ``n_steps``, layout or number of environments, or
+            is pickled and not trusted; the model keeps its buffer then
         """
         check_path(path)
         if isinstance(path, (str, os.PathLike)) and not pathlib.Path(path).suffix:
@@ -1049,6 +1059,8 @@ class MADDPG(OffPolicyAlgorithm):
                         "command line `--trust`)."
                     )
             self._check_replay_buffer(self.replay_buffer, path)
+            self.replay_buffer.gamma = self.gamma
+            self.replay_buffer.handle_timeout_termination = present.handle_timeout_termination
         except BaseException:
             self.replay_buffer = present
             raise
@@ -1057,7 +1069,11 @@ class MADDPG(OffPolicyAlgorithm):
         if not isinstance(buffer, TeamReplayBuffer):
             raise ValueError(f"{path} holds a {type(buffer).__name__}, but the model needs a TeamReplayBuffer.")
         n_pairs = self.replay_buffer_kwargs.get("n_pairs", 0)
+        names = [cls.__name__ for cls in (type(buffer), cast(type, self.replay_buffer_class))]
         for what, loaded, needed in (
+            ("transitions in a {}", *names),
+            ("windows of n_steps={}", buffer.n_steps, self.n_steps),
+            ("transitions with optimize_memory_usage={}", buffer.optimize_memory_usage, self.optimize_memory_usage),
             ("transitions of {} parallel environment(s)", buffer.n_envs, self.n_envs),
             ("observations of {}", buffer.observation_space, self.observation_space),
             ("actions of {}", buffer.action_space, self.action_space),
@@ -1102,7 +1118,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     :param verbose: see SB3's ``BaseAlgorithm``
     :param monitor_wrapper: see SB3's ``BaseAlgorithm``
     :return: the vectorised environment
-    :raises ValueError: if the spaces do not describe a team
+    :raises ValueError: if the spaces do not describe a team, or see ``check_single_envs``
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
         raise ValueError(
@@ -1112,6 +1128,8 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+    if isinstance(vec_env.unwrapped, DummyVecEnv):
+        check_single_envs(vec_env.unwrapped.envs)
     # SB3's own error would suggest policies that do not exist here
     Team.from_spaces(vec_env.observation_space, vec_env.action_space)
     return vec_env
@@ -1165,6 +1183,26 @@ class UnusableParametersError(ValueError, RuntimeError):
     Raised for parameters that are not finite or do not fit the networks. It is also a RuntimeError, because SB3's
     ``load`` takes a plain ValueError for the sign of an older file.
     """
+
+
+def _check_same_policy(given: Any, stored: Any, policy_class: Any) -> None:
+    """
+    Check arguments of the policy that were passed to ``load``, like SB3, but without those that the environment adds.
+
+    :param given: the arguments
+    :param stored: the arguments in the file
+    :param policy_class: class of the policy
+    :raises ValueError: if they differ
+    """
+    if not isinstance(given, dict) or not isinstance(stored, dict):
+        raise ValueError(f"policy_kwargs={shown(given)} must be a dict of arguments by name.")
+    from_env = getattr(policy_class, "env_attributes", ())
+    full = {name: value for name, value in stored.items() if name in from_env} | given
+    if differing := sorted(name for name in {*full, *stored} if full.get(name) != stored.get(name)):
+        raise ValueError(
+            f"policy_kwargs: {', '.join(differing)} differ from those of the model, {shown(stored)}. Leave them out: "
+            "the networks of a model do not change."
+        )
 
 
 @contextmanager

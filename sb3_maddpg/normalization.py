@@ -58,12 +58,14 @@ class SafeVecNormalize(VecNormalize):
             trusted
         """
         path = Path(load_path)
+        if not path.suffix and not path.exists():
+            path = path.with_suffix(".pkl")  # which `save` has added
         with path.open("rb") as file:
             start = file.read(1)
         with as_damage(path, "statistics"):
             if start != b"{":
                 if trusted(trust):
-                    return VecNormalize.load(load_path, venv)
+                    return VecNormalize.load(str(path), venv)
                 raise ValueError(
                     f"{path} does not hold statistics that this version writes. If it is pickled, it may run any code "
                     "when it is loaded: if you trust its author, load it with `trust=True` (on the command line "

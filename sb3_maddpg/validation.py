@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -43,9 +44,12 @@ class Arguments(BaseModel):
 
 def _device(device: Any) -> Any:
     try:
-        th.empty(0, device=get_device(device))
+        found = get_device(device)
+        th.empty(0, device=found)
     except (RuntimeError, TypeError, AssertionError, NotImplementedError):
         raise ValueError from None
+    if device != "auto" and th.device(device).type != found.type:  # SB3 falls back silently
+        warnings.warn(f"device={str(device)!r}: PyTorch finds no such device, so {found} is used.", stacklevel=2)
     return device
 
 

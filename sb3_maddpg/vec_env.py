@@ -1,13 +1,16 @@
-"""Adapter from Gymnasium's vector environments to Stable-Baselines3's."""
+"""Vectorised environments: an adapter from Gymnasium's, and checks of environments that are stepped together."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import Wrapper
+from gymnasium import Env, RewardWrapper, Wrapper
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers import NormalizeReward
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.utils import as_seed, not_finite_at, shown
 
 
@@ -143,3 +146,46 @@ def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
             for k in np.flatnonzero(mask):
                 rows[k][name] = parts[k]
     return rows
+
+
+def check_single_envs(envs: Sequence[Env]) -> None:
+    """
+    Check environments that are stepped together.
+
+    :param envs: the environments, which may be wrapped
+    :raises ValueError: if two of them step the same PettingZoo environment or are of different teams, or wrappers hide
+        a ``TeamEnv`` from the algorithm
+    """
+    stepped: dict[int, int] = {}
+    for index, env in enumerate(envs):
+        spaces_of_env = (env.observation_space, env.action_space)
+        if spaces_of_env != (first := (envs[0].observation_space, envs[0].action_space)):
+            raise ValueError(
+                f"Environments 0 and {index} are of different teams: {shown(first)} and {shown(spaces_of_env)}. Create "
+                "all environments with the same arguments."
+            )
+        team_env = env.unwrapped
+        if not isinstance(team_env, TeamEnv):
+            continue
+        if (other := stepped.setdefault(id(team_env.parallel_env.unwrapped), index)) != index:
+            raise ValueError(
+                f"Environments {other} and {index} step the same PettingZoo environment, {team_env.parallel_env}: "
+                "create one for each, for example DummyVecEnv([lambda: TeamEnv(make_env()) for _ in range(2)])."
+            )
+        _check_wrappers(env, team_env)
+
+
+def _check_wrappers(env: Env, team_env: TeamEnv) -> None:
+    remedy = "Wrap the PettingZoo environment instead, for example with SuperSuit, and then TeamEnv around it."
+    if env.observation_space != team_env.observation_space:
+        raise ValueError(
+            f"A Gymnasium wrapper changes the observations of TeamEnv, {env}: names, padding and action masks of the "
+            f"agents would be lost. {remedy}"
+        )
+    while isinstance(env, Wrapper):
+        if isinstance(env, (RewardWrapper, NormalizeReward)):
+            raise ValueError(
+                f"{type(env).__name__} changes only the team's reward, but the algorithm learns from the agents' "
+                f"rewards in `info`. {remedy}"
+            )
+        env = env.env

@@ -119,3 +119,10 @@ def test_statistics_of_other_observations_are_refused(tmp_path):
     path.write_bytes(pickle.dumps({})[:3])
     with pytest.raises(ValueError, match="damaged"):
         SafeVecNormalize.load(str(path), DummyVecEnv([OwnBit]), trust=True)
+
+
+def test_the_suffix_may_be_left_out(tmp_path):
+    env = seen()
+    env.save(str(tmp_path / "stats"))
+    loaded = SafeVecNormalize.load(str(tmp_path / "stats"), DummyVecEnv([OwnBit]))
+    assert loaded.ret_rms.count == env.ret_rms.count

@@ -2,6 +2,7 @@
 
 import io
 import json
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_maddpg import MADDPG
+from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
 from sb3_maddpg.team_tasks import OtherBit, OwnBit
 
 SMALL = {"learning_starts": 20, "batch_size": 16, "train_freq": 5, "buffer_size": 1000, "seed": 0}
@@ -337,3 +339,59 @@ def test_lean_is_one_of_two_and_needs_the_actor(tmp_path):
             new.writestr(name, changed if name == "data" else old.read(name))
     with pytest.raises(ValueError, match=r"they have no critic\."):
         MADDPG.load(tmp_path / "other")
+
+
+def test_a_loaded_replay_buffer_follows_the_model(tmp_path):
+    learned(gamma=0.95).save_replay_buffer(tmp_path / "buffer")
+    model = MADDPG(
+        "MlpPolicy", "OwnBit-v0", **SMALL, gamma=0.5, replay_buffer_kwargs={"handle_timeout_termination": False}
+    )
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.gamma == 0.5
+    assert not model.replay_buffer.handle_timeout_termination
+    model.gamma = 0.25
+    model.learn(10, reset_num_timesteps=False)
+    assert model.replay_buffer.sample(4).discounts == 0.25
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_steps": 3}, "holds windows of n_steps=1, but the model needs windows of n_steps=3"),
+        (
+            {"replay_buffer_class": PrioritizedTeamReplayBuffer},
+            "in a TeamReplayBuffer, but the model needs .* Prioritized",
+        ),
+        (
+            {
+                "optimize_memory_usage": True,
+                "replay_buffer_kwargs": {"handle_timeout_termination": False},
+            },
+            "optimize_memory_usage=False, but the model needs",
+        ),
+    ],
+)
+def test_a_replay_buffer_of_other_arguments_is_refused(tmp_path, kwargs, message):
+    learned().save_replay_buffer(tmp_path / "buffer")
+    model = MADDPG("MlpPolicy", "OwnBit-v0", **SMALL, **kwargs)
+    with pytest.raises(ValueError, match=message):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.size() == 0
+
+
+def test_the_arguments_of_the_policy_may_be_repeated(tmp_path):
+    kwargs = {"net_arch": [8], "threshold": 0.3}
+    learned(policy_kwargs=kwargs).save(tmp_path / "model")
+    assert MADDPG.load(tmp_path / "model", OwnBit(), policy_kwargs=kwargs).policy.threshold == 0.3
+    with pytest.raises(ValueError, match=r"policy_kwargs: net_arch, threshold differ .* Leave them out"):
+        MADDPG.load(tmp_path / "model", OwnBit(), policy_kwargs={"net_arch": [9]})
+
+
+def test_a_model_remembers_that_its_observations_were_normalised(tmp_path):
+    MADDPG("MlpPolicy", VecNormalize(make_vec_env("OwnBit-v0", 1)), **SMALL).save(tmp_path / "normalised")
+    learned().save(tmp_path / "plain")
+    with pytest.warns(UserWarning, match="trained with VecNormalize"):
+        MADDPG.load(tmp_path / "normalised").agent_policy(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        MADDPG.load(tmp_path / "plain").agent_policy(0)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch as th
 
+from sb3_maddpg import MADDPG
 from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.team import MixedActions, Team
+from sb3_maddpg.team_tasks import OwnBit
 from sb3_maddpg.validation import PairPolicyArguments, PolicyArguments, validated
 from toys import toy
 
@@ -58,3 +60,9 @@ def test_homogeneous_agents_have_the_same_spaces():
     assert [[team.homogeneous(i, j) for j in range(4)] for i in range(4)] == np.eye(4, dtype=bool).tolist()
     shared = MADDPGPolicy(env.observation_space, env.action_space, lambda _: 1e-3, share_actor=False).team
     assert shared.homogeneous(2, 2)
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_device_that_is_missing_is_told():
+    with pytest.warns(UserWarning, match="device='cuda': PyTorch finds no such device, so cpu is used"):
+        MADDPG("MlpPolicy", OwnBit(), device="cuda")

@@ -9,7 +9,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
+from sb3_maddpg import MADDPG
+from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.vec_env import GymnasiumVecEnv
+from toys import Toy
 
 SAME_STEP = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
@@ -155,3 +158,36 @@ def test_an_episode_that_ends_without_its_last_observation_is_refused():
     env.reset()
     with pytest.raises(ValueError, match=r"without info\['final_obs'\]"):
         [env.step(np.zeros(2, int)) for _ in range(20)]
+
+
+def test_one_pettingzoo_environment_cannot_be_stepped_twice():
+    env = Toy("binary")
+    for envs in (DummyVecEnv([lambda: TeamEnv(env)] * 2), make_vec_env(TeamEnv, 2, env_kwargs={"env": env})):
+        with pytest.raises(ValueError, match=r"Environments 0 and 1 step the same .*: create one for each"):
+            MADDPG("MlpPolicy", envs)
+    MADDPG("MlpPolicy", DummyVecEnv([lambda: TeamEnv(Toy("binary"))] * 2))
+
+
+def test_environments_of_different_teams_are_refused():
+    envs = DummyVecEnv([lambda: TeamEnv(Toy("binary")), lambda: TeamEnv(renamed(Toy("binary")))])
+    with pytest.raises(ValueError, match="Environments 0 and 1 are of different teams"):
+        MADDPG("MlpPolicy", envs)
+
+
+def renamed(env: Toy) -> Toy:
+    env.possible_agents = env.possible_agents[::-1]
+    return env
+
+
+@pytest.mark.parametrize(
+    ("wrap", "message"),
+    [
+        (gymnasium.wrappers.NormalizeObservation, "changes the observations of TeamEnv.*action masks"),
+        (gymnasium.wrappers.NormalizeReward, "NormalizeReward changes only the team's reward"),
+        (lambda env: gymnasium.wrappers.TransformReward(env, np.negative), "TransformReward changes only the team's"),
+    ],
+)
+def test_wrappers_that_would_have_no_effect_are_refused(wrap, message):
+    with pytest.raises(ValueError, match=message):
+        MADDPG("MlpPolicy", wrap(TeamEnv(Toy("binary"))))
+    MADDPG("MlpPolicy", gymnasium.wrappers.TimeLimit(TeamEnv(Toy("binary")), 5))
