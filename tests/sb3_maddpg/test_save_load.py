@@ -350,7 +350,7 @@ def test_a_loaded_replay_buffer_follows_the_model(tmp_path):
     assert model.replay_buffer.gamma == 0.5
     assert not model.replay_buffer.handle_timeout_termination
     model.gamma = 0.25
-    model.learn(10, reset_num_timesteps=False)
+    model.learn(40)
     assert model.replay_buffer.sample(4).discounts == 0.25
 
 
