@@ -21,8 +21,9 @@ import threading
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, cast
 
@@ -47,7 +48,7 @@ from sb3_maddpg.env_states import (
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.model_files import as_damage, check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
-from sb3_maddpg.utils import is_full_disk, shown, sync_folder
+from sb3_maddpg.utils import arguments_of, is_full_disk, shown, sync_folder
 
 _FORMAT = 2
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
@@ -97,14 +98,18 @@ class RunCheckpoint(BaseCallback):
         self.logger_folder: str | None = None  # of the run that is resumed
         self._pending: dict[str, Any] | None = None
         self._segments: list[dict[str, Any]] = []
+        # Callbacks with their values at the start of training
+        self._at_start: list[tuple[BaseCallback, dict[str, Any]]] = []
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         for path in self.folder.glob(f"*{_UNFINISHED}"):
             shutil.rmtree(path, ignore_errors=True)
+        callbacks, known = _callbacks(self._root()), [one for one, _ in self._at_start]
+        self._at_start += [(one, deepcopy(_values(one))) for one in callbacks if one not in known]
         if self._pending is not None:
             try:
-                _restore(cast(MADDPG, self.model), _callbacks(self._root()), self._pending)
+                _restore(cast(MADDPG, self.model), callbacks, self._pending)
             except (KeyError, TypeError, AttributeError, IndexError) as error:
                 raise ValueError(
                     f"A checkpoint in {self.folder} is damaged, or belongs to another environment or other callbacks "
@@ -187,7 +192,7 @@ class RunCheckpoint(BaseCallback):
         started = time.monotonic()
         self.saved_at = model.num_timesteps
         kept, (first, end) = self._kept_segments(buffer), self._new_rows(buffer)
-        state = _state_of(model, _callbacks(self._root()))
+        state = _state_of(model, _callbacks(self._root()), self._at_start)
         self.inexact = state["inexact"]
         self._writer = _Writer(self.folder, model, _Segment(buffer, first, end), kept, state, self.keep)
         self._writer.start()
@@ -380,7 +385,8 @@ def resume(
 ) -> tuple[MADDPG, RunCheckpoint] | None:
     """
     Load the newest checkpoint of a run. Continue training with ``model.learn(total_timesteps - model.num_timesteps,
-    [callback, ...], reset_num_timesteps=False)``, with the same environment and callbacks as in the run.
+    [callback, ...], reset_num_timesteps=False)``, with the same environment and callbacks as in the run. The callbacks'
+    arguments may differ: those passed now apply, and what the training changed is restored.
 
     :param folder: folder of the checkpoints
     :param env: environment, created as for the run
@@ -478,8 +484,15 @@ def digest(model: MADDPG) -> str:
     return found.hexdigest()
 
 
-def _state_of(model: MADDPG, callbacks: list[BaseCallback]) -> dict[str, Any]:
-    """:return: the state of everything that is not in the model's file"""
+def _state_of(
+    model: MADDPG, callbacks: list[BaseCallback], at_start: Sequence[tuple[BaseCallback, dict[str, Any]]]
+) -> dict[str, Any]:
+    """
+    :param model: the model
+    :param callbacks: all callbacks
+    :param at_start: callbacks with their values at the start of training
+    :return: the state of everything that is not in the model's file
+    """
     buffer = model.replay_buffer
     assert isinstance(buffer, TeamReplayBuffer)
     _, counters, arrays = buffer.contents()
@@ -492,8 +505,9 @@ def _state_of(model: MADDPG, callbacks: list[BaseCallback]) -> dict[str, Any]:
         if isinstance(other := getattr(one, "eval_env", None), VecEnv):
             reason, evaluation = _env_state_or_reason(other)
             inexact = inexact or reason
-        values = plain_values(one) if not isinstance(one, RunCheckpoint) else {"n_calls": one.n_calls}
-        states.append({"class": type(one).__name__, "values": values, "eval_env": evaluation})
+        began = next((values for known, values in at_start if known is one), None)
+        values = {"values": _values(one), "at_start": began}
+        states.append({"class": type(one).__name__, **values, "eval_env": evaluation})
     return {
         "format": _FORMAT,
         "fingerprint": fingerprint(),
@@ -536,17 +550,58 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
             setattr(model, name, _checked_last(model, name, state["last"][name]))
     model.action_noise = state["action_noise"]
     names = [type(one).__name__ for one in callbacks]
-    if names != [one["class"] for one in state["callbacks"]]:
-        written = [one["class"] for one in state["callbacks"]]
+    states = [one for one in state["callbacks"] if one["class"] != CallbackList.__name__]
+    if names != (written := [one["class"] for one in states]):
         raise ValueError(f"The run had the callbacks {written}, but now they are {names}: resume with the same ones.")
-    for one, saved in zip(callbacks, state["callbacks"], strict=True):
-        set_plain_values(one, saved["values"])
+    for one, saved in zip(callbacks, states, strict=True):
+        set_plain_values(one, _values_to_restore(one, saved["values"], saved.get("at_start")))
         if saved["eval_env"] is not None:
             load_vec_env_state(one.eval_env, saved["eval_env"])  # type: ignore[attr-defined]
     for name, values in state["logger"].items():
         getattr(model.logger, name).update(values)
     set_space_generators(model.action_space, state["spaces"])
     _set_random_state(state["random"])
+
+
+def _values(callback: BaseCallback) -> dict[str, Any]:
+    """:return: the values of a callback that checkpoints hold"""
+    return {"n_calls": callback.n_calls} if isinstance(callback, RunCheckpoint) else plain_values(callback)
+
+
+def _values_to_restore(
+    callback: BaseCallback, values: dict[str, Any], at_start: dict[str, Any] | None
+) -> dict[str, Any]:
+    """
+    Leave out the arguments of a callback that were changed for the resumed run, and what follows from them.
+
+    :param callback: the callback of the resumed run
+    :param values: its values in the checkpoint
+    :param at_start: its values at the start of the run, None if the checkpoint does not hold them
+    :return: all values if its arguments are those of the run; otherwise those that had changed since the start
+    """
+    present, arguments = _values(callback), arguments_of(type(callback))
+    differ = {
+        name: value for name, value in present.items() if at_start and not _equal(value, at_start.get(name, value))
+    }
+    changed = [name for name in differ if name.lstrip("_") in arguments]
+    if at_start is None or not changed:
+        return values
+    restored = {
+        name: value for name, value in values.items() if name not in differ or not _equal(value, at_start[name])
+    }
+    for name in changed:
+        if name in restored and not _equal(restored[name], present[name]):
+            warnings.warn(
+                f"{type(callback).__name__}: {name}={shown(present[name])} has no effect. The run began with "
+                f"{shown(at_start[name])}, and what it became during training is restored: {shown(restored[name])}. "
+                "Start a new run to begin with another value.",
+                stacklevel=2,
+            )
+    return restored
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return json.dumps(encode(one, "value")) == json.dumps(encode(other, "value"))
 
 
 def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
@@ -586,13 +641,14 @@ def _set_random_state(state: dict[str, Any]) -> None:
 
 
 def _callbacks(root: BaseCallback) -> list[BaseCallback]:
-    """:return: a callback and all callbacks inside it"""
+    """:return: a callback and all callbacks inside it, without lists, which have no state of their own"""
     inner: list[BaseCallback | None] = []
     if isinstance(root, CallbackList):
         inner = [*root.callbacks]
     elif isinstance(root, EventCallback):
         inner = [root.callback, getattr(root, "callback_on_new_best", None)]
-    return [root, *(one for callback in inner if callback is not None for one in _callbacks(callback))]
+    own = [] if type(root) is CallbackList else [root]
+    return [*own, *(one for callback in inner if callback is not None for one in _callbacks(callback))]
 
 
 def fingerprint() -> dict[str, str]:

@@ -247,6 +247,8 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
         of_all = getattr(of_class, name, None)
         if callable(of_all) or hasattr(of_all, "__set__") or not _same_kind(present, value):
             raise ValueError(f"{shown(value)} cannot be the {name} of a {of_class.__name__}.")
+        if isinstance(present, deque) and isinstance(value, deque):  # the length follows from an argument
+            value = deque(value, present.maxlen)
         setattr(owner, name, value)
 
 

@@ -109,6 +109,7 @@ def publish(
     :param token: access token, by default the one that ``hf auth login`` stored
     :return: the repository's URL
     :raises ValueError: if the id is invalid, or ``huggingface_hub`` is not installed
+    :raises OSError: if the Hub cannot be reached, or refuses the upload
     """
     if not isinstance(repo_id, str) or repo_id.count("/") != 1 or not all(repo_id.split("/")):
         raise ValueError(f"repo_id={shown(repo_id)} must be NAME/REPOSITORY.")
@@ -119,8 +120,18 @@ def publish(
     api = HfApi(token=token)
     with tempfile.TemporaryDirectory() as folder:
         write_model_folder(model, Path(folder), repo_id, run, lean)
-        api.create_repo(repo_id, private=private, exist_ok=True)
-        api.upload_folder(folder_path=folder, repo_id=repo_id, commit_message="Model of sb3-maddpg")
+        try:
+            api.create_repo(repo_id, private=private, exist_ok=True)
+            api.upload_folder(folder_path=folder, repo_id=repo_id, commit_message="Model of sb3-maddpg")
+        except ValueError:
+            raise
+        except Exception as error:  # the classes depend on the HTTP library that huggingface_hub uses
+            told = " ".join(str(error).split())[:300]
+            raise OSError(
+                f"{repo_id} could not be uploaded ({type(error).__name__}: {told}). Check the network, and the token "
+                "with `hf auth whoami`; or write the files into a folder with `write_model_folder` (on the command "
+                "line `--out DIR`) and upload them later."
+            ) from error
     return f"https://huggingface.co/{repo_id}"
 
 

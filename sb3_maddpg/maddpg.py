@@ -24,7 +24,7 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict, TrainFrequencyUnit
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -58,7 +58,7 @@ from sb3_maddpg.model_files import (
 from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
-from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
+from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, Team
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import arguments_of, as_numbers, atomic_write, describe_env, shown, suggest
@@ -89,6 +89,8 @@ NOT_BUFFER_KWARGS = {
 }
 # Arguments that the algorithm and the replay buffer share
 OWN_BUFFER_KWARGS = ("n_steps", "gamma")
+# Arguments that a model takes from its file only
+NOT_LOADED = {"policy", "_init_setup_model"}
 # Arguments that a model resized to another team does not inherit
 NOT_RESIZED = {"policy", "env", "policy_kwargs", "replay_buffer_kwargs", "tensorboard_log", "verbose", "seed", "device"}
 # Arguments that may be schedules, and the smallest value that each may have
@@ -329,10 +331,12 @@ class MADDPG(OffPolicyAlgorithm):
         for name in self.policy_class.env_attributes:
             if name not in self.policy_kwargs and env.has_attr(name):
                 self.policy_kwargs[name] = env.get_attr(name, indices=0)[0]
-        if self.policy_kwargs.get("pair_credit") and "observation_layout" in self.policy_kwargs:
-            n_pairs = len(self.policy_kwargs["observation_layout"]["neighbours"])
-            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_pairs": n_pairs}
-            if "who_columns" in self.policy_kwargs["observation_layout"]:
+        layout = self.policy_kwargs.get("observation_layout")
+        if layout is not None:
+            check_layout(layout)
+        if layout is not None and self.policy_kwargs.get("pair_credit"):
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_pairs": len(layout["neighbours"])}
+            if "who_columns" in layout:
                 self.replay_buffer_kwargs["pairs_end"] = True
 
     def _check_normalization(self, env: GymEnv) -> None:
@@ -447,14 +451,20 @@ class MADDPG(OffPolicyAlgorithm):
             setattr(self, name, value)
         for name in LEAST_OF_SCHEDULES:
             self._at_present(name)
+        self._check_train_freq(self.n_envs)
         self._check_buffer_size()
         if self.threshold_price is not None and not isinstance(self.action_space, spaces.MultiBinary):
             raise ValueError(
                 f"threshold_price is for binary actions (MultiBinary), but the action space is {self.action_space}."
             )
         for name in self.policy_kwargs:
-            if name not in (known := arguments_of(self.policy_class)):
-                raise ValueError(suggest("argument in policy_kwargs", name, known - NOT_POLICY_KWARGS))
+            if name in NOT_POLICY_KWARGS:
+                raise ValueError(
+                    f"policy_kwargs[{name!r}] is set by the algorithm: leave it out"
+                    f"{' and pass learning_rate to the algorithm' if name == 'lr_schedule' else ''}."
+                )
+            if name not in (known := arguments_of(self.policy_class) - NOT_POLICY_KWARGS - {"args"}):
+                raise ValueError(suggest("argument in policy_kwargs", name, known))
         self._check_replay_buffer_arguments()
         if self.env is not None:  # warn before training about what save() would refuse after it
             for name in ("policy_class", "replay_buffer_class", "learning_rate", "temperature", "policy_kwargs"):
@@ -462,6 +472,14 @@ class MADDPG(OffPolicyAlgorithm):
                     encode(getattr(self, name), name)
                 except ValueError as error:
                     warnings.warn(str(error), stacklevel=2)
+
+    def _check_train_freq(self, n_envs: int) -> None:
+        frequency, unit = self.train_freq if isinstance(self.train_freq, tuple) else (self.train_freq, "step")
+        if n_envs > 1 and unit in ("episode", TrainFrequencyUnit.EPISODE):
+            raise ValueError(
+                f'train_freq=({frequency}, "episode") needs a single environment, but there are {n_envs}: pass a '
+                "number of steps."
+            )
 
     def _check_buffer_size(self) -> None:
         if self.batch_size > self.buffer_size:
@@ -806,6 +824,11 @@ class MADDPG(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfMADDPG:
         given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
+        if self.env is None:
+            raise ValueError(
+                f"This model has no environment to train in: load it with `{type(self).__name__}.load(path, env=env)`, "
+                "or call `set_env(env)` before `learn`."
+            )
         if self.lean is not None:
             missing = "the optimizers' state" if self.lean == "critic" else "critics and the optimizers' state"
             warnings.warn(f"This model was saved without {missing}, which are initialised afresh.", stacklevel=2)
@@ -832,6 +855,7 @@ class MADDPG(OffPolicyAlgorithm):
         env = self._wrap_env(env, self.verbose)
         self._check_normalization(env)
         before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
+        self._check_train_freq(n_envs)
         if self.replay_buffer.size() and self.replay_buffer.n_envs != n_envs:
             raise ValueError(
                 f"The replay buffer holds transitions of {self.replay_buffer.n_envs} parallel environment(s) and "
@@ -887,8 +911,9 @@ class MADDPG(OffPolicyAlgorithm):
 
         :param trust: also load pickled values, which can run code. Older files and those of ``save(pickle=True)``
             contain them. By default, the environment variable ``SB3_MADDPG_TRUST`` decides (1 means yes).
+        :param kwargs: arguments of the algorithm, or other attributes of the model, which override those in the file
         :raises ValueError: if the file holds no model of this algorithm, is damaged, or holds pickled values that are
-            not trusted
+            not trusted; if ``kwargs`` has an unknown name
         """
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
         if env is not None:
@@ -896,6 +921,13 @@ class MADDPG(OffPolicyAlgorithm):
         with as_damage(path):
             data = read_data(path, cls.__name__, {base.__name__ for base in algorithms})
             values = attributes(data, cls, path, trust, custom_objects or {})
+            for name in kwargs:
+                if name in NOT_LOADED:
+                    raise ValueError(
+                        f"{name}={shown(kwargs[name])} is no argument of load, which reads it from {path}."
+                    )
+                if name not in (known := {*data, *arguments_of(cls)}):
+                    raise ValueError(suggest("argument of load", name, {one for one in known if one[0] != "_"}))
             if "policy_kwargs" in kwargs:
                 _check_same_policy(kwargs.pop("policy_kwargs"), values.get("policy_kwargs"), values.get("policy_class"))
             with _remedy_for_other_team(), limited_networks(path, trust):

@@ -93,7 +93,7 @@ class TeamEnv(gymnasium.Env):
         if (images := _image_space(self._observation_spaces)) is not None:
             self.image_space = images
         self.parallel_env = env
-        self.metadata = {"render_modes": [], **getattr(env, "metadata", {})}
+        self.metadata = {"render_modes": [], **_metadata_of(env)}
         self.render_mode = getattr(env, "render_mode", None)
         self.agent_names = tuple(map(str, agents))
         self.observation_space = TeamObservation(
@@ -458,13 +458,13 @@ class TurnBased(ParallelEnv):
     metadata: dict[str, Any]
 
     def __init__(self, env: AECEnv):
-        if getattr(env, "metadata", {}).get("is_parallelizable"):
+        self.metadata = dict(_metadata_of(env))
+        if self.metadata.get("is_parallelizable"):
             raise ValueError(
                 f"{env} is parallelizable, so its agents need not take turns: use its parallel_env, or "
                 "pettingzoo.utils.conversions.aec_to_parallel(env)."
             )
         self.env = env
-        self.metadata = {**getattr(env, "metadata", {})}
         self.render_mode = getattr(env, "render_mode", None)
         self.possible_agents = list(getattr(env, "possible_agents", None) or ())
         self.agents: list[Any] = []
@@ -614,6 +614,13 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
     if len(set(map(str, agents))) < len(agents):
         raise ValueError(f"possible_agents of {env} contains a name twice: {', '.join(map(str, agents))}.")
     return agents
+
+
+def _metadata_of(env: ParallelEnv | AECEnv) -> Mapping[str, Any]:
+    metadata = getattr(env, "metadata", None) or {}
+    if not isinstance(metadata, Mapping):
+        raise ValueError(f"metadata={shown(metadata)} of {type(env).__name__} must be a dict, or left out.")
+    return metadata
 
 
 def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:

@@ -518,7 +518,8 @@ class MADDPGPolicy(BasePolicy):
     :param action_space: flat joint action, see ``Team.from_spaces``
     :param lr_schedule: learning rate schedule (could be constant)
     :param net_arch: widths of the hidden layers, as a list or as ``dict(pi=[...], qf=[...])``
-    :param activation_fn: activation function between the layers
+    :param activation_fn: activation function between the layers, which maps every number by itself and has no
+        parameters
     :param share_actor: parameter sharing of actors: True for one network for all agents, False for one network per
         agent, or lists of the agents (names or indices) that share a network
     :param share_critic: parameter sharing of critics, like ``share_actor``, or "team" for a single value for the whole

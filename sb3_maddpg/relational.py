@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from itertools import chain, pairwise
 from typing import Any, ClassVar, TypedDict, cast
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from torch import nn
@@ -16,6 +17,7 @@ from torch.nn import functional as F
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.team import AgentActionSpace, Team
+from sb3_maddpg.utils import shown
 from sb3_maddpg.validation import PairPolicyArguments, validated
 
 
@@ -54,13 +56,44 @@ def _others(n_agents: int) -> list[list[int]]:
     return [[other for other in range(n_agents) if other != agent] for agent in range(n_agents)]
 
 
+def check_layout(layout: Any) -> None:
+    """
+    Check the form of an observation layout, without the team.
+
+    :param layout: see ``ObservationLayout``
+    :raises ValueError: if it is not a dict, or an entry is unknown, missing or of another type
+    """
+    known = ObservationLayout.__annotations__
+    if not isinstance(layout, Mapping):
+        raise ValueError(
+            f"observation_layout={shown(layout)} must be a dict with the entries of "
+            "sb3_maddpg.relational.ObservationLayout."
+        )
+    if not {"own", "neighbours"} <= set(layout) <= set(known):
+        raise ValueError(
+            f"observation_layout has entries {sorted(map(str, layout))}, but needs `own` and `neighbours`, and may "
+            "only add `who`, `who_columns`, `acts_on_neighbours`, `critic`, `action_mask` and `complete`."
+        )
+    for name, value in layout.items():
+        if name in ("acts_on_neighbours", "complete"):
+            fits, what = isinstance(value, (bool, np.bool_)), "True or False"
+        elif name in ("neighbours", "who", "critic"):
+            fits = isinstance(value, (Sequence, np.ndarray)) and all(map(_are_integers, value))
+            what = "a list of lists of integers"
+        else:
+            fits, what = _are_integers(value), "a list of integers"
+        if not fits:
+            raise ValueError(f"observation_layout: {name}={shown(value)} must be {what}.")
+
+
+def _are_integers(values: Any) -> bool:
+    return isinstance(values, (Sequence, np.ndarray)) and all(
+        isinstance(one, (int, np.integer)) and not isinstance(one, bool) for one in values
+    )
+
+
 def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[int]] | None:
     """:return: the indices of each agent's neighbours, None if they change"""
-    if not {"own", "neighbours"} <= set(layout) <= set(ObservationLayout.__annotations__):
-        raise ValueError(
-            f"observation_layout has entries {sorted(layout)}, but needs `own` and `neighbours`, and may only add "
-            "`who`, `who_columns`, `acts_on_neighbours`, `critic`, `action_mask` and `complete`."
-        )
     neighbours = layout["neighbours"]
     hidden = layout.get("critic", [[]] * len(neighbours))
     mask = layout.get("action_mask", [0] * len(neighbours))
@@ -504,6 +537,7 @@ class PairPolicy(MADDPGPolicy):
                 "`observation_layout` (see sb3_maddpg.relational.ObservationLayout) to the environment as an attribute "
                 "or to policy_kwargs, or use MlpPolicy."
             )
+        check_layout(observation_layout)
         own = validated(PairPolicyArguments, pair_credit=pair_credit, shared_threshold=shared_threshold)
         self.observation_layout = observation_layout
         self.pair_credit = own["pair_credit"]

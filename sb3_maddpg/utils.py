@@ -212,7 +212,7 @@ def as_numbers(values: Any) -> np.ndarray:
     :raises ValueError: if they are not real numbers
     """
     array = np.asarray(values)
-    if array.dtype.kind not in "biufO":
+    if array.dtype.kind not in "biufO" or (array.dtype.kind == "O" and any(one is None for one in array.flat)):
         raise ValueError("no real numbers")
     try:
         with np.errstate(over="ignore"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -97,7 +98,7 @@ class TrainingArguments(Arguments):
     tau: float = Field(gt=0, le=1, description="a number above 0 and up to 1")
     gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
     train_freq: InstanceOf[TrainFreq] | Natural | tuple[Natural, Literal["step", "episode"]] = Field(
-        description='at least 1, or such a number with its unit, (1, "step") or (1, "episode")'
+        description='an integer of at least 1, or such a number with its unit, (1, "step") or (1, "episode")'
     )
     gradient_steps: Annotated[int, Field(ge=-1, lt=LARGEST)] = Field(
         description="a number of steps, or -1 for as many as environment steps"
@@ -116,7 +117,7 @@ class TrainingArguments(Arguments):
     temperature: Annotated[float, Field(ge=LEAST_TEMPERATURE)] | Schedule = Field(
         description=f"positive, at least {LEAST_TEMPERATURE:g}, or a schedule"
     )
-    policy_delay: Natural = Field(description="at least 1, a number of critic updates")
+    policy_delay: Natural = Field(description="a number of critic updates, an integer of at least 1")
     max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
     policy_regularization: float = Field(ge=0, description="a finite number of at least 0")
 
@@ -141,6 +142,25 @@ class ThresholdArgument(Arguments):
     threshold: float = Field(ge=0, lt=1, description="a number with 0 <= threshold < 1, as probabilities are")
 
 
+@th.no_grad()
+def _is_elementwise(activation_fn: type[nn.Module]) -> bool:
+    """
+    :param activation_fn: class of an activation function
+    :return: whether it maps every number by itself. Others would mix agents, and their axes are not those of
+        ``torch.nn``, see ``StackedMLP``; parameters would be shared by all networks.
+    """
+    try:
+        activation = activation_fn().eval()
+        if next(chain(activation.parameters(), activation.buffers()), None) is not None:
+            return False
+        numbers = th.linspace(-3.0, 3.0, 2 * 3 * 4).reshape(2, 3, 4)
+        alone = [activation(number.reshape(1, 1, 1)) for number in numbers.flatten()]
+        together = activation(numbers.clone())
+        return together.shape == numbers.shape and th.allclose(together.flatten(), th.cat(alone).flatten(), atol=1e-5)
+    except Exception:  # from foreign code
+        return False
+
+
 class PolicyArguments(ThresholdArgument):
     """Arguments of ``MADDPGPolicy``."""
 
@@ -148,8 +168,11 @@ class PolicyArguments(ThresholdArgument):
         description="a list of widths, each at least 1, or dict(pi=[...], qf=[...]) of such lists"
     )
     random_thresholds: float = Field(gt=0, le=1, description="a fraction above 0 and up to 1 (0 would not explore)")
-    n_critics: Natural = Field(description="at least 1")
-    activation_fn: type[nn.Module] = Field(description="a class of torch.nn, such as torch.nn.ReLU")
+    n_critics: Natural = Field(description="an integer of at least 1")
+    activation_fn: type[nn.Module] = Field(
+        description="a class of torch.nn that needs no arguments, has no parameters and maps every number by itself, "
+        "such as torch.nn.ReLU"
+    )
     optimizer_class: type[th.optim.Optimizer] = Field(
         description="a class of torch.optim, such as torch.optim.Adam, but neither LBFGS, which needs a closure, nor "
         "SparseAdam, which needs sparse gradients"
@@ -157,6 +180,13 @@ class PolicyArguments(ThresholdArgument):
     optimizer_kwargs: dict[str, Any] | None = Field(description="a dict of the optimizer's arguments, or None")
     agent_names: list[str] | tuple[str, ...] | None = Field(description="a list of names, one per agent, or None")
     normalize_images: bool = Field(description="True or False")
+
+    @field_validator("activation_fn")
+    @classmethod
+    def _elementwise(cls, activation_fn: type[nn.Module]) -> type[nn.Module]:
+        if not _is_elementwise(activation_fn):
+            raise ValueError
+        return activation_fn
 
     @field_validator("optimizer_class")
     @classmethod

@@ -14,7 +14,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
@@ -214,6 +220,106 @@ def test_a_curriculum_goes_on_where_it_was(tmp_path, monkeypatch):
     resumed = go_on("one swarm", tmp_path / "b", [CurriculumCallback(0.1, 3)])
     assert digest(resumed) == digest(whole)
     assert resumed.curriculum_level == whole.curriculum_level
+
+
+def test_a_run_that_a_callback_ended_goes_on_with_another_argument(tmp_path):
+    ended = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, 50), StopTrainingOnMaxEpisodes(25)])
+    assert ended.num_timesteps == 250
+    model = go_on("replayed", tmp_path, [stop := StopTrainingOnMaxEpisodes(40)])
+    assert model.num_timesteps == 400, "the episodes before are counted"
+    assert (stop.max_episodes, stop._total_max_episodes, stop.n_episodes) == (40, 40, 40)
+    assert digest(model) == digest(make("replayed").learn(STEPS, callback=StopTrainingOnMaxEpisodes(40)))
+    model = go_on("replayed", tmp_path, [stop := StopTrainingOnMaxEpisodes(50)])
+    assert (model.num_timesteps, stop.n_episodes) == (500, 50), "also after a second resumption"
+
+
+def test_arguments_of_nested_callbacks_are_those_passed_now_and_their_counters_go_on(tmp_path):
+    def callbacks(eval_freq: int, at_most: int) -> list[BaseCallback]:
+        none_better = StopTrainingOnNoModelImprovement(at_most)
+        env = DummyVecEnv([lambda: Monitor(Replayable(OwnBit()))])
+        return [EvalCallback(env, callback_after_eval=none_better, eval_freq=eval_freq, verbose=0)]
+
+    first = callbacks(90, 100)
+    make("replayed").learn(350, callback=[RunCheckpoint(tmp_path, EVERY), *first])
+    (evaluation,) = callbacks(30, 200)
+    seen = {}
+
+    class Looks(RunCheckpoint):
+        def _on_training_start(self):
+            super()._on_training_start()
+            seen.update(calls=evaluation.n_calls, best=evaluation.best_mean_reward, none=evaluation.callback.n_calls)
+
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    callback.__class__ = Looks
+    Looks.__name__ = "RunCheckpoint"
+    model.learn(60, callback=[callback, evaluation], reset_num_timesteps=False)
+    assert seen == {"calls": 300, "best": first[0].best_mean_reward, "none": 3}
+    assert (evaluation.eval_freq, evaluation.callback.max_no_improvement_evals) == (30, 200)
+    assert evaluation.evaluations_timesteps == []
+    assert evaluation.callback.n_calls == 5, "evaluated at 330 and 360"
+
+
+class Decays(BaseCallback):
+    """Changes its argument during training."""
+
+    def __init__(self, rate: float, factor: float = 1.0):
+        super().__init__()
+        self.rate, self.factor, self.began_at = rate, factor, -1
+
+    def _init_callback(self) -> None:
+        self.began_at = self.model.num_timesteps
+
+    def _on_step(self) -> bool:
+        self.rate -= 2**-10
+        return True
+
+
+def test_an_argument_that_the_training_changed_is_restored_and_another_value_is_named(tmp_path):
+    make("replayed").learn(250, callback=[Decays(1.0), RunCheckpoint(tmp_path, EVERY)])
+
+    def resumed(*arguments: float) -> Decays:
+        model, callback = resume(tmp_path, Replayable(OwnBit()))
+        model.learn(1, callback=[decays := Decays(*arguments), callback], reset_num_timesteps=False)
+        return decays
+
+    after = 1.0 - 210 / 2**10  # the rollout of an episode
+    decays = resumed(1.0)
+    assert (decays.rate, decays.began_at) == (after, 0)
+    decays = resumed(1.0, 3.0)
+    assert (decays.rate, decays.factor) == (after, 3.0)
+    with pytest.warns(UserWarning, match=r"Decays: rate=2\.0 has no effect. The run began with 1\.0, .*: 0\.80"):
+        assert resumed(2.0).rate == after
+
+
+def test_the_window_of_a_curriculum_is_the_one_passed_now(tmp_path):
+    make("one swarm").learn(250, callback=[RunCheckpoint(tmp_path, EVERY), CurriculumCallback(1.0, 50)])
+    model, callback = resume(tmp_path, RUNS["one swarm"][0]())
+    model.learn(1, callback=[callback, curriculum := CurriculumCallback(0.5, 3)], reset_num_timesteps=False)
+    assert (curriculum.success_threshold, curriculum.successes.maxlen) == (0.5, 3)
+
+
+def test_checkpoints_without_the_values_at_the_start_are_read(tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1), StopTrainingOnMaxEpisodes(90)])
+
+    def as_before(state: dict) -> None:
+        for one in state["callbacks"]:
+            del one["at_start"]
+        values = {"n_calls": 100, "num_timesteps": 100, "verbose": 0}
+        state["callbacks"].insert(0, {"class": "CallbackList", "values": values, "eval_env": None})
+
+    edit(tmp_path, as_before)
+    model = go_on("replayed", tmp_path, [stop := StopTrainingOnMaxEpisodes(90)])
+    assert (model.num_timesteps, stop.n_episodes) == (STEPS, 64)
+
+
+@pytest.mark.parametrize("bare", ["first", "now"])
+def test_a_list_of_one_callback_is_the_same_as_the_callback(bare, tmp_path):
+    checkpoint = RunCheckpoint(tmp_path, EVERY)
+    make("replayed").learn(250, callback=checkpoint if bare == "first" else [checkpoint])
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    given = CallbackList([CallbackList([callback])]) if bare == "first" else callback
+    model.learn(STEPS - model.num_timesteps, callback=given, reset_num_timesteps=False)
+    assert digest(model) == digest(make("replayed").learn(STEPS))
 
 
 def test_only_new_transitions_are_written(tmp_path):

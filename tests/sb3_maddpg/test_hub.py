@@ -105,6 +105,22 @@ def test_a_whole_model_can_be_trained_on(api, tmp_path):
     assert IDDPG.load(tmp_path / "again.zip").lean is None
 
 
+def test_a_hub_that_cannot_be_reached_is_one_line(api, model, tmp_path, monkeypatch, capsys):
+    class UnreachableError(Exception):
+        """Of an HTTP library, none of Python's own errors."""
+
+    def unreachable(self, repo_id, **kwargs):
+        raise UnreachableError("Name or service\nnot known")
+
+    monkeypatch.setattr(api, "create_repo", unreachable)
+    message = r"me/a-model could not be uploaded \(UnreachableError: Name or service not known\)\. Check the network"
+    with pytest.raises(OSError, match=message):
+        hub.publish(model, "me/a-model")
+    model.save(tmp_path / "model.zip")
+    assert main(["publish", str(tmp_path / "model.zip"), "me/a-model"]) == 2
+    assert re.match(f"error: {message}.*--out DIR.*\n$", capsys.readouterr().err)
+
+
 @pytest.mark.parametrize("name", ["model", "a/b/c", "/model", "me/", 3])
 def test_another_name_is_refused(api, model, name):
     with pytest.raises(ValueError, match="must be NAME/REPOSITORY"):

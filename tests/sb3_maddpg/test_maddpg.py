@@ -182,6 +182,15 @@ def test_tasks_are_proper_environments():
         ({"max_grad_norm": 0.0}, "max_grad_norm=0.0 must be positive"),
         ({"policy_kwargs": {"threshold": 1.5}}, "threshold=1.5"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics=0"),
+        (
+            {"policy_kwargs": {"lr_schedule": 3}},
+            r"policy_kwargs\['lr_schedule'\] is set by .*: leave it out and pass learn",
+        ),
+        (
+            {"policy_kwargs": {"action_space": 3}},
+            r"policy_kwargs\['action_space'\] is set by the algorithm: leave it out\.",
+        ),
+        ({"train_freq": 2.5}, r"train_freq=2\.5 must be an integer of at least 1"),
         ({"policy_kwargs": {"agent_names": ["a", "b"]}}, "2 names, a, b, for 3 agents"),
         ({"exploration_noise": -0.1}, r"exploration_noise=-0\.1 must be a standard deviation"),
         ({"exploration_noise": (0.1, 0.2, 0.3)}, "or two of them"),
@@ -189,12 +198,27 @@ def test_tasks_are_proper_environments():
         ({"n_steps": 0}, "n_steps=0 must be a number of steps of at least 1"),
         ({"tau": "fast"}, "tau='fast' must be a number above 0 and up to 1"),
         ({"gamma": 1.5}, "gamma=1.5 must be a number between 0 and 1"),
-        ({"policy_delay": 0}, "policy_delay=0 must be at least 1"),
+        ({"policy_delay": 0}, "policy_delay=0 must be a number of critic updates, an integer of at least 1"),
     ],
 )
 def test_a_bad_argument_is_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         MADDPG("MlpPolicy", "OwnBit-v0", **kwargs)
+
+
+def test_rollouts_of_episodes_need_a_single_environment(tmp_path):
+    episodes = {"train_freq": (2, "episode"), **{key: SMALL[key] for key in ("learning_starts", "batch_size")}}
+    message = r'train_freq=\(2, "episode"\) needs a single environment, but there are 2: pass a number of steps'
+    with pytest.raises(ValueError, match=message):
+        MADDPG("MlpPolicy", make_vec_env("OwnBit-v0", 2), **episodes)
+    model = MADDPG("MlpPolicy", "OwnBit-v0", **episodes)
+    with pytest.raises(ValueError, match=message):
+        model.set_env(make_vec_env("OwnBit-v0", 2))
+    assert model.n_envs == 1
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match=message):
+        MADDPG.load(tmp_path / "model", env=make_vec_env("OwnBit-v0", 2))
+    assert model.learn(40).num_timesteps == 40
 
 
 def test_a_cost_of_another_shape_is_refused():

@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.parallel import TeamEnv
+from toys import Toy
 
 SHORT = spaces.Box(-1, 1, (2,))
 TERMINATED, TRUNCATED, BOTH = (True, False), (False, True), (True, True)
@@ -255,6 +256,16 @@ def test_a_terminated_agent_need_not_see_its_end():
 )
 def test_an_environment_that_does_not_fit_is_refused(env, message):
     with pytest.raises(ValueError, match=message):
+        TeamEnv(env)
+
+
+@pytest.mark.parametrize("make", [lambda: Toy("mixed"), lambda: Turns()])
+def test_an_environment_need_not_have_metadata(make):
+    env = make()
+    env.metadata = None
+    assert TeamEnv(env).metadata == {"render_modes": []}
+    env.metadata = ["human"]
+    with pytest.raises(ValueError, match=rf"metadata=\['human'\] of {type(env).__name__} must be a dict"):
         TeamEnv(env)
 
 

@@ -8,7 +8,9 @@ import torch as th
 from gymnasium import spaces
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
+from sb3_maddpg import MADDPG
 from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.team_tasks import OwnBit
 
 N, M, B = 5, 4, 6
 # Columns of a neighbour lie apart, as in the swarm
@@ -229,6 +231,15 @@ def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
         (None, "PairPolicy needs to know .*`observation_layout`"),
         ({"own": [0]}, r"has entries \['own'\], but needs `own` and `neighbours`"),
         ({**LAYOUT, "owns": [0]}, "`action_mask` and `complete`\\."),
+        ([1], r"observation_layout=\[1\] must be a dict"),
+        ({1: 2}, r"has entries \['1'\], but needs"),
+        ({**LAYOUT, "own": "ab"}, "own='ab' must be a list of integers"),
+        ({**LAYOUT, "own": 0}, "own=0 must be a list of integers"),
+        ({**LAYOUT, "own": [0.5]}, r"own=\[0\.5\] must be a list of integers"),
+        ({**LAYOUT, "own": [True]}, r"own=\[True\] must be a list of integers"),
+        ({**LAYOUT, "neighbours": [2]}, r"neighbours=\[2\] must be a list of lists of integers"),
+        ({**LAYOUT, "who": 3}, "who=3 must be a list of lists of integers"),
+        ({**LAYOUT, "complete": "no"}, "complete='no' must be True or False"),
         ({**LAYOUT, "own": [10]}, "each from 0 to 9"),
         ({**LAYOUT, "neighbours": [[2], [3], [4], [5, 6]]}, "the same number of columns"),
         ({**LAYOUT, "neighbours": []}, "the same number of columns"),
@@ -239,6 +250,24 @@ def test_neighbours_are_explored_one_by_one_unless_told_otherwise(shared):
 def test_a_layout_that_does_not_fit_is_refused(layout, message):
     with pytest.raises(ValueError, match=message):
         policy(layout=layout)
+
+
+def test_a_layout_of_arrays_and_ranges_is_read():
+    layout = {**LAYOUT, "own": range(2), "neighbours": np.array(LAYOUT["neighbours"])}
+    built = policy(layout=layout)
+    obs, _ = batch(built)
+    expected = policy()
+    expected.load_state_dict(built.state_dict())
+    assert th.equal(built.actor(obs), expected.actor(obs))
+
+
+@pytest.mark.parametrize("pair_credit", [False, True])
+@pytest.mark.parametrize("layout", [3, {"own": [0]}, {"own": [0], "neighbours": 2}])
+def test_the_layout_of_an_environment_is_checked(layout, pair_credit):
+    env = OwnBit()
+    env.observation_layout = layout
+    with pytest.raises(ValueError, match="observation_layout"):
+        MADDPG("PairPolicy", env, policy_kwargs={"pair_credit": pair_credit})
 
 
 @pytest.mark.parametrize("space", [ACTIONS["continuous"], ACTIONS["categorical"]])

@@ -231,6 +231,27 @@ def test_a_replay_buffer_that_does_not_fit_is_refused_where_it_is_loaded(tmp_pat
         model.load_replay_buffer(tmp_path / "td3", trust=True)
 
 
+def test_training_needs_an_environment(tmp_path):
+    MADDPG("MlpPolicy", OwnBit(), **SMALL).save(tmp_path / "model")
+    model = MADDPG.load(tmp_path / "model")
+    with pytest.raises(
+        ValueError, match=r"no environment .* `MADDPG\.load\(path, env=env\)`, or call `set_env\(env\)`"
+    ):
+        model.learn(10)
+    model.set_env(OwnBit())
+    assert model.learn(10).num_timesteps == 10
+
+
+def test_arguments_of_load_override_the_file_and_unknown_ones_are_refused(tmp_path):
+    MADDPG("MlpPolicy", OwnBit(), **SMALL).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="Unknown argument of load 'learningrate': did you mean 'learning_rate'"):
+        MADDPG.load(tmp_path / "model", learningrate=1e-3)
+    with pytest.raises(ValueError, match="policy='PairPolicy' is no argument of load"):
+        MADDPG.load(tmp_path / "model", policy="PairPolicy")
+    model = MADDPG.load(tmp_path / "model", env=OwnBit(), learning_rate=1e-3, gamma=0.5, num_timesteps=7)
+    assert (model.learning_rate, model.lr_schedule(1), model.gamma, model.num_timesteps) == (1e-3, 1e-3, 0.5, 7)
+
+
 def test_other_numbers_of_environments_need_an_empty_replay_buffer():
     model = learned()
     before = model.get_env()

@@ -41,6 +41,57 @@ def test_other_values_are_refused_in_one_line(name, value):
     assert repr(value) in str(refused.value)
 
 
+@pytest.mark.parametrize("n_critics", [2.5, "two", 0])
+def test_a_number_of_critics_is_an_integer(n_critics):
+    with pytest.raises(ValueError, match=rf"^n_critics={n_critics!r} must be an integer of at least 1\.$"):
+        validated(PolicyArguments, **{**GOOD, "n_critics": n_critics})
+
+
+class Centred(th.nn.Module):
+    def forward(self, x):
+        return x - x.mean()
+
+
+@pytest.mark.filterwarnings("ignore:Implicit dimension")
+@pytest.mark.parametrize(
+    "activation_fn",
+    [
+        *(th.nn.LayerNorm, th.nn.Linear, th.nn.GLU, th.nn.Flatten, th.nn.Threshold, th.nn.PReLU, th.nn.LazyBatchNorm1d),
+        *(th.nn.Softmax, th.nn.Softmin, th.nn.LogSoftmax, th.nn.Softmax2d, Centred),
+    ],
+)
+def test_activations_that_mix_numbers_or_have_parameters_are_refused(activation_fn):
+    with pytest.raises(ValueError, match=rf"^activation_fn=.*{activation_fn.__name__}'> must be .* by itself, such as"):
+        validated(PolicyArguments, **{**GOOD, "activation_fn": activation_fn})
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "ReLU",
+            "Tanh",
+            "ELU",
+            "GELU",
+            "SiLU",
+            "Mish",
+            "LeakyReLU",
+            "Sigmoid",
+            "Softplus",
+            "Softsign",
+            "SELU",
+            "CELU",
+        ),
+        *("Hardtanh", "Hardswish", "LogSigmoid", "Softshrink", "Tanhshrink", "RReLU", "ReLU6", "Identity"),
+    ],
+)
+def test_elementwise_activations_are_accepted_and_draw_no_random_numbers(name):
+    before = th.get_rng_state()
+    activation_fn = getattr(th.nn, name)
+    assert validated(PolicyArguments, **{**GOOD, "activation_fn": activation_fn})["activation_fn"] is activation_fn
+    assert th.equal(th.get_rng_state(), before)
+
+
 def test_messages_about_long_values_are_short():
     for value in (10**400, 10**5000, [10**400], "x" * 5000):
         with pytest.raises(ValueError, match=r"^n_critics=") as refused:
