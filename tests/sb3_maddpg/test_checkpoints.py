@@ -341,7 +341,7 @@ def test_a_slow_disk_does_not_change_a_checkpoint(name, tmp_path, monkeypatch):
     blocks, wait = checkpoints._stored_block, checkpoints._Writer.wait_for
 
     def slowly(*args):
-        time.sleep(0.002)
+        time.sleep(0.01)
         return blocks(*args)
 
     monkeypatch.setattr(checkpoints, "_stored_block", slowly)
