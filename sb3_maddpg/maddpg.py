@@ -58,7 +58,7 @@ from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, remedy_for_other_observations
-from sb3_maddpg.team import ACTION_SPACES, Team
+from sb3_maddpg.team import ACTION_SPACES, Team, into_box
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import arguments_of, as_numbers, atomic_write, describe_env, shown, suggest
 from sb3_maddpg.validation import (
@@ -534,7 +534,7 @@ class MADDPG(OffPolicyAlgorithm):
                 return drawn, scaled
             legal = actions.legal(th.as_tensor(scaled, dtype=th.float32, device=self.device), self._present_obs())
             scaled = legal.cpu().numpy()
-            return actions.unscale(scaled).astype(self.action_space.dtype), scaled
+            return self._into_action_space(actions.unscale(scaled)), scaled
         with th.no_grad():
             obs = self._present_obs()
             flat = self.policy.flat_actions(obs).cpu().numpy()
@@ -543,7 +543,11 @@ class MADDPG(OffPolicyAlgorithm):
             noise = action_noise() if action_noise else np.random.normal(0.0, self.noise_std, flat.shape)  # noqa: NPY002
             noisy = np.clip(flat + noise, -1.0, 1.0)
             flat = np.where(actions.is_continuous, noisy, flat).astype(np.float32)
-        return actions.unscale(flat).astype(self.action_space.dtype), flat
+        return self._into_action_space(actions.unscale(flat)), flat
+
+    def _into_action_space(self, actions: np.ndarray) -> np.ndarray:
+        space = self.action_space
+        return into_box(space, actions) if isinstance(space, spaces.Box) else actions.astype(space.dtype)
 
     def _present_obs(self) -> th.Tensor:
         """:return: the current observations, (n_envs, n_agents, obs_dim or more)"""

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 
-from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint_action_space
+from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
 from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
@@ -311,8 +311,7 @@ class TeamEnv(gymnasium.Env):
             elif isinstance(space, spaces.Box):
                 part = values[begin:end].reshape(space.shape)
                 if clips:
-                    part = np.rint(part) if np.issubdtype(space.dtype, np.integer) else part
-                    part = np.clip(part, space.low, space.high).astype(space.dtype)
+                    part = into_box(space, part)
             else:
                 part = values[begin:end].astype(space.dtype).reshape(space.shape)
                 if start is not None:

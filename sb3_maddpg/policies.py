@@ -16,7 +16,7 @@ from torch import nn
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.networks import StackedMLP
-from sb3_maddpg.team import MixedActions, Team
+from sb3_maddpg.team import MixedActions, Team, into_box
 from sb3_maddpg.utils import all_finite, as_numbers, shown
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
 
@@ -701,6 +701,10 @@ class MADDPGPolicy(BasePolicy):
     def set_training_mode(self, mode: bool) -> None:
         if self.training != mode:  # SB3 sets the mode at each prediction, and visiting all modules is slow
             super().set_training_mode(mode)
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        assert isinstance(self.action_space, spaces.Box)
+        return into_box(self.action_space, super().unscale_action(scaled_action))  # rounding may exceed the bounds
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)

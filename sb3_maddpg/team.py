@@ -217,6 +217,19 @@ def heads_of(space: AgentActionSpace) -> tuple[int, ...]:
     return (2,) * int(np.prod(space.shape))
 
 
+def into_box(space: spaces.Box, actions: np.ndarray) -> np.ndarray:
+    """
+    Round actions if the space holds integers, and clip them to its bounds.
+
+    :param space: an agent's continuous action space
+    :param actions: finite numbers, (..., *shape of the space)
+    :return: actions of the space, in its data type
+    """
+    if np.issubdtype(space.dtype, np.integer):
+        actions = np.rint(actions)
+    return np.clip(actions, space.low, space.high).astype(space.dtype)
+
+
 def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
     """
     Return the joint action space of a team, flat, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` if
