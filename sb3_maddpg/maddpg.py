@@ -38,7 +38,7 @@ from sb3_maddpg.actions import Continuous
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
-from sb3_maddpg.callbacks import check_success, record_metrics
+from sb3_maddpg.callbacks import check_success, record_metrics, widen_tables
 from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
@@ -614,8 +614,10 @@ class MADDPG(OffPolicyAlgorithm):
         n_agents = self.policy.team.n_agents
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/critic_loss", np.mean(critic_losses) / n_agents)
-        for name, mean in zip(self.policy.team.names, th.stack(q_values).mean(dim=0).tolist(), strict=True):
-            self.logger.record(f"train/q_value/{name}", mean)
+        keys = [f"train/q_value/{name}" for name in self.policy.team.names]
+        widen_tables(self.logger, keys)
+        for key, mean in zip(keys, th.stack(q_values).mean(dim=0).tolist(), strict=True):
+            self.logger.record(key, mean)
         if outputs:
             self.logger.record("train/actor_loss", np.mean(actor_losses) / n_agents)
             if self.policy.actions.discrete:
