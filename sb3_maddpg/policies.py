@@ -43,8 +43,8 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
             lists = [[team.index(agent) for agent in agents] for agents in share]
         except TypeError:
             raise ValueError(
-                f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network, such "
-                f'as {[[*team.names[:2]]]}; share_critic may also be "team".'
+                f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network, "
+                f'such as {[[*team.names[:2]]]}; share_critic may also be "team".'
             ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
