@@ -15,11 +15,13 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.actions import ActionKind, Categorical, Continuous, make_kinds
-from sb3_maddpg.team import AgentActionSpace
+from sb3_maddpg.team import AgentActionSpace, into_box
 from sb3_maddpg.utils import as_numbers, atomic_write, shown
 
 if TYPE_CHECKING:
     from sb3_maddpg.policies import MADDPGPolicy
+
+_TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
 
 
 class AgentPolicy(nn.Module):
@@ -68,6 +70,7 @@ class AgentPolicy(nn.Module):
         if isinstance(self.kind, Categorical):
             start = th.as_tensor(np.ravel(getattr(action_space, "start", 0)), dtype=th.int64)
             self.register_buffer("start", start)
+        self.whole = isinstance(action_space, spaces.Box) and np.issubdtype(action_space.dtype, np.integer)
         if isinstance(action_space, spaces.Box):
             for bound in ("low", "high"):
                 self.register_buffer(bound, th.as_tensor(getattr(action_space, bound)).float().flatten())
@@ -94,14 +97,16 @@ class AgentPolicy(nn.Module):
         """
         :param obs: observations, (batch, obs_dim)
         :return: actions in the environment's units, (batch, length of the action), as int8 if binary, float32 if
-            continuous and int64 if categorical
+            continuous and int64 if categorical. Continuous actions lie within their bounds in single precision, and are
+            whole numbers if the space holds integers
         """
         logits = self.network(obs)[:, self.columns].unsqueeze(1)
         if self.has_mask:
             logits = self.kind.mask(logits, (obs[:, self.mask] > 0).unsqueeze(1))
         actions = self.kind.act(logits, deterministic=True).squeeze(1)
         if isinstance(self.kind, Continuous):
-            return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+            actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+            return (actions.round() if self.whole else actions).clamp(self.low, self.high)
         if isinstance(self.kind, Categorical):
             return actions.unflatten(-1, self.kind.shape).argmax(dim=-1) + self.start
         return actions.to(th.int8)
@@ -110,27 +115,36 @@ class AgentPolicy(nn.Module):
         """
         Choose the action for an observation.
 
-        :param observation: a flat observation, (obs_dim,), or a batch of them, (batch, obs_dim)
+        :param observation: a flat observation, (obs_dim,), or a batch of them, (batch, obs_dim), flattened as by
+            Gymnasium's ``flatten``
         :return: an action of the agent's action space, or a batch of flat ones, (batch, length of the action)
         :raises ValueError: if the observation has another length or holds NaN or infinity
         """
+        flatten = (
+            f"Flatten an observation as TeamEnv does: gymnasium.spaces.flatten(env.observation_space({self.name!r}), "
+            "observation)."
+        )
         try:
             obs = th.as_tensor(as_numbers(observation))
         except ValueError:
             raise ValueError(
-                f"The observation of {self.name} is not an array of numbers: {shown(observation)}"
+                f"The observation of {self.name} is not an array of numbers: {shown(observation)}. {flatten}"
             ) from None
         if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
-            raise ValueError(f"An observation of {self.name} has shape ({self.obs_dim},), not {tuple(obs.shape)}.")
+            raise ValueError(
+                f"An observation of {self.name} has shape ({self.obs_dim},), not {tuple(obs.shape)}. {flatten}"
+            )
         if not obs.isfinite().all():
             raise ValueError(f"The observation of {self.name} holds NaN or infinity: clip or replace such values.")
         with th.no_grad():
             actions = self(obs.reshape(-1, self.obs_dim)).numpy()
+        space = self.action_space
+        if isinstance(space, spaces.Box):
+            actions = into_box(space, actions.reshape(-1, *space.shape)).reshape(actions.shape)
+        actions = actions.astype(space.dtype, copy=False)
         if obs.dim() == 2:
             return actions
-        if isinstance(self.action_space, spaces.Discrete):
-            return actions[0, 0]
-        return actions[0].reshape(self.action_space.shape)
+        return actions[0, 0] if isinstance(space, spaces.Discrete) else actions[0].reshape(space.shape)
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """
@@ -138,18 +152,24 @@ class AgentPolicy(nn.Module):
         (batch, obs_dim) to the actions that ``forward`` returns.
 
         The suffix ``.onnx`` selects ONNX, for ONNX Runtime and compilers for embedded processors (input
-        ``observation``, output ``action``; needs the extra ``onnx``). Any other suffix selects TorchScript, for
-        ``torch.jit.load`` and libtorch (C++).
+        ``observation``, output ``action``; needs the extra ``onnx``). The suffixes ``.pt``, ``.pth``, ``.ts`` and
+        ``.torchscript`` select TorchScript, for ``torch.jit.load`` and libtorch (C++).
 
-        :param path: path of the file
-        :raises ValueError: if a parameter is not finite, or ONNX is needed and not installed
+        :param path: path of the file; ``.pt`` is added to a path without a suffix
+        :raises ValueError: if the suffix is unknown, a parameter is not finite, or ONNX is needed and not installed
         """
         if not isinstance(path, (str, os.PathLike)):
             raise ValueError(f"{shown(path)} is not the path of a file.")
+        suffix = os.path.splitext(os.fspath(path))[1]
+        if suffix.lower() not in ("", ".onnx", *_TORCHSCRIPT):
+            raise ValueError(
+                f"{shown(os.fspath(path))} has the suffix {suffix}: end the path with .onnx for ONNX, or with .pt for "
+                "TorchScript."
+            )
         for name, parameter in self.named_parameters():
             if not parameter.isfinite().all():
                 raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
-        if os.fspath(path).endswith(".onnx"):
+        if suffix.lower() == ".onnx":
             program = self._to_onnx()
             with atomic_write(path, suffix="onnx") as file:
                 file.write(program)

@@ -2,18 +2,32 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Figure, HParam, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import Figure, HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
 from sb3_maddpg.utils import arguments_of, shown
 from sb3_maddpg.validation import CurriculumArguments, validated
 
 # Outputs that cannot show figures and hyperparameters
 TENSORBOARD_ONLY = ("stdout", "log", "json", "csv")
+
+
+def widen_tables(logger: Logger, keys: Iterable[str]) -> None:
+    """
+    Widen the logger's tables so that long keys fit, which Stable-Baselines3 would cut off, or refuse if they are then
+    alike.
+
+    :param logger: the algorithm's logger
+    :param keys: keys that will be logged
+    """
+    width = max((3 + len(key.partition("/")[2] or key) for key in keys), default=0)  # indented, without their tag
+    for output in logger.output_formats:
+        if isinstance(output, HumanOutputFormat):
+            output.max_length = max(output.max_length, width)
 
 
 def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
@@ -28,6 +42,7 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
         metrics = info.get("metrics", {})
         if not isinstance(metrics, Mapping):
             raise ValueError(f"info['metrics'] is {shown(metrics)}: it must be a dict of numbers by name.")
+        widen_tables(logger, map(str, metrics))
         for name, value in metrics.items():
             try:
                 number = float(value)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import gymnasium
 import numpy as np
+import torch as th
+from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.env_checker import check_env
 
+from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.callbacks import check_success
-from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.parallel import TeamEnv, layers_of
 from sb3_maddpg.relational import NeighbourViews
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
@@ -22,6 +26,7 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
     """
     Check that an environment follows the team convention, see ``TeamEnvironment``, ``TeamAttributes`` and ``TeamInfo``.
     Runs Stable-Baselines3's ``check_env``, then checks the spaces, the attributes and an episode of random actions.
+    Actions that action masks forbid are replaced by legal ones. Errors that the environment itself raises pass through.
 
     :param env: team environment or PettingZoo environment
     :param max_steps: maximum number of steps of the episode
@@ -35,13 +40,89 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
         raise ValueError(f"{shown(env)} is neither a Gymnasium environment nor a PettingZoo ParallelEnv.")
     names = env.get_wrapper_attr("agent_names") if env.has_wrapper_attr("agent_names") else None
     team = Team.from_spaces(env.observation_space, env.action_space, names)
-    try:
-        check_env(env, warn=False, skip_render_check=True)
-    except AssertionError as error:
-        raise ValueError(f"Stable-Baselines3's check_env: {error}") from error
-    _check_attributes(env, team)
-    _check_episode(env, team, max_steps, seed)
+    space, legal = env.observation_space, _LegalActions(env, team)
+    assert isinstance(space, spaces.Box)
+    _check_reset(legal, seed)
+    with th.random.fork_rng(devices=[]):  # legal actions are drawn by PyTorch
+        th.manual_seed(seed)
+        try:
+            check_env(legal, warn=False, skip_render_check=True)
+        except AssertionError as error:
+            if "does not match the bounds" in str(error):
+                raise ValueError(_out_of_bounds(space, legal.obs, team)) from None
+            raise ValueError(f"Stable-Baselines3's check_env: {' '.join(str(error).split())[:500]}") from error
+        _check_attributes(env, team)
+        _check_episode(legal, team, max_steps, seed)
     return team
+
+
+class _LegalActions(gymnasium.Wrapper):
+    """
+    Wrapper that replaces illegal actions, see ``TeamActions.legal``.
+
+    :param env: the team environment
+    :param team: the team
+    """
+
+    def __init__(self, env: gymnasium.Env, team: Team):
+        super().__init__(env)
+        self.actions = TeamActions(team.action_spaces, masks=team.masks)
+        self.obs: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        returned = self.env.reset(seed=seed, **({} if options is None else {"options": options}))
+        self.obs = returned[0] if isinstance(returned, tuple) and returned else None
+        return returned
+
+    def step(self, action: np.ndarray) -> Any:
+        if self.actions.has_masks:
+            scaled = th.as_tensor(self.actions.scale(action[np.newaxis]), dtype=th.float32)
+            flat = self.actions.legal(scaled, th.as_tensor(self.obs, dtype=th.float32).unsqueeze(0))
+            action = self.actions.unscale(flat.numpy())[0].astype(action.dtype)
+        returned = self.env.step(action)
+        self.obs = returned[0] if isinstance(returned, tuple) and returned else None
+        return returned
+
+
+def _check_reset(env: gymnasium.Env, seed: int) -> None:
+    try:
+        env.reset(seed=seed)
+    except TypeError as error:
+        for inner in layers_of(env) if "unexpected keyword argument" in str(error) else ():
+            if missing := [f"`{name}`" for name in ("seed", "options") if not _takes(inner.reset, name)]:
+                raise ValueError(
+                    f"reset() of {inner} takes no {' and no '.join(missing)}: declare it as "
+                    "`def reset(self, seed=None, options=None)`."
+                ) from error
+        raise
+
+
+def _takes(method: Any, name: str) -> bool:
+    """:return: whether a method takes a keyword argument, also if its signature is unknown"""
+    try:
+        parameters = inspect.signature(method).parameters
+    except (TypeError, ValueError):
+        return True
+    kinds = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return any(
+        one.kind is inspect.Parameter.VAR_KEYWORD or (one.name == name and one.kind in kinds)
+        for one in parameters.values()
+    )
+
+
+def _out_of_bounds(space: spaces.Box, obs: np.ndarray, team: Team) -> str:
+    """:return: a message about the value that is farthest out of the bounds"""
+    obs = obs.astype(float)
+    excess = np.maximum(space.low - obs, obs - space.high)
+    row, column = np.unravel_index(excess.argmax(), excess.shape)
+    where = f"column {column} of agent {team.names[row]}"
+    if column >= team.obs_dim:
+        where = f"column {column} of row {row}, which holds the state,"
+    return (
+        f"The observation is {obs[row, column]:g} in {where}, but its space allows {space.low[row, column]:g} to "
+        f"{space.high[row, column]:g} there ({np.count_nonzero(excess > 0)} of {obs.size} numbers are out of bounds): "
+        "correct the bounds, or clip or rescale the observation."
+    )
 
 
 def _check_attributes(env: gymnasium.Env, team: Team) -> None:

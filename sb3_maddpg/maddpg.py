@@ -39,7 +39,7 @@ from sb3_maddpg.actions import Continuous
 from sb3_maddpg.agent_policy import AgentPolicy
 from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
-from sb3_maddpg.callbacks import check_success, record_metrics
+from sb3_maddpg.callbacks import check_success, record_metrics, widen_tables
 from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
@@ -59,7 +59,7 @@ from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
-from sb3_maddpg.team import ACTION_SPACES, Team
+from sb3_maddpg.team import ACTION_SPACES, Team, into_box
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import arguments_of, as_numbers, atomic_write, describe_env, shown, suggest
 from sb3_maddpg.validation import (
@@ -556,7 +556,7 @@ class MADDPG(OffPolicyAlgorithm):
                 return drawn, scaled
             legal = actions.legal(th.as_tensor(scaled, dtype=th.float32, device=self.device), self._present_obs())
             scaled = legal.cpu().numpy()
-            return actions.unscale(scaled).astype(self.action_space.dtype), scaled
+            return self._into_action_space(actions.unscale(scaled)), scaled
         with th.no_grad():
             obs = self._present_obs()
             flat = self.policy.flat_actions(obs).cpu().numpy()
@@ -565,7 +565,11 @@ class MADDPG(OffPolicyAlgorithm):
             noise = action_noise() if action_noise else np.random.normal(0.0, self.noise_std, flat.shape)  # noqa: NPY002
             noisy = np.clip(flat + noise, -1.0, 1.0)
             flat = np.where(actions.is_continuous, noisy, flat).astype(np.float32)
-        return actions.unscale(flat).astype(self.action_space.dtype), flat
+        return self._into_action_space(actions.unscale(flat)), flat
+
+    def _into_action_space(self, actions: np.ndarray) -> np.ndarray:
+        space = self.action_space
+        return into_box(space, actions) if isinstance(space, spaces.Box) else actions.astype(space.dtype)
 
     def _present_obs(self) -> th.Tensor:
         """:return: the current observations, (n_envs, n_agents, obs_dim or more)"""
@@ -634,8 +638,10 @@ class MADDPG(OffPolicyAlgorithm):
         n_agents = self.policy.team.n_agents
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/critic_loss", np.mean(critic_losses) / n_agents)
-        for name, mean in zip(self.policy.team.names, th.stack(q_values).mean(dim=0).tolist(), strict=True):
-            self.logger.record(f"train/q_value/{name}", mean)
+        keys = [f"train/q_value/{name}" for name in self.policy.team.names]
+        widen_tables(self.logger, keys)
+        for key, mean in zip(keys, th.stack(q_values).mean(dim=0).tolist(), strict=True):
+            self.logger.record(key, mean)
         if outputs:
             self.logger.record("train/actor_loss", np.mean(actor_losses) / n_agents)
             if self.policy.actions.discrete:

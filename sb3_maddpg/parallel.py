@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -14,12 +15,17 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 
-from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, joint_action_space
+from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
 from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
 MASK = "action_mask"
 _LARGEST_REWARD = float(np.finfo(np.float32).max)
+_BLACK_DEATH = (
+    "The wrapper {} keeps dead agents in the episode, which then hardly ever ends (in SuperSuit 3.11 only if all "
+    "agents are both terminated and truncated in the same step). Remove this wrapper: TeamEnv handles agents that end "
+    "before the others."
+)
 
 
 class _Action(NamedTuple):
@@ -31,6 +37,8 @@ class _Action(NamedTuple):
     clips: bool
     """Whether to clip again, because the space's precision is not that of the joint action"""
     start: Any
+    scalar: Any
+    """The type of a number of the space"""
 
 
 class TeamEnv(gymnasium.Env):
@@ -66,11 +74,17 @@ class TeamEnv(gymnasium.Env):
     - ``agent_active``: whether the agent acted in this step
     - ``agent_infos``: the environment's infos by agent name, left out if they are all empty
     - ``metrics``: at the end of an episode, ``rollout/ep_rew_NAME`` of each agent that took part
+      (``rollout/ep_rew_agent_mean`` of an agent called "mean", since ``rollout/ep_rew_mean`` is the team's)
+
+    Rewards of agents that have already ended are ignored with a warning, as are action masks in infos without
+    ``info_mask``.
 
     :param env: the environment, parallel or turn-based
     :param state: append ``env.state()`` to the observation, for the critics
-    :param info_mask: read action masks from ``infos[agent]["action_mask"]``; agents without one may choose any action
-    :raises ValueError: if the environment or one of its spaces is not supported
+    :param info_mask: read action masks from ``infos[agent]["action_mask"]``; agents without one, and those with
+        continuous actions, may choose any action
+    :raises ValueError: if the environment or one of its spaces is not supported, or the environment is wrapped in
+        SuperSuit's ``black_death``, which changes what is learned
     """
 
     observation_space: TeamObservation
@@ -79,6 +93,7 @@ class TeamEnv(gymnasium.Env):
         if isinstance(env, AECEnv):
             env = TurnBased(env)
         agents = _possible_agents(env)
+        _refuse_black_death(env)
         self._agents = agents
         self._rows = {agent: row for row, agent in enumerate(agents)}
         action_spaces = [_space_of(env, "action_space", agent) for agent in agents]
@@ -87,8 +102,14 @@ class TeamEnv(gymnasium.Env):
         self._observation_spaces = [_space_of(env, "observation_space", agent) for agent in agents]
         self._info_mask = info_mask
         if info_mask:
+            if all(isinstance(space, spaces.Box) for space in action_spaces):
+                raise ValueError(
+                    f"info_mask=True, but the actions of all agents of {env} ({', '.join(map(str, agents))}) are "
+                    "continuous and cannot be masked: leave info_mask out."
+                )
             self._observation_spaces = [
-                _masked_space(seen, space) for seen, space in zip(self._observation_spaces, action_spaces, strict=True)
+                seen if isinstance(space, spaces.Box) else _masked_space(seen, space)
+                for seen, space in zip(self._observation_spaces, action_spaces, strict=True)
             ]
         if (images := _image_space(self._observation_spaces)) is not None:
             self.image_space = images
@@ -106,11 +127,12 @@ class TeamEnv(gymnasium.Env):
         )
         self.action_space = joint_action_space(action_spaces)
         self._state_space: Any = env.state_space if state else None
-        self._metric_names = [f"rollout/ep_rew_{name}" for name in self.agent_names]
+        self._metric_names = _names_of_returns(self.agent_names)
         self._lay_out(action_spaces)
         self._live: list[int] = []
         self._taking_part: list[int] = []
         self._returns = [0.0] * len(agents)
+        self._warned: set[str] = set()
 
     def has_wrapper_attr(self, name: str) -> bool:
         """:return: whether this wrapper or the PettingZoo environment has the attribute"""
@@ -134,7 +156,7 @@ class TeamEnv(gymnasium.Env):
             else:
                 self._least[begin:end], self._most[begin:end] = 0, np.array(heads_of(space)) - 1
             clips = isinstance(space, spaces.Box) and space.dtype != np.float32
-            self._actions.append(_Action(begin, end, space, clips, getattr(space, "start", None)))
+            self._actions.append(_Action(begin, end, space, clips, _start_of(space), space.dtype.type))
         self._clip = any(isinstance(space, spaces.Box) for space in action_spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
@@ -201,6 +223,7 @@ class TeamEnv(gymnasium.Env):
             # Some environments leave out the final observation of a terminated agent, which training does not need
             if not ends or cut or agent in observations:
                 seen.append(row)
+        self._warn_of_lost_rewards(agent_rewards, acted)
         if len(left) != len(live) or not all(agents[row] in left for row in live):
             self._check_left(left, live, acted, terminations, truncations)
         if not finite:
@@ -304,15 +327,16 @@ class TeamEnv(gymnasium.Env):
             values = np.minimum(np.maximum(values, self._low), self._high, dtype=np.float32)
         actions = {}
         for row in self._live:
-            begin, end, space, clips, start = self._actions[row]
+            begin, end, space, clips, start, scalar = self._actions[row]
             part: Any
             if isinstance(space, spaces.Discrete):
-                part = int(values[begin]) + int(start)
+                part = values[begin]
+                if start or type(part) is not scalar:
+                    part = scalar(int(part) + start)
             elif isinstance(space, spaces.Box):
                 part = values[begin:end].reshape(space.shape)
                 if clips:
-                    part = np.rint(part) if np.issubdtype(space.dtype, np.integer) else part
-                    part = np.clip(part, space.low, space.high).astype(space.dtype)
+                    part = into_box(space, part)
             else:
                 part = values[begin:end].astype(space.dtype).reshape(space.shape)
                 if start is not None:
@@ -374,16 +398,49 @@ class TeamEnv(gymnasium.Env):
 
     def _with_masks(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> Mapping[Any, Any]:
         """:return: observations with the action masks in infos, if ``info_mask`` is set"""
+        if infos and self._steps < 2:
+            self._warn_of_ignored_masks(infos)
         if not self._info_mask:
             return observations
         masked = {}
         for agent, observation in observations.items():
+            if agent not in self._rows or not self.observation_space.masks[self._rows[agent]]:
+                masked[agent] = observation
+                continue
             mask = (infos.get(agent) or {}).get(MASK)
-            if mask is None and agent in self._rows:
+            if mask is None:
                 space: Any = self._observation_spaces[self._rows[agent]]
                 mask = np.ones(space[MASK].shape, np.int8)
             masked[agent] = {MASK: mask, "observation": observation}
         return masked
+
+    def _warn_of_ignored_masks(self, infos: Mapping[Any, Any]) -> None:
+        for agent, info in infos.items():
+            if info and MASK in info and agent in self._rows and not self.observation_space.masks[self._rows[agent]]:
+                remedy = "pass TeamEnv(env, info_mask=True) to read action masks from infos"
+                if isinstance(self._actions[self._rows[agent]].space, spaces.Box):
+                    remedy = "its actions are continuous and cannot be masked"
+                self._warn_once("masks", f"infos[{agent!r}]['{MASK}'] of {self.parallel_env} is ignored: {remedy}.")
+
+    def _warn_of_lost_rewards(self, rewards: Mapping[Any, Any], acted: list[int]) -> None:
+        if len(rewards) <= len(acted) or "rewards" in self._warned:
+            return
+        for row, agent in enumerate(self._agents):
+            reward: Any = 0.0
+            with suppress(ValueError):
+                reward = self._number(agent, rewards.get(agent, 0.0))
+            if reward and row not in acted:
+                self._warn_once(
+                    "rewards",
+                    f"{self.parallel_env} returned a reward of {reward} for agent {agent!r} {self._when}, which takes "
+                    "part no more: such rewards are ignored. Return them in the step in which the agent ends, or let "
+                    "it end later.",
+                )
+
+    def _warn_once(self, kind: str, message: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
+            warnings.warn(message, stacklevel=4)
 
     def _state(self, size: int) -> np.ndarray:
         try:
@@ -558,6 +615,20 @@ class TurnBased(ParallelEnv):
         self.env.close()
 
 
+def _start_of(space: spaces.Space) -> Any:
+    """:return: the first category of each sub-action, None for other actions"""
+    start = getattr(space, "start", None)
+    return int(start) if isinstance(space, spaces.Discrete) else start  # type: ignore[arg-type]
+
+
+def _names_of_returns(names: Sequence[str]) -> list[str]:
+    """:return: the names under which agents' returns are logged, other than that of the team's, ep_rew_mean"""
+    renamed = "agent_mean"
+    while renamed in names:
+        renamed = f"agent_{renamed}"
+    return [f"rollout/ep_rew_{renamed if name == 'mean' else name}" for name in names]
+
+
 def _agent_infos(infos: Mapping[Any, Any]) -> dict[str, Any]:
     if not any(infos.values()):
         return {}
@@ -623,6 +694,25 @@ def _metadata_of(env: ParallelEnv | AECEnv) -> Mapping[str, Any]:
     return metadata
 
 
+def layers_of(env: Any) -> Iterator[Any]:
+    """
+    :param env: an environment of Gymnasium or PettingZoo
+    :return: the environment and those that it wraps, outermost first
+    """
+    seen: list[Any] = []
+    while hasattr(env, "reset") and not any(env is one for one in seen):
+        yield env
+        seen.append(env)
+        attributes = getattr(env, "__dict__", {})  # unlike getattr, not those that a wrapper passes on
+        env = next((attributes[name] for name in ("parallel_env", "env", "aec_env") if name in attributes), None)
+
+
+def _refuse_black_death(env: Any) -> None:
+    """:raises ValueError: if SuperSuit's wrapper ``black_death`` is among the environment's wrappers"""
+    if any(type(layer).__name__.startswith("black_death") for layer in layers_of(env)):
+        raise ValueError(_BLACK_DEATH.format("black_death"))
+
+
 def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:
     """
     :param env: the environment
@@ -669,8 +759,6 @@ def _image_space(observations: Sequence[spaces.Space]) -> spaces.Box | None:
 def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:
     heads = heads_of(action)
     length = len(heads) if isinstance(action, spaces.MultiBinary) else sum(heads)
-    if not length:
-        raise ValueError(f"info_mask=True: {action} is continuous and cannot be masked.")
     return spaces.Dict({MASK: spaces.Box(0, 1, (length,), np.int8), "observation": observation})
 
 
@@ -731,11 +819,7 @@ def make_parallel_env(
     pairs = _wrappers(wrappers)
     for path, _ in pairs:
         if path.rpartition(".")[2].startswith("black_death"):
-            raise ValueError(
-                f"The wrapper {path} keeps dead agents in the episode, which then hardly ever ends (in SuperSuit 3.11 "
-                "only if all agents are both terminated and truncated in the same step). Remove it from `wrappers`: "
-                "TeamEnv handles agents that end before the others."
-            )
+            raise ValueError(_BLACK_DEATH.format(path))
     env = find_parallel_env(entry)(**kwargs)
     for path, arguments in pairs:
         env = _load(path)(env, **arguments)

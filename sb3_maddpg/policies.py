@@ -16,7 +16,7 @@ from torch import nn
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.networks import StackedMLP
-from sb3_maddpg.team import MixedActions, Team
+from sb3_maddpg.team import MixedActions, Team, into_box
 from sb3_maddpg.utils import all_finite, as_numbers, shown
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
 
@@ -38,13 +38,13 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
         lists = [list(range(team.n_agents))] if share else []
     else:
         try:
-            if isinstance(share, str):
+            if isinstance(share, (str, Mapping)) or any(isinstance(agents, (str, Mapping)) for agents in share):
                 raise TypeError
             lists = [[team.index(agent) for agent in agents] for agents in share]
         except TypeError:
             raise ValueError(
-                f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network; "
-                'share_critic may also be "team".'
+                f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network, "
+                f'such as {[[*team.names[:2]]]}; share_critic may also be "team".'
             ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
@@ -702,6 +702,10 @@ class MADDPGPolicy(BasePolicy):
     def set_training_mode(self, mode: bool) -> None:
         if self.training != mode:  # SB3 sets the mode at each prediction, and visiting all modules is slow
             super().set_training_mode(mode)
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        assert isinstance(self.action_space, spaces.Box)
+        return into_box(self.action_space, super().unscale_action(scaled_action))  # rounding may exceed the bounds
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)

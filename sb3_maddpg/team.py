@@ -5,6 +5,7 @@ Teams: the number of agents, their observations and their actions, read from the
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypedDict
@@ -16,6 +17,7 @@ from sb3_maddpg.utils import shown
 
 AgentActionSpace = spaces.MultiBinary | spaces.Box | spaces.Discrete | spaces.MultiDiscrete
 ACTION_SPACES = (spaces.MultiBinary, spaces.Box, spaces.Discrete, spaces.MultiDiscrete)
+_INTEGER = re.compile("0|-?[1-9][0-9]*")
 
 
 class TeamInfo(TypedDict, total=False):
@@ -215,6 +217,19 @@ def heads_of(space: AgentActionSpace) -> tuple[int, ...]:
     return (2,) * int(np.prod(space.shape))
 
 
+def into_box(space: spaces.Box, actions: np.ndarray) -> np.ndarray:
+    """
+    Round actions if the space holds integers, and clip them to its bounds.
+
+    :param space: an agent's continuous action space
+    :param actions: finite numbers, (..., *shape of the space)
+    :return: actions of the space, in its data type
+    """
+    if np.issubdtype(space.dtype, np.integer):
+        actions = np.rint(actions)
+    return np.clip(actions, space.low, space.high).astype(space.dtype)
+
+
 def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
     """
     Return the joint action space of a team, flat, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` if
@@ -264,17 +279,18 @@ class Team:
 
     def index(self, agent: str | int) -> int:
         """
-        :param agent: name or index of an agent
+        :param agent: name or index of an agent; a name if all names are integers, as in ``possible_agents = [1, 2]``
         :return: the agent's index
         :raises ValueError: if there is no such agent
         """
         if isinstance(agent, str) and agent in self.names:
             return self.names.index(agent)
-        if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and 0 <= agent < self.n_agents:
-            return int(agent)
-        raise ValueError(
-            f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}, or 0 to {self.n_agents - 1}."
-        )
+        named_by_integers = all(_INTEGER.fullmatch(name) for name in self.names)
+        numbers = list(map(int, self.names)) if named_by_integers else range(self.n_agents)
+        if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and agent in numbers:
+            return numbers.index(agent)
+        positions = "" if named_by_integers else f", or 0 to {self.n_agents - 1}"
+        raise ValueError(f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}{positions}.")
 
     def homogeneous(self, agent: int, other: int) -> bool:
         """

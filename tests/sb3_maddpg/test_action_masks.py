@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
@@ -105,10 +107,10 @@ def test_nobody_chooses_what_is_forbidden(estimator, share):
 
 @pytest.mark.parametrize("in_infos", [False, True])
 def test_all_of_the_library_keeps_to_masks(in_infos):
-    env = Masked(("one", "some", "bits", "free"), in_infos)
-    model = MATD3("MlpPolicy", TeamEnv(env, info_mask=in_infos), **SMALL)
+    model = MATD3("MlpPolicy", TeamEnv(Masked(in_infos=in_infos), info_mask=in_infos), **SMALL)
     model.learn(120)
-    team = TeamEnv(Masked(("one", "some", "bits", "free"), in_infos), info_mask=in_infos)
+    team = TeamEnv(Masked(in_infos=in_infos), info_mask=in_infos)
+    assert team.observation_space.masks[-1] == ()
     obs, _ = team.reset(seed=3)
     for deterministic in (True, False) * 6:
         action, _ = model.predict(obs, deterministic=deterministic)
@@ -123,10 +125,21 @@ def test_all_of_the_library_keeps_to_masks(in_infos):
 
 
 def test_an_environment_with_masks_passes_the_checker():
-    # Random actions know no masks
-    env = Masked(("one", "bits"))
-    env.allowed = lambda agent, action: True
-    assert check_team_env(env).masks == ((0, 1, 2, 3), (0, 1, 2))
+    state = th.random.get_rng_state()
+    assert check_team_env(Masked(("one", "bits"))).masks == ((0, 1, 2, 3), (0, 1, 2))
+    assert len(check_team_env(TeamEnv(Masked(in_infos=True), info_mask=True)).masks) == 5
+    assert th.equal(th.random.get_rng_state(), state)
+
+
+def test_masks_in_infos_are_ignored_with_one_warning():
+    env = TeamEnv(Masked(in_infos=True))
+    with pytest.warns(UserWarning, match=r"infos\['one'\]\['action_mask'\] of .* is ignored: .*info_mask=True"):
+        env.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        env.reset()
+        TeamEnv(Masked(in_infos=True), info_mask=True).reset()
+        TeamEnv(Masked()).reset()
 
 
 def of_space(*action_spaces, masks=()) -> TeamActions:
@@ -217,7 +230,7 @@ def test_what_does_not_fit_is_refused():
         MADDPG("MlpPolicy", Short(("one",)))
     with pytest.raises(ValueError, match="is continuous and takes no mask"):
         MADDPG("MlpPolicy", Short(("smooth",)))
-    with pytest.raises(ValueError, match=r"info_mask=True: .* is continuous"):
+    with pytest.raises(ValueError, match=r"info_mask=True, but .* \(smooth\) are continuous.*leave info_mask out"):
         TeamEnv(Masked(("smooth",)), info_mask=True)
     env = DummyVecEnv([lambda: TeamEnv(Masked(("one",)))])
     with pytest.raises(ValueError, match=r"shifts the action masks.*norm_obs=False"):

@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 import sys
+import warnings
 
 import gymnasium
 import numpy as np
@@ -153,6 +154,78 @@ def test_agents_exported_to_onnx_act_as_in_the_team(make, tmp_path):
     assert th.equal(th.random.get_rng_state(), state)
 
 
+class Bounded(Toy):
+    """Continuous actions whose bounds rounding exceeds, and that hold integers."""
+
+    def __init__(self):
+        super().__init__("continuous")
+        self.spaces = (
+            spaces.Box(-3.0, 0.9, (2,)),
+            spaces.Box(-3.0, 0.9, (2,), np.float64),
+            spaces.Box(0, 200, (2, 1), np.uint8),
+            spaces.Box(-(2**31), 2**31 - 1, (1,), np.int32),
+        )
+        self.possible_agents = [f"agent_{i}" for i in range(len(self.spaces))]
+
+
+def test_actions_lie_within_their_space_and_those_of_integers_are_whole(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    saturated = 0
+    for policy, obs, expected in team_actions(varied(lambda: MADDPG("MlpPolicy", Bounded(), **SMALL))):
+        space, obs = policy.action_space, obs.astype(np.float32)
+        for row, joint in zip(obs, expected, strict=True):
+            action = policy.predict(row)
+            assert space.contains(action)
+            assert action.dtype == space.dtype
+            assert np.allclose(action.ravel(), np.rint(joint) if policy.whole else joint, atol=1e-6)
+            saturated += np.isin(action, [space.low, space.high]).sum()
+        actions = policy.predict(obs)
+        assert actions.dtype == space.dtype
+        policy.export(tmp_path / "a.pt")
+        policy.export(tmp_path / "a.ONNX")
+        session = onnxruntime.InferenceSession(str(tmp_path / "a.ONNX"), providers=["CPUExecutionProvider"])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            program = th.jit.load(tmp_path / "a.pt")
+        low, high = np.float32(space.low).ravel(), np.float32(space.high).ravel()
+        for exported in (program(th.from_numpy(obs)).numpy(), session.run(None, {"observation": obs})[0]):
+            assert ((exported >= low) & (exported <= high)).all()
+            assert (np.abs(exported - actions.astype(float)) <= 1e-5 * (high - low)).all()
+    assert saturated > 20
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
+def test_joint_actions_lie_within_their_space(dtype):
+    class Joint(Neighbours):
+        def __init__(self):
+            super().__init__()
+            self.action_space = (
+                spaces.Box(0, 7, (8,), dtype) if dtype == np.uint8 else spaces.Box(-3.0, 0.9, (8,), dtype)
+            )
+
+        def step(self, action):
+            assert self.action_space.contains(action)
+            return self.observation_space.sample(), 0.0, False, False, {}
+
+    model = varied(lambda: MADDPG("MlpPolicy", Joint(), **SMALL))
+    for _ in range(50):
+        assert model.action_space.contains(model.predict(model.observation_space.sample(), deterministic=True)[0])
+    model.learn(60)
+
+
+def test_an_export_has_the_format_of_its_suffix(tmp_path):
+    policy = MODELS["binary"]().agent_policy(0)
+    for name in ("a.onxx", "a.zip", "robot.1"):
+        with pytest.raises(
+            ValueError, match=rf"{name}' has the suffix .*end the path with .onnx for ONNX, or with .pt"
+        ):
+            policy.export(tmp_path / name)
+    assert not list(tmp_path.iterdir())
+    for name in ("a.PT", "a.pth", "b"):
+        policy.export(tmp_path / name)
+    assert {file.name for file in tmp_path.iterdir()} == {"a.PT", "a.pth", "b.pt"}
+
+
 def test_without_onnx_the_remedy_is_named(tmp_path, monkeypatch):
     policy = MODELS["binary"]().agent_policy(0)
 
@@ -184,7 +257,8 @@ def test_agents_have_the_names_of_the_environment():
     [
         (np.zeros(3), r"An observation of binary_2 has shape \(4,\), not \(3,\)"),
         (np.zeros((2, 5)), r"not \(2, 5\)"),
-        (np.zeros((1, 2, 4)), r"not \(1, 2, 4\)"),
+        (np.zeros((1, 2, 4)), r"not \(1, 2, 4\).*gymnasium.spaces.flatten\(env.observation_space\('binary_2'\), obs"),
+        ({"x": np.zeros(4)}, r"is not an array of numbers: {'x': .*gymnasium.spaces.flatten"),
         (np.array(0.0), r"not \(\)"),
         (np.array([0, 0, np.nan, 0]), "observation of binary_2 holds NaN or infinity"),
         (np.array([[0, 0, np.inf, 0]]), "observation of binary_2 holds NaN or infinity"),

@@ -7,7 +7,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -129,6 +129,27 @@ def test_metrics_of_another_algorithm(tmp_path):
     assert [values["task/level"] for values in logged] == [0, 0]
     assert all(0.3 < values["task/mean_action"] < 0.7 for values in logged)
     assert np.diff([values["task/mean_action"] for values in logged]) != 0
+
+
+def test_long_names_fit_into_tables(capsys, tmp_path):
+    """Stable-Baselines3 refuses keys that are alike when they are cut off."""
+    names = [f"a_robot_with_a_name_of_many_letters_{number}" for number in range(3)]
+
+    class Named(Levelled):
+        agent_names = names
+
+        def step(self, action):
+            *rest, info = super().step(action)
+            return *rest, {**info, "metrics": {f"rollout/{key}_of_{name}": 1.0 for name in names for key in "ab"}}
+
+    for logger in (None, configure(str(tmp_path), ["stdout", "log", "csv"])):
+        model = MADDPG("MlpPolicy", Named(), verbose=1, **SMALL)
+        if logger:
+            model.set_logger(logger)
+        model.learn(100, callback=EvalCallback(Monitor(Named()), eval_freq=70))
+        printed = capsys.readouterr().out
+        assert all(f"   q_value/{name} " in printed and f"   a_of_{name} " in printed for name in names)
+    PPO("MlpPolicy", make_vec_env(Named, 1), n_steps=20, batch_size=20, verbose=1).learn(40, callback=MetricsCallback())
 
 
 @pytest.mark.parametrize("wrong", [None, "x", np.nan, -np.inf, [1.0, 2.0], 10**400])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from mpe2 import simple_spread_v3
+from pettingzoo.utils import BaseParallelWrapper
 
 import quad_swarm
 from sb3_maddpg import check_team_env, team_tasks
@@ -99,6 +100,56 @@ class Wrong(team_tasks.OwnBit):
 def test_what_is_wrong_is_said(env, message):
     with pytest.raises(ValueError, match=message):
         check_team_env(env)
+
+
+class Reset(Toy):
+    """An environment whose reset() does not fit."""
+
+    def __init__(self, takes, bug=False):
+        super().__init__("binary")
+        self.takes, self.bug = takes, bug
+        if takes:
+            self.reset = self.reset_with_seed if takes == "seed" else self.reset_with_options
+
+    def reset(self, seed=None, options=None):
+        if self.bug:
+            len(5)  # type: ignore[arg-type]
+        return super().reset(seed)
+
+    def reset_with_seed(self, seed=None):
+        return super().reset(seed)
+
+    def reset_with_options(self, *, options=None):
+        return super().reset()
+
+
+def test_arguments_that_reset_does_not_take_are_named():
+    with pytest.raises(
+        ValueError, match=r"reset\(\) of toy takes no `options`: declare it as `def reset\(self, seed="
+    ) as raised:
+        check_team_env(Reset("seed"))
+    assert isinstance(raised.value.__cause__, TypeError)
+    with pytest.raises(ValueError, match=r"reset\(\) of toy takes no `seed`:"):
+        check_team_env(BaseParallelWrapper(Reset("options")))
+    with pytest.raises(TypeError, match=r"object of type 'int' has no len\(\)"):
+        check_team_env(Reset(None, bug=True))
+
+
+def test_observations_out_of_bounds_are_reported_in_one_line():
+    class Bright(Toy):
+        def observation_space(self, agent):
+            return spaces.Box(0, 1, (40, 40, 3), np.uint8)
+
+        def _observe(self):
+            seen = {agent: np.zeros((40, 40, 3), np.uint8) for agent in self.possible_agents}
+            seen["binary_1"][0, 1, 2], seen["binary_2"][:] = 255, 9
+            return seen
+
+    with pytest.raises(
+        ValueError, match=r"is 255 in column 5 of agent binary_1, but .* 0 to 1 there \(4801 of 14400"
+    ) as raised:
+        check_team_env(Bright("binary"))
+    assert len(str(raised.value)) < 250
 
 
 def test_the_tables_of_the_convention_name_what_the_contract_does():

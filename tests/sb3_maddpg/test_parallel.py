@@ -1,6 +1,7 @@
 """Who takes part in an episode of a PettingZoo environment, how it ends, and what is refused."""
 
 import pickle
+import warnings
 
 import gymnasium
 import numpy as np
@@ -224,9 +225,30 @@ def test_an_environment_may_go_on_listing_agents_that_ended():
             truncations["a"] = True
         rewards["a"] = 100  # nor is what they get their own any more
 
-    steps = play(TeamEnv(Broken(listed)))
+    with pytest.warns(UserWarning, match="reward of 100.0 for agent 'a' in step 3 .* takes part no more"):
+        steps = play(TeamEnv(Broken(listed)))
     assert [step[4]["agent_active"].tolist() for step in steps] == [[1, 1], [1, 1], [0, 1], [0, 1]]
     assert steps[-1][4]["metrics"]["rollout/ep_rew_a"] == 200
+
+
+@pytest.mark.parametrize("reward", [5.0, np.float32(5.0), 0.0, None])
+def test_rewards_of_agents_that_ended_are_ignored_with_one_warning(reward):
+    env = TeamEnv(Broken(lambda env, _, rewards, *__: rewards.setdefault("a", reward)))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            assert play(env)[-1][4]["metrics"]["rollout/ep_rew_a"] == 1 + 2
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == (1 if reward else 0)
+    assert all("reward of 5.0 for agent 'a' in step 3 of the episode" in message for message in messages)
+
+
+def test_the_return_of_an_agent_called_mean_is_not_that_of_the_team():
+    ends = dict.fromkeys(("mean", "agent_mean", "b"), (2, TRUNCATED))
+    metrics = play(TeamEnv(Script(ends)))[-1][4]["metrics"]
+    assert metrics == {
+        "rollout/ep_rew_agent_agent_mean": 3.0, "rollout/ep_rew_agent_mean": 6.0, "rollout/ep_rew_b": 9.0
+    }  # fmt: skip
 
 
 def test_a_terminated_agent_need_not_see_its_end():

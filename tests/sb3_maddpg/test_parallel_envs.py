@@ -78,7 +78,7 @@ def test_every_agent_acts_in_its_own_way():
         assert np.array_equal(action, before)
         for agent, part in zoo.sent.items():
             assert zoo.action_space(agent).contains(part), (agent, part)
-            assert type(part) is int or part.dtype == zoo.action_space(agent).dtype
+            assert part.dtype == zoo.action_space(agent).dtype
     # By hand, out of bounds where there are any
     env.step(np.float32([2, 1, 2, 3, 0, 0, 1, 1, 0, -7, 1 / 3, 5, 0.5, 300, 99.6]))
     expected = (1, [[1, 3], [3, -2]], [[0, 1], [1, 0]], [[-1], [1 / 3]], [[2, 0.5]], [200, 100])
@@ -161,6 +161,28 @@ def test_supersuits_wrappers_go_inside(wrapper, kwargs):
         if truncated:
             break
     assert truncated
+
+
+def test_black_death_is_refused_wherever_it_is():
+    env = simple_tag_v3.parallel_env(continuous_actions=True)
+    env.possible_agents = list(env.possible_agents)
+    wrapped = supersuit.black_death_v3(env)
+    for env in (wrapped, supersuit.clip_reward_v0(wrapped), supersuit.dtype_v0(wrapped, dtype="float64")):
+        with pytest.raises(ValueError, match=r"black_death keeps dead agents .*Remove this wrapper: TeamEnv handles"):
+            TeamEnv(env)
+
+
+def test_categories_of_one_type_are_passed_on_in_another():
+    class Small(Zoo):
+        actions = (spaces.Discrete(3), spaces.Discrete(3, start=5))
+        observations = Zoo.observations[2:4]
+
+    zoo = Small()
+    env = TeamEnv(zoo)
+    env.reset()
+    for dtype in (np.int64, np.int8, np.float32):
+        env.step(np.array([2, 1], dtype))
+        assert [(type(part), part.item()) for part in zoo.sent.values()] == [(np.int64, 2), (np.int64, 6)]
 
 
 def test_processes_make_the_same_steps():

@@ -153,6 +153,11 @@ def test_agents_are_found_by_name_and_number():
     for wrong in ("adversary_3", "1", 4, -1):
         with pytest.raises(ValueError, match=f"no agent {wrong!r}.*adversary_0, .*or 0 to 3"):
             team.index(wrong)
+    numbered = Team.from_spaces(spaces.Box(-1, 1, (3, 3)), spaces.MultiBinary(3), names=["1", "-2", "0"])
+    assert [numbered.index(agent) for agent in (1, -2, np.int64(0), "1")] == [0, 1, 2, 0]
+    for wrong in (2, -1, "2", 10**5000):
+        with pytest.raises(ValueError, match=r"no agent .*: the agents are 1, -2, 0\."):
+            numbered.index(wrong)
     plain = Team.from_spaces(spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary(4))
     assert (plain.names, plain.obs_dims, plain.obs_dim) == (("agent_0", "agent_1"), (3, 3), 3)
     assert plain.action_spaces == (spaces.MultiBinary(2),) * 2
