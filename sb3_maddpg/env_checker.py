@@ -15,7 +15,7 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.callbacks import check_success
 from sb3_maddpg.parallel import TeamEnv, layers_of
-from sb3_maddpg.relational import NeighbourViews
+from sb3_maddpg.relational import NeighbourViews, check_layout
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
 
@@ -142,7 +142,9 @@ def _check_attributes(env: gymnasium.Env, team: Team) -> None:
         if not callable(env.get_wrapper_attr("set_curriculum_level")):
             raise ValueError("set_curriculum_level must be a method that takes the level.")
     if env.has_wrapper_attr("observation_layout"):
-        NeighbourViews(env.get_wrapper_attr("observation_layout"), team)  # raises ValueError
+        layout = env.get_wrapper_attr("observation_layout")
+        check_layout(layout)
+        NeighbourViews(layout, team)  # raises ValueError
 
 
 def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) -> None:

@@ -1166,7 +1166,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-    if isinstance(vec_env.unwrapped, DummyVecEnv):
+    if type(vec_env.unwrapped) is DummyVecEnv:  # subclasses may step other things than their envs
         check_single_envs(vec_env.unwrapped.envs)
     # SB3's own error would suggest policies that do not exist here
     Team.from_spaces(vec_env.observation_space, vec_env.action_space)
