@@ -225,9 +225,9 @@ def into_box(space: spaces.Box, actions: np.ndarray) -> np.ndarray:
     :param actions: finite numbers, (..., *shape of the space)
     :return: actions of the space, in its data type
     """
-    if np.issubdtype(space.dtype, np.integer):
+    if space.dtype.kind in "iu":
         actions = np.rint(actions)
-    return np.clip(actions, space.low, space.high).astype(space.dtype)
+    return np.minimum(np.maximum(actions, space.low), space.high).astype(space.dtype)  # np.clip takes twice as long
 
 
 def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
