@@ -44,12 +44,12 @@ from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
     FILE_FORMAT,
+    NetworkLimit,
     as_damage,
     attributes,
     check_attributes,
     check_members,
     check_path,
-    limited_networks,
     optimizer_not_finite,
     optimizer_problem,
     read_data,
@@ -936,7 +936,7 @@ class MADDPG(OffPolicyAlgorithm):
                     raise ValueError(suggest("argument of load", name, {one for one in known if one[0] != "_"}))
             if "policy_kwargs" in kwargs:
                 _check_same_policy(kwargs.pop("policy_kwargs"), values.get("policy_kwargs"), values.get("policy_class"))
-            with _remedy_for_other_team(), limited_networks(path, trust):
+            with _remedy_for_other_team(), NetworkLimit(path, trust):
                 model = super().load(path, env, device, values, print_system_info, force_reset, **kwargs)
             check_attributes(model, path)
         model.file_format = FILE_FORMAT

@@ -173,7 +173,7 @@ def _size_of(archive: zipfile.ZipFile) -> int:
     return size
 
 
-class limited_networks(TorchFunctionMode):
+class NetworkLimit(TorchFunctionMode):
     """
     Refuse to build networks that need much more memory than the weights in a model's file.
 

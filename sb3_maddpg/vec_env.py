@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import NormalizeReward
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.parallel import TeamEnv, layers_of
 from sb3_maddpg.utils import as_seed, not_finite_at, shown
 
 
@@ -182,10 +182,9 @@ def _check_wrappers(env: Env, team_env: TeamEnv) -> None:
             f"A Gymnasium wrapper changes the observations of TeamEnv, {env}: names, padding and action masks of the "
             f"agents would be lost. {remedy}"
         )
-    while isinstance(env, Wrapper):
-        if isinstance(env, (RewardWrapper, NormalizeReward)):
+    for layer in layers_of(env):
+        if isinstance(layer, (RewardWrapper, NormalizeReward)):
             raise ValueError(
-                f"{type(env).__name__} changes only the team's reward, but the algorithm learns from the agents' "
+                f"{type(layer).__name__} changes only the team's reward, but the algorithm learns from the agents' "
                 f"rewards in `info`. {remedy}"
             )
-        env = env.env
