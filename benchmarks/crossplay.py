@@ -237,7 +237,7 @@ def report(rows: Sequence[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as a JSON list")
     parser.add_argument("--only", nargs="+", choices=EVERYTHING, default=EVERYTHING, help="only these libraries")
     parser.add_argument("--tasks", nargs="+", choices=COMPETITIVE, default=COMPETITIVE)
     parser.add_argument("--seeds", type=int, help="maximum number of trainings per library")

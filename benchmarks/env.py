@@ -11,7 +11,6 @@ face, world, n_robots, n_envs, cores, steps_per_s, and the share of each part.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import time
@@ -25,6 +24,7 @@ import gymnasium
 import numpy as np
 
 import quad_swarm
+from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.task.request_task import RequestTask
 from sb3_maddpg.cli.bench import timed
 from sb3_maddpg.vec_env import GymnasiumVecEnv
@@ -114,7 +114,7 @@ def attach_timers(task: RequestTask) -> dict[str, list[float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write one JSON object per cell")
+    parser.add_argument("--json", type=Path, help="write the cells as a JSON list")
     parser.add_argument("--seconds", type=float, default=4.0, help="seconds per cell (default 4)")
     parser.add_argument("--solver", default="auto", help="planner's solver (default auto)")
     args = parser.parse_args()
@@ -132,8 +132,7 @@ def main() -> None:
             shares = "  ".join(f"{name} {share:.0%}" for name, share in parts[0].items())
             print(f"{face:7} {world:23} {n_envs:5} {cores:5} {total:9.0f}   {shares}", flush=True)
     if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        write_rows(args.json, rows)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ Compare how well the gradient estimators for bits and categories learn the small
 """
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from quad_swarm.evaluation.rows import write_rows
 from sb3_maddpg import MADDPG
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.team_tasks import BINARY_TASKS, OwnCategory, TeamTask
-from sb3_maddpg.utils import atomic_write
 
 # Arguments for all estimators, and the steps after which the deterministic policy is evaluated
 RECIPE: dict[str, Any] = {
@@ -76,8 +75,7 @@ def main() -> None:
             print(f"{task.__name__:12} {estimator:24}" + "".join(f"{text:>15}" for text in cells), flush=True)
             rows.append({"task": task.__name__, "estimator": estimator, "steps": CHECKPOINTS, "returns": curves})
     if arguments.json is not None:
-        with atomic_write(arguments.json, suffix="json") as file:
-            file.write("".join(json.dumps(row) + "\n" for row in rows).encode())
+        write_rows(arguments.json, rows)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ steps_ratio and critic_ratio.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import multiprocessing
 import os
@@ -33,6 +32,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.task.request_task import RequestTask, make_task
 from sb3_maddpg.relational import PairPolicy
 
@@ -147,7 +147,7 @@ def _peak_mb() -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write one JSON object per cell")
+    parser.add_argument("--json", type=Path, help="write the cells as a JSON list")
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots (default 4 to 128)")
     parser.add_argument("--envs", type=int, default=16, help="number of swarms per process (default 16)")
     parser.add_argument(
@@ -171,8 +171,7 @@ def main() -> None:
                 flush=True,
             )
     if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        write_rows(args.json, rows)
 
 
 if __name__ == "__main__":

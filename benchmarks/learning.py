@@ -28,6 +28,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.training import OURS, REFERENCE, ROOT, machine, missing, python_of
+from quad_swarm.evaluation.rows import write_rows
 
 TASKS = ("simple_speaker_listener_v4", "simple_tag_v3", "simple_adversary_v3", "simple_spread_v3")
 TWIN = "matd3"
@@ -80,10 +81,8 @@ def read(folder: Path) -> list[Row]:
 
 
 def write(path: Path, rows: Iterable[Row]) -> None:
-    """Write one JSON object per row, with null for missing intervals."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    clean = ({key: None if value != value else value for key, value in row.items()} for row in rows)
-    path.write_text("".join(json.dumps(row) + "\n" for row in clean))
+    """Write rows as a JSON list, with null for missing intervals."""
+    write_rows(path, [{key: None if value != value else value for key, value in row.items()} for row in rows])
 
 
 def actors_of(folder: Path, name: str, env: str, seed: int, steps: int) -> Path:
@@ -151,7 +150,7 @@ def report(rows: Iterable[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as a JSON list")
     parser.add_argument("--peers", action="store_true", help="also the other libraries, and MATD3")
     parser.add_argument("--only", nargs="+", choices=EVERYTHING, help="only these libraries")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS[:3])

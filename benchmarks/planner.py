@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import math
 import os
 import shutil
@@ -36,6 +35,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.planner import FatropSolver, OptimalControlProblem, Problems, RtiSolver, Solution
 from quad_swarm.planner.fatrop import transcribe
 from quad_swarm.world.presets import SwarmConfig, make_config
@@ -364,7 +364,7 @@ def _line(row: dict[str, Any]) -> str:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as a JSON list")
     parser.add_argument("--full", action="store_true", help="more problems and variants (half an hour)")
     parser.add_argument("--agreement", action="store_true", help="compare plans with the converged optimum instead")
     parser.add_argument("--horizon", type=int, nargs="+", default=HORIZONS, help="default 10 20")
@@ -385,8 +385,7 @@ def main() -> None:
                 rows += compare(n_robots, horizon, args.n_envs, args.full, Path(folder))
         os.chdir(Path(__file__).parent)
     if target:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+        write_rows(target, rows)
 
 
 if __name__ == "__main__":

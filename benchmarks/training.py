@@ -26,6 +26,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from quad_swarm.evaluation.rows import write_rows
+
 ROOT = Path(__file__).resolve().parent.parent
 OURS, REFERENCE, PEERS = "ours", "plain", ("agilerl", "benchmarl", "xuance")
 # Who has which kind of networks, see `benchmarks.peers.common.Task`
@@ -123,7 +125,7 @@ def report(rounds: Rounds) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     everything = (OURS, REFERENCE, *PEERS)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per row")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as a JSON list")
     parser.add_argument("--only", nargs="+", choices=everything, default=everything, help="only these libraries")
     parser.add_argument("--networks", nargs="+", choices=HAVE, default=list(HAVE))
     parser.add_argument("--rounds", type=int, default=3, help="number of rounds (default 3)")
@@ -158,8 +160,7 @@ def main() -> None:
         sys.exit("Nothing was measured.")
     rows = report(rounds)
     if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        write_rows(args.json, rows)
     if failures:
         sys.exit(f"{len(failures)} of {len(rounds) + len(failures)} failed, see above.")
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 def shown(value: object, most: int = 200) -> str:
@@ -30,3 +31,19 @@ def unknown_name(kind: str, value: object, known: Iterable[str]) -> ValueError:
     near = difflib.get_close_matches(value if isinstance(value, str) else shown(value), names, n=1, cutoff=0.4)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return ValueError(f"Unknown {kind} {shown(value)}; known: {', '.join(names)}.{hint}")
+
+
+@contextmanager
+def needs_extra(what: str, extra: str) -> Iterator[None]:
+    """Let imports in the ``with`` block fail with the name of the extra that is missing.
+
+    :param what: what needs the extra, e.g. the option ``"--plot"``
+    :param extra: name of an extra of the package
+    :raises ImportError: if a package is missing
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(
+            f"{what} needs the extra {extra!r}: in the clone, pip install -e '.[{extra}]' ({error})."
+        ) from error

@@ -1,5 +1,6 @@
 """``sb3-maddpg bench``: how fast a recipe trains on this machine, and where the time goes."""
 
+import contextlib
 import functools
 import json
 import sys
@@ -88,14 +89,16 @@ class BenchManager(TeamExperimentManager):
 
 def main(argv: list[str]) -> int:
     """
-    :param argv: options of ``sb3-maddpg train``, and ``--json FILE``
+    :param argv: options of ``sb3-maddpg train``, and ``--json FILE``, where ``-`` is the standard output
     :return: exit status
     """
     parser = common_options()
     parser.add_argument("--json", type=Path)
     parser.add_argument("--n-timesteps", "-n", type=int, default=20_000)
     known, given = parser.parse_known_args(argv)
-    if known.json:
+    piped = known.json == Path("-")
+    printed = sys.stderr if piped else sys.stdout
+    if known.json and not piped:
         check_writable(known.json)
     check_options(known, LengthOption)
     zoo.register()
@@ -105,12 +108,17 @@ def main(argv: list[str]) -> int:
         options = ["--algo", known.algo, "--n-timesteps", str(known.n_timesteps), "--log-folder", folder]
         options += ["--env", known.env] if known.env else []
         options += ["--progress"] if sys.stderr.isatty() else []
-        zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given])
-    print(f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="")
-    print(f"{result['steps_per_second']:.0f} steps/s")
+        with contextlib.redirect_stdout(printed):
+            zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given])
+    print(
+        f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="", file=printed
+    )
+    print(f"{result['steps_per_second']:.0f} steps/s", file=printed)
     for name in ("environments", "learning", "acting", "rest"):
-        print(f"  {name:13} {result[f'share_{name}']:6.1%}")
-    if known.json:
+        print(f"  {name:13} {result[f'share_{name}']:6.1%}", file=printed)
+    if piped:
+        print(json.dumps(result))
+    elif known.json:
         known.json.write_text(json.dumps(result) + "\n")
         print(f"wrote {known.json}")
     return 0

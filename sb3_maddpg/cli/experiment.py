@@ -249,7 +249,13 @@ class TeamExperimentManager(ExperimentManager):
             return
         offers = entry_points(group="sb3_maddpg.dashboards")
         name = self.env_name.gym_id
-        offer = offers[name].load() if name in offers.names else None
+        try:
+            offer = offers[name].load() if name in offers.names else None
+        except ImportError as error:
+            raise ImportError(
+                f"--tensorboard-log draws figures of {name}, which needs the extra 'plot': in the clone, "
+                f"pip install -e '.[plot]' ({error})."
+            ) from error
         evaluation = next((one for one in self.callbacks if isinstance(one, EvalCallback)), None)
         if evaluation is None:  # without evaluations, there are no figures
             self.callbacks.append(DashboardCallback(layout=offer and offer.LAYOUT))

@@ -18,8 +18,9 @@ try:
     import rl_zoo3.enjoy
     import rl_zoo3.train
     import rl_zoo3.utils
+    import torch.utils.tensorboard  # noqa: F401
 except ImportError as error:
-    raise ImportError(f"{error}. The zoo needs its own packages: pip install 'sb3-maddpg[zoo]'.") from error
+    raise ImportError(f"{error}. This needs the extra 'zoo': in the clone, pip install -e '.[zoo]'.") from error
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, get_latest_run_id, get_saved_hyperparams

@@ -31,7 +31,7 @@ TEAM = {"scale_observation": True, "scenario": "random", "n_robots": 3}
 def evaluate_rows(tmp_path, *arguments: str) -> list[dict]:
     target = tmp_path / "rows.json"
     assert evaluate([*arguments, "--scenario", "random", "--episodes", "2", "--json", str(target)]) == 0
-    return [json.loads(line) for line in target.read_text().splitlines()]
+    return json.loads(target.read_text())
 
 
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])

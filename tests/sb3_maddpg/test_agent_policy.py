@@ -233,7 +233,7 @@ def test_without_onnx_the_remedy_is_named(tmp_path, monkeypatch):
         raise ModuleNotFoundError("No module named 'onnxscript'", name="onnxscript")
 
     monkeypatch.setattr(th.onnx, "export", export)
-    with pytest.raises(ValueError, match=r'ONNX is not installed .*pip install "sb3-maddpg\[onnx\]"'):
+    with pytest.raises(ValueError, match=r'ONNX is not installed .*pip install -e "\.\[onnx\]"'):
         policy.export(tmp_path / "a.onnx")
     assert not list(tmp_path.iterdir())
 

@@ -11,7 +11,7 @@ from sb3_maddpg.team_tasks import OwnBit
 
 def test_without_ray_the_message_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r'Ray is not installed .*pip install "sb3-maddpg\[ray\]"'):
+    with pytest.raises(ValueError, match=r'Ray is not installed .*pip install -e "\.\[ray\]"'):
         RayVecEnv([OwnBit])
 
 

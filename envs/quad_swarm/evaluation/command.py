@@ -10,21 +10,22 @@ from concurrent.futures import Executor
 from contextlib import nullcontext
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import yaml
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import needs_extra, unknown_name
 from quad_swarm.evaluation.evaluation import evaluate, make_pool
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.policies import is_model, load_model, short_name, short_names, trained_in
-from quad_swarm.evaluation.rows import check_writable, write_csv, write_rows, write_text
+from quad_swarm.evaluation.provenance import provenance
+from quad_swarm.evaluation.rows import STDOUT, check_writable, write_csv, write_rows, write_text
 from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, simulated_vehicles
 from quad_swarm.task.rules import RULES
 from quad_swarm.tasks import ENGINES
 from quad_swarm.tasks.journal import default_folder
-from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
+from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
@@ -232,7 +233,7 @@ def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace)
     """
     try:
         command(args)
-    except (ValueError, FileNotFoundError, ModuleNotFoundError, BuildError) as error:
+    except (ValueError, FileNotFoundError, ImportError, BuildError) as error:
         if args.debug:
             raise
         print(f"error: {error}", file=sys.stderr)
@@ -255,7 +256,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
     add_worker_arguments(parser, jobs=1)
     parser.add_argument("--wide", action="store_true", help="print all columns, in long lines")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write one JSON object per policy and scenario")
+    parser.add_argument(
+        "--json",
+        type=Path,
+        metavar="FILE",
+        help="write a JSON list with an object per policy and scenario, and what was flown; - is the standard output, "
+        "also for the next two, and the table then goes to the standard error",
+    )
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the same results as comma-separated values")
     parser.add_argument("--latex", type=Path, metavar="FILE", help="write the printed table as LaTeX with booktabs")
     parser.add_argument(
@@ -295,11 +302,8 @@ def _compare(args: argparse.Namespace) -> None:
         raise ValueError(f"--scenario {' '.join(args.scenario)}: 'all' already names every scenario.")
     args.policy = args.policy or paper_policies()
     conditions = make_conditions(args, list(SCENARIOS) if args.scenario == ["all"] else args.scenario)
-    for option in ("json", "csv", "latex"):
-        if path := getattr(args, option):
-            check_writable(path, f"--{option}")
-    if args.plot:
-        check_writable(args.plot / "plot", "--plot")
+    printed = _check_files(args)
+    solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name  # fails here if a simulator is missing
     elsewhere = args.engine != "local" or args.address is not None
     try:
         with workers(args) if elsewhere else nullcontext() as executor:
@@ -307,26 +311,57 @@ def _compare(args: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         print("interrupted; repeat the command to continue", file=sys.stderr)
         raise
-    solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name
-    common = {"preset": args.preset, "preset_version": PRESET_VERSION, "seed": args.seed, "solver": solver}
-    rows = [row | common | ({"world": _parse_world(args.world)} if args.world else {}) for row in rows]
-    print(format_table(rows, args.wide))
-    world = f" with {' '.join(args.world)}" if args.world else ""
-    robots = conditions[0].config.n_robots
-    print(f"\nepisodes: {args.episodes} each; robots: {robots}; preset: {args.preset}{world}; set: {args.seed}")
+    rows = [
+        row | provenance(condition, args.preset, args.seed, solver)
+        for row, condition in zip(rows, conditions, strict=True)
+    ]
+    footer = _footer(args, rows)
+    print(format_table(rows, args.wide), "", *footer, sep="\n", file=printed)
     if args.json:
         write_rows(args.json, rows)
     if args.csv:
         write_csv(args.csv, rows)
     if args.latex:
-        write_text(args.latex, _latex(table_texts(rows, args.wide)))
+        comment = "".join(f"% {line}\n" for line in footer)
+        write_text(args.latex, comment + _latex(table_texts(rows, args.wide)))
     for path in filter(None, (args.json, args.csv, args.latex)):
-        print(f"wrote {path}")
+        if path != STDOUT:
+            print(f"wrote {path}", file=printed)
     if args.plot:
         from quad_swarm.figures.plots import draw_all  # matplotlib is only needed here
 
         for path in draw_all(rows, conditions, args.seed, args.plot):
-            print(f"drew {path}")
+            print(f"drew {path}", file=printed)
+
+
+def _check_files(args: argparse.Namespace) -> TextIO:
+    """Check before the flights that everything can be written and drawn after them.
+
+    :return: where the table goes: the standard output, unless a file is written there
+    """
+    paths = {f"--{name}": path for name in ("json", "csv", "latex") if (path := getattr(args, name))}
+    for option, path in paths.items():
+        check_writable(path, option)
+    if len(streams := [option for option, path in paths.items() if path == STDOUT]) > 1:
+        raise ValueError(f"{' and '.join(streams)} cannot both be the standard output (-): write one into a file.")
+    if args.plot:
+        check_writable(args.plot / "plot", "--plot")
+        with needs_extra("--plot", "plot"):
+            import quad_swarm.figures.plots  # noqa: F401  matplotlib is only needed here
+    return sys.stderr if streams else sys.stdout
+
+
+def _footer(args: argparse.Namespace, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the lines below the table, which say what was flown."""
+    row = rows[0]
+    world = f" with {' '.join(args.world)}" if args.world else ""
+    simulator = row["plant"].partition(":")[0]
+    versions = [f"{name} {row['versions'][name]}" for name in ("sb3-maddpg", simulator) if name in row["versions"]]
+    limit = "" if args.max_steps is None else f"at most {args.max_steps} steps; "
+    return [
+        f"episodes: {args.episodes} each; robots: {row['n_robots']}; preset: {args.preset}{world}; set: {args.seed}",
+        f"plant: {row['plant']}; solver: {row['solver']}; {limit}{', '.join(versions)}",
+    ]
 
 
 if __name__ == "__main__":

@@ -200,7 +200,7 @@ def _fly(
 
 def _key(condition: Condition, episodes: range) -> str:
     """Return the key of a piece of work, which includes the content of a model's file."""
-    packages, files = {"quad_swarm", *_user_modules()}, []
+    packages, files = {"quad_swarm", *user_modules()}, []
     if is_model(condition.policy):
         packages.add(condition.algo.partition(":")[0])
         files.append(Path(condition.policy.partition("@")[0]))
@@ -215,9 +215,10 @@ def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixe
     :param address: see `make_executor`
     :param mixed: see `make_executor`
     """
-    return make_executor(engine, jobs, _user_modules(), address, mixed)
+    return make_executor(engine, jobs, user_modules(), address, mixed)
 
 
-def _user_modules() -> list[str]:
+def user_modules() -> list[str]:
+    """Return the modules of all scenarios and rules, custom ones included."""
     added = {function.__module__ for function in (*SCENARIOS.values(), *(make for make, _ in RULES.values()))}
     return sorted(added - {"__main__"})

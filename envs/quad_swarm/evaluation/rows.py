@@ -1,4 +1,7 @@
-"""Files of rows: one JSON object per line, or comma-separated values."""
+"""Files of rows: a JSON list with an object per line, or comma-separated values.
+
+The path ``-`` stands for the standard output.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,24 @@ import csv
 import io
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+STDOUT = Path("-")
+
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Read the rows of a file, none if it does not exist."""
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    """Read the rows of a file, none if it does not exist. Files of earlier versions, JSON Lines, are read as well."""
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    return json.loads(text) if text.startswith("[") else [json.loads(line) for line in text.splitlines()]
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows to a file, atomically."""
-    write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+    """Write rows to a file as a JSON list, atomically. Each row has a line of its own, for `grep` and `diff`."""
+    write_text(path, "[" + ",".join(f"\n{json.dumps(row)}" for row in rows) + "\n]\n")
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -34,6 +41,9 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write text to a file, atomically. Missing folders are created."""
+    if path == STDOUT:
+        sys.stdout.write(text)
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(
         "w", encoding="utf-8", newline="", dir=path.parent, prefix=path.name, suffix=".part", delete=False
@@ -51,10 +61,12 @@ def write_text(path: Path, text: str) -> None:
 def check_writable(path: Path, option: str) -> None:
     """Check that a file can be written before doing the work that it will hold. This creates its folder.
 
-    :param path: path of the file
+    :param path: path of the file, or ``-``
     :param option: option of the command line that names the file, for error messages
     :raises ValueError: if the path is a folder, or its folder cannot be created or written to
     """
+    if path == STDOUT:
+        return
     if path.is_dir():
         raise ValueError(f"{option} {path} is a folder: pass the path of a file.")
     try:

@@ -7,12 +7,15 @@ writes a vehicle file, which worlds accept as ``quadrotor``.
 from __future__ import annotations
 
 import argparse
+import sys
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import yaml
 
+from quad_swarm.errors import needs_extra
 from quad_swarm.plants.base import make_plant, simulated_vehicles
 from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams
 
@@ -60,12 +63,8 @@ def identify(plant: str) -> Identification:
     :raises ValueError: if the plant is unknown
     :raises ImportError: if the extra ``plants`` is not installed
     """
-    try:
+    with needs_extra("identify", "plants"):
         from scipy.optimize import least_squares  # imported here, so that the help needs no extra
-    except ImportError as missing:
-        raise ImportError(
-            f"Identification needs more packages: pip install 'sb3-maddpg[plants]' ({missing})."
-        ) from missing
     u = experiment()
     count = u.shape[1]
     params = QuadrotorParams()
@@ -108,20 +107,33 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
     parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="vehicle file to write, YAML")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="vehicle file to write, YAML; - is the standard output"
+    )
     args = parser.parse_args(argv)
+    piped = args.out == Path("-")
+    if args.out and not piped:
+        if args.out.is_dir():
+            raise ValueError(f"--out {args.out} is a folder: pass the path of a file.")
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=args.out.parent).close()  # fails here, not after the flights
     found = identify(args.plant)
-    print(f"{'parameter':22}{args.plant:>22}{'bebop2':>10}")
+    lines = [f"{'parameter':22}{args.plant:>22}{'bebop2':>10}"]
     for name in VEHICLE_PARAMETERS:
-        print(f"{name:22}{getattr(found.params, name):22.4f}{getattr(QuadrotorParams(), name):10.4f}")
-    print(
+        lines.append(f"{name:22}{getattr(found.params, name):22.4f}{getattr(QuadrotorParams(), name):10.4f}")
+    lines.append(
         f"residuals: roll and pitch {found.attitude_rms:.2f} deg rms, {found.attitude_max:.2f} deg max; "
         f"velocity {found.velocity_rms:.3f} m/s rms, {found.velocity_max:.3f} m/s max"
     )
+    print(*lines, sep="\n", file=sys.stderr if piped else sys.stdout)
     if args.out:
         values = {name: round(getattr(found.params, name), 4) for name in VEHICLE_PARAMETERS}
         residuals = {name: round(getattr(found, name), 4) for name in Identification._fields[1:]}
         text = f"# sb3-maddpg identify --plant {args.plant}\n"
-        args.out.write_text(text + yaml.safe_dump({"parameters": values, "residuals": residuals}, sort_keys=False))
-        print(f"wrote {args.out}")
+        text += yaml.safe_dump({"parameters": values, "residuals": residuals}, sort_keys=False)
+        if piped:
+            sys.stdout.write(text)
+        else:
+            args.out.write_text(text)
+            print(f"wrote {args.out}")
     return 0

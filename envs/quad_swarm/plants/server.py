@@ -8,6 +8,7 @@ import sys
 from multiprocessing.connection import Connection
 from typing import Any
 
+from quad_swarm.errors import needs_extra
 from quad_swarm.plants.base import SIMULATORS
 
 
@@ -15,12 +16,8 @@ def make(simulator: str, vehicle: str, *arguments: Any) -> Any:
     """Create a plant in this process."""
     if simulator not in SIMULATORS:
         raise ValueError(f"No adapter for the simulator {simulator!r}.")
-    try:
+    with needs_extra(f"plant='{simulator}:{vehicle}'", "plants"):
         adapter = getattr(importlib.import_module(f"quad_swarm.plants.{simulator}"), f"{simulator.capitalize()}Plant")
-    except ImportError as error:
-        raise ImportError(
-            f"plant='{simulator}:{vehicle}' needs the simulator: pip install 'sb3-maddpg[plants]' ({error})."
-        ) from None
     return adapter(vehicle, *arguments)
 
 

@@ -1,16 +1,21 @@
 """``sb3-maddpg evaluate``: its table, its files, its messages."""
 
 import csv
+import hashlib
 import json
+import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from quad_swarm.evaluation.command import COLUMNS, main
+from quad_swarm.plants import remote
 from quad_swarm.plants.base import simulated_vehicles
 from quad_swarm.task.rules import RULES
-from quad_swarm.world.presets import PRESETS
+from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
+from quad_swarm.world.swarm import Swarm
 from sb3_maddpg.pretrained_models import pretrained_folder
 
 KEYS = {
@@ -26,7 +31,7 @@ def test_writes_table_json_and_figures(tmp_path, capsys):
     assert main([*arguments, "--json", str(target), "--plot", str(tmp_path / "plots")]) == 0
     printed = capsys.readouterr().out
     assert printed.count("random_swap") == 2
-    rows = [json.loads(line) for line in target.read_text().splitlines()]
+    rows = json.loads(target.read_text())
     assert [(row["scenario"], row["policy"]) for row in rows] == [
         ("random", "none"), ("random", "full"), ("random_swap", "none"), ("random_swap", "full")
     ]  # fmt: skip
@@ -78,6 +83,8 @@ def test_the_table_goes_into_latex_and_csv(tmp_path, capsys):
     assert main([*flags, "--latex", str(tmp_path / "a.tex"), "--csv", str(tmp_path / "a.csv"), "--wide"]) == 0
     printed = capsys.readouterr().out
     tex = (tmp_path / "a.tex").read_text().splitlines()
+    comments, tex = tex[:2], tex[2:]
+    assert [line.removeprefix("% ") for line in comments] == printed.split("\n\n")[1].splitlines()[:2]
     assert tex[:2] == [f"\\begin{{tabular}}{{ll{'r' * (len(COLUMNS) - 2)}}}", r"\toprule"]
     assert "$>$ 1 cm" in tex[2]
     assert tex[-2:] == [r"\bottomrule", r"\end{tabular}"]
@@ -105,6 +112,112 @@ def test_world_can_be_changed(capsys):
     arguments = ["--policy", "full", "--scenario", "random", "--episodes", "1", "--n-robots", "3", "--max-steps", "5"]
     assert main([*arguments, "--world", "noise.wind=1", "planner.separation=0.7", "memory=0.3"]) == 0
     assert "robots: 3; preset: paper with noise.wind=1 planner.separation=0.7 memory=0.3;" in capsys.readouterr().out
+
+
+FEW = ["--policy", "none", "--scenario", "random", "--episodes", "1", "--max-steps", "3"]
+
+
+def table(path: Path, *arguments: str) -> dict:
+    """Fly few steps and return the only row of the JSON file."""
+    assert main([*FEW, *arguments, "--json", str(path)]) == 0
+    (row,) = json.loads(path.read_text())
+    return row
+
+
+def test_files_say_what_was_flown(tmp_path, capsys):
+    row = table(tmp_path / "a.json")
+    assert {name: row[name] for name in ("world", "plant", "preset", "n_robots", "max_steps", "seed", "solver")} == {
+        "world": {}, "plant": "model", "preset": "paper", "n_robots": 4, "max_steps": 3, "seed": 0,
+        "solver": Swarm(make_config("paper"), 1).planner.solver.name,
+    }  # fmt: skip
+    assert row["versions"]["sb3-maddpg"] == version("sb3-maddpg")
+    assert f"plant: model; solver: {row['solver']}; at most 3 steps; sb3-maddpg" in capsys.readouterr().out
+    changed = table(tmp_path / "a.json", "--world", "noise.wind=1", "planner.separation=0.7", "--solver", "fatrop")
+    assert changed["world"] == {"noise": {"wind": 1.0}, "planner": {"separation": 0.7}}
+    assert changed["solver"] == "fatrop"
+    assert "solver: fatrop;" in capsys.readouterr().out
+    # The content of a file, not its name, and what follows from another field
+    vehicle = tmp_path / "vehicle.yml"
+    seen = []
+    for drag in (0.2, 0.3):
+        vehicle.write_text(f"parameters: {{drag_x: {drag}}}")
+        seen.append(table(tmp_path / "a.json", "--world", f"quadrotor={vehicle}", "radius=0.31")["world"])
+    assert [world["quadrotor"]["drag_x"] for world in seen] == [0.2, 0.3]
+    assert seen[0]["planner"] == {"separation": pytest.approx(0.62)}
+
+
+@pytest.mark.parametrize("plant", ["crazyflow", "rotorpy:hummingbird"])
+def test_files_and_the_table_name_the_simulator(plant, tmp_path, capsys):
+    pytest.importorskip("mujoco", reason="the extra `plants` is not installed")
+    flags = ("--preset", "flight", "--csv", str(tmp_path / "a.csv"), "--latex", str(tmp_path / "a.tex"))
+    row = table(tmp_path / "a.json", *flags, "--plant", plant)
+    name = {"crazyflow": "crazyflow:cf21B_500"}.get(plant, plant)
+    simulator = name.partition(":")[0]
+    assert row["plant"] == name
+    assert row["world"] == {"plant": name, "mismatch": 0.0}
+    assert row["versions"][simulator] == version(simulator)
+    footer = (
+        f"plant: {name}; solver: {row['solver']}; at most 3 steps; sb3-maddpg {version('sb3-maddpg')}, {simulator} "
+    )
+    assert footer in capsys.readouterr().out
+    assert footer in (tmp_path / "a.tex").read_text()
+    with (tmp_path / "a.csv").open(newline="") as file:
+        assert next(csv.DictReader(file))["plant"] == name
+    by_world = table(tmp_path / "a.json", "--preset", "flight", "--world", f"plant={plant}")
+    assert {**by_world, "solve_us": 0} == {**row, "solve_us": 0}, "either option flies and records the same"
+
+
+def test_another_model_under_the_same_name_is_seen_in_the_file(tmp_path):
+    copy = tmp_path / "model.zip"
+    sums = []
+    for name in ("quad-swarm-paper", "quad-swarm-dense"):
+        model = pretrained_folder(name) / "model.zip"
+        copy.write_bytes(model.read_bytes())
+        sums.append(table(tmp_path / "a.json", "--policy", str(copy))["model_sha256"])
+        assert sums[-1] == hashlib.sha256(model.read_bytes()).hexdigest()
+    assert sums[0] != sums[1]
+
+
+@pytest.mark.parametrize("option", ["--json", "--csv", "--latex"])
+def test_a_dash_writes_a_file_to_the_standard_output_alone(option, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([*FEW, option, "-"]) == 0
+    printed = capsys.readouterr()
+    assert "at most 3 steps" in printed.err
+    assert not list(tmp_path.iterdir())
+    if option == "--json":
+        assert [row["policy"] for row in json.loads(printed.out)] == ["none"]
+    elif option == "--csv":
+        assert [row["policy"] for row in csv.DictReader(printed.out.splitlines())] == ["none"]
+    else:
+        assert printed.out.endswith("\\end{tabular}\n")
+        assert "wrote" not in printed.out
+    assert main([*FEW, option, "-", "--json" if option != "--json" else "--csv", "-"]) == 2
+    assert "cannot both be the standard output" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("missing", ["matplotlib", "pygame", "PIL"])
+def test_figures_without_their_packages_fail_before_the_flights(missing, tmp_path, monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.startswith(("quad_swarm.figures", missing))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    monkeypatch.setattr("quad_swarm.evaluation.command.evaluate", lambda *_: pytest.fail("it flew"))
+    assert main([*FEW, "--plot", str(tmp_path / "plots"), "--json", str(tmp_path / "a.json")]) == 2
+    error = capsys.readouterr().err
+    assert "--plot needs the extra 'plot': in the clone, pip install -e '.[plot]'" in error
+    assert missing in error
+    assert not (tmp_path / "a.json").exists()
+
+
+def test_a_missing_simulator_is_told_before_the_flights(tmp_path, monkeypatch, capsys):
+    (tmp_path / "crazyflow.py").write_text("raise ModuleNotFoundError('no crazyflow here')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(remote, "_servers", {})
+    monkeypatch.setattr("quad_swarm.evaluation.command.evaluate", lambda *_: pytest.fail("it flew"))
+    assert main([*FEW, "--plant", "crazyflow"]) == 2
+    error = capsys.readouterr().err
+    assert "needs the extra 'plants': in the clone, pip install -e '.[plants]' (no crazyflow here)" in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,8 @@
 """Tables of rows in files."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 from quad_swarm.evaluation.rows import check_writable, read_rows, write_csv, write_rows
@@ -10,8 +13,25 @@ def test_rows_come_back(tmp_path):
     assert read_rows(path) == []
     rows = [{"a": 1, "b": None}, {"a": [1.5, "x"]}]
     write_rows(path, rows)
-    assert read_rows(path) == rows
+    assert read_rows(path) == json.loads(path.read_text()) == rows
+    assert path.read_text().splitlines()[1] == '{"a": 1, "b": null},', "a line for each row, for grep and diff"
     assert list(path.parent.iterdir()) == [path]
+    write_rows(path, [])
+    assert read_rows(path) == json.loads(path.read_text()) == []
+
+
+def test_files_of_earlier_versions_are_read(tmp_path):
+    path = tmp_path / "table.json"
+    path.write_text('{"a": 1}\n{"a": [2]}\n')
+    assert read_rows(path) == [{"a": 1}, {"a": [2]}]
+
+
+def test_a_dash_is_the_standard_output(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    check_writable(Path("-"), "--json")
+    write_rows(Path("-"), [{"a": 1}, {"a": 2}])
+    assert json.loads(capsys.readouterr().out) == [{"a": 1}, {"a": 2}]
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_table_as_comma_separated_values(tmp_path):

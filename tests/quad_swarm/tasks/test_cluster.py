@@ -159,7 +159,7 @@ def test_engines_by_name(monkeypatch):
     with pytest.raises(ValueError, match="address='auto' is for engine='ray'"):
         make_executor("local", 1, address="auto")
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r'Ray is not installed .*pip install "sb3-maddpg\[ray\]"'):
+    with pytest.raises(ValueError, match=r'Ray is not installed .*pip install -e "\.\[ray\]"'):
         make_executor("ray", 1)
 
 

@@ -58,3 +58,11 @@ def test_bench_finds_out_before_the_work_that_it_cannot_be_done(capsys, argv, me
     assert f"error: {message}" in shown.err
     assert shown.err.count("\n") == 1
     assert "hyperparameters" not in shown.out
+
+
+def test_bench_writes_a_json_object_alone_to_the_standard_output(capsys):
+    assert main(["bench", "--env", "OwnBit-v0", "-n", "300", "--json", "-"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["steps"] == 300
+    assert "steps/s" in printed.err
+    assert not Path("-").exists()

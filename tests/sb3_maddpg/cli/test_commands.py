@@ -125,7 +125,7 @@ def test_a_pretrained_model_is_evaluated_and_replayed_by_its_name(capsys):
     flown = ["--policy", "pretrained:quad-swarm-paper@0.5"]
     argv = ["evaluate", *flown, "--scenario", "random", "--episodes", "2", "--json", "table.json"]
     assert main(argv) == 0
-    (row,) = map(json.loads, Path("table.json").read_text().splitlines())
+    (row,) = json.loads(Path("table.json").read_text())
     assert row["policy"].endswith("quad-swarm-paper/model.zip@0.5")
     assert main(["replay", *flown, "--out", "page.html"]) == 0
     assert "quad-swarm-paper@0.5" in Path("page.html").read_text()

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -288,3 +289,30 @@ def test_the_script_finds_environments_in_the_present_folder(tmp_path):
     argv = ["train", "--env", "pack/spread", "-n", "100", "--eval-freq", "-1", "--verbose", "0"]
     subprocess.run([*script, *argv], check=True, cwd=tmp_path)
     assert (tmp_path / "logs" / "maddpg" / "pack-spread_1" / "pack-spread.zip").is_file()
+
+
+@pytest.mark.parametrize(
+    ("missing", "words", "message"),
+    [
+        ("rl_zoo3", [], "This needs the extra 'zoo': in the clone, pip install -e '.[zoo]'."),
+        ("tensorboard", [], "This needs the extra 'zoo': in the clone, pip install -e '.[zoo]'."),
+        (
+            "matplotlib",
+            ["--tensorboard-log", "curves"],
+            "needs the extra 'plot': in the clone, pip install -e '.[plot]'",
+        ),
+    ],
+)
+def test_missing_packages_are_told_with_their_extra_before_the_training(missing, words, message, tmp_path):
+    (tmp_path / "fake").mkdir()
+    (tmp_path / "fake" / f"{missing}.py").write_text(f"raise ModuleNotFoundError('No module named {missing}')")
+    command = [sys.executable, "-m", "sb3_maddpg", "train", "--env", "QuadSwarm-v0", "--n-timesteps", "10", *words]
+    path = os.pathsep.join([str(tmp_path / "fake"), *filter(None, sys.path)])
+    done = subprocess.run(
+        command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    error = done.stderr.splitlines()[-1]
+    assert message in error
+    assert missing in error
+    assert not list((tmp_path / "logs").rglob("*.zip"))
