@@ -21,6 +21,7 @@ import numpy as np
 from quad_swarm.evaluation.command import add_policy_arguments, make_conditions, run
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import is_model, short_name
+from quad_swarm.evaluation.provenance import plant_name
 from quad_swarm.evaluation.rows import check_writable
 from quad_swarm.figures.colours import COLOURS
 from quad_swarm.geometry import length
@@ -39,19 +40,23 @@ _PLAN_STRIDE = 2
 EXAMPLES = "  sb3-maddpg replay --policy full pretrained:quad-swarm-paper --scenario symmetric_swap --out replay.html"
 
 
-def replay_page(conditions: Sequence[Condition], seed: int = 0, episode: int = 0, preset: str = "") -> str:
+def replay_page(
+    conditions: Sequence[Condition], seed: int = 0, episode: int = 0, preset: str = "", world: Sequence[str] = ()
+) -> str:
     """Fly an episode with several policies and create its web page.
 
     :param conditions: policies in the same scenario and world
     :param seed: index of the set of held-out episodes
     :param episode: index of the episode in the set
     :param preset: name of the world on the page
+    :param world: what differs from this preset, as texts to show
     :return: the page as HTML
     """
     config = conditions[0].config
     data = {
         "scenario": conditions[0].scenario,
         "preset": preset,
+        "world": list(world),
         "seed": seed,
         "episode": episode,
         "dt": config.planner.dt,
@@ -150,7 +155,8 @@ def _write(args: argparse.Namespace) -> None:
         raise ValueError(f"--episode {args.episode}: episodes count from 0.")
     check_writable(args.out, "--out")
     conditions = make_conditions(args, [args.scenario])
-    page = replay_page(conditions, args.seed, args.episode, args.preset)
+    changes = [*args.world, *([f"plant={plant_name(conditions[0].config)}"] if args.plant else [])]
+    page = replay_page(conditions, args.seed, args.episode, args.preset, changes)
     args.out.write_text(page, encoding="utf-8")
     print(f"wrote {args.out}, {len(page) / 1e6:.1f} MB: open it in a browser")
 

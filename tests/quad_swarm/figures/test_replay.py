@@ -13,8 +13,10 @@ from PIL import Image
 
 from quad_swarm.figures import replay
 from quad_swarm.figures.replay import main
+from sb3_maddpg.pretrained_models import pretrained_folder
 
 FIGURES = Path(replay.__file__).parent
+ANNOUNCING = str(pretrained_folder("quad-swarm-flight") / "model.zip")
 SIZES = {"phone": (390, 844), "tablet": (768, 1024), "desktop": (1280, 800), "wide": (1920, 640)}
 
 
@@ -100,7 +102,10 @@ def pages(tmp_path_factory) -> dict[str, Path]:
     assert main(["--policy", "full", "cpa:0.7:1.5", *scenario, "--out", str(four)]) == 0
     arguments = ["--preset", "flight", "--policy", "none", "full", *scenario, "--max-steps", "40"]
     assert main([*arguments, "--out", str(eight)]) == 0
-    return {"four": four, "eight": eight}
+    told = folder / "told.html"
+    world = ["--world", "noise.wind=1.5", "--plant", "model"]
+    assert main(["--policy", "full", ANNOUNCING, "--max-steps", "40", *scenario, *world, "--out", str(told)]) == 0
+    return {"four": four, "eight": eight, "told": told}
 
 
 @pytest.fixture
@@ -291,6 +296,76 @@ def test_step_in_the_address(view):
     cursors = page.locator("line.cursor").evaluate_all("lines => lines.map(line => line.getAttribute('x1'))")
     assert len(cursors) == 6
     assert len(set(cursors)) == 1, "all plots show the same time"
+
+
+def test_every_listed_key_works_wherever_the_focus_is(view):
+    page = view("four", "step=7")
+    listed = page.locator("#about dt").all_text_contents()
+    assert [text for text in listed if "Space" in text or "?" in text] == ["Space", "?"]
+    dialog = "document.getElementById('about').open"
+    for focused in ("#canvas", "#time", "#speed", "#view", "#follow", "#loop", "#help"):
+        page.focus(focused)
+        page.keyboard.press("?")
+        assert page.evaluate(dialog), focused
+        page.keyboard.press("ArrowRight")
+        assert page.input_value("#time") == "7", "the list is in front"
+        page.keyboard.press("?")
+        assert not page.evaluate(dialog), focused
+        page.keyboard.press("Shift+?")
+        page.keyboard.press("Escape")
+        assert not page.evaluate(dialog), focused
+    for focused in ("#canvas", "#time", "#loop"):
+        page.focus(focused)
+        page.keyboard.press("Home")
+        drawn(page, 0)
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowLeft")
+        drawn(page, 1)
+        for key, view_ in zip("2341", ("top", "side", "chase", "perspective"), strict=True):
+            page.keyboard.press(key)
+            assert page.input_value("#view") == view_, (focused, key)
+        for key in ("w", "A", "s", "d", "+", "-", "Shift+ArrowUp", "Shift+ArrowLeft"):
+            page.keyboard.press("1")
+            page.keyboard.press(key)
+            assert page.input_value("#view") == "", (focused, key)
+        drawn(page, 1)
+        page.keyboard.press("End")
+        assert page.input_value("#time") == page.get_attribute("#time", "max")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", ["phone", "wide"])
+def test_no_two_things_have_the_same_sign_in_the_legend(view, size, scheme):
+    page = view("told", size=size, scheme=scheme)
+    items = page.locator("#legend li").all()
+    texts = [item.inner_text() for item in items]
+    assert any(text.startswith("request:") for text in texts)
+    assert any(text.startswith("announced plan, sent unasked:") for text in texts)
+    signs = [item.locator("i").screenshot() for item in items]
+    assert len(set(signs)) == len(signs) == len(texts)
+
+
+def test_announced_plans_are_drawn_and_counted_apart_from_requests(view, pages):
+    data = data_of(pages["told"].read_text())
+    steps = data["flights"][1]["requests"]
+    step = next(k for k, pairs in enumerate(steps) if any(len(pair) == 3 for pair in pairs))
+    page = view("told", f"step={step}")
+    sent = sum(map(len, steps[: step + 1]))
+    assert page.locator(".count").last.inner_text().split()[:3] == [str(sent), "plans", "sent"]
+    assert "plans sent (" in page.locator(".summary").last.inner_text()
+    assert "A plan is sent in answer to a request, or announced" in page.locator("#about-text").text_content()
+    text = pages["told"].read_text()
+    pages["solid"] = pages["told"].with_name("solid.html")
+    pages["solid"].write_text(text.replace("discard;", ";"))
+    differ = (pixels(page) != pixels(view("solid", f"step={step}"))).any(axis=2)
+    assert not differ[:, : differ.shape[1] // 2].any(), "requests are drawn as before"
+    assert differ.sum() > 20, "announced plans are dashed"
+
+
+def test_the_page_says_what_differs_from_the_preset(view):
+    header = view("told").inner_text("header")
+    assert "held-out episode 0 (set 0), noise.wind=1.5, plant=model" in header
 
 
 def test_plays_by_itself_once_and_loops_on_request(view):

@@ -335,12 +335,18 @@ function beginPage() {
 }
 
 function onKey(event) {
-  const {key, target} = event, kind = target.tagName;
-  if (element("about").open || event.ctrlKey || event.metaKey || event.altKey) return;
+  const {key, target} = event, kind = target.tagName, about_ = element("about");
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (key === "?") {
+    event.preventDefault();
+    if (about_.open) about_.close();
+    else about_.showModal();
+  }
+  if (about_.open) return;
   if (key === "Escape") choose(undefined, null);
   if (kind === "SELECT") return;
   if (kind === "BUTTON" && (key === " " || key === "Enter")) return;
-  if (kind === "INPUT" && key !== " " && !/^[a-z0-9+=-]$/i.test(key)) return;
+  if (kind === "INPUT" && !event.shiftKey && key !== " " && !/^[a-z0-9+=-]$/i.test(key)) return;
   if (camera?.key(event)) { mark(); event.preventDefault(); return; }
   const actions = {
     " ": () => state.playing ? pause() : play(), ArrowLeft: () => step(-1), ArrowRight: () => step(1),

@@ -1,13 +1,13 @@
 // What belongs to each flight on the page: its view with counters, and its timeline and plots.
 
 import {
-  askedUntil, contact, data, flights, fullName, grouped, hasArrived, hasCollided, metres, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
+  askedUntil, contact, counted, data, flights, fullName, grouped, hasArrived, hasCollided, metres, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
 } from "./data.js";
 import {drawRequests, drawSeparation, stepUnder, timeScale, top} from "./plots.js";
 import {drawTimeline, wordsAt} from "./timeline.js";
 
 const cell = `<div class="head"><div><h2></h2><p class="detail"></p></div>
-<p class="count"><b class="asked"></b> <span>requests<br><span class="share"></span> of all<span class="long"> possible</span></span></p>
+<p class="count"><b class="asked"></b> <span>${counted()}<br><span class="share"></span> of all<span class="long"> possible</span></span></p>
 <p class="apart"></p></div><p class="badge" role="status" hidden></p>`;
 
 const details = `<h2></h2><p class="summary"></p>
@@ -19,7 +19,7 @@ function summary(flight) {
   const asked = flight.asked.at(-1), possible = flight.steps * nPairs;
   const parts = [
     `${flight.steps} steps (${seconds(flight.steps)})`,
-    `${grouped(asked)} of ${grouped(possible)} requests (${percent(asked, possible)})`,
+    `${grouped(asked)} of ${grouped(possible)} ${counted(possible)} (${percent(asked, possible)})`,
     `closest ${metres(flight.closest)}`,
     flight.collision === null ? "no collision" : `collision at step ${flight.collision}`,
     flight.arrival === null ? "not all arrived" : `all arrived after ${seconds(flight.arrival)}`,
@@ -47,7 +47,7 @@ export class Panel {
         ? "Who receives whose plan, requested or announced: one lane per pair, one block per receiving robot, in the colour of the robot whose plan it is"
         : "Who asks whom: one lane per pair, one block per asking robot, in the colour of the robot that is asked",
       `Closest two robots (m)${Math.max(...flight.separation) > top ? `; dashed where it is more than ${top.toFixed(1)} m` : ""}`,
-      "Requests so far",
+      `${counted()[0].toUpperCase()}${counted().slice(1)} so far`,
     ];
     this.details.querySelectorAll("figcaption").forEach((node, k) => { node.textContent = captions[k]; });
     [this.asked, this.share, this.apart, this.badge] = [".asked", ".share", ".apart", ".badge"].map(find);
@@ -65,7 +65,7 @@ export class Panel {
       const box = svg.getBoundingClientRect(), k = Math.min(Math.max(step(event), 0), this.flight.steps);
       const words = svg.classList.contains("asks") ? wordsAt(svg, this.flight, event.clientX - box.left, event.clientY - box.top)?.text
         : svg.classList.contains("separation") ? `step ${k}: ${metres(this.flight.separation[k])}`
-        : `step ${k}: ${grouped(this.flight.asked[k])} requests`;
+        : `step ${k}: ${grouped(this.flight.asked[k])} ${counted(this.flight.asked[k])}`;
       tooltip(words, event.clientX, event.clientY);
     });
     for (const name of ["pointerleave", "pointercancel"]) svg.addEventListener(name, () => tooltip());
@@ -78,9 +78,9 @@ export class Panel {
   }
 
   show(t) {
-    const {flight} = this, counted = askedUntil(flight, t), collided = hasCollided(flight, t), arrived = hasArrived(flight, t);
-    set(this.asked, grouped(counted));
-    set(this.share, percent(counted, possibleUntil(flight, t)));
+    const {flight} = this, asked = askedUntil(flight, t), collided = hasCollided(flight, t), arrived = hasArrived(flight, t);
+    set(this.asked, grouped(asked));
+    set(this.share, percent(asked, possibleUntil(flight, t)));
     set(this.apart, `closest two ${metres(separationAt(flight, t))} apart`);
     this.badge.hidden = !collided && !arrived;
     this.badge.classList.toggle("alarm", collided);
@@ -99,7 +99,7 @@ function set(node, text) {
 
 export const legend = [
   ["arc", "request: from the robot that asks to the one it asks; a light runs there and returns with the plan"],
-  ...(flights.some(flight => flight.announces) ? [["arc", "plan sent unasked: from the robot whose plan it is"]] : []),
+  ...(flights.some(flight => flight.announces) ? [["arc announced", "announced plan, sent unasked: from the robot whose plan it is; a light runs there"]] : []),
   ["tube", `plan for the next ${seconds((flights[0].plans[0][0].length - 1) * data.plan_stride)}`],
   ["goal", "goal of the robot of this colour"],
   ["bubble", `safety bubble, radius ${data.radius} m: two that touch are a collision`],
@@ -109,4 +109,5 @@ export const legend = [
 
 export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
   `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
-  `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A request is one robot asking another in one step.`;
+  `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A request is one robot asking another in one step.` +
+  (flights.some(flight => flight.announces) ? " A plan is sent in answer to a request, or announced without one." : "");

@@ -1,7 +1,7 @@
 // The views with titles and counters as one picture, for export and for animations made by a script.
 
 import {
-  askedUntil, flights, grouped, hasArrived, hasCollided, metres, nRobots, percent, possibleUntil, seconds, separationAt, title,
+  askedUntil, counted as words, flights, grouped, hasArrived, hasCollided, metres, nRobots, percent, possibleUntil, seconds, separationAt, title,
 } from "./data.js";
 import {css, isDark} from "./theme.js";
 
@@ -49,7 +49,7 @@ export class Picture {
       this.text(flight.name, left, y + 25, `700 19px ${FONT}`, ink, "left", wide - 24);
       this.text(flight.detail, left, y + 43, `400 13px ${FONT}`, faint, "left", wide - 24);
       const number = grouped(counted), used = this.text(number, left, y + 79, `700 30px ${FONT}`, ink);
-      this.text(counted === 1 ? "request" : "requests", left + used + 7, y + 67, `400 13px ${FONT}`, faint);
+      this.text(words(counted), left + used + 7, y + 67, `400 13px ${FONT}`, faint);
       this.text(`${percent(counted, possibleUntil(flight, t))} of all possible`, left + used + 7, y + 82, `400 13px ${FONT}`, faint);
       if (hasCollided(flight, t)) this.badge(`Collision at ${seconds(flight.collision)}`, left, y + 92, css("--alarm-fill"), "#ffffff");
       else if (hasArrived(flight, t)) this.badge(`All arrived at ${seconds(flight.arrival)}`, left, y + 92, css("--good-fill"), "#ffffff");

@@ -1,6 +1,6 @@
 // Who asks whom: arcs with an arrowhead at the one who is asked. A light runs along in the asker's colour, and back in
-// that of the one who is asked: its plan. An announced plan runs from its owner, in its colour. All arcs of a view are one
-// instanced mesh, bent by the vertex shader.
+// that of the one who is asked: its plan. An announced plan is a dashed arc, along which a light runs one way, from its owner
+// and in its colour. All arcs of a view are one instanced mesh, bent by the vertex shader.
 
 import {
   BufferAttribute, Color, DynamicDrawUsage, InstancedBufferAttribute, InstancedBufferGeometry, Mesh, ShaderMaterial, Vector2,
@@ -14,11 +14,11 @@ const PERIOD = 0.9; // s that the light takes there and back
 const vertexShader = `
 attribute vec2 place; // along the arc 0..1, of which the last tenth is the head; and the side, -1 or 1
 attribute vec3 from, to, asker, asked;
-attribute float strength, phase;
+attribute float strength, phase, announced;
 uniform vec2 size;
 uniform float width;
 varying vec3 near, far;
-varying float along, shown, began, side;
+varying float along, shown, began, side, dashed;
 
 vec3 bent(float u) {
   vec3 chord = to - from;
@@ -44,18 +44,21 @@ void main() {
   float half_width = inHead ? (1.0 - (place.x - 0.91) / 0.09) * (1.6 + 1.5 * width) : 0.5 * width;
   here.xy += place.y * half_width * vec2(-way.y, way.x) / size * 2.0 * here.w;
   gl_Position = here;
-  near = asker; far = asked; along = u; shown = strength; began = phase; side = place.y;
+  near = asker; far = asked; along = u; shown = strength; began = phase; side = place.y; dashed = announced;
 }`;
 
 const fragmentShader = `
+#define DASHES 8.0
 uniform float time, base, glow;
 varying vec3 near, far;
-varying float along, shown, began, side;
+varying float along, shown, began, side, dashed;
 
 void main() {
+  bool oneWay = dashed > 0.5;
+  if (oneWay && along < 0.85 && fract(along * DASHES) > 0.55) discard;
   float beat = fract(time + began);
-  bool back = beat > 0.5;
-  float at = back ? 2.0 - 2.0 * beat : 2.0 * beat;
+  bool back = beat > 0.5 && !oneWay;
+  float at = back ? 2.0 - 2.0 * beat : fract(2.0 * beat);
   float light = smoothstep(0.13, 0.0, abs(along - at));
   vec3 lit = mix(back ? far : near, vec3(1.0), glow * light);
   gl_FragColor = vec4(mix(near, lit, light), shown * min(1.0, base + light * (0.3 + 0.5 * base)));
@@ -73,7 +76,7 @@ export class Requests {
     const geometry = this.geometry = new InstancedBufferGeometry();
     geometry.setAttribute("place", new BufferAttribute(places, 2));
     geometry.setIndex(index);
-    for (const [name, size] of [["from", 3], ["to", 3], ["asker", 3], ["asked", 3], ["strength", 1], ["phase", 1]]) {
+    for (const [name, size] of [["from", 3], ["to", 3], ["asker", 3], ["asked", 3], ["strength", 1], ["phase", 1], ["announced", 1]]) {
       const attribute = new InstancedBufferAttribute(new Float32Array(size * nPairs), size).setUsage(DynamicDrawUsage);
       geometry.setAttribute(name, attribute);
     }
@@ -94,7 +97,7 @@ export class Requests {
       const left = k === step ? 1 : 1 - (t - k - 1) * dt / FADE;
       if (left > 0) for (const [i, j, announced] of flight.requests[k]) strengths.set(i * nRobots + j, [left, announced]);
     }
-    const {from, to, asker, asked, strength, phase} = this.geometry.attributes;
+    const {from, to, asker, asked, strength, phase, announced: unasked} = this.geometry.attributes;
     let count = 0;
     for (const [pair, [left, announced]] of strengths) {
       const gets = Math.floor(pair / nRobots), gives = pair % nRobots, [i, j] = announced ? [gives, gets] : [gets, gives];
@@ -104,9 +107,10 @@ export class Requests {
       asked.setXYZ(count, this.colours[gives].r, this.colours[gives].g, this.colours[gives].b);
       strength.setX(count, left);
       phase.setX(count, 0.618 * pair % 1);
+      unasked.setX(count, announced ? 1 : 0);
       count++;
     }
-    for (const attribute of [from, to, asker, asked, strength, phase]) attribute.needsUpdate = true;
+    for (const attribute of [from, to, asker, asked, strength, phase, unasked]) attribute.needsUpdate = true;
     this.geometry.instanceCount = count;
     this.mesh.visible = count > 0;
     // With full communication, single arcs cannot be followed anyway. They are thin and pale, so that robots stay visible
