@@ -1,4 +1,4 @@
-"""Train the swarm in Python: ``python examples/train_swarm.py [--quick]`` (seven minutes on one core)."""
+"""Train the swarm in Python: ``python examples/train_swarm.py [--quick]`` (7.5 minutes on one core)."""
 
 import argparse
 

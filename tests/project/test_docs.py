@@ -17,6 +17,7 @@ from sb3_maddpg import MADDPG, MATD3, MADDPGPolicy, PairPolicy
 from sb3_maddpg.estimators import ESTIMATORS
 
 ROOT = Path(__file__).parents[2]
+TRIED = "benchmarks/results/action_spaces.json"
 LEARNER = ("maddpg", "matd3", "pettingzoo", "relational", "migration", "support", "integrations")
 SITE = ("quickstart", "tensorboard", "resuming", "clusters", "tutorials/swarm", "tutorials/pettingzoo")
 NO_LEARNING = ("tutorials/scenario", "tutorials/rule", "tutorials/reading", "planner", "index", "faq", "files")
@@ -177,3 +178,41 @@ def test_tables_of_arguments_are_those_of_the_code(page, heading, expected):
 def test_every_estimator_is_described():
     described = table("docs/maddpg.md", "How agents act and explore")
     assert [name for name in described if name in ESTIMATORS] == list(ESTIMATORS)
+
+
+def test_a_duration_is_the_same_on_every_page():
+    """Those of `python -m studies.swarm.training_time` and `python benchmarks/checkpoints.py --whole`."""
+    runs = json.loads(text_of("studies/swarm/data/training.json"))
+    (paper,) = (run["seconds"] / 60 for run in runs if run["recipe"] == "zoo_configs/quad_swarm_paper.yml")
+    whole = json.loads(text_of("benchmarks/results/checkpoints.json"))
+    (flight,) = (run["seconds"] / 60 for run in whole if run["whole"])
+    for page in ("README.md", "docs/tutorials/swarm.md", "docs/notebooks/quickstart.ipynb", "examples/train_swarm.py"):
+        assert f"{paper:.1f} minutes on one core" in text_of(page), page
+    for page in ("README.md", "docs/flight.md"):
+        assert f"{flight:.0f} minutes on one core" in text_of(page), page
+    assert f"whole training, {flight:.0f} minutes" in text_of("docs/resuming.md")
+
+
+def test_the_code_of_the_readme_fits_github():
+    """GitHub cuts off what is longer, without a hint."""
+    lines = [line for block in FENCED.finditer(text_of("README.md")) for line in block[2].splitlines()]
+    assert len(lines) > 20
+    assert max(map(len, lines)) <= 92
+
+
+def test_the_table_of_libraries_is_what_was_tried():
+    rows = [line.strip("| ").split(" | ") for line in text_of("README.md").splitlines() if line.startswith("| ")]
+    titles = next(row for row in rows if "AgileRL 2.58" in row)
+    cells = {row[0]: dict(zip(titles, row[1:], strict=True)) for row in rows if len(row) == len(titles) + 1}
+    tried = {(row["library"], row["actions"]): row["trains"] for row in json.loads(text_of(TRIED))}
+    asked = {
+        "`Box` / `Discrete` actions": ("Box", "Discrete"),
+        "`MultiDiscrete` / `MultiBinary`": ("MultiDiscrete", "MultiBinary"),
+        "lengths that differ within a team, `Box` / `Discrete`": ("Box(3) and Box(5)", "Discrete(3) and Discrete(5)"),
+        "`Box` beside `Discrete` in a team": ("Box and Discrete",),
+    }
+    libraries = {"here": "ours", "AgileRL 2.58": "agilerl", "BenchMARL 1.5.2": "benchmarl", "XuanCe 1.4.4": "xuance"}
+    for row, actions in asked.items():
+        for title, library in libraries.items():
+            answers = ["yes" if tried[library, one] == "yes" else "no" for one in actions]
+            assert cells[row][title] == " / ".join(answers), (row, title)

@@ -166,8 +166,9 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
         nargs="+",
         required=required,
         metavar="POLICY",
-        help=f"a rule ({_rules_usage()}; EPS and DIST in m, or with the suffix s in separations of the planner), rules "
-        "joined by & (both) and | (either), a model's zip, MODEL.zip@THRESHOLD, latest:LOGDIR or pretrained:NAME",
+        help=f"a rule ({_rules_usage()}; EPS and DIST in m, or in separations of the planner with the suffix s, which "
+        "does not mean seconds: 1.1s; LOOKAHEAD and TIME in seconds), rules joined by & (both) and | (either), a "
+        "model's zip, MODEL.zip@THRESHOLD, latest:LOGDIR or pretrained:NAME",
     )
     parser.add_argument("--seed", type=int, default=0, help="index of the set of held-out episodes (default 0)")
     parser.add_argument(

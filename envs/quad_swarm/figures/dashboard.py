@@ -66,7 +66,7 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
     conditions = [Condition("model", name, config, linger=5) for name in SCENARIOS]
     asked, possible, steps, collisions = requests_by_pair(conditions[-1], model)
     pictures: dict[str, Figure | float] = {
-        f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5) for one in conditions
+        f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5, "") for one in conditions
     }
     return pictures | {
         "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), conditions[-1].scenario),

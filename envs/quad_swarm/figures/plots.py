@@ -120,12 +120,15 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: 
 
 
 @rc_context(STYLE)
-def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight], size: float = 3.6) -> Figure:
+def draw_flights(
+    conditions: Sequence[Condition], flights: Sequence[Flight], size: float = 3.6, name: str | None = None
+) -> Figure:
     """Draw a flight of a policy in each scenario from above, with the places of requests (Fig. 2).
 
     :param conditions: conditions of the flights
     :param flights: the flights
     :param size: width and height of each flight's panel (inches)
+    :param name: name of the policy in the legend, by default its short name; empty for none
     """
     columns = min(len(conditions), 2)
     lines = math.ceil(len(conditions) / columns)
@@ -136,7 +139,7 @@ def draw_flights(conditions: Sequence[Condition], flights: Sequence[Flight], siz
     for axes, condition, flight in zip(panels.flat, conditions, flights, strict=False):
         draw_flight(axes, flight)
         axes.set_title(condition.scenario.replace("_", " "))
-    explain_flights(figure, panels.flat[0], short_name(conditions[-1].policy))
+    explain_flights(figure, panels.flat[0], short_name(conditions[-1].policy) if name is None else name)
     return figure
 
 

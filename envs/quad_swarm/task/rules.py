@@ -1,7 +1,8 @@
 """Hand-made rules for requests: the baselines of Sec. V-C and stronger ones.
 
 A rule maps the knowledge of the robots of E swarms to requests. To add a rule, write a function and add it to `RULES`.
-Lengths may be in units of the planner's separation: "cpa:1.1s:1.5" uses 1.1 times the separation.
+Lengths are in m, or with the suffix "s" in units of the planner's separation: "cpa:1.1s:1.5" uses 1.1 times the
+separation, within 1.5 seconds.
 "&" requests if both rules do, "|" if at least one does; "&" binds tighter.
 """
 

@@ -93,6 +93,8 @@ def test_a_panel_for_each_flight(flown):
     (legend,) = figure.legends
     assert legend.get_title().get_text() == "distance:2.5"
     assert [text.get_text() for text in legend.get_texts()] == ["start", "goal", "asks somebody"]
+    (legend,) = plots.draw_flights([condition], [flight], name="").legends
+    assert legend.get_title().get_text() == ""
 
 
 def test_the_animation_ends_shortly_after_all_have_arrived(flown, tmp_path):
