@@ -67,7 +67,7 @@ def model_card(model: MADDPG, repo_id: str, evaluations: Path | None = None) -> 
         f"# {algorithm} on {env_id}",
         "",
         f"{team.n_agents} agents ({', '.join(team.names[:8])}{', ...' if team.n_agents > 8 else ''}) trained for "
-        f"{model.num_timesteps} steps with [sb3-maddpg](https://pypi.org/project/sb3-maddpg), MADDPG for "
+        f"{model.num_timesteps} steps with sb3-maddpg, MADDPG for "
         "Stable-Baselines3.",
         "",
     ]

@@ -22,7 +22,7 @@ from quad_swarm.evaluation.command import add_policy_arguments, make_conditions,
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import is_model, short_name
 from quad_swarm.evaluation.provenance import plant_name
-from quad_swarm.evaluation.rows import check_writable
+from quad_swarm.evaluation.rows import STDOUT, check_writable, write_text
 from quad_swarm.figures.colours import COLOURS
 from quad_swarm.geometry import length
 from quad_swarm.quadrotor import ATTITUDE, POSITION
@@ -146,7 +146,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_policy_arguments(parser)
     parser.add_argument("--scenario", default="symmetric_swap", help=f"one of {', '.join(SCENARIOS)} (%(default)s)")
     parser.add_argument("--episode", type=int, default=0, help="index of the episode in the set (default 0)")
-    parser.add_argument("--out", type=Path, default=Path("replay.html"), help="file of the page (default %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("replay.html"), help="file of the page, or - (default %(default)s)"
+    )
     return run(_write, parser.parse_args(argv))
 
 
@@ -157,8 +159,9 @@ def _write(args: argparse.Namespace) -> None:
     conditions = make_conditions(args, [args.scenario])
     changes = [*args.world, *([f"plant={plant_name(conditions[0].config)}"] if args.plant else [])]
     page = replay_page(conditions, args.seed, args.episode, args.preset, changes)
-    args.out.write_text(page, encoding="utf-8")
-    print(f"wrote {args.out}, {len(page) / 1e6:.1f} MB: open it in a browser")
+    write_text(args.out, page)
+    if args.out != STDOUT:
+        print(f"wrote {args.out}, {len(page) / 1e6:.1f} MB: open it in a browser")
 
 
 if __name__ == "__main__":

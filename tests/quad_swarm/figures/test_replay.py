@@ -74,6 +74,15 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_dash_writes_the_page_to_the_standard_output(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["--policy", "none", "--max-steps", "5", "--out", "-"]) == 0
+    printed = capsys.readouterr().out
+    assert [flight["policy"] for flight in data_of(printed)["flights"]] == ["none"]
+    assert printed.rstrip().endswith("</html>")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_page_was_built_from_its_sources():
     sources = FIGURES / "page"
     names = sorted(path.name for path in sources.iterdir() if re.search(r"\.(js|mjs|css|html|json)$", path.name))
