@@ -14,7 +14,7 @@ TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan 
 POLICIES ?= none full distance:4 "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
 PEERS := agilerl benchmarl xuance
 
-.PHONY: help install train test lint docs page bench bench-peers results results-quick clean
+.PHONY: help install train test lint docs page bench bench-peers check-peers results results-quick clean
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
@@ -82,6 +82,9 @@ results-quick: install  ## the same with few episodes and rules, into $(LOGS)/re
 
 bench-peers: install $(PEERS:%=.bench/%/.installed)  ## training speed against other libraries, each in its own environment
 	$(BIN)/python benchmarks/training.py --json benchmarks/results/training.json
+
+check-peers: install $(PEERS:%=.bench/%/.installed)  ## which action spaces the other libraries train on
+	$(BIN)/python -m benchmarks.peers.action_spaces --json benchmarks/results/action_spaces.json
 
 .bench/%/.installed: benchmarks/peers/%.txt
 	$(PYTHON) -m venv .bench/$*

@@ -1,8 +1,8 @@
 """Which action spaces each library's MADDPG trains on.
 
-``python -m benchmarks.peers.action_spaces``, after ``make bench-peers`` has installed the other libraries, trains two
-agents with each library's own loop and prints a table. "yes" means that every action was in its agent's space and that
-the actors of both agents learned; otherwise the cell holds the error. The README's table of libraries is based on it.
+``make check-peers`` installs the other libraries, trains two agents with each library's own loop and prints a table.
+"yes" means that every action was in its agent's space and that the actors of both agents learned; otherwise the cell
+holds the error. The README's table of libraries is based on it.
 """
 
 import argparse

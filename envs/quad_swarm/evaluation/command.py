@@ -340,16 +340,20 @@ def _check_files(args: argparse.Namespace) -> TextIO:
 
     :return: where the table goes: the standard output, unless a file is written there
     """
-    paths = {f"--{name}": path for name in ("json", "csv", "latex") if (path := getattr(args, name))}
+    paths = {f"--{name}": path for name in ("json", "csv", "latex", "plot") if (path := getattr(args, name))}
     for option, path in paths.items():
-        check_writable(path, option)
-    if len(streams := [option for option, path in paths.items() if path == STDOUT]) > 1:
-        raise ValueError(f"{' and '.join(streams)} cannot both be the standard output (-): write one into a file.")
+        same = [other for other, its in paths.items() if its.absolute() == path.absolute()]
+        if len(same) > 1:
+            raise ValueError(f"{' and '.join(same)} are both {path}: one would overwrite the other; name two files.")
+        if option != "--plot":
+            check_writable(path, option)
+    if args.plot == STDOUT:
+        raise ValueError("--plot -: figures need a folder.")
     if args.plot:
         check_writable(args.plot / "plot", "--plot")
         with needs_extra("--plot", "plot"):
             import quad_swarm.figures.plots  # noqa: F401  matplotlib is only needed here
-    return sys.stderr if streams else sys.stdout
+    return sys.stderr if STDOUT in paths.values() else sys.stdout
 
 
 def _footer(args: argparse.Namespace, rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -193,7 +193,7 @@ def test_a_dash_writes_a_file_to_the_standard_output_alone(option, tmp_path, mon
         assert printed.out.endswith("\\end{tabular}\n")
         assert "wrote" not in printed.out
     assert main([*FEW, option, "-", "--json" if option != "--json" else "--csv", "-"]) == 2
-    assert "cannot both be the standard output" in capsys.readouterr().err
+    assert "are both -: one would overwrite the other" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("missing", ["matplotlib", "pygame", "PIL"])
@@ -243,6 +243,9 @@ def test_a_missing_simulator_is_told_before_the_flights(tmp_path, monkeypatch, c
         (["--policy", "none", "--csv", "."], "--csv . is a folder"),
         (["--policy", "none", "--latex", "."], "--latex . is a folder"),
         (["--policy", "none", "--json", "/proc/nowhere/table.json"], "choose another folder"),
+        (["--policy", "none", "--json", "a", "--csv", "./a"], "--json and --csv are both a: one would overwrite"),
+        (["--policy", "none", "--latex", "a", "--plot", "a"], "--latex and --plot are both a: one would overwrite"),
+        (["--policy", "none", "--plot", "-"], "figures need a folder"),
     ],
 )
 def test_errors_are_one_line_with_the_remedy(arguments, message, capsys):
