@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, fly_steps
+from quad_swarm.evaluation.policies import trained_in
 from quad_swarm.figures.plots import draw_flights
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import make_config
@@ -69,7 +70,9 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
         f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5, "") for one in conditions
     }
     return pictures | {
-        "symmetric_swap/requests_by_pair": draw_requests_by_pair(asked / max(steps, 1), conditions[-1].scenario),
+        "symmetric_swap/requests_by_pair": draw_requests_by_pair(
+            asked / max(steps, 1), conditions[-1].scenario, bool(trained_in(model).get("announcements"))
+        ),
         "symmetric_swap/request_share": float(asked.sum() / max(possible, 1)),
         "symmetric_swap/collision_rate": collisions / EPISODES,
     }
@@ -99,11 +102,12 @@ def requests_by_pair(condition: Condition, model: Any) -> tuple[np.ndarray, int,
     return asked, possible, steps, int(collided.sum())
 
 
-def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:
+def draw_requests_by_pair(share: np.ndarray, scenario: str, announcements: bool = False) -> Figure:
     """Draw a heat map of requests.
 
-    :param share: fraction of steps in which robot i requests robot j's plan, (n, n)
+    :param share: fraction of steps in which robot i gets robot j's plan, (n, n)
     :param scenario: name of the scenario, for the title
+    :param announcements: whether plans are also sent without a request, for the labels
     """
     n = len(share)
     figure = Figure(figsize=(4.2, 3.6), layout="constrained")
@@ -114,8 +118,8 @@ def draw_requests_by_pair(share: np.ndarray, scenario: str) -> Figure:
         axes.text(j, i, f"{100 * share[i, j]:.0f}", ha="center", va="center", color="white" if dark else "black")
     axes.set_xticks(range(n))
     axes.set_yticks(range(n))
-    axes.set_xlabel("is asked")
-    axes.set_ylabel("asks")
+    axes.set_xlabel("sends its plan" if announcements else "is asked")
+    axes.set_ylabel("gets it" if announcements else "asks")
     axes.set_title(f"{scenario.replace('_', ' ')}: % of the steps", fontsize=10)
     figure.colorbar(shown, format=PercentFormatter(1.0))
     return figure

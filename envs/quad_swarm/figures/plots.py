@@ -19,6 +19,7 @@ from quad_swarm.evaluation.policies import short_name
 from quad_swarm.figures.colours import INK, RULES, STYLE, colour_of
 from quad_swarm.figures.render import Renderer
 from quad_swarm.geometry import length
+from quad_swarm.world.beliefs import other_indices
 
 
 def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition], seed: int, folder: Path) -> list[Path]:
@@ -139,7 +140,8 @@ def draw_flights(
     for axes, condition, flight in zip(panels.flat, conditions, flights, strict=False):
         draw_flight(axes, flight)
         axes.set_title(condition.scenario.replace("_", " "))
-    explain_flights(figure, panels.flat[0], short_name(conditions[-1].policy) if name is None else name)
+    announced = any(flight.announced.any() for flight in flights)
+    explain_flights(figure, panels.flat[0], short_name(conditions[-1].policy) if name is None else name, announced)
     return figure
 
 
@@ -151,7 +153,7 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
     for k in range(steps):
         lines = [
             f"{short_name(condition.policy)}, {condition.scenario}",
-            f"step {k + 1}   requests {flight.requests[k].sum()}",
+            f"step {k + 1}   {'plans sent' if flight.announced.any() else 'requests'} {flight.requests[k].sum()}",
         ]
         picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
         frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
@@ -160,9 +162,10 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
 
 
 def draw_flight(axes: Axes, flight: Flight) -> None:
-    """Draw a flight from above in the colours of the robots, with dots where a robot makes requests and an arrow
-    halfway along each path."""
-    asks = flight.requests.sum(axis=2) > 0
+    """Draw a flight from above in the colours of the robots, with dots where a robot makes requests, squares where it
+    announces its plan, and an arrow halfway along each path."""
+    asks = (flight.requests & ~flight.announced).any(axis=2)
+    others = other_indices(flight.n_robots)
     for i, goal in enumerate(flight.goal):
         path, colour = flight.state[:, i, :2], colour_of(i)
         axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.2)
@@ -172,6 +175,11 @@ def draw_flight(axes: Axes, flight: Flight) -> None:
         axes.annotate("", path[k + 1], path[k], arrowprops=arrow)
         asking = path[:-1][asks[:, i]]
         axes.scatter(asking[:, 0], asking[:, 1], s=18, color=colour, edgecolor="black", linewidth=0.5, zorder=3)
+        if flight.announced.any():
+            telling = path[:-1][(flight.announced & (others == i)).any(axis=(1, 2))]
+            axes.scatter(
+                telling[:, 0], telling[:, 1], s=26, marker="s", color="white", edgecolor=colour, linewidth=1.2, zorder=2
+            )
         axes.plot(*path[0], "o", color=colour, markersize=7, markerfacecolor="white")
         axes.plot(*goal[:2], "*", color=colour, markersize=10)
     axes.set_aspect("equal")
@@ -180,17 +188,20 @@ def draw_flight(axes: Axes, flight: Flight) -> None:
     axes.margins(0.08)
 
 
-def explain_flights(figure: Figure, axes: Axes, policy: str = "") -> None:
+def explain_flights(figure: Figure, axes: Axes, policy: str = "", announced: bool = False) -> None:
     """Add a legend of `draw_flight` at the bottom of a figure.
 
     :param figure: the figure
     :param axes: any of its panels
     :param policy: name of the policy
+    :param announced: whether robots announce their plans
     """
     marks: dict[str, dict[str, Any]] = {
         "start": {"marker": "o", "markersize": 7, "markerfacecolor": "white"},
         "goal": {"marker": "*", "markersize": 10},
         "asks somebody": {"marker": "o", "markersize": 5, "markeredgecolor": "black"},
     }
+    if announced:
+        marks["announces its plan"] = {"marker": "s", "markersize": 5, "markerfacecolor": "white"}
     handles = [axes.plot([], [], linestyle="", color=RULES, label=name, **style)[0] for name, style in marks.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), title=policy or None)

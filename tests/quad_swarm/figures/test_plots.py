@@ -97,6 +97,20 @@ def test_a_panel_for_each_flight(flown):
     assert legend.get_title().get_text() == ""
 
 
+def test_announced_plans_are_no_requests_in_the_picture(flown):
+    condition, flight = flown
+    told = np.zeros_like(flight.requests)
+    told[3, 1, 0] = told[5, 2, 1] = True  # robot 0 tells 1, and robot 1 tells 2
+    figure = plots.draw_flights([condition], [dataclasses.replace(flight, requests=told, announced=told)])
+    dots, squares = figure.axes[0].collections[::2], figure.axes[0].collections[1::2]
+    assert not any(len(points.get_offsets()) for points in dots), "nobody asks"
+    places = [points.get_offsets().tolist() for points in squares]
+    assert places[0] == [flight.state[3, 0, :2].tolist()]
+    assert places[1] == [flight.state[5, 1, :2].tolist()]
+    assert not any(places[2:])
+    assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "announces its plan"
+
+
 def test_the_animation_ends_shortly_after_all_have_arrived(flown, tmp_path):
     condition, flight = flown
     assert flight.arrival is not None
