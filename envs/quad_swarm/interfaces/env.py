@@ -225,7 +225,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         swarm, statistics = self.task.swarm, self.task.statistics
         lines = [
             f"step {statistics.steps[0]}   {self.task.scenario[0]}",
-            f"requests {self._requests.sum()} now, {statistics.requests[0]} in all",
+            f"{'plans sent' if self.task.n_bits == 2 else 'requests'} {self._requests.sum()} now, "
+            f"{statistics.requests[0]} in all",
             f"smallest separation {statistics.min_separation[0]:.2f} m",
         ]
         if statistics.collided[0]:
