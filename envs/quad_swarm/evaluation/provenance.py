@@ -13,6 +13,7 @@ from quad_swarm.evaluation.evaluation import user_modules
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.plants.base import MODEL, parse_plant
+from quad_swarm.tasks.journal import sources_digest
 from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig
 
 
@@ -24,8 +25,9 @@ def provenance(condition: Condition, preset: str, seed: int, solver: str) -> dic
     :param seed: index of the set of held-out episodes
     :param solver: name of the solver that planned
     :return: ``preset``, ``preset_version``, ``world`` (all fields that differ from the preset, with their values),
-        ``n_robots``, ``plant``, ``max_steps``, ``seed``, ``solver``, ``versions`` (package -> version), and for a model
-        ``model_sha256``; ``modules`` are those of custom scenarios and rules
+        ``n_robots``, ``plant``, ``max_steps``, ``seed``, ``solver``, ``versions`` (package -> version),
+        ``code_sha256`` (of this package's sources, which a version does not tell in a clone), and for a model
+        ``model_sha256``; ``modules`` (module -> SHA-256 of its sources) are those of custom scenarios and rules
     """
     config = replace(condition.config, plant=plant_name(condition.config))
     row = {
@@ -38,9 +40,10 @@ def provenance(condition: Condition, preset: str, seed: int, solver: str) -> dic
         "seed": seed,
         "solver": solver,
         "versions": _versions(condition),
+        "code_sha256": sources_digest("quad_swarm"),
     }
     if modules := [name for name in user_modules() if not name.startswith("quad_swarm.")]:
-        row["modules"] = modules
+        row["modules"] = {name: sources_digest(name) for name in modules}
     if is_model(condition.policy):
         row["model_sha256"] = hashlib.sha256(Path(condition.policy.partition("@")[0]).read_bytes()).hexdigest()
     return row

@@ -52,7 +52,7 @@ class Journal:
         :param files: other files that it depends on, such as models
         """
         digest = hashlib.sha256(what.encode())
-        for part in (*(_sources(name) for name in sorted(set(packages))), *map(_content, files), machine()):
+        for part in (*(sources_digest(name) for name in sorted(set(packages))), *map(_content, files), machine()):
             digest.update(b"\0" + part.encode())
         return digest.hexdigest()[:32]
 
@@ -117,7 +117,7 @@ def _remove_old(folder: Path) -> None:
 
 
 @functools.lru_cache(maxsize=64)
-def _sources(name: str) -> str:
+def sources_digest(name: str) -> str:
     """Return a digest of the sources of a package or a top-level module."""
     top = name.partition(".")[0]
     spec = importlib.util.find_spec(top)

@@ -7,6 +7,7 @@ import pytest
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.provenance import plant_name, provenance
 from quad_swarm.task.rules import RULES
+from quad_swarm.tasks.journal import sources_digest
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -43,13 +44,26 @@ def test_changes_make_the_same_world_again(world, changed):
     assert {**vars(again), "plant": ""} == {**vars(config), "plant": ""}
 
 
-def test_modules_of_custom_scenarios_and_rules_are_named(monkeypatch):
+def test_modules_of_custom_scenarios_and_rules_are_named(monkeypatch, tmp_path):
     assert "modules" not in of()
 
     def custom(n_robots, space, rng):
         raise NotImplementedError
 
-    custom.__module__ = "my_lab.scenarios"
+    custom.__module__ = "my_scenarios_of_this_test"
     monkeypatch.setitem(SCENARIOS, "custom", custom)
     monkeypatch.setitem(RULES, "custom", (custom, ()))
-    assert of()["modules"] == ["my_lab.scenarios"]
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = []
+    for text in ("ROOM = 1", "ROOM = 2"):
+        (tmp_path / "my_scenarios_of_this_test.py").write_text(text)
+        sources_digest.cache_clear()
+        found.append(of()["modules"]["my_scenarios_of_this_test"])
+    assert found[0] != found[1], "the same name, other code"
+
+
+def test_other_code_of_the_package_is_seen(monkeypatch):
+    before = of()["code_sha256"]
+    assert before == sources_digest("quad_swarm")
+    monkeypatch.setattr("quad_swarm.evaluation.provenance.sources_digest", lambda name: f"other {name}")
+    assert of()["code_sha256"] == "other quad_swarm"
