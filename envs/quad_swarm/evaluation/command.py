@@ -12,9 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.evaluation.evaluation import evaluate, make_pool
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.policies import is_model, load_model, short_name, short_names, trained_in
@@ -24,6 +22,7 @@ from quad_swarm.plants.base import MODEL, simulated_vehicles
 from quad_swarm.task.rules import RULES
 from quad_swarm.tasks import ENGINES
 from quad_swarm.tasks.journal import default_folder
+from quad_swarm.validation import read_yaml
 from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -139,9 +138,11 @@ def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
         if leaf in place:
             raise ValueError(f"--world {assignment!r}: {name!r} is given twice.")
         try:
-            place[leaf] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ValueError(f"--world {assignment!r}: {value!r} is not valid YAML; quote text.") from None
+            place[leaf] = read_yaml(value)
+        except ValueError as error:
+            raise ValueError(
+                f"--world {shown(assignment)}: {shown(value)} is not valid YAML ({shown(str(error))}); quote text."
+            ) from None
     return world
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
@@ -197,7 +198,7 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
         ):  # not a number, which the check of the fields reports
             separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
             changes = {**changes, "planner": {**planner, "separation": separation}}
-    if isinstance(vehicle := changes.get("quadrotor"), str):
+    if isinstance(vehicle := changes.get("quadrotor"), (str, os.PathLike)):
         changes = {**changes, "quadrotor": load_vehicle(vehicle)}
     if changes.get("plant", MODEL) != MODEL:
         changes = {"mismatch": 0.0, **changes}
