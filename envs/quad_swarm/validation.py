@@ -30,10 +30,10 @@ _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 # Limit of lengths and coordinates (m), far beyond any flight and small enough for precise squares
-_FARTHEST = 1e4
-Length = Annotated[float, pydantic.Field(ge=0, le=_FARTHEST)]
-PositiveLength = Annotated[float, pydantic.Field(gt=0, le=_FARTHEST)]
-Coordinate = Annotated[float, pydantic.Field(ge=-_FARTHEST, le=_FARTHEST)]
+FARTHEST = 1e4
+Length = Annotated[float, pydantic.Field(ge=0, le=FARTHEST)]
+PositiveLength = Annotated[float, pydantic.Field(gt=0, le=FARTHEST)]
+Coordinate = Annotated[float, pydantic.Field(ge=-FARTHEST, le=FARTHEST)]
 
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
@@ -137,7 +137,7 @@ MOST_CHARACTERS, _MOST_VALUES = 100_000, 10_000
 class _PlainLoader(yaml.SafeLoader):
     """YAML loader with the plain values of YAML 1.2 only: no dates, and "010", "1:30" and "yes" are no surprises."""
 
-    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # filled below
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # type: ignore[misc]  # filled below
     yaml_constructors: ClassVar[dict[Any, Any]] = {}
 
     def get_single_node(self) -> yaml.Node | None:
@@ -180,7 +180,7 @@ for _tag, _pattern, _construct in (
     if _pattern is not None:
         _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), None)
     _PlainLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct)
-_PlainLoader.add_constructor(None, yaml.SafeLoader.construct_undefined)
+_PlainLoader.add_constructor(None, yaml.SafeLoader.construct_undefined)  # type: ignore[type-var]
 
 
 def _count(node: yaml.Node, counted: dict[int, float]) -> float:

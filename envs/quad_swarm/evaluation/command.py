@@ -211,7 +211,7 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, but this is {args.preset!r}", file=sys.stderr)
     for name in scenarios:
-        ScenarioSampler(name, config.n_robots, config.space)  # raises if the robots do not fit
+        ScenarioSampler(name, config.n_robots, config.space, config)  # raises if the robots do not fit
     return [
         Condition(policy, name, config, args.max_steps, args.algo, args.solver)
         for name in dict.fromkeys(scenarios)

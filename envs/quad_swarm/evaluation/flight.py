@@ -16,6 +16,7 @@ from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, req
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import spread
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
@@ -51,6 +52,8 @@ class Condition:
     def __post_init__(self) -> None:
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
+        for sentence in too_short(self.config, self.max_steps) if self.max_steps is not None else ():
+            warn(sentence)
         if self.linger is not None and self.linger < 0:
             raise ValueError(f"linger={self.linger} must be a number of steps, or None to fly until the time limit.")
 
@@ -83,7 +86,7 @@ def begin(
         policy, observation = policy_of(model, condition.policy, config)
     task = RequestTask(
         Swarm(config, len(episodes), condition.solver),
-        ScenarioSampler(condition.scenario, config.n_robots, config.space),
+        ScenarioSampler(condition.scenario, config.n_robots, config.space, config),
         RewardConfig(),
         condition.max_steps,
         observation,
