@@ -38,7 +38,7 @@ class Condition:
     :param solver: see `make_planner`
     :param linger: number of steps to fly after all robots have reached their goals; None for flying until the time
         limit
-    :raises ValueError: if ``max_steps`` is less than 1, or ``linger`` is negative
+    :raises ValueError: if ``max_steps`` is less than 1, ``linger`` is negative, or the scenario does not fit the world
     """
 
     policy: str
@@ -52,6 +52,7 @@ class Condition:
     def __post_init__(self) -> None:
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
+        ScenarioSampler(self.scenario, self.config.n_robots, self.config.space, self.config)
         for sentence in too_short(self.config, self.max_steps) if self.max_steps is not None else ():
             warn(sentence)
         if self.linger is not None and self.linger < 0:

@@ -109,7 +109,7 @@ def far_goals(config: SwarmConfig) -> tuple[float, str]:
     return distance, (
         f"planner.goal_weight={planner.goal_weight:g} is divided by the squared distance to the goal, so robots whose "
         f"goals are more than {distance:.0f} m away fly at less than half of {min(fastest):.2g} m/s, the slower the "
-        "farther: raise it in proportion to the distance"
+        f"farther: raise it to {2 * planner.goal_weight / max(distance, 1e-9):.2g} per metre of their distance"
     )
 
 
