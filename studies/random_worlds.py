@@ -106,7 +106,7 @@ def draw_world(seed: int, number: int) -> dict[str, Any]:
     """Return the arguments of a `QuadSwarmEnv` in a random world. Ten consecutive ones share what the planner's kernel
     depends on, because to compile one takes seconds."""
     shared, rng = np.random.default_rng([seed, number // 10]), np.random.default_rng([seed, number, 1])
-    preset, n_robots = str(shared.choice(list(PRESETS))), int(shared.choice([2, 4, 8, 16, shared.integers(2, 65)]))
+    preset, n_robots = str(shared.choice(list(PRESETS))), int(shared.choice([2, 4, 8, 16, int(shared.integers(2, 65))]))
     world: dict[str, Any] = {}
     for source, names in ((shared, _COMPILED), (rng, [name for name in _FIELDS if name not in _COMPILED])):
         share = float(source.choice([0.0, 0.1, 0.3]))

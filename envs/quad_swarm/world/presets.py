@@ -32,6 +32,8 @@ PRESET_VERSION = 1
 class SwarmConfig:
     """Complete definition of a world, except for the scenario.
 
+    Fields that do not fit each other, though each may be right, cause a `DoubtfulWorld` warning, see `world.doubts`.
+
     :param n_robots: number of robots n, 2 to 1000
     :param radius: radius r of the sphere around a robot (m)
     :param collision_tolerance: two robots collide if their centres are closer than 2r minus this tolerance (m), because
@@ -56,8 +58,6 @@ class SwarmConfig:
     :param clock_skew: latest time in a step, as a fraction of its length, at which a robot's new input takes effect,
         drawn uniformly among the sub-steps for each robot and episode. A robot knows its own time and plans from its
         state at that time
-    Fields that do not fit each other, though each may be right, cause a `DoubtfulWorld` warning.
-
     :raises ValueError: if a value is out of range, the planner's separation or the spacing of starts and goals is less
         than 2r, the tolerance hides every collision, a step is too long for the vehicle's dynamics, or robots could
         tilt or turn too far
