@@ -80,6 +80,11 @@ def checked(cls: type[T]) -> type[T]:
     return strict  # type: ignore[return-value]
 
 
+def _is_plain(annotation: Any) -> bool:
+    """Return whether an argument is a number or a text, and true and false are neither."""
+    return "bool" not in str(annotation) and any(one in str(annotation) for one in ("int", "Int", "float", "str"))
+
+
 def _unflagged(value: Any) -> Any:
     """Return a value with texts instead of true and false, which would count as the numbers 1 and 0."""
     if isinstance(value, (bool, np.bool_)):
@@ -96,8 +101,11 @@ def checked_arguments(function: F) -> F:
     def call() -> Callable[..., Any]:
         return pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False))(function)
 
+    plain = {name for name, one in inspect.signature(function).parameters.items() if _is_plain(one.annotation)}
+
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        kwargs = {name: _unflagged(value) if name in plain else value for name, value in kwargs.items()}
         try:
             return call()(*args, **kwargs)
         except pydantic.ValidationError as error:

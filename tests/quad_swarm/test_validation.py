@@ -10,6 +10,7 @@ import pytest
 from pydantic import PositiveInt
 
 from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import Range, checked, checked_arguments, read_yaml, replaced
 from quad_swarm.world.presets import make_config
 
@@ -112,3 +113,11 @@ def test_truth_values_are_no_numbers(flag):
         with pytest.raises(ValueError, match=rf"='{bool(flag)}': it must be a valid"):
             make_config("paper", changes)
     assert make_config("paper", continuous_collisions=flag).continuous_collisions is bool(flag)
+
+
+def test_truth_values_are_no_numbers_among_arguments():
+    for arguments in ({"memory": True}, {"max_steps": np.True_}, {"n_robots": True}):
+        (name,) = arguments
+        with pytest.raises(ValueError, match=f"{name}='True': it must be a valid"):
+            make_task(**arguments)
+    assert make_task(n_robots=2, end_at_arrival=True, max_steps=100).end_at_arrival

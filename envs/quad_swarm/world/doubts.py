@@ -190,7 +190,7 @@ def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:
     distance, warning = far_goals(config)
     if not planner.goal_weight:
         yield "planner.goal_weight=0: robots do not fly to their goals; use a positive weight"
-    elif space.half_width > distance:
+    elif _usual_flight(config) > distance:
         yield warning
     yield from too_short(config, config.max_steps)
     if config.goal_radius > max(space.spacing, 2 * config.radius):
@@ -206,14 +206,20 @@ def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:
         )
 
 
+def _usual_flight(config: SwarmConfig) -> float:
+    """Return about the mean distance of starts and goals in the scenario where it is largest (m)."""
+    space = config.space
+    return max(space.half_width, 2 * space.circle_radius[0], 2 * space.sector_radius[0])
+
+
 def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
-    """Yield a sentence if robots cannot fly half of the room's width, or climb a third of its height, in time."""
+    """Yield a sentence if robots cannot fly a usual distance, or climb a third of the room's height, in time."""
     planner, space, vehicle = config.planner, config.space, config.quadrotor
     seconds = max_steps * planner.dt
     speed = min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle)))
     climb = min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain)
     needed = max(
-        (space.half_width - config.goal_radius) / speed,
+        (_usual_flight(config) - config.goal_radius) / speed,
         ((space.heights[1] - space.heights[0]) / 3 - config.goal_radius) / climb,
     )
     if needed > seconds:
@@ -232,6 +238,16 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
             f"are {oldest} steps old have no future left in a plan of planner.horizon={planner.horizon}; use at most "
             f"{max(planner.horizon - 2, 0)} together"
         )
+    for name, error in (
+        ("sensing.pos", config.sensing.pos),
+        ("sensing.others_pos", config.sensing.others_pos),
+        ("noise.pos", config.noise.pos),
+    ):
+        if error > config.radius:
+            yield (
+                f"{name}={error:g} is in metres and exceeds radius={config.radius:g}: robots cannot keep clear of each "
+                "other by that; use a few centimetres"
+            )
     if config.memory > 2 * config.radius:
         yield (
             f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "

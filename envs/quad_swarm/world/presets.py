@@ -15,6 +15,7 @@ from pydantic import Field, PositiveInt
 
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.planner import PlannerConfig
+from quad_swarm.planner.problem import check_vehicle
 from quad_swarm.plants.base import MODEL, parse_plant
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.validation import FARTHEST, Length, PositiveLength, checked, replaced
@@ -113,12 +114,8 @@ class SwarmConfig:
             )
 
     def _check_vehicle(self) -> None:
-        planner, vehicle, longest = self.planner, self.quadrotor, self.quadrotor.longest_step
-        if planner.dt > longest:
-            raise ValueError(
-                f"planner.dt={planner.dt}: steps must not exceed {longest:.2g} s, "
-                "the stability limit of the integration of the quadrotor's fastest response"
-            )
+        planner, longest = self.planner, self.quadrotor.longest_step
+        check_vehicle(planner, self.quadrotor, self.mismatch)
         if parse_plant(self.plant)[0] != MODEL and self.mismatch:
             raise ValueError(
                 f"mismatch={self.mismatch}: it only applies to plant={MODEL!r}, since plant={self.plant!r} differs "
@@ -133,12 +130,6 @@ class SwarmConfig:
         short = short_horizon(self)
         if short is not None and planner.goal_weight and far_goals(self)[0] < self.goal_radius:
             raise ValueError(short)
-        gain = max(vehicle.roll_gain, vehicle.pitch_gain) * (1 + self.mismatch)
-        if planner.max_tilt * gain >= math.pi / 2:
-            raise ValueError(
-                f"planner.max_tilt={planner.max_tilt:g}: with the quadrotor's gains, vehicles would tilt by "
-                f"{math.degrees(planner.max_tilt * gain):.0f} degrees; use at most {math.floor(1570 / gain) / 1000}"
-            )
         if planner.max_yaw_rate * planner.dt > math.pi:
             raise ValueError(
                 f"planner.max_yaw_rate={planner.max_yaw_rate:g} is in rad/s: it must be at most half a turn per step, "
