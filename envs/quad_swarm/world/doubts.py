@@ -264,9 +264,20 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
             )
 
 
+_told: set[str] = set()
+
+
 def warn(sentence: str) -> None:
-    """Warn of something doubtful. By default, Python shows each sentence once, in one line."""
-    warnings.warn_explicit(f"{sentence}.", DoubtfulWorld, "quad_swarm", 0, registry=_told)
-
-
-_told: dict = {}
+    """Warn of something doubtful, in one line. Each sentence is shown once in a process, unless Python's filters say
+    "always", as in tests, or "error"."""
+    usual = ("default", "module", "once")
+    actions = (
+        action
+        for action, message, category, module, _ in warnings.filters
+        if issubclass(DoubtfulWorld, category) and message is None and module is None
+    )
+    if next(actions, "default") in usual:
+        if sentence in _told:
+            return
+        _told.add(sentence)
+    warnings.warn_explicit(f"{sentence}.", DoubtfulWorld, "quad_swarm", 0)
