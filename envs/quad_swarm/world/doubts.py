@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from quad_swarm.world.presets import SwarmConfig
 
 _SLOW_START = 5.0  # a planner that takes longer to half of the speed is slow (s)
-_USUAL_GUST = 0.5  # standard deviations of the gusts in which robots should still arrive
+_LIGHT_AIR = 0.01  # wind in which offsets are linear (m/s)
+_SETTLING = 2.5  # time for which a disturbed velocity moves a robot (s)
 _FASTEST_TURN = 4 * math.pi  # of the yaw (rad/s)
 
 
@@ -113,14 +114,22 @@ def far_goals(config: SwarmConfig) -> tuple[float, str]:
     )
 
 
-def standing_offset(config: SwarmConfig, gusts: float = 0.0) -> float:
-    """Return the distance to the goal (m) at which robots stand in the world's wind, which their planner does not know;
+def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:
+    """Return the distance to the goal (m) at which robots stand in a steady wind, which their planner does not know;
     infinity if the wind blows them away.
 
-    :param gusts: number of standard deviations of the gusts to add to the wind
+    :param config: the world
+    :param wind: speed of the wind (m/s), by default the world's
     """
-    wind = config.noise.wind + gusts * config.noise.gust
+    wind = config.noise.wind if wind is None else wind
     return max(axis.offset(wind) for axis in axes(config.planner, config.quadrotor))
+
+
+def arrival_radius(config: SwarmConfig) -> float:
+    """Return the goal radius (m) below which robots hardly arrive together, from the steady wind, the gusts and the
+    noise of the velocity. The factors were measured in `flight` (docs/flight.md)."""
+    gusts = config.noise.gust * standing_offset(config, _LIGHT_AIR) / _LIGHT_AIR
+    return math.hypot(1.1 * standing_offset(config), 1.1 * gusts, _SETTLING * config.noise.vel)
 
 
 def _up(number: float) -> float:
@@ -175,7 +184,7 @@ def _doubts_about_the_vehicle(config: SwarmConfig) -> Iterator[str]:
 def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:
     planner, space = config.planner, config.space
     offset = standing_offset(config)
-    needed = min(1.05 * standing_offset(config, _USUAL_GUST), 2 * offset)
+    needed = arrival_radius(config)
     if math.isinf(offset):
         yield (
             f"noise.wind={config.noise.wind:g}: with planner.max_tilt={planner.max_tilt:.3g} rad, robots hold their "
@@ -183,9 +192,9 @@ def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:
         )
     elif config.goal_radius < needed:
         yield (
-            f"goal_radius={config.goal_radius:g}: in noise.wind={config.noise.wind:g}, which planners do not know, "
-            f"robots stand {offset:.2f} m beside their goals and hardly arrive; use at least "
-            f"goal_radius={_up(125 * needed) / 100:g}"
+            f"goal_radius={config.goal_radius:g}: in noise.wind={config.noise.wind:g} and "
+            f"noise.gust={config.noise.gust:g}, which planners do not know, robots stand {offset:.2f} m beside their "
+            f"goals, or are moved away, and hardly arrive; use at least goal_radius={_up(125 * needed) / 100:g}"
         )
     distance, warning = far_goals(config)
     if not planner.goal_weight:
@@ -248,6 +257,11 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
                 f"{name}={error:g} is in metres and exceeds radius={config.radius:g}: robots cannot keep clear of each "
                 "other by that; use a few centimetres"
             )
+    if not config.continuous_collisions and planner.max_speed * planner.dt > 4 * config.radius:
+        yield (
+            f"radius={config.radius:g}: robots fly up to {planner.max_speed * planner.dt:.2g} m in a step and through "
+            "each other between steps, where collisions are not counted; use continuous_collisions=true"
+        )
     if config.memory > 2 * config.radius:
         yield (
             f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "

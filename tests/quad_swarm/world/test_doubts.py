@@ -83,7 +83,10 @@ def test_far_goals_are_reached_at_full_speed_with_the_weight_that_is_said(preset
 @pytest.mark.parametrize(
     ("preset", "world", "message"),
     [
-        ("flight", {"goal_radius": 0.1}, r"goal_radius=0\.1: in noise\.wind=1,.* stand 0\.13 m .* goal_radius=0\.21"),
+        ("flight", {"goal_radius": 0.16}, r"goal_radius=0\.16: .* stand 0\.13 m"),
+        ("flight", {"goal_radius": 0.08, "noise": {"wind": 0}}, r"goal_radius=0\.08: .*gust=0\.5.* moved away"),
+        ("paper", {"radius": 0.05}, r"radius=0\.05: .* 0\.4 m in a step .* use continuous_collisions=true"),
+        ("flight", {"goal_radius": 0.1}, r"goal_radius=0\.1: in noise\.wind=1 .* 0\.13 m .* goal_radius=0\.21"),
         ("paper", {"goal_radius": 30}, r"goal_radius=30 exceeds the distance of the goals"),
         ("paper", {"sensing": {"pos": 5}}, r"sensing\.pos=5 is in metres and exceeds radius=0\.3"),
         ("paper", {"noise": {"pos": 0.5}}, r"noise\.pos=0\.5 is in metres"),
@@ -115,7 +118,9 @@ def test_what_is_doubtful_is_warned_of_in_one_line(preset, world, message):
 
 def test_what_is_recommended_is_not_doubtful():
     worlds = [
-        ("flight", {"goal_radius": 0.21}), ("paper", {"planner": {"dt": 0.02, "horizon": 36}, "max_steps": 500}),
+        ("flight", {"goal_radius": 0.21}), ("flight", {"goal_radius": 0.18}), ("paper", {"noise": {"wind": 2}}),
+        ("flight", {"goal_radius": 0.1, "noise": {"wind": 0}}), ("paper", {"radius": 0.1}),
+        ("paper", {"planner": {"dt": 0.02, "horizon": 36}, "max_steps": 500}),
         ("paper", {"radio": {"delay": 8}}), ("paper", {"neighbourhood": {"range": 2.4}}),
         ("paper", {"quadrotor": {"roll_time_constant": 2}, "planner": {"horizon": 60}}),
         ("paper", {"planner": {"separation": 3}}),
