@@ -262,6 +262,11 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
             f"radius={config.radius:g}: robots fly up to {planner.max_speed * planner.dt:.2g} m in a step and through "
             "each other between steps, where collisions are not counted; use continuous_collisions=true"
         )
+    if planner.right_of_way > planner.separation:
+        yield (
+            f"planner.right_of_way={planner.right_of_way:g} is in metres and exceeds planner.separation="
+            f"{planner.separation:g}: robots make detours around others that are far away; use less than it"
+        )
     if config.memory > 2 * config.radius:
         yield (
             f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "

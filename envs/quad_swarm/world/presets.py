@@ -308,7 +308,7 @@ def _with_followers(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any
     room = changes.get("space", {})
     if isinstance(room, Mapping) and "spacing" not in room and base.space.spacing < planner.separation:
         spacing = planner.separation + (base.space.spacing - base.planner.separation)
-        room = {**room, "spacing": round(spacing, 6)}
+        room = {**room, "spacing": min(round(spacing, 6), FARTHEST)}
     space = replaced(base.space, room) if isinstance(room, Mapping) else room
     if isinstance(given, Mapping):
         given = {**_workspace(base, space), **given}

@@ -91,6 +91,7 @@ def test_far_goals_are_reached_at_full_speed_with_the_weight_that_is_said(preset
         ("paper", {"sensing": {"pos": 5}}, r"sensing\.pos=5 is in metres and exceeds radius=0\.3"),
         ("paper", {"noise": {"pos": 0.5}}, r"noise\.pos=0\.5 is in metres"),
         ("paper", {"space": {"circle_radius": [60, 70]}, "max_steps": 999}, r"goals are more than 41 m away"),
+        ("paper", {"planner": {"right_of_way": 30}}, r"right_of_way=30 is in metres and exceeds .*separation=0\.6"),
         ("paper", {"memory": 30}, r"memory=30: .* off by more than .* 0\.6 m"),
         ("paper", {"radio": {"delay": 50}}, r"radio\.delay=50 .* in steps of 0\.1 s.* at most 8 together"),
         ("flight", {"radio": {"delay": 18}}, r"radio\.delay=18 and radio\.jitter=1 .* 20 steps old"),

@@ -149,6 +149,7 @@ def test_the_spacing_follows_a_separation_that_exceeds_it(given):
     assert given({"planner": {"separation": 3}}).space.spacing == pytest.approx(3.4)
     assert given({"radius": 0.6, "space": {"half_width": 5}}).space.spacing == pytest.approx(1.6)
     assert given({"radius": 0.6, "space": {"spacing": 1.3}}).space.spacing == 1.3
+    assert given({"planner": {"separation": 1e4}}).space.spacing == 1e4, "the limit of lengths"
     assert given({"radius": 0.5}).space == PRESETS["paper"].space, "robots 1 m apart keep their separation of 1 m"
     assert given({"radius": 0.1}).space == PRESETS["paper"].space
     for world in ({"radius": 0.6, "space": {"spacing": 1}}, {"space": {"spacing": 0.5}}):
