@@ -166,6 +166,12 @@ def short_horizon(config: SwarmConfig) -> str | None:
 
 def _doubts_about_the_vehicle(config: SwarmConfig) -> Iterator[str]:
     planner, vehicle = config.planner, config.quadrotor
+    fastest = min(axis.fastest for axis in axes(planner, vehicle))
+    if planner.max_speed > 2 * fastest:
+        yield (
+            f"planner.max_speed={planner.max_speed:g} is in m/s: with planner.max_tilt={planner.max_tilt:.3g} rad, the "
+            f"vehicle reaches {fastest:.2g} m/s; use at most twice that, or tilt more"
+        )
     fall = vehicle.climb_gain * planner.max_climb_rate / vehicle.climb_time_constant
     if fall > vehicle.gravity:
         slower = vehicle.gravity * vehicle.climb_time_constant / vehicle.climb_gain
@@ -257,9 +263,10 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
                 f"{name}={error:g} is in metres and exceeds radius={config.radius:g}: robots cannot keep clear of each "
                 "other by that; use a few centimetres"
             )
-    if not config.continuous_collisions and planner.max_speed * planner.dt > 4 * config.radius:
+    stride = planner.dt * min(planner.max_speed, *(axis.fastest for axis in axes(planner, config.quadrotor)))
+    if not config.continuous_collisions and stride > 4 * config.radius:
         yield (
-            f"radius={config.radius:g}: robots fly up to {planner.max_speed * planner.dt:.2g} m in a step and through "
+            f"radius={config.radius:g}: robots fly up to {stride:.2g} m in a step and through "
             "each other between steps, where collisions are not counted; use continuous_collisions=true"
         )
     if planner.right_of_way > planner.separation:

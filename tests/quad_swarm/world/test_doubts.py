@@ -99,6 +99,7 @@ def test_far_goals_are_reached_at_full_speed_with_the_weight_that_is_said(preset
         ("paper", {"quadrotor": {"roll_time_constant": 2}}, r"quadrotor\.roll_time_constant=2 s.*planner\.horizon=60"),
         ("paper", {"planner": {"max_climb_rate": 100}}, r"max_climb_rate=100: .* faster than they would fall"),
         ("paper", {"planner": {"max_yaw_rate": 30}}, r"max_yaw_rate=30 is in rad/s.*0\.524"),
+        ("paper", {"planner": {"max_speed": 40}}, r"max_speed=40 is in m/s: .* reaches 7\.1 m/s"),
         ("paper", {"planner": {"max_speed": 0.01}}, r"max_steps=100: episodes of 10 s are too short"),
         ("paper", {"planner": {"max_climb_rate": 1e-6}}, r"max_steps=100: .* vertically"),
         ("paper", {"planner": {"goal_weight": 0}}, r"goal_weight=0: robots do not fly to their goals"),
