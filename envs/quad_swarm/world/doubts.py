@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from quad_swarm.world.presets import SwarmConfig
 
 _SLOW_START = 5.0  # a planner that takes longer to half of the speed is slow (s)
+_TINIEST = 1e-30  # avoids division by zero
 _LIGHT_AIR = 0.01  # wind in which offsets are linear (m/s)
 _SETTLING = 2.5  # time for which a disturbed velocity moves a robot (s)
 _FASTEST_TURN = 4 * math.pi  # of the yaw (rad/s)
@@ -59,7 +60,7 @@ class _Axis(NamedTuple):
     def fastest(self) -> float:
         """Speed through the air at the maximum tilt (m/s)."""
         thrust = self.gravity * math.tan(min(self.gain * self.max_tilt, 0.5 * math.pi - 1e-6))
-        return thrust / max(self.drag, 1e-9)
+        return max(thrust / max(self.drag, 1e-9), _TINIEST)
 
     def farthest(self, speed: float) -> float:
         """Return the distance to the goal (m) from which on robots are slower than ``speed`` (m/s), or take too long to
@@ -231,8 +232,8 @@ def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
     """Yield a sentence if robots cannot fly a usual distance, or climb a third of the room's height, in time."""
     planner, space, vehicle = config.planner, config.space, config.quadrotor
     seconds = max_steps * planner.dt
-    speed = min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle)))
-    climb = min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain)
+    speed = max(min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle))), _TINIEST)
+    climb = max(min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain), _TINIEST)
     needed = max(
         (_usual_flight(config) - config.goal_radius) / speed,
         ((space.heights[1] - space.heights[0]) / 3 - config.goal_radius) / climb,
@@ -281,8 +282,10 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
         )
     reach = config.neighbourhood.range
     if reach is not None and config.is_limited:
-        braking = min(axis.gravity * math.tan(axis.gain * axis.max_tilt) for axis in axes(planner, config.quadrotor))
-        needed = planner.separation + (planner.max_speed / 2) ** 2 / braking
+        both = axes(planner, config.quadrotor)
+        braking = min(axis.gravity * math.tan(axis.gain * axis.max_tilt) for axis in both)
+        speed = min(planner.max_speed, *(axis.fastest for axis in both)) / 2
+        needed = planner.separation + speed * speed / max(braking, _TINIEST)
         if reach < needed:
             yield (
                 f"neighbourhood.range={reach:g}: two robots that meet at half of planner.max_speed="

@@ -148,3 +148,31 @@ def test_a_command_says_it_once_in_one_line():
     (line,) = (line for line in done.stderr.splitlines() if "memory" in line)
     assert "DoubtfulWorld: memory=30: " in line
     assert done.stdout.count("memory=30") == 2, "the tables are printed"
+
+
+EXTREMES = {
+    "planner": {"input_weight": (1e-300, 1e300), "goal_weight": (0, 1e300), "max_speed": (5e-324, 1e300),
+                "max_vertical_speed": (5e-324, 1e300), "max_tilt": (1e-6, 1.3), "max_climb_rate": (1e-6, 1e4)},
+    "quadrotor": {"drag_x": (0, 1e-300, 5), "gravity": (1e-300, 1e4), "roll_gain": (1e-300, 1),
+                  "climb_gain": (1e-300, 9), "climb_time_constant": (0.1, 1e300), "roll_time_constant": (0.1, 1e300)},
+    "noise": {"wind": (0, 1e3), "gust": (0, 1e3), "vel": (0, 1e3)},
+    "neighbourhood": {"range": (0.8, 1e4)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.filterwarnings("error::RuntimeWarning", "ignore::quad_swarm.world.doubts.DoubtfulWorld")
+def test_extreme_worlds_are_accepted_or_refused_in_one_line(seed):
+    rng = np.random.default_rng(seed)
+    accepted = 0
+    for _ in range(200):
+        world = {
+            part: {name: float(rng.choice(values)) for name, values in fields.items() if rng.random() < 0.3}
+            for part, fields in EXTREMES.items()
+        }
+        try:
+            accepted += isinstance(make_config("paper", world), SwarmConfig)
+        except ValueError as error:
+            if "\n" in str(error):
+                raise
+    assert 20 < accepted < 200
