@@ -1,6 +1,7 @@
 """Validation of settings and arguments by pydantic, with error messages of one line.
 
-Text is converted to the value it stands for ("false", "1e-3", "10"), as it comes from YAML and command lines.
+Text is converted to the value it stands for ("false", "1e-3", "10"), as it comes from YAML and command lines, which
+`read_yaml` reads.
 """
 
 from __future__ import annotations
@@ -8,11 +9,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import itertools
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
+import numpy as np
 import pydantic
 import pydantic.dataclasses
+import yaml
+from pydantic_core import ArgsKwargs
 
 from quad_swarm.errors import shown, unknown_name
 
@@ -23,10 +30,10 @@ _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 # Limit of lengths and coordinates (m), far beyond any flight and small enough for precise squares
-_FARTHEST = 1e4
-Length = Annotated[float, pydantic.Field(ge=0, le=_FARTHEST)]
-PositiveLength = Annotated[float, pydantic.Field(gt=0, le=_FARTHEST)]
-Coordinate = Annotated[float, pydantic.Field(ge=-_FARTHEST, le=_FARTHEST)]
+FARTHEST = 1e4
+Length = Annotated[float, pydantic.Field(ge=0, le=FARTHEST)]
+PositiveLength = Annotated[float, pydantic.Field(gt=0, le=FARTHEST)]
+Coordinate = Annotated[float, pydantic.Field(ge=-FARTHEST, le=FARTHEST)]
 
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
@@ -41,8 +48,24 @@ Range = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ascend
 def checked(cls: type[T]) -> type[T]:
     """Decorate a frozen dataclass so that its fields are converted to their types and checked against their bounds.
 
-    Nested dataclasses may be mappings. Invalid values raise a `ValueError` with one line.
+    Nested dataclasses may be mappings. Truth values are no numbers. Invalid values raise a `ValueError` with one line.
     """
+    plain = [field.name for field in dataclasses.fields(cls) if "bool" not in str(field.type)]  # type: ignore[arg-type]
+
+    def unflagged(values: Any) -> Any:
+        if isinstance(values, ArgsKwargs):
+            named = {
+                name: _unflagged(value) if name in plain else value for name, value in (values.kwargs or {}).items()
+            }
+            names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+            rest = zip(names, values.args, strict=False)
+            given = [_unflagged(value) if name in plain else value for name, value in rest]
+            return ArgsKwargs((*given, *values.args[len(names) :]), named)
+        if isinstance(values, Mapping):
+            return {name: _unflagged(value) if name in plain else value for name, value in values.items()}
+        return values
+
+    cls._unflagged = pydantic.model_validator(mode="before")(staticmethod(unflagged))  # type: ignore[attr-defined]
     strict = pydantic.dataclasses.dataclass(frozen=True, config=_STRICT)(cls)
     construct = strict.__init__
 
@@ -57,6 +80,20 @@ def checked(cls: type[T]) -> type[T]:
     return strict  # type: ignore[return-value]
 
 
+def _is_plain(annotation: Any) -> bool:
+    """Return whether an argument is a number or a text, and true and false are neither."""
+    return "bool" not in str(annotation) and any(one in str(annotation) for one in ("int", "Int", "float", "str"))
+
+
+def _unflagged(value: Any) -> Any:
+    """Return a value with texts instead of true and false, which would count as the numbers 1 and 0."""
+    if isinstance(value, (bool, np.bool_)):
+        return str(value)
+    if isinstance(value, (list, tuple)) and any(isinstance(one, (bool, np.bool_)) for one in value):
+        return [_unflagged(one) for one in value]
+    return value
+
+
 def checked_arguments(function: F) -> F:
     """Decorate a function so that its arguments are converted and checked like the fields of `checked`."""
 
@@ -64,8 +101,11 @@ def checked_arguments(function: F) -> F:
     def call() -> Callable[..., Any]:
         return pydantic.validate_call(config=pydantic.ConfigDict(allow_inf_nan=False))(function)
 
+    plain = {name for name, one in inspect.signature(function).parameters.items() if _is_plain(one.annotation)}
+
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        kwargs = {name: _unflagged(value) if name in plain else value for name, value in kwargs.items()}
         try:
             return call()(*args, **kwargs)
         except pydantic.ValidationError as error:
@@ -96,6 +136,86 @@ def _values(config: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
         nested = isinstance(value, Mapping) and dataclasses.is_dataclass(values.get(name))
         values[name] = _values(values[name], value) if nested else value
     return values
+
+
+# Limits of what `read_yaml` reads
+MOST_CHARACTERS, _MOST_VALUES = 100_000, 10_000
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML loader with the plain values of YAML 1.2 only: no dates, and "010", "1:30" and "yes" are no surprises."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # type: ignore[misc]  # filled below
+    yaml_constructors: ClassVar[dict[Any, Any]] = {}
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None and _count(node, {}) > _MOST_VALUES:
+            raise ValueError(f"more than {_MOST_VALUES} values")
+        return node
+
+    def whole(self, node: yaml.ScalarNode) -> int:
+        """Construct an integer."""
+        text = self.construct_scalar(node)
+        return int(text, 0 if text[:2] in ("0x", "0o") else 10)
+
+    def number(self, node: yaml.ScalarNode) -> float:
+        """Construct a number."""
+        return float(self.construct_scalar(node).lower().replace(".inf", "inf").replace(".nan", "nan"))
+
+    def mapping(self, node: yaml.MappingNode) -> dict[Any, Any]:
+        """Construct a mapping, in which each name occurs once."""
+        pairs = [tuple(self.construct_object(one, deep=True) for one in pair) for pair in node.value]
+        names = [name for name, _ in pairs]
+        if len(set(names)) < len(names):
+            raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} is given twice")
+        return dict(pairs)
+
+
+for _tag, _pattern, _construct in (
+    ("null", r"~|null|Null|NULL|", yaml.SafeLoader.construct_yaml_null),
+    ("bool", r"true|True|TRUE|false|False|FALSE", yaml.SafeLoader.construct_yaml_bool),
+    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", _PlainLoader.whole),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        _PlainLoader.number,
+    ),
+    ("str", None, yaml.SafeLoader.construct_yaml_str),
+    ("seq", None, lambda loader, node: loader.construct_sequence(node, deep=True)),
+    ("map", None, _PlainLoader.mapping),
+):  # the first pattern that matches counts
+    if _pattern is not None:
+        _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), None)
+    _PlainLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct)
+_PlainLoader.add_constructor(None, yaml.SafeLoader.construct_undefined)  # type: ignore[type-var]
+
+
+def _count(node: yaml.Node, counted: dict[int, float]) -> float:
+    """Return the number of values in a node, infinite for a node inside itself."""
+    if id(node) not in counted:
+        counted[id(node)] = math.inf
+        pairs = isinstance(node, yaml.MappingNode)
+        parts = itertools.chain.from_iterable(node.value) if pairs else node.value
+        counted[id(node)] = 1 + sum(_count(one, counted) for one in parts if isinstance(one, yaml.Node))
+    return counted[id(node)]
+
+
+def read_yaml(text: str) -> Any:
+    """Read values from text that may come from strangers, in bounded time and memory.
+
+    Plain values are those of YAML 1.2: "010" is 10, and "1:30", "yes" and dates are text.
+
+    :raises ValueError: if it is not YAML, too long, nested too deeply, or has a name twice; the message has one line
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise ValueError(f"more than {MOST_CHARACTERS} characters")
+    try:
+        return yaml.load(text, _PlainLoader)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except (yaml.YAMLError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise ValueError("no valid YAML: " + " ".join(str(error).split())) from None
 
 
 def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueError:

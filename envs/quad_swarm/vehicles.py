@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.validation import MOST_CHARACTERS, read_yaml, replaced
 
 VEHICLES: dict[str, QuadrotorParams] = {
     # Parrot Bebop 2, the paper's vehicle: identified by tud-amr/mrca-mav
@@ -61,23 +60,35 @@ VEHICLES: dict[str, QuadrotorParams] = {
 }
 
 
-def load_vehicle(name: str) -> QuadrotorParams:
+def load_vehicle(name: str | os.PathLike[str]) -> QuadrotorParams:
     """Load the parameters of a vehicle.
 
-    :param name: a name of `VEHICLES`, or the path of a vehicle file (``.yml``)
-    :raises ValueError: if the name is unknown, or the file is not a valid vehicle file
-    :raises OSError: if the file cannot be read
+    :param name: a name of `VEHICLES`, or the path of a vehicle file (as a text: ``.yml``)
+    :raises ValueError: if the name is unknown, or the file cannot be read or is not a valid vehicle file; the message
+        names the file
+    :raises FileNotFoundError: if there is no such file
     """
-    if not name.endswith((".yml", ".yaml")):
+    if isinstance(name, str) and not name.endswith((".yml", ".yaml")):
         if name not in VEHICLES:
             raise unknown_name("vehicle", name, [*VEHICLES, "FILE.yml"])
         return VEHICLES[name]
+    path = Path(name)
+    if path.exists() and not path.is_file():  # to read a pipe would wait for a writer
+        raise ValueError(f"{path} is not a file: name a vehicle file, or one of {', '.join(VEHICLES)}.")
     try:
-        content: Any = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
-        values = content["parameters"]
-        return QuadrotorParams(**values)
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError) as error:
+        with path.open(encoding="utf-8") as file:
+            content = read_yaml(file.read(MOST_CHARACTERS + 1))
+        values = dict(content["parameters"])
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except (ValueError, TypeError, KeyError) as error:
         raise ValueError(
-            f"{name} is not a vehicle file ({shown(str(error))}): `sb3-maddpg identify --out` writes one, with the "
+            f"{path} is not a vehicle file ({shown(str(error))}): `sb3-maddpg identify --out` writes one, with the "
             "vehicle's values under `parameters`."
         ) from None
+    try:
+        return replaced(QuadrotorParams(), {str(parameter): value for parameter, value in values.items()})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -65,8 +65,10 @@ class DelayCheckedSwarm(Swarm):
             setattr(self, name, getattr(self, name)[swarms])
         self._sent = [sent[swarms] for sent in self._sent]
 
-    def reset(self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
-        super().reset(swarm, starts, goals, noise_seed)
+    def reset(
+        self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0, checked: bool = False
+    ) -> None:
+        super().reset(swarm, starts, goals, noise_seed, checked)
         self._x[swarm] = self.state[swarm][:, None, None]
         self._inputs[swarm] = 0.0
         self._pending[swarm] = 0
@@ -187,7 +189,7 @@ def fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequence
 
 def _fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequence[int]) -> Rows:
     swarm = DelayCheckedSwarm(config, len(episodes), clearance)
-    sampler = ScenarioSampler(scenario, config.n_robots, config.space)
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
     task = RequestTask(swarm, sampler, RewardConfig(), end_at_collision=False)
     rngs = [np.random.default_rng(seed) for seed in episodes]
     for k, rng in enumerate(rngs):

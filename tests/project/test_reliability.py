@@ -1,15 +1,18 @@
-"""Short forms of the studies of kills, of damaged files and of solvers that fail."""
+"""Short forms of the studies of kills, of damaged files, of solvers that fail and of random worlds."""
 
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from quad_swarm.evaluation.flight import run_episodes
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
-from studies import solver_faults
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import Swarm
+from studies import random_worlds, solver_faults
 from studies.kills import POINTS
 from studies.swarm.protocol import condition
 
@@ -73,3 +76,49 @@ def test_without_faults_it_is_the_evaluation():
     expected = run_episodes(one, range(3))
     for row, same in zip(solver_faults.fly("random", 0.0, "none", range(3)), expected, strict=True):
         assert {**row, "solve_seconds": 0} == {**same, "solve_seconds": 0}
+
+
+WORLDS = [random_worlds.draw_world(0, number) for number in range(20)]
+
+
+def test_random_worlds_fly_or_are_refused_when_they_are_created():
+    outcomes = [random_worlds.attempt(world, number, steps=6) for number, world in enumerate(WORLDS)]
+    assert [told for outcome, told in outcomes if outcome == "wrong"] == []
+    assert {"flown", "refused"} == {outcome for outcome, _ in outcomes}
+
+
+def _reports(**changes):
+    report = Swarm._report
+
+    def wrong(self, *args):
+        found = report(self, *args)
+        return found._replace(**{name: change(getattr(found, name)) for name, change in changes.items()})
+
+    return wrong
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"min_separation": lambda value: value + 1e-3}, "min_separation is"),
+        ({"collision": lambda value: ~value}, "collision is"),
+        ({"at_goal": lambda value: ~value}, "at_goal is wrong"),
+        ({"min_separation": lambda value: value + np.nan}, "min_separation"),
+        ({"belief_source": lambda value: value + (len(value) > 1)}, "otherwise alone than in a batch"),
+    ],
+)
+def test_random_worlds_find_wrong_reports(changes, message, monkeypatch):
+    monkeypatch.setattr(Swarm, "_report", _reports(**changes))
+    outcome, told = random_worlds.attempt({"n_robots": 2, "preset": "paper"}, 0, steps=3)
+    assert outcome == "wrong"
+    assert message in " ".join(told)
+
+
+def test_random_worlds_find_steps_and_resets_that_fail(monkeypatch):
+    def fails(self, rng):
+        raise ValueError("late")
+
+    monkeypatch.setattr(ScenarioSampler, "sample", fails)
+    outcome, told = random_worlds.attempt({"n_robots": 2, "preset": "paper"}, 0, steps=3)
+    assert outcome == "wrong"
+    assert "late" in told[0]

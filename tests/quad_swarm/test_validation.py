@@ -1,13 +1,18 @@
 """How a wrong value is told: in one line, with its name, also where it was given by position."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 from pydantic import PositiveInt
 
-from quad_swarm.validation import Range, checked, checked_arguments, replaced
+from quad_swarm.quadrotor import QuadrotorParams
+from quad_swarm.task.request_task import make_task
+from quad_swarm.validation import Range, checked, checked_arguments, read_yaml, replaced
+from quad_swarm.world.presets import make_config
 
 
 @checked
@@ -60,3 +65,59 @@ def test_one_line_says_where_and_what(call, message):
 def test_values_come_in_their_types():
     assert function("3", {"a": "1e-3"}) == (3, {"a": 0.001}, {})
     assert replaced(Outer(), {"flag": "true", "inner": {"pair": ["0.5", 2]}}) == Outer(Inner((0.5, 2.0)), True)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("010", 10), ("0x10", 16), ("-3", -3), ("1e-3", 1e-3), (".5", 0.5), ("1.0e-05", 1e-5), ("-.inf", -math.inf),
+        ("1:30", "1:30"), ("2001-01-01", "2001-01-01"), ("2001-99-99", "2001-99-99"), ("yes", "yes"), ("on", "on"),
+        ("true", True), ("", None), ("[1, {a: x}]", [1, {"a": "x"}]), ("a: &a [1]\nb: *a", {"a": [1], "b": [1]}),
+        ("<<: {a: 1}", {"<<": {"a": 1}}),
+    ],
+)  # fmt: skip
+def test_yaml_holds_plain_values(text, value):
+    found = read_yaml(text)
+    assert found == value
+    assert type(found) is type(value)
+
+
+def _aliases(levels: int) -> str:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join(9 * [f'*a{k - 1}'])}]" for k in range(1, levels)]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (_aliases(9), "more than 10000 values"), ("&a [*a]", "more than 10000 values"), ("x" * 200_000, "characters"),
+        ("[" * 9000, "nested too deeply"), ("{a: " * 9000, "nested too deeply"), ("{a: 1, a: 2}", "'a' is given twice"),
+        ("!!python/name:os.system", "constructor"), ("!!int 1:30", "1:30"), ("!!timestamp 1", "constructor"),
+        ("!!binary x", "constructor"), ("[", "no valid YAML"), ("\0", "no valid YAML"), ("{[1]: 2}", "no valid YAML"),
+    ],
+)  # fmt: skip
+def test_yaml_of_strangers_is_refused_in_one_line(text, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        read_yaml(text)
+    assert "\n" not in str(caught.value)
+    assert type(caught.value) is ValueError
+
+
+@pytest.mark.parametrize("flag", [True, False, np.True_])
+def test_truth_values_are_no_numbers(flag):
+    for make in (lambda: QuadrotorParams(flag), lambda: QuadrotorParams(drag_x=flag)):
+        with pytest.raises(ValueError, match=rf"='{bool(flag)}': it must be a valid number"):
+            make()
+    for changes in ({"substeps": flag}, {"space": {"heights": [flag, 2]}}, {"planner": {"max_tilt": flag}}):
+        with pytest.raises(ValueError, match=rf"='{bool(flag)}': it must be a valid"):
+            make_config("paper", changes)
+    assert make_config("paper", continuous_collisions=flag).continuous_collisions is bool(flag)
+
+
+def test_truth_values_are_no_numbers_among_arguments():
+    for arguments in ({"memory": True}, {"max_steps": np.True_}, {"n_robots": True}):
+        (name,) = arguments
+        with pytest.raises(ValueError, match=f"{name}='True': it must be a valid"):
+            make_task(**arguments)
+    assert make_task(n_robots=2, end_at_arrival=True, max_steps=100).end_at_arrival

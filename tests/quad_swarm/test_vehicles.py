@@ -1,5 +1,7 @@
 """Vehicles by name and from files."""
 
+import os
+
 import pytest
 
 from quad_swarm.quadrotor import QuadrotorParams
@@ -35,3 +37,45 @@ def test_files_that_hold_something_else_are_refused(content, tmp_path):
 def test_a_missing_file_is_named():
     with pytest.raises(FileNotFoundError, match=r"nowhere\.yml"):
         load_vehicle("nowhere.yml")
+
+
+BOMB = "a: &a [x, x]\n" + "".join(f"{one}: &{one} [{9 * f'*{chr(ord(one) - 1)}, '}]\n" for one in "bcdefghij")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("parameters: {drag_x: -1}", "drag_x=-1: it must be greater"),
+        ("parameters: {drag_x: 2001-99-99}", "drag_x='2001-99-99': it must be a valid number"),
+        ("parameters: {drag_x: 1:30}", "drag_x='1:30': it must be a valid number"),
+        ("parameters: {drag_x: true}", "drag_x='True': it must be a valid number"),
+        ("parameters: {drag_x: 1, drag_x: 2}", "'drag_x' is given twice"),
+        ("parameters: {mass: 2}", "parameter 'mass'"),
+        ("parameters: " + "[" * 9000, "nested too deeply"),
+        (BOMB + "parameters: {drag_x: *j}", "more than 10000 values"),
+        (b"\xff\xfe", "utf-8"),
+    ],
+)
+def test_every_message_names_the_file_in_one_line(content, message, tmp_path):
+    path = tmp_path / "vehicle.yml"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    for name in (path, str(path)):
+        with pytest.raises(ValueError, match=message) as caught:
+            make_config("paper", quadrotor=name)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yml")
+    (tmp_path / "folder.yml").mkdir()
+    for name in ("pipe.yml", "folder.yml"):
+        with pytest.raises(ValueError, match=rf"{name} is not a file"):
+            load_vehicle(tmp_path / name)
+
+
+def test_paths_may_be_objects_and_numbers_are_decimal(tmp_path):
+    path = tmp_path / "vehicle.txt"
+    path.write_text("# mine\nparameters: {drag_x: 010, drag_y: 1e-1}\nresiduals: {roll_rms: 0.1}\n")
+    for make in (lambda: make_config("paper", quadrotor=path), lambda: make_config("paper", {"quadrotor": path})):
+        assert make().quadrotor == QuadrotorParams(drag_x=10.0, drag_y=0.1)

@@ -12,9 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
-import yaml
-
-from quad_swarm.errors import needs_extra, unknown_name
+from quad_swarm.errors import needs_extra, shown, unknown_name
 from quad_swarm.evaluation.evaluation import evaluate, make_pool
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.policies import is_model, load_model, short_name, short_names, trained_in
@@ -25,6 +23,7 @@ from quad_swarm.plants.base import MODEL, simulated_vehicles
 from quad_swarm.task.rules import RULES
 from quad_swarm.tasks import ENGINES
 from quad_swarm.tasks.journal import default_folder
+from quad_swarm.validation import read_yaml
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -140,9 +139,11 @@ def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
         if leaf in place:
             raise ValueError(f"--world {assignment!r}: {name!r} is given twice.")
         try:
-            place[leaf] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ValueError(f"--world {assignment!r}: {value!r} is not valid YAML; quote text.") from None
+            place[leaf] = read_yaml(value)
+        except ValueError as error:
+            raise ValueError(
+                f"--world {shown(assignment)}: {shown(value)} is not valid YAML ({shown(str(error))}); quote text."
+            ) from None
     return world
 
 
@@ -212,7 +213,7 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, but this is {args.preset!r}", file=sys.stderr)
     for name in scenarios:
-        ScenarioSampler(name, config.n_robots, config.space)  # raises if the robots do not fit
+        ScenarioSampler(name, config.n_robots, config.space, config)  # raises if the robots do not fit
     return [
         Condition(policy, name, config, args.max_steps, args.algo, args.solver)
         for name in dict.fromkeys(scenarios)

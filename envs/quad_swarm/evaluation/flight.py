@@ -16,6 +16,7 @@ from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, req
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import spread
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
@@ -37,7 +38,7 @@ class Condition:
     :param solver: see `make_planner`
     :param linger: number of steps to fly after all robots have reached their goals; None for flying until the time
         limit
-    :raises ValueError: if ``max_steps`` is less than 1, or ``linger`` is negative
+    :raises ValueError: if ``max_steps`` is less than 1, ``linger`` is negative, or the scenario does not fit the world
     """
 
     policy: str
@@ -51,6 +52,9 @@ class Condition:
     def __post_init__(self) -> None:
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
+        ScenarioSampler(self.scenario, self.config.n_robots, self.config.space, self.config)
+        for sentence in too_short(self.config, self.max_steps) if self.max_steps is not None else ():
+            warn(sentence)
         if self.linger is not None and self.linger < 0:
             raise ValueError(f"linger={self.linger} must be a number of steps, or None to fly until the time limit.")
 
@@ -83,7 +87,7 @@ def begin(
         policy, observation = policy_of(model, condition.policy, config)
     task = RequestTask(
         Swarm(config, len(episodes), condition.solver),
-        ScenarioSampler(condition.scenario, config.n_robots, config.space),
+        ScenarioSampler(condition.scenario, config.n_robots, config.space, config),
         RewardConfig(),
         condition.max_steps,
         observation,

@@ -43,7 +43,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
 
     ## Starting State
     Robots start at rest. The scenario draws starts and goals; `reset(options={"starts": ..., "goals": ...})` sets them,
-    both (n, 3), m.
+    both (n, 3), m. They must lie in the workspace; robots must not start in contact, and goals must not be too close
+    for two robots to be at both.
 
     ## Episode End
     A collision terminates the episode, and with `end_at_arrival` so does the arrival of all robots. The episode is

@@ -82,6 +82,28 @@ class PlannerConfig:
             )
 
 
+def check_vehicle(config: PlannerConfig, quadrotor: QuadrotorParams, mismatch: float = 0.0) -> None:
+    """Check that a planner fits a vehicle.
+
+    :param config: horizon, limits and weights
+    :param quadrotor: physical parameters
+    :param mismatch: maximum relative deviation of the flown vehicle's parameters
+    :raises ValueError: if a step is too long for the vehicle's dynamics, or it could tilt beyond 90 degrees
+    """
+    longest = quadrotor.longest_step
+    if config.dt > longest:
+        raise ValueError(
+            f"planner.dt={config.dt}: steps must not exceed {longest:.2g} s, "
+            "the stability limit of the integration of the quadrotor's fastest response"
+        )
+    gain = max(quadrotor.roll_gain, quadrotor.pitch_gain) * (1 + mismatch)
+    if config.max_tilt * gain >= math.pi / 2:
+        raise ValueError(
+            f"planner.max_tilt={config.max_tilt:g}: with the quadrotor's gains, vehicles would tilt by "
+            f"{math.degrees(config.max_tilt * gain):.0f} degrees; use at most {math.floor(1570 / gain) / 1000}"
+        )
+
+
 class Problems(NamedTuple):
     """A batch of B optimal control problems.
 
@@ -118,9 +140,11 @@ class OptimalControlProblem:
     :param config: horizon, limits and weights
     :param quadrotor: physical parameters
     :param n_others: number of other robots
+    :raises ValueError: if the planner does not fit the vehicle, see `check_vehicle`
     """
 
     def __init__(self, config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int):
+        check_vehicle(config, quadrotor)
         self.config = config
         self.quadrotor = quadrotor
         self.n_others = n_others

@@ -14,6 +14,7 @@ from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.validation import checked, checked_arguments, replaced
 from quad_swarm.world.beliefs import other_indices, reverse_indices
+from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
@@ -165,12 +166,20 @@ class RequestTask:
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
         """Draw a new episode for one swarm. All random numbers of the episode derive from ``rng``."""
-        self.place(swarm, *self.sampler.sample(rng), rng)
+        self.place(swarm, *self.sampler.sample(rng), rng, checked=self.sampler.world is self.swarm.config)
 
-    def place(self, swarm: int, name: str, starts: np.ndarray, goals: np.ndarray, rng: np.random.Generator) -> None:
+    def place(
+        self,
+        swarm: int,
+        name: str,
+        starts: np.ndarray,
+        goals: np.ndarray,
+        rng: np.random.Generator,
+        checked: bool = False,
+    ) -> None:
         """Start a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
         noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
-        self.swarm.reset(swarm, starts, goals, noise_seed)
+        self.swarm.reset(swarm, starts, goals, noise_seed, checked)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
 
@@ -347,7 +356,9 @@ def make_task(
     config = make_config(
         preset, world, n_robots=n_robots, memory=memory, planner=planner, noise=noise, radio=radio, space=space
     )
-    sampler = ScenarioSampler(scenario, config.n_robots, config.space)
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
+    for sentence in too_short(config, max_steps) if max_steps is not None else ():
+        warn(sentence)
     weights = replaced(RewardConfig(), reward or {}, "reward")
     swarm = Swarm(config, n_swarms, solver)
     seen = make_observation(config, observation, scale_observation)

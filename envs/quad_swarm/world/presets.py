@@ -5,21 +5,25 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field, PositiveInt
 
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.planner import PlannerConfig
+from quad_swarm.planner.problem import check_vehicle
 from quad_swarm.plants.base import MODEL, parse_plant
 from quad_swarm.quadrotor import QuadrotorParams
-from quad_swarm.validation import Length, PositiveLength, checked, replaced
+from quad_swarm.validation import FARTHEST, Length, PositiveLength, checked, replaced
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
+from quad_swarm.world.doubts import doubts, far_goals, short_horizon, warn
 from quad_swarm.world.neighbours import Neighbourhood
-from quad_swarm.world.scenarios import ScenarioSpace
+from quad_swarm.world.scenarios import SCENARIOS, Extent, ScenarioSpace, extent
 
 PRESET_VERSION = 1
 
@@ -28,6 +32,8 @@ PRESET_VERSION = 1
 @dataclass(frozen=True)
 class SwarmConfig:
     """Complete definition of a world, except for the scenario.
+
+    Fields that do not fit each other, though each may be right, cause a `DoubtfulWorld` warning, see `world.doubts`.
 
     :param n_robots: number of robots n, 2 to 1000
     :param radius: radius r of the sphere around a robot (m)
@@ -53,8 +59,9 @@ class SwarmConfig:
     :param clock_skew: latest time in a step, as a fraction of its length, at which a robot's new input takes effect,
         drawn uniformly among the sub-steps for each robot and episode. A robot knows its own time and plans from its
         state at that time
-    :raises ValueError: if a value is out of range, the planner's separation is less than 2r, the tolerance hides every
-        collision, or a step is too long for the vehicle's dynamics
+    :raises ValueError: if a value is out of range, the planner's separation or the spacing of starts and goals is less
+        than 2r, the tolerance hides every collision, a step is too long for the vehicle's dynamics, or robots could
+        tilt or turn too far
     """
 
     n_robots: Annotated[int, Field(ge=2, le=1000)] = 4
@@ -77,6 +84,12 @@ class SwarmConfig:
     clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
     def __post_init__(self) -> None:
+        self._check_distances()
+        self._check_vehicle()
+        for sentence in doubts(self):
+            warn(sentence)
+
+    def _check_distances(self) -> None:
         contact, planner = 2 * self.radius, self.planner
         if planner.separation < contact:
             raise ValueError(
@@ -88,12 +101,21 @@ class SwarmConfig:
                 f"collision_tolerance={self.collision_tolerance}: it must be less than 2 * radius = {contact}, "
                 "otherwise nothing is a collision"
             )
-        longest = self.quadrotor.longest_step
-        if planner.dt > longest:
+        if self.space.spacing < contact - self.collision_tolerance:
             raise ValueError(
-                f"planner.dt={planner.dt}: steps must not exceed {longest:.2g} s, "
-                "the stability limit of the integration of the quadrotor's fastest response"
+                f"space.spacing={self.space.spacing:g}: robots would start or stop in contact; it must be at least "
+                f"2 * radius = {contact:g}, or left out of `make_config` to follow the separation"
             )
+        reach = self.neighbourhood.range
+        if reach is not None and reach < planner.separation:
+            raise ValueError(
+                f"neighbourhood.range={reach}: robots must perceive others at least up to the distance that they keep, "
+                f"planner.separation={planner.separation}"
+            )
+
+    def _check_vehicle(self) -> None:
+        planner, longest = self.planner, self.quadrotor.longest_step
+        check_vehicle(planner, self.quadrotor, self.mismatch)
         if parse_plant(self.plant)[0] != MODEL and self.mismatch:
             raise ValueError(
                 f"mismatch={self.mismatch}: it only applies to plant={MODEL!r}, since plant={self.plant!r} differs "
@@ -105,17 +127,90 @@ class SwarmConfig:
                 f"mismatch={self.mismatch}: the fastest vehicles need sub-steps of at most {fastest:.2g} s, but "
                 f"planner.dt / substeps = {planner.dt / self.substeps:.2g} s: raise substeps"
             )
-        reach = self.neighbourhood.range
-        if reach is not None and reach < planner.separation:
+        short = short_horizon(self)
+        if short is not None and planner.goal_weight and far_goals(self)[0] < self.goal_radius:
+            raise ValueError(short)
+        if planner.max_yaw_rate * planner.dt > math.pi:
             raise ValueError(
-                f"neighbourhood.range={reach}: robots must perceive others at least up to the distance that they keep, "
-                f"planner.separation={planner.separation}"
+                f"planner.max_yaw_rate={planner.max_yaw_rate:g} is in rad/s: it must be at most half a turn per step, "
+                f"{math.floor(100 * math.pi / planner.dt) / 100}"
             )
         if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
             raise ValueError(
                 f"clock_skew={self.clock_skew} is shorter than one of the substeps={self.substeps} of a step: raise "
                 "either of them"
             )
+
+    @property
+    def least_spacing(self) -> float:
+        """Distance of two goals (m) from which on robots that keep their separation can be at both. Their repulsion
+        keeps robots that are pulled together further apart than the separation."""
+        separation = self.planner.separation
+        kept = separation + min(0.3 * separation, 0.2)
+        return max(2 * self.radius, kept - 2 * self.goal_radius)
+
+    def outside(self, points: np.ndarray) -> np.ndarray:
+        """Return the distances of points, (..., 3), to the workspace, (...) (m)."""
+        low, high = self.planner.workspace_low, self.planner.workspace_high
+        return np.linalg.norm(points - np.clip(points, low, high), axis=-1)
+
+    def check_flight(self, starts: Any, goals: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Check that robots can fly from starts to goals, and return them as arrays, (n, 3) each (m).
+
+        :param starts: starts, (n, 3), world frame (m)
+        :param goals: goals, (n, 3), world frame (m)
+        :raises ValueError: if they are not n finite points, a point is farther outside the workspace than half of the
+            goal radius, robots start in contact, or goals are too close for two robots to be at both
+        """
+        starts, goals = points("starts", starts, self.n_robots), points("goals", goals, self.n_robots)
+        for name, places, least in (
+            ("starts", starts, 2 * self.radius - self.collision_tolerance),
+            ("goals", goals, self.least_spacing - self.collision_tolerance),
+        ):
+            beyond = self.outside(places)
+            worst = int(beyond.argmax())
+            if beyond[worst] > self._leeway:
+                raise ValueError(
+                    f"{name}[{worst}]={places[worst].tolist()} is {beyond[worst]:.3g} m outside the workspace, "
+                    f"planner.workspace_low={self.planner.workspace_low} to "
+                    f"planner.workspace_high={self.planner.workspace_high}: choose a point inside, or enlarge it"
+                )
+            i, j, distance = _closest(places)
+            if distance < least:
+                why = "robots touch" if name == "starts" else "robots that keep their distance cannot be at both goals"
+                raise ValueError(
+                    f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart, where {why}: place them at least "
+                    f"{least + self.collision_tolerance:.3g} m apart"
+                )
+        distance, warning = far_goals(self)
+        if (np.linalg.norm(goals - starts, axis=1) > distance).any():
+            warn(warning)
+        return starts, goals
+
+    def check_room(self, scenario: str, extent: Extent) -> None:
+        """Check that the starts and goals of a scenario lie in the workspace.
+
+        :raises ValueError: if they may be farther outside than half of the goal radius; the message names the scenario
+        """
+        r = extent.radius
+        corners = np.array([[x, y, z] for x in (-r, r) for y in (-r, r) for z in (extent.low, extent.high)])
+        low, high = np.array(self.planner.workspace_low), np.array(self.planner.workspace_high)
+        beyond = np.maximum(low - corners, corners - high).max(axis=0)
+        if beyond.max() <= self._leeway:
+            return
+        field = extent.field if beyond[:2].max() > self._leeway else "heights"
+        wider = np.array([[-r, -r, extent.low], [r, r, extent.high]])
+        wider = np.array([np.minimum(low, wider[0]), np.maximum(high, wider[1])]).round(3).tolist()
+        raise ValueError(
+            f"space.{field}={getattr(self.space, field)}: starts and goals of {scenario!r} lie up to "
+            f"{beyond.max():.3g} m outside the workspace; choose a smaller room, or planner.workspace_low={wider[0]} "
+            f"and planner.workspace_high={wider[1]}, which `make_config` also does if both are left out."
+        )
+
+    @property
+    def _leeway(self) -> float:
+        """Distance from the workspace at which robots still reach a goal, which they approach along its border (m)."""
+        return self.goal_radius / 2 + 1e-6
 
     @property
     def n_others(self) -> int:
@@ -177,9 +272,10 @@ PRESETS: dict[str, SwarmConfig] = {
 def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, **overrides: Any) -> SwarmConfig:
     """Create a preset with some of its fields replaced.
 
-    The planner's separation follows the radius: if only the radius is replaced, the margin beyond twice the radius
-    stays that of the preset. ``quadrotor`` may also be a name of `VEHICLES` or the path of a vehicle file. With another
-    ``plant`` than the model, ``mismatch`` defaults to 0.
+    What depends on other fields follows them, unless it is given: the planner's separation keeps the preset's margin
+    beyond twice the radius; the spacing of starts and goals keeps the preset's margin beyond the separation if robots
+    would start closer than that; and the workspace grows with a room that exceeds it. ``quadrotor`` may also be a name
+    of `VEHICLES` or the path of a vehicle file. With another ``plant`` than the model, ``mismatch`` defaults to 0.
 
     :param preset: a name of `PRESETS`
     :param world: fields of `SwarmConfig` to replace, nested ones as mappings
@@ -190,18 +286,82 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
         raise unknown_name("preset", preset, PRESETS)
     changes = _joined(world or {}, {name: value for name, value in overrides.items() if value is not None})
     base = PRESETS[preset]
-    planner = changes.get("planner", {})
-    if "radius" in changes and isinstance(planner, Mapping) and "separation" not in planner:
-        with contextlib.suppress(
-            TypeError, ValueError, OverflowError
-        ):  # not a number, which the check of the fields reports
-            separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
-            changes = {**changes, "planner": {**planner, "separation": separation}}
-    if isinstance(vehicle := changes.get("quadrotor"), str):
+    if isinstance(vehicle := changes.get("quadrotor"), (str, os.PathLike)):
         changes = {**changes, "quadrotor": load_vehicle(vehicle)}
     if changes.get("plant", MODEL) != MODEL:
         changes = {"mismatch": 0.0, **changes}
+    with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError):  # the check of the fields tells
+        changes = _with_followers(base, changes)
     return replaced(base, changes)
+
+
+def _with_followers(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any]:
+    """Add the fields that follow others, see `make_config`.
+
+    :raises TypeError, ValueError, OverflowError: if a value is not valid
+    """
+    given = changes.get("planner", {})
+    if "radius" in changes and isinstance(given, Mapping) and "separation" not in given:
+        separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
+        given = {**given, "separation": separation}
+    planner = replaced(base.planner, given) if isinstance(given, Mapping) else given
+    room = changes.get("space", {})
+    if isinstance(room, Mapping) and "spacing" not in room and base.space.spacing < planner.separation:
+        spacing = planner.separation + (base.space.spacing - base.planner.separation)
+        room = {**room, "spacing": min(round(spacing, 6), FARTHEST)}
+    space = replaced(base.space, room) if isinstance(room, Mapping) else room
+    if isinstance(given, Mapping):
+        given = {**_workspace(base, space), **given}
+    followers = {"planner": given, "space": room}
+    return {**changes, **{name: value for name, value in followers.items() if value != {}}}
+
+
+def _workspace(base: SwarmConfig, space: ScenarioSpace) -> dict[str, Any]:
+    """Return the bounds of the workspace that a room exceeds, with the preset's margins around its own room."""
+    bounds = {}
+    for name, sign in (("workspace_low", -1), ("workspace_high", 1)):
+        found = tuple(getattr(base.planner, name))
+        edge, usual = (_edges(one, sign) for one in (space, base.space))
+        wider = tuple(
+            old if sign * (new - old) <= 0 else round(new + (old - own), 6)
+            for old, new, own in zip(found, edge, usual, strict=True)
+        )
+        if wider != found:
+            bounds[name] = wider
+    return bounds
+
+
+def _edges(space: ScenarioSpace, sign: int) -> tuple[float, float, float]:
+    """Return the lowest (``sign=-1``) or highest coordinates of starts and goals in all scenarios."""
+    bounds = [bound for one in SCENARIOS.values() if (bound := extent(one, space)) is not None]
+    radius = sign * max(bound.radius for bound in bounds)
+    height = max(bound.high for bound in bounds) if sign > 0 else min(bound.low for bound in bounds)
+    return radius, radius, height
+
+
+def points(name: str, values: Any, count: int) -> np.ndarray:
+    """Convert points to an array, (count, 3) (m).
+
+    :raises ValueError: if the points have another shape, are not numbers, or are farther away than `FARTHEST`
+    """
+    try:
+        array = np.asarray(values, dtype=float)
+        valid = array.shape == (count, 3) and bool((np.abs(array) <= FARTHEST).all())
+    except (TypeError, ValueError, OverflowError):
+        valid = False
+    if not valid:
+        raise ValueError(
+            f"{name} must be {count} finite points, shape ({count}, 3), within {FARTHEST:.0f} m; got {shown(values)}."
+        )
+    return array
+
+
+def _closest(places: np.ndarray) -> tuple[int, int, float]:
+    """Return the indices of the closest two points, and their distance (m)."""
+    squares = ((places[:, None] - places) ** 2).sum(axis=-1)
+    np.fill_diagonal(squares, np.inf)
+    i, j = sorted(divmod(int(squares.argmin()), len(places)))
+    return i, j, float(np.sqrt(squares[i, j]))
 
 
 def _joined(first: Mapping[str, Any], second: Mapping[str, Any], path: str = "") -> dict[str, Any]:

@@ -6,19 +6,27 @@ write a function and add it to `SCENARIOS`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.validation import Length, PositiveLength, Range, checked
+from quad_swarm.validation import FARTHEST, Length, PositiveLength, Range, checked
+
+if TYPE_CHECKING:
+    from quad_swarm.world.presets import SwarmConfig
 
 Rng = np.random.Generator
 Scenario = Callable[[int, "ScenarioSpace", Rng], tuple[np.ndarray, np.ndarray]]
 
 _DRAWS_PER_POINT = 100  # before the whole set is redrawn
 _MAX_DRAWS = 20_000
+_MOST_ATTEMPTS = 100  # draws of a whole episode
+_TRIALS = 8  # episodes that are tried before the first one
 
 
 @checked
@@ -35,6 +43,7 @@ class ScenarioSpace:
     :param whole_sectors: whether sectors of `asymmetric_swap` start at the x axis and are used completely, as in the
         paper (for four robots, one anywhere in each quadrant). By default they are centred on the x axis and used to
         80 %
+    :raises ValueError: if a length is out of range, or displaced starts could be farther away than 10 km
     """
 
     half_width: PositiveLength = 4.0
@@ -45,6 +54,32 @@ class ScenarioSpace:
     sector_radius: Range = (2.0, 4.5)
     whole_sectors: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ("circle_radius", "sector_radius"):
+            if getattr(self, name)[0] < 0:
+                raise ValueError(f"space.{name}={getattr(self, name)}: a radius must not be negative")
+        most = FARTHEST - max(self.circle_radius[1], -self.heights[0], self.heights[1])
+        if self.circle_jitter > most:
+            raise ValueError(
+                f"space.circle_jitter={self.circle_jitter}: starts must stay within {FARTHEST:.0f} m, so with "
+                f"space.circle_radius={self.circle_radius} and space.heights={self.heights} it must be at most {most:g}"
+            )
+
+
+class Extent(NamedTuple):
+    """Bounds of the starts and goals of a scenario.
+
+    :param field: field of `ScenarioSpace` that sets the radius
+    :param radius: limit of the horizontal coordinates (m)
+    :param low: minimum height (m)
+    :param high: maximum height (m)
+    """
+
+    field: str
+    radius: float
+    low: float
+    high: float
+
 
 class DoesNotFit(ValueError):
     """Raised if the robots do not fit into the room of a scenario."""
@@ -53,10 +88,10 @@ class DoesNotFit(ValueError):
 def _place(n_points: int, draw: Callable[[int], np.ndarray], spacing: float) -> np.ndarray:
     """Draw points ``draw(0) ... draw(n_points - 1)``, (n, 3), until all are at least ``spacing`` apart.
 
-    :raises DoesNotFit: if a limited number of draws finds no such set; the message says how many points were placed
+    :raises DoesNotFit: if a limited number of draws finds no such set
     """
     points = np.empty((n_points, 3))
-    placed = most = 0
+    placed = 0
     for k in range(_MAX_DRAWS):
         if k % (_DRAWS_PER_POINT * n_points) == 0:
             placed = 0
@@ -64,12 +99,11 @@ def _place(n_points: int, draw: Callable[[int], np.ndarray], spacing: float) -> 
         if placed == 0 or ((points[:placed] - point) ** 2).sum(axis=1).min() >= spacing**2:
             points[placed] = point
             placed += 1
-            most = max(most, placed)
             if placed == n_points:
                 return points
     raise DoesNotFit(
-        f"{n_points} robots at least {spacing} m apart do not fit into the room of this scenario; about {most} do. "
-        "Choose fewer robots or a larger room."
+        f"{n_points} robots at least {spacing} m apart do not fit into the room of this scenario: choose fewer robots "
+        "or a larger room."
     )
 
 
@@ -140,19 +174,84 @@ SCENARIOS: dict[str, Scenario] = {
 MIXTURES = ("mixed", "curriculum")
 
 
+def extent(scenario: Scenario, space: ScenarioSpace) -> Extent | None:
+    """Return the bounds of a scenario, None if it is not one of this module."""
+    low, high = space.heights
+    if scenario in (random, random_swap):
+        return Extent("half_width", space.half_width, low, high)
+    if scenario is asymmetric_swap:
+        return Extent("sector_radius", space.sector_radius[1], low, high)
+    if scenario is symmetric_swap:
+        jitter = space.circle_jitter
+        return Extent("circle_radius", space.circle_radius[1] + jitter, low - jitter, high + jitter)
+    return None
+
+
+def _succeeds(scenario: Scenario, n_robots: int, space: ScenarioSpace, seed: int) -> bool:
+    try:
+        scenario(n_robots, space, np.random.default_rng(seed))
+    except DoesNotFit:
+        return False
+    return True
+
+
+@functools.lru_cache(maxsize=256)
+def _fits(scenario: Scenario, n_robots: int, space: ScenarioSpace) -> bool:
+    """Return whether at least about half of the attempts to draw an episode succeed, so that `_MOST_ATTEMPTS` do."""
+    found = 0
+    for seed in range(_TRIALS):
+        found += _succeeds(scenario, n_robots, space, seed)
+        if 2 * found >= _TRIALS:
+            return True
+        if seed >= 2 and not found:
+            return False
+    return False
+
+
+def _most(scenarios: Sequence[Scenario], n_robots: int, space: ScenarioSpace) -> int:
+    """Return about how many robots fit into the room of all scenarios, fewer than ``n_robots``."""
+    low, high = 1, n_robots
+    while high - low > 1:
+        middle = (low + high) // 2
+        fits = all(_succeeds(scenario, middle, space, 0) for scenario in scenarios)
+        low, high = (middle, high) if fits else (low, middle)
+    while low > 1 and not all(_fits(scenario, low, space) for scenario in scenarios):
+        low -= 1
+    return low
+
+
+def _larger(field: str, n_robots: int, space: ScenarioSpace) -> str:
+    """Return a value of a field with which ``n_robots`` fit, as text."""
+    if field == "half_width":
+        return f"{math.ceil(9 * space.spacing * math.sqrt(n_robots)) / 10}"
+    low, high = getattr(space, field)
+    around = (space.spacing + space.circle_jitter) / (2 * math.sin(math.pi / n_robots))
+    least = math.ceil(10 * max(low, around if field == "circle_radius" else 1.2 * around)) / 10
+    return f"[{least}, {round(least + high - low, 3)}]"
+
+
 class ScenarioSampler:
     """Sampler of episodes of a scenario or a mixture of scenarios.
+
+    Draws that fail, or that the world refuses, are repeated.
 
     :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among all of them; "curriculum" to draw uniformly
         among the first ``level + 1`` of them; or a mapping of names to weights, such as ``{"symmetric_swap": 3,
         "random": 1}``
     :param n_robots: number of robots, at least 2
     :param space: the room
-    :raises ValueError: if a name is unknown, weights are invalid, there are fewer than two robots, or they do not fit
-        (`DoesNotFit`)
+    :param world: the world that the episodes are flown in, whose `SwarmConfig.check_flight` then holds for each of them
+    :raises ValueError: if a name is unknown, weights are invalid, there are fewer than two robots, they do not fit
+        (`DoesNotFit`), or a scenario leaves the workspace or returns starts or goals that the world refuses
     """
 
-    def __init__(self, name: str | Mapping[str, float], n_robots: int, space: ScenarioSpace):
+    def __init__(
+        self,
+        name: str | Mapping[str, float],
+        n_robots: int,
+        space: ScenarioSpace,
+        world: SwarmConfig | None = None,
+    ):
         for one in [name] if isinstance(name, str) else name:
             if one not in SCENARIOS and (one not in MIXTURES or not isinstance(name, str)):
                 raise unknown_name("scenario", one, [*SCENARIOS, *MIXTURES])
@@ -166,11 +265,55 @@ class ScenarioSampler:
         self.name = name
         self.n_robots = n_robots
         self.space = space
+        self.world = world
         self.level = 0
         self._weights = np.array(weights) / sum(weights) if weights else None
+        # Fail now rather than during training
         for scenario in self._names:
-            # Fail now rather than during training if the robots do not fit
-            SCENARIOS[scenario](n_robots, space, np.random.default_rng(0))
+            self._check_room(scenario)
+        for scenario in self._names:
+            if extent(SCENARIOS[scenario], space) is None:
+                for seed in range(_TRIALS):
+                    self._attempt(scenario, np.random.default_rng(seed))
+
+    def _check_room(self, name: str) -> None:
+        """Check a scenario of this module.
+
+        :raises ValueError: if it leaves the workspace, or the robots do not fit
+        """
+        bounds = extent(SCENARIOS[name], self.space)
+        if bounds is None:
+            return
+        if self.world is not None:
+            self.world.check_room(name, bounds)
+        if _fits(SCENARIOS[name], self.n_robots, self.space):
+            return
+        own = [SCENARIOS[one] for one in self._names if extent(SCENARIOS[one], self.space) is not None]
+        most = _most(own, self.n_robots, self.space)
+        raise DoesNotFit(
+            f"{self.n_robots} robots at least {self.space.spacing:g} m apart do not fit into the room of {name!r}; "
+            f"{f'about {most} do' if most > 1 else 'not even two do'}. Choose fewer robots, or for example "
+            f"space.{bounds.field}={_larger(bounds.field, self.n_robots, self.space)}."
+        )
+
+    def _attempt(self, name: str, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
+        """Draw an episode once.
+
+        :raises DoesNotFit: if the robots do not fit
+        :raises ValueError: if the world refuses what a registered scenario returns; the message names the scenario
+        """
+        scenario = SCENARIOS[name]
+        drawn = scenario(self.n_robots, self.space, rng)
+        if extent(scenario, self.space) is not None or self.world is None:
+            return drawn
+        try:
+            starts, goals = drawn
+        except (TypeError, ValueError):
+            raise ValueError(f"Scenario {name!r} returns {shown(drawn)}: it must return starts and goals.") from None
+        try:
+            return self.world.check_flight(starts, goals)
+        except ValueError as error:
+            raise ValueError(f"Scenario {name!r}: {error}") from None
 
     @property
     def _names(self) -> list[str]:
@@ -198,10 +341,18 @@ class ScenarioSampler:
         self.level = level
 
     def sample(self, rng: Rng) -> tuple[str, np.ndarray, np.ndarray]:
-        """Draw an episode and return the scenario's name, starts (n, 3) and goals (n, 3), world frame (m)."""
+        """Draw an episode and return the scenario's name, starts (n, 3) and goals (n, 3), world frame (m).
+
+        :raises ValueError: if a registered scenario returns starts or goals that the world refuses again and again
+        """
         active = self._active()
         if self._weights is not None:
             name = active[int(rng.choice(len(active), p=self._weights))]
         else:
             name = active[int(rng.integers(len(active)))] if len(active) > 1 else active[0]
-        return name, *SCENARIOS[name](self.n_robots, self.space, rng)
+        for _ in range(_MOST_ATTEMPTS - 1):
+            try:
+                return name, *self._attempt(name, rng)
+            except ValueError:
+                continue
+        return name, *self._attempt(name, rng)

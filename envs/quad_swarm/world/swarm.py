@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.errors import shown
 from quad_swarm.native.pairs import advance, resample
 from quad_swarm.native.steps import measure
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
@@ -22,12 +21,11 @@ from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.states import like
 from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, of_others, other_indices, resampled
 from quad_swarm.world.neighbours import Neighbours
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, points
 from quad_swarm.world.realisation import Realisation
 
 # Distance (in separations) at which an empty slot shows a robot, far beyond all plans
 _NOBODY = 30.0
-_FARTHEST = 1e4  # limit of starts and goals (m), far beyond any room and small enough for precise squares
 
 
 class StepReport(NamedTuple):
@@ -177,17 +175,23 @@ class Swarm:
         between = plans[:, i] - plans[:, j]
         return np.sqrt(_dot(between, between))[:, self._pair_of]
 
-    def reset(self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
+    def reset(
+        self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0, checked: bool = False
+    ) -> None:
         """Place the robots of one swarm at rest.
 
         :param swarm: index of the swarm
         :param starts: starts, (n, 3), world frame (m)
         :param goals: goals, (n, 3), world frame (m)
         :param noise_seed: seed of the disturbances, unused without any
-        :raises ValueError: if starts or goals are not n finite points
+        :param checked: whether the starts and goals are known to fit the world, as those of a `ScenarioSampler` are
+        :raises ValueError: if robots cannot fly from these starts to these goals, see `SwarmConfig.check_flight`
         """
         n = self.config.n_robots
-        starts, goals = _points("starts", starts, n), _points("goals", goals, n)
+        if checked:
+            starts, goals = points("starts", starts, n), points("goals", goals, n)
+        else:
+            starts, goals = self.config.check_flight(starts, goals)
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
@@ -377,23 +381,6 @@ class Swarm:
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
         )
-
-
-def _points(name: str, points: Any, count: int) -> np.ndarray:
-    """Convert points to an array, (count, 3) (m).
-
-    :raises ValueError: if the points have another shape, are not numbers, or are farther away than `_FARTHEST`
-    """
-    try:
-        array = np.asarray(points, dtype=float)
-        valid = array.shape == (count, 3) and bool((np.abs(array) <= _FARTHEST).all())
-    except (TypeError, ValueError, OverflowError):
-        valid = False
-    if not valid:
-        raise ValueError(
-            f"{name} must be {count} finite points, shape ({count}, 3), within {_FARTHEST:.0f} m; got {shown(points)}."
-        )
-    return array
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

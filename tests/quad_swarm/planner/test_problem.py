@@ -8,7 +8,7 @@ import pytest
 from planning import QUADROTOR
 
 from quad_swarm.planner import OptimalControlProblem, PlannerConfig
-from quad_swarm.quadrotor import QuadrotorModel
+from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
 CONFIG = PlannerConfig()
 PROBLEM = OptimalControlProblem(CONFIG, QUADROTOR, 2)
@@ -107,3 +107,15 @@ def test_what_leaves_the_box_is_a_violation_by_so_much(column, value, violation)
 def test_refuses_senseless_settings(values, message):
     with pytest.raises(ValueError, match=message):
         PlannerConfig(**values)
+
+
+@pytest.mark.parametrize(
+    ("config", "quadrotor", "message"),
+    [
+        ({"max_tilt": 1.047}, {"pitch_gain": 2.0}, r"max_tilt=1\.047: .* tilt by 120 degrees; use at most 0\.785"),
+        ({"dt": 0.7}, {}, r"dt=0\.7: steps must not exceed 0\.65 s"),
+    ],
+)
+def test_a_planner_that_does_not_fit_its_vehicle_is_refused(config, quadrotor, message):
+    with pytest.raises(ValueError, match=message):
+        OptimalControlProblem(PlannerConfig(**config), QuadrotorParams(**quadrotor), 1)

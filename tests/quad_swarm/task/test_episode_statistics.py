@@ -16,13 +16,13 @@ def begun(starts, goals) -> RequestTask:
     """Two robots whose episode goes on after a collision."""
     task = make_task(n_robots=2)
     task.end_at_collision = False
-    task.place(0, "given", np.asarray(starts), np.asarray(goals), np.random.default_rng(0))
+    task.place(0, "given", np.asarray(starts), np.asarray(goals), np.random.default_rng(0), checked=True)
     return task
 
 
 def put(task: RequestTask, positions) -> None:
     """Move the robots there, at rest."""
-    task.swarm.reset(0, np.asarray(positions), task.swarm.goal[0])
+    task.swarm.reset(0, np.asarray(positions), task.swarm.goal[0], checked=True)
 
 
 def test_requests_stop_counting_at_a_collision_while_separations_go_on():

@@ -106,7 +106,7 @@ def test_the_side_on_which_the_other_would_pass_is_seen_although_the_frame_is_mi
     seen = []
     for lateral in (0.5, -0.5):
         swarm = Swarm(config, 1)
-        swarm.reset(0, np.array([[0.0, 0, 1], [4, lateral, 1]]), np.zeros((2, 3)))
+        swarm.reset(0, np.array([[0.0, 0, 1], [4, lateral, 1]]), np.zeros((2, 3)), checked=True)
         swarm.state[0, :, 3] = [1.0, -1.0]
         seen.append(observation(swarm)[0][:, columns])
     left, right = seen

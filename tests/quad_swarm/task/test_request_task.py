@@ -110,7 +110,7 @@ def test_collisions_need_not_end_episodes(ends):
     task = make_task(n_robots=2, max_steps=3)
     task.end_at_collision = ends
     close = np.array([[-0.25, 0, 1], [0.25, 0, 1]])
-    task.place(0, "given", close, close, np.random.default_rng(0))
+    task.place(0, "given", close, close, np.random.default_rng(0), checked=True)
     silent = np.zeros((1, 2, 1), bool)
     first = task.step(silent)
     assert (first.terminated[0], first.truncated[0]) == (ends, False)
@@ -129,10 +129,11 @@ def test_reward_is_the_paper_s():
     _, reward, *_ = env.step(np.array([1, 1]))
     assert reward == pytest.approx(1.3 - 0.2)
 
-    env.reset(options={"starts": [[0, 0, 1.0], [0.5, 0, 1.0]], "goals": [[0, 0, 1.0], [0.5, 0, 1.0]]})
+    env.reset(options={"starts": line, "goals": line})
+    env.task.swarm.state[0, :, 0] = [0.0, 0.5]  # in contact
     _, reward, terminated, truncated, info = env.step(np.array([0, 0]))
     assert (terminated, truncated, info["collision"], info["is_success"]) == (True, False, True, False)
-    assert reward == pytest.approx(1.3 - 150)
+    assert reward == pytest.approx(info["reward_terms"]["goal"] - 150)
 
 
 def test_ends_at_the_time_limit():
@@ -225,7 +226,8 @@ def test_near_misses_far_ahead_may_count_from_less_distance():
     costs = {}
     for narrowing in (0.0, 0.1, 0.7):
         env = QuadSwarmEnv(n_robots=2, reward={**weights, "near_miss_narrowing": narrowing})
-        env.reset(options={"starts": ends, "goals": np.tile([0.0, 0, 1], (2, 1))})
+        env.reset(seed=0)
+        env.task.place(0, "given", ends, np.tile([0.0, 0, 1], (2, 1)), env.np_random, checked=True)
         costs[narrowing] = -env.step(np.array([0, 0]))[-1]["reward_terms"]["near_miss"]
     assert costs[0.0] > costs[0.1] > costs[0.7] == 0
 

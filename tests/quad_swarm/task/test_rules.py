@@ -102,7 +102,7 @@ def test_rules_that_remember_ask_again_when_a_plan_is_old_or_wrong():
 def test_plan_looks_at_the_own_plan():
     swarm = Swarm(make_config("paper", n_robots=2), 1)
     # Robot 0 flies to where robot 1 rests
-    swarm.reset(0, np.array([[-1.5, 0, 1], [1.5, 0, 1]]), np.array([[1.5, 0.2, 1], [1.5, 0, 1]]))
+    swarm.reset(0, np.array([[-1.5, 0, 1], [1.5, 0, 1]]), np.array([[1.5, 0.2, 1], [1.5, 0, 1]]), checked=True)
     for _ in range(6):
         swarm.step(np.zeros((1, 2, 1), bool))
     near = View(swarm).plan_approach.least

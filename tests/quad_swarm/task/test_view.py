@@ -13,7 +13,7 @@ def swarm_at(pos, vel=None, goals=None, **config) -> Swarm:
     """One swarm with its robots at ``pos``."""
     pos = np.asarray(pos, float)
     swarm = Swarm(make_config("paper", n_robots=len(pos), **config), 1)
-    swarm.reset(0, pos, pos if goals is None else np.asarray(goals, float))
+    swarm.reset(0, pos, pos if goals is None else np.asarray(goals, float), checked=True)
     swarm.state[0, :, VELOCITY] = 0.0 if vel is None else vel
     return swarm
 

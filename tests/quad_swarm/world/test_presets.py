@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quad_swarm import QuadSwarmEnv, QuadSwarmParallelEnv
 from quad_swarm.planner import PlannerConfig
+from quad_swarm.world.doubts import DoubtfulWorld
 from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
+from quad_swarm.world.swarm import Swarm
 
 FROZEN = json.loads(Path(__file__).with_name(f"presets_v{PRESET_VERSION}.json").read_text())
 
@@ -135,3 +138,129 @@ def test_what_is_given_twice_is_refused():
 def test_an_unknown_preset_is_refused(preset):
     with pytest.raises(ValueError, match="Unknown preset"):
         make_config(preset)
+
+
+@pytest.mark.parametrize(
+    "given", [lambda world: make_config("paper", world), lambda world: make_config("paper", **world)]
+)
+def test_the_spacing_follows_a_separation_that_exceeds_it(given):
+    assert given({"radius": 0.6}).space.spacing == pytest.approx(1.6), "the margin of the preset, 0.4 m"
+    assert given({"radius": "0.6"}).space.spacing == pytest.approx(1.6)
+    assert given({"planner": {"separation": 3}}).space.spacing == pytest.approx(3.4)
+    assert given({"radius": 0.6, "space": {"half_width": 5}}).space.spacing == pytest.approx(1.6)
+    assert given({"radius": 0.6, "space": {"spacing": 1.3}}).space.spacing == 1.3
+    assert given({"planner": {"separation": 1e4}}).space.spacing == 1e4, "the limit of lengths"
+    assert given({"radius": 0.5}).space == PRESETS["paper"].space, "robots 1 m apart keep their separation of 1 m"
+    assert given({"radius": 0.1}).space == PRESETS["paper"].space
+    for world in ({"radius": 0.6, "space": {"spacing": 1}}, {"space": {"spacing": 0.5}}):
+        with pytest.raises(ValueError, match=r"^space\.spacing=[01.5]+: .* at least 2 \* radius = [01]\.[26]"):
+            given(world)
+    with pytest.raises(ValueError, match=r"^space\.spacing=1:"):
+        SwarmConfig(radius=0.6, planner=PlannerConfig(separation=1.2))
+
+
+@pytest.mark.parametrize(
+    ("space", "low", "high"),
+    [
+        ({"half_width": 4.7}, (-4.8, -4.8, 0.48), (4.8, 4.8, 2.4)),  # fits: nothing changes
+        ({"half_width": 10}, (-10.3, -10.3, 0.48), (10.3, 10.3, 2.4)),  # a margin of 0.3 m as in the preset
+        ({"heights": [4, 8]}, (-4.8, -4.8, 0.48), (4.8, 4.8, 8.3)),
+        ({"heights": [0.2, 1]}, (-4.8, -4.8, -0.02), (4.8, 4.8, 2.4)),
+        ({"circle_radius": [5, 6]}, (-6.45, -6.45, 0.48), (6.45, 6.45, 2.4)),
+        ({"sector_radius": [2, 5]}, (-5.3, -5.3, 0.48), (5.3, 5.3, 2.4)),
+        ({"circle_jitter": 2.0}, (-5.3, -5.3, -1.37), (5.3, 5.3, 4.25)),
+    ],
+)
+def test_the_workspace_grows_with_a_room_that_exceeds_it(space, low, high):
+    planner = make_config("paper", space=space).planner
+    assert planner.workspace_low == pytest.approx(low)
+    assert planner.workspace_high == pytest.approx(high)
+    given = make_config("paper", space=space, planner={"workspace_high": (9, 9, 9)}).planner
+    assert given.workspace_high == (9, 9, 9)
+    assert given.workspace_low == pytest.approx(low)
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        ({"planner": {"max_tilt": 1.047}, "quadrotor": {"roll_gain": 2}}, r"max_tilt=1\.047: .* 120 degrees.* 0\.785"),
+        ({"planner": {"max_tilt": 1.3}, "mismatch": 0.2}, r"planner\.max_tilt=1\.3: .* use at most 1\.161"),
+        ({"planner": {"max_yaw_rate": 90}}, r"max_yaw_rate=90 is in rad/s: .* half a turn per step, 31\.41"),
+        ({"planner": {"dt": 0.01}}, r"planner\.horizon=10 .* 0\.1 s ahead, .* use planner\.horizon=72"),
+        (
+            {"quadrotor": {"roll_time_constant": 237, "pitch_time_constant": 232, "climb_time_constant": 337}},
+            r"quadrotor\.roll_time_constant=237 s.* time constants are in seconds",
+        ),
+        ({"space": {"heights": [-1e4, 1e4], "circle_jitter": 1e3}}, r"circle_jitter=1000\.0: .* it must be at most 0"),
+        ({"space": {"circle_radius": [2, 9999], "circle_jitter": 5}}, r"circle_jitter=5\.0: .* it must be at most 1"),
+        ({"space": {"sector_radius": [-2, 4]}}, r"sector_radius=\(-2\.0, 4\.0\): a radius must not be negative"),
+    ],
+)
+def test_what_cannot_be_flown_is_refused_with_a_value_that_works(world, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make_config("paper", world)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_recommended_is_accepted():
+    make_config("paper", planner={"max_tilt": 0.785}, world={"quadrotor": {"roll_gain": 2, "pitch_gain": 2}})
+    make_config("paper", planner={"max_tilt": 1.161}, world={"mismatch": 0.2})
+    with pytest.warns(DoubtfulWorld):
+        make_config("paper", planner={"max_yaw_rate": 31.41})
+    make_config("paper", planner={"dt": 0.01, "horizon": 72}, world={"max_steps": 1000})
+
+
+GOALS = np.array([[-2.0, 0, 1.5], [2.0, 0, 1.5]])
+FLIGHTS = [
+    (GOALS, [[7, 0, 1.5], [-2, 0, 1.5]], r"goals\[0\]=\[7\.0, 0\.0, 1\.5\] is 2\.2 m outside the workspace"),
+    (GOALS, [[2, 0, 1.5], [-2, 0, 0]], r"goals\[1\]=.* is 0\.48 m outside"),
+    ([[-900, 0, 1], [2, 0, 1]], GOALS, r"starts\[0\]=.* is 895 m outside"),
+    ([[0, 0, 1], [0, 0, 1]], GOALS, r"starts\[0\] and starts\[1\] are 0 m apart.* at least 0\.6 m apart"),
+    ([[0, 0, 1], [0, 0.59, 1]], GOALS, r"starts\[0\] and starts\[1\] are 0\.59 m apart"),
+    (GOALS, [[0, 0, 1], [0, 0, 1]], r"goals\[0\] and goals\[1\] are 0 m apart.* at least 0\.6 m apart"),
+    (GOALS, [[0, 0, 1], [0, 0.5, 1]], r"goals\[0\] and goals\[1\] are 0\.5 m apart"),
+    (GOALS, [[0, 0, 1]], r"goals must be 2 finite points, shape \(2, 3\)"),
+    (GOALS, [[0, 0, 1], [0, np.nan, 1]], "goals must be 2 finite points"),
+    (GOALS, [[0, 0, 1], [0, "x", 1]], "goals must be 2 finite points"),
+    (GOALS, [[0, 0, 1], [0, 1e5, 1]], "goals must be 2 finite points.* within 10000 m"),
+]
+
+
+@pytest.mark.parametrize(("starts", "goals", "message"), FLIGHTS)
+def test_flights_that_do_not_fit_the_world_are_refused_at_every_entrance(starts, goals, message):
+    config = make_config("paper", n_robots=2)
+    options = {"starts": starts, "goals": goals}
+    for fly in (
+        lambda: config.check_flight(starts, goals),
+        lambda: Swarm(config).reset(0, starts, goals),
+        lambda: QuadSwarmEnv(n_robots=2).reset(options=options),
+        lambda: QuadSwarmParallelEnv(n_robots=2).reset(options=options),
+    ):
+        with pytest.raises(ValueError, match=message) as caught:
+            fly()
+        assert "\n" not in str(caught.value)
+
+
+def test_what_robots_can_reach_from_the_border_is_accepted():
+    config = make_config("paper", n_robots=2)
+    beside = [[4.94, 0, 1.5], [-2, 0, 0.4]]  # at most half of the goal radius outside
+    swarm = Swarm(config)
+    swarm.reset(0, GOALS, beside)
+    for _ in range(100):
+        report = swarm.step(np.ones((1, 2, 1), bool))
+    assert report.at_goal.all()
+    for close in (0.6, 0.62):  # robots are pushed apart, but not by more than the goal radius
+        swarm.reset(0, GOALS, [[0, 0, 1], [close, 0, 1]])
+        for _ in range(100):
+            report = swarm.step(np.ones((1, 2, 1), bool))
+        assert report.at_goal.all()
+
+
+def test_a_state_outside_is_no_reset():
+    """Robots may leave the workspace in flight, and their states are restored as they are."""
+    env = QuadSwarmEnv(n_robots=2)
+    env.reset(seed=0)
+    env.task.swarm.state[0, 0, 0] = 7.0
+    other = QuadSwarmEnv(n_robots=2)
+    other.load_state_dict(env.state_dict())
+    assert other.task.swarm.state[0, 0, 0] == 7.0

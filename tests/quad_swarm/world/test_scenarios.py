@@ -1,11 +1,17 @@
 """Scenarios: what the paper says of each, bounds, and robots that do not fit."""
 
+import ast
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quad_swarm.world.presets import PRESETS
+from quad_swarm import QuadSwarmEnv, QuadSwarmParallelEnv, QuadSwarmVectorEnv
+from quad_swarm.evaluation.flight import Condition
+from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS, DoesNotFit, ScenarioSampler, ScenarioSpace
 
 SPACE = ScenarioSpace()
@@ -115,3 +121,147 @@ def test_weights_are_shares():
 def test_senseless_weights_are_refused(weights, message):
     with pytest.raises(ValueError, match=message):
         ScenarioSampler(weights, 4, SPACE)
+
+
+@pytest.mark.parametrize(("preset", "n_robots"), [("paper", 14), ("paper", 16), ("dense", 16), ("flight", 16)])
+def test_robots_that_fit_at_construction_fit_at_every_reset(preset, n_robots):
+    config = make_config(preset, n_robots=n_robots)
+    sampler = ScenarioSampler("symmetric_swap", n_robots, config.space, config)
+    for seed in range(40):  # 13 to 87 of 200 draws fail
+        _, starts, goals = sampler.sample(np.random.default_rng(seed))
+        assert min(spacing(starts), spacing(goals)) >= config.space.spacing
+
+
+@given(
+    name=st.sampled_from([*SCENARIOS, "mixed"]),
+    n_robots=st.integers(2, 40),
+    gap=st.floats(0.3, 3.0),
+    half_width=st.floats(0.5, 8.0),
+    circle=st.tuples(st.floats(0.1, 5.0), st.floats(0.0, 3.0)),
+    jitter=st.floats(0, 1.0),
+    seed=st.integers(0, 2**32),
+)
+@settings(max_examples=10, deadline=None)
+def test_a_room_is_refused_at_construction_or_never(name, n_robots, gap, half_width, circle, jitter, seed):
+    radius = (circle[0], circle[0] + circle[1])
+    space = ScenarioSpace(half_width, (0.7, 2.1), gap, radius, jitter, radius)
+    try:
+        sampler = ScenarioSampler(name, n_robots, space)
+    except DoesNotFit:
+        return
+    for k in range(3):
+        _, starts, goals = sampler.sample(np.random.default_rng(seed + k))
+        assert min(spacing(starts), spacing(goals)) >= gap
+
+
+def test_draws_that_succeed_at_once_are_as_they_were():
+    space = PRESETS["paper"].space
+    sampler = ScenarioSampler("symmetric_swap", 16, space)
+    same = 0
+    for seed in range(20):
+        try:
+            expected = SCENARIOS["symmetric_swap"](16, space, np.random.default_rng(seed))
+        except DoesNotFit:
+            continue
+        found = sampler.sample(np.random.default_rng(seed))[1:]
+        assert np.array_equal(found, expected)
+        same += 1
+    assert 5 < same < 20, "the others were drawn again"
+
+
+@pytest.mark.parametrize("n_robots", [18, 20, 40, 300])
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_the_number_and_the_room_that_are_named_fit(name, n_robots):
+    space = SPACE if n_robots < 100 or "swap" in name[6:] else replace(SPACE, half_width=5.0)
+    try:
+        ScenarioSampler(name, n_robots, space)
+        return
+    except DoesNotFit as error:
+        told = str(error)
+    field = {"asymmetric_swap": "sector_radius", "symmetric_swap": "circle_radius"}.get(name, "half_width")
+    found = re.fullmatch(rf"{n_robots} robots .* of '{name}'; about (\d+) do\. .* space\.{field}=(.*)\.", told)
+    assert found, told
+    ScenarioSampler(name, int(found[1]), space)
+    ScenarioSampler(name, n_robots, replace(space, **{field: ast.literal_eval(found[2])}))
+    with pytest.raises(DoesNotFit):
+        ScenarioSampler(name, 2 * int(found[1]) + 4, space)
+
+
+def test_about_sixteen_robots_fit_on_the_circle_of_the_paper():
+    for n_robots in (20, 40):
+        with pytest.raises(DoesNotFit, match=r"about 1[5-8] do\..* space\.circle_radius="):
+            ScenarioSampler("symmetric_swap", n_robots, SPACE)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        (
+            "random",
+            {"half_width": 10},
+            r"space\.half_width=10\.0: starts and goals of 'random' lie up to 5\.2 m outside",
+        ),
+        ("symmetric_swap", {"circle_radius": [5, 6]}, r"space\.circle_radius=.* 'symmetric_swap' lie up to 1\.35 m"),
+        ("asymmetric_swap", {"sector_radius": [2, 6]}, r"space\.sector_radius=.* 'asymmetric_swap' lie up to 1\.2 m"),
+        ("mixed", {"heights": [4, 8]}, r"space\.heights=.* lie up to 5\.6 m outside"),
+    ],
+)
+def test_a_room_beyond_a_given_workspace_is_refused_where_it_is_used(name, changes, message):
+    given = {"workspace_low": (-4.8, -4.8, 0.48), "workspace_high": (4.8, 4.8, 2.4)}
+    config = make_config("paper", planner=given, space=changes)
+    for make in (
+        lambda: ScenarioSampler(name, 4, config.space, config),
+        lambda: QuadSwarmEnv(scenario=name, planner=given, space=changes),
+        lambda: QuadSwarmVectorEnv(2, scenario=name, planner=given, space=changes),
+        lambda: QuadSwarmParallelEnv(scenario=name, planner=given, space=changes),
+        lambda: Condition("none", name, config),
+    ):
+        with pytest.raises(ValueError, match=message) as caught:
+            make()
+        assert "\n" not in str(caught.value)
+    wider = re.findall(r"workspace_\w+=(\[[^]]*\])", str(caught.value))
+    workspace = dict(zip(given, map(ast.literal_eval, wider), strict=True))
+    ScenarioSampler(name, 4, config.space, make_config("paper", planner=workspace, space=changes))
+    other = "random" if name != "random" else "symmetric_swap"
+    if "heights" not in changes:
+        ScenarioSampler(other, 4, config.space, config)
+
+
+def _foreign(starts, goals):
+    return lambda n_robots, space, rng: (np.array(starts, float), np.array(goals, float))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "message"),
+    [
+        (_foreign([[0, 0, 1], [0.2, 0, 1]], [[2, 0, 1], [-2, 0, 1]]), r"starts\[0\] and starts\[1\] are 0\.2 m apart"),
+        (_foreign([[0, 0, 1], [2, 0, 1]], [[9, 0, 1], [-2, 0, 1]]), r"goals\[0\]=.* 4\.2 m outside the workspace"),
+        (_foreign([[0, 0, 1], [2, 0, 1]], [[0, np.nan, 1], [-2, 0, 1]]), "goals must be 2 finite points"),
+        (_foreign([[0, 0], [2, 0]], [[0, 1], [-2, 0]]), r"starts must be 2 finite points, shape \(2, 3\)"),
+        (lambda n_robots, space, rng: None, "returns None: it must return starts and goals"),
+    ],
+)
+def test_what_a_registered_scenario_returns_is_checked(scenario, message, monkeypatch):
+    monkeypatch.setitem(SCENARIOS, "foreign", scenario)
+    for make in (
+        lambda: QuadSwarmEnv(n_robots=2, scenario="foreign"),
+        lambda: QuadSwarmVectorEnv(2, n_robots=2, scenario="foreign"),
+        lambda: QuadSwarmParallelEnv(n_robots=2, scenario={"random": 1, "foreign": 1}),
+        lambda: Condition("none", "foreign", make_config("paper", n_robots=2)),
+    ):
+        with pytest.raises(ValueError, match=f"^Scenario 'foreign':? {message}") as caught:
+            make()
+        assert "\n" not in str(caught.value)
+
+
+def test_a_registered_scenario_that_seldom_fails_is_drawn_again(monkeypatch):
+    def seldom(n_robots, space, rng):
+        starts, goals = SCENARIOS["random"](n_robots, space, rng)
+        if rng.random() < 0.05:
+            starts[1] = starts[0]
+        return starts, goals
+
+    monkeypatch.setitem(SCENARIOS, "seldom", seldom)
+    config = make_config("paper")
+    sampler = ScenarioSampler("seldom", 4, config.space, config)
+    assert min(spacing(sampler.sample(np.random.default_rng(seed))[1]) for seed in range(100)) >= SPACE.spacing

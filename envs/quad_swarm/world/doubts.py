@@ -1,0 +1,312 @@
+"""What is doubtful about a world: fields that are valid, but do not fit each other.
+
+The horizontal motion is analysed with the planner's problem linearised about hovering, for one axis: state (position,
+velocity, tilt), input (commanded tilt). Far from a goal, the terminal cost has the constant slope ``2 w / d`` at the
+distance d, so the first input is ``w S_0 / (q d)``, where S_0 is the effect of the first input on the last position and
+q the weight of the squared input. Near the goal, it is linear in the offset and in the tilt, which gives the offset at
+which a robot stands in a steady wind that the planner does not know.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from quad_swarm.planner import PlannerConfig
+from quad_swarm.quadrotor import QuadrotorParams
+
+if TYPE_CHECKING:
+    from quad_swarm.world.presets import SwarmConfig
+
+_SLOW_START = 5.0  # a planner that takes longer to half of the speed is slow (s)
+_TINIEST = 1e-30  # avoids division by zero
+_LIGHT_AIR = 0.01  # wind in which offsets are linear (m/s)
+_SETTLING = 2.5  # time for which a disturbed velocity moves a robot (s)
+_FASTEST_TURN = 4 * math.pi  # of the yaw (rad/s)
+
+
+class DoubtfulWorld(UserWarning):
+    """Warning of a world that is valid, but in which flights hardly mean what they should."""
+
+
+class _Axis(NamedTuple):
+    """Linearised horizontal motion along one axis.
+
+    :param gravity: gravitational acceleration (m/s^2)
+    :param drag: drag coefficient (1/s)
+    :param gain: steady-state gain of the tilt command (-)
+    :param max_tilt: limit of the commanded tilt (rad)
+    :param effects: effect of each of the N inputs on the last position, (N,) (m/rad)
+    :param of_tilt: effect of the current tilt on the last position (m/rad)
+    :param input_weight: weight of the squared input (1/rad^2)
+    :param goal_weight: weight of the squared distance to the goal at the end of the horizon (1/m^2)
+    """
+
+    gravity: float
+    drag: float
+    gain: float
+    max_tilt: float
+    effects: np.ndarray
+    of_tilt: float
+    input_weight: float
+    goal_weight: float
+
+    @property
+    def fastest(self) -> float:
+        """Speed through the air at the maximum tilt (m/s)."""
+        thrust = self.gravity * math.tan(min(self.gain * self.max_tilt, 0.5 * math.pi - 1e-6))
+        return max(thrust / max(self.drag, 1e-9), _TINIEST)
+
+    def farthest(self, speed: float) -> float:
+        """Return the distance to the goal (m) from which on robots are slower than ``speed`` (m/s), or take too long to
+        reach it."""
+        thrust = max(self.drag * speed, speed / _SLOW_START)
+        needed = self.input_weight * math.atan(thrust / self.gravity) / self.gain
+        return self.goal_weight * max(float(self.effects[0]), 0.0) / needed if needed > 1e-12 else math.inf
+
+    def offset(self, wind: float) -> float:
+        """Return the distance to the goal (m) at which a robot stands in a steady wind (m/s)."""
+        tilt = math.atan(self.drag * wind / self.gravity) / self.gain
+        curvature = self.input_weight + self.goal_weight * float(self.effects @ self.effects)
+        pull = self.goal_weight * float(self.effects[0]) / curvature
+        if tilt > self.max_tilt or (tilt and pull <= 0):
+            return math.inf
+        return tilt * (1 / pull + self.of_tilt * self.gain) if tilt else 0.0
+
+
+@functools.lru_cache(maxsize=64)
+def axes(planner: PlannerConfig, quadrotor: QuadrotorParams) -> tuple[_Axis, ...]:
+    """Return the motion along x and y."""
+    found = []
+    for drag, gain, lag in (
+        (quadrotor.drag_x, quadrotor.pitch_gain, quadrotor.pitch_time_constant),
+        (quadrotor.drag_y, quadrotor.roll_gain, quadrotor.roll_time_constant),
+    ):
+        rates = planner.dt * np.array([[0, 1, 0], [0, -drag, quadrotor.gravity], [0, 0, -1 / lag]])
+        one = np.eye(3)
+        integral = one + rates @ (one / 2 + rates @ (one / 6 + rates / 24))  # as the Runge-Kutta step
+        step, command = one + rates @ integral, planner.dt * integral @ [0, 0, gain / lag]
+        effects, last = np.empty(planner.horizon), np.array([1.0, 0.0, 0.0])
+        for k in range(planner.horizon):
+            effects[-1 - k] = last @ command
+            last = last @ step
+        weight = planner.input_weight / planner.max_tilt**2
+        found.append(
+            _Axis(quadrotor.gravity, drag, gain, planner.max_tilt, effects, float(last[2]), weight, planner.goal_weight)
+        )
+    return tuple(found)
+
+
+def far_goals(config: SwarmConfig) -> tuple[float, str]:
+    """Return the distance (m) from which on goals are approached at less than half of the possible speed, and the
+    warning about it."""
+    both, planner = axes(config.planner, config.quadrotor), config.planner
+    fastest = [min(planner.max_speed, axis.fastest) for axis in both]
+    distance = min(axis.farthest(speed / 2) for axis, speed in zip(both, fastest, strict=True))
+    return distance, (
+        f"planner.goal_weight={planner.goal_weight:g} is divided by the squared distance to the goal, so robots whose "
+        f"goals are more than {distance:.0f} m away fly at less than half of {min(fastest):.2g} m/s, the slower the "
+        f"farther: raise it to {2 * planner.goal_weight / max(distance, 1e-9):.2g} per metre of their distance"
+    )
+
+
+def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:
+    """Return the distance to the goal (m) at which robots stand in a steady wind, which their planner does not know;
+    infinity if the wind blows them away.
+
+    :param config: the world
+    :param wind: speed of the wind (m/s), by default the world's
+    """
+    wind = config.noise.wind if wind is None else wind
+    return max(axis.offset(wind) for axis in axes(config.planner, config.quadrotor))
+
+
+def arrival_radius(config: SwarmConfig) -> float:
+    """Return the goal radius (m) below which robots hardly arrive together, from the steady wind, the gusts and the
+    noise of the velocity. The factors were measured in `flight` (docs/flight.md)."""
+    gusts = config.noise.gust * standing_offset(config, _LIGHT_AIR) / _LIGHT_AIR
+    return math.hypot(1.1 * standing_offset(config), 1.1 * gusts, _SETTLING * config.noise.vel)
+
+
+def _up(number: float) -> float:
+    """Round a number up for a message."""
+    return math.ceil(number) if number < 1e9 else float(f"{number:.1e}")
+
+
+def doubts(config: SwarmConfig) -> Iterator[str]:
+    """Yield a sentence about everything that is doubtful about a world, with a field and what to do."""
+    short = short_horizon(config)
+    if short is None:
+        yield from _doubts_about_arriving(config)
+    else:
+        yield short
+    yield from _doubts_about_the_vehicle(config)
+    yield from _doubts_about_the_others(config)
+
+
+def short_horizon(config: SwarmConfig) -> str | None:
+    """Return a sentence if the planner's horizon is too short for the vehicle's lags."""
+    planner, vehicle = config.planner, config.quadrotor
+    ahead = planner.horizon * planner.dt
+    for name, factor in (("roll_time_constant", 1.5), ("pitch_time_constant", 1.5), ("climb_time_constant", 0.75)):
+        needed = factor * getattr(vehicle, name)
+        if ahead < 0.999 * needed:
+            longer = math.ceil(2 * needed / planner.dt) if needed < 400 * planner.dt else None
+            return (
+                f"planner.horizon={planner.horizon} steps of planner.dt={planner.dt:g} s look {ahead:.2g} s ahead, too "
+                f"little for quadrotor.{name}={getattr(vehicle, name):g} s: robots hardly move or collide; "
+                + (f"use planner.horizon={longer}" if longer else "time constants are in seconds")
+            )
+    return None
+
+
+def _doubts_about_the_vehicle(config: SwarmConfig) -> Iterator[str]:
+    planner, vehicle = config.planner, config.quadrotor
+    fastest = min(axis.fastest for axis in axes(planner, vehicle))
+    if planner.max_speed > 2 * fastest:
+        yield (
+            f"planner.max_speed={planner.max_speed:g} is in m/s: with planner.max_tilt={planner.max_tilt:.3g} rad, the "
+            f"vehicle reaches {fastest:.2g} m/s; use at most twice that, or tilt more"
+        )
+    fall = vehicle.climb_gain * planner.max_climb_rate / vehicle.climb_time_constant
+    if fall > vehicle.gravity:
+        slower = vehicle.gravity * vehicle.climb_time_constant / vehicle.climb_gain
+        yield (
+            f"planner.max_climb_rate={planner.max_climb_rate:g}: with quadrotor.climb_time_constant="
+            f"{vehicle.climb_time_constant:g}, robots descend with {fall:.0f} m/s^2, faster than they would fall; at "
+            f"most {slower:.2g} m/s is plausible"
+        )
+    if planner.max_yaw_rate > _FASTEST_TURN:
+        yield (
+            f"planner.max_yaw_rate={planner.max_yaw_rate:g} is in rad/s and more than two turns per second: "
+            f"{math.radians(planner.max_yaw_rate):.3g} would be the same number in degrees"
+        )
+
+
+def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:
+    planner, space = config.planner, config.space
+    offset = standing_offset(config)
+    needed = arrival_radius(config)
+    if math.isinf(offset):
+        yield (
+            f"noise.wind={config.noise.wind:g}: with planner.max_tilt={planner.max_tilt:.3g} rad, robots hold their "
+            f"place in at most {min(axis.fastest for axis in axes(planner, config.quadrotor)):.2g} m/s"
+        )
+    elif config.goal_radius < needed:
+        yield (
+            f"goal_radius={config.goal_radius:g}: in noise.wind={config.noise.wind:g} and "
+            f"noise.gust={config.noise.gust:g}, which planners do not know, robots stand {offset:.2f} m beside their "
+            f"goals, or are moved away, and hardly arrive; use at least goal_radius={_up(125 * needed) / 100:g}"
+        )
+    distance, warning = far_goals(config)
+    if not planner.goal_weight:
+        yield "planner.goal_weight=0: robots do not fly to their goals; use a positive weight"
+    elif _usual_flight(config) > distance:
+        yield warning
+    yield from too_short(config, config.max_steps)
+    if config.goal_radius > max(space.spacing, 2 * config.radius):
+        yield (
+            f"goal_radius={config.goal_radius:g} exceeds the distance of the goals, space.spacing={space.spacing:g}: "
+            "robots are at their goals before they fly there; use at most half of that distance"
+        )
+    least = config.least_spacing
+    if space.spacing < least:
+        yield (
+            f"space.spacing={space.spacing:g}: with planner.separation={planner.separation:g}, robots push each other "
+            f"away from goals that close; use at least {least:g}, or leave it out of make_config to follow"
+        )
+
+
+def _usual_flight(config: SwarmConfig) -> float:
+    """Return about the mean distance of starts and goals in the scenario where it is largest (m)."""
+    space = config.space
+    return max(space.half_width, 2 * space.circle_radius[0], 2 * space.sector_radius[0])
+
+
+def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
+    """Yield a sentence if robots cannot fly a usual distance, or climb a third of the room's height, in time."""
+    planner, space, vehicle = config.planner, config.space, config.quadrotor
+    seconds = max_steps * planner.dt
+    speed = max(min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle))), _TINIEST)
+    climb = max(min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain), _TINIEST)
+    needed = max(
+        (_usual_flight(config) - config.goal_radius) / speed,
+        ((space.heights[1] - space.heights[0]) / 3 - config.goal_radius) / climb,
+    )
+    if needed > seconds:
+        yield (
+            f"max_steps={max_steps}: episodes of {seconds:.2g} s are too short to reach goals at {speed:.2g} m/s, and "
+            f"{climb:.2g} m/s vertically, in this room; use at least max_steps={_up(2 * needed / planner.dt)}"
+        )
+
+
+def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
+    planner, radio = config.planner, config.radio
+    oldest = 1 + radio.delay + radio.jitter
+    if oldest >= planner.horizon:
+        yield (
+            f"radio.delay={radio.delay} and radio.jitter={radio.jitter} are in steps of {planner.dt:g} s: answers that "
+            f"are {oldest} steps old have no future left in a plan of planner.horizon={planner.horizon}; use at most "
+            f"{max(planner.horizon - 2, 0)} together"
+        )
+    for name, error in (
+        ("sensing.pos", config.sensing.pos),
+        ("sensing.others_pos", config.sensing.others_pos),
+        ("noise.pos", config.noise.pos),
+    ):
+        if error > config.radius:
+            yield (
+                f"{name}={error:g} is in metres and exceeds radius={config.radius:g}: robots cannot keep clear of each "
+                "other by that; use a few centimetres"
+            )
+    stride = planner.dt * min(planner.max_speed, *(axis.fastest for axis in axes(planner, config.quadrotor)))
+    if not config.continuous_collisions and stride > 4 * config.radius:
+        yield (
+            f"radius={config.radius:g}: robots fly up to {stride:.2g} m in a step and through "
+            "each other between steps, where collisions are not counted; use continuous_collisions=true"
+        )
+    if planner.right_of_way > planner.separation:
+        yield (
+            f"planner.right_of_way={planner.right_of_way:g} is in metres and exceeds planner.separation="
+            f"{planner.separation:g}: robots make detours around others that are far away; use less than it"
+        )
+    if config.memory > 2 * config.radius:
+        yield (
+            f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "
+            f"touch, {2 * config.radius:g} m; use a few centimetres, as in the presets"
+        )
+    reach = config.neighbourhood.range
+    if reach is not None and config.is_limited:
+        both = axes(planner, config.quadrotor)
+        braking = min(axis.gravity * math.tan(axis.gain * axis.max_tilt) for axis in both)
+        speed = min(planner.max_speed, *(axis.fastest for axis in both)) / 2
+        needed = planner.separation + speed * speed / max(braking, _TINIEST)
+        if reach < needed:
+            yield (
+                f"neighbourhood.range={reach:g}: two robots that meet at half of planner.max_speed="
+                f"{planner.max_speed:g} cannot stop within it; use at least {_up(10 * needed) / 10:g}"
+            )
+
+
+_told: set[str] = set()
+
+
+def warn(sentence: str) -> None:
+    """Warn of something doubtful, in one line. Each sentence is shown once in a process, unless Python's filters say
+    "always", as in tests, or "error"."""
+    usual = ("default", "module", "once")
+    actions = (
+        action
+        for action, message, category, module, _ in warnings.filters
+        if issubclass(DoubtfulWorld, category) and message is None and module is None
+    )
+    if next(actions, "default") in usual:
+        if sentence in _told:
+            return
+        _told.add(sentence)
+    warnings.warn_explicit(f"{sentence}.", DoubtfulWorld, "quad_swarm", 0)

@@ -1,0 +1,258 @@
+"""Fly random worlds within and at the limits of their fields.
+
+``python -m studies.random_worlds [--count 1000] [--steps 20] [--seed 0] [--json F]``. Each world has 2 to 64 robots,
+and each of its fields may have any valid value. A world is either refused with one line when it is created, or flies:
+resets never fail, steps neither raise nor return anything that is not finite, the reported separations and collisions
+are those of the states, and a swarm flies in a batch as it does alone, to the last bit. Actions are random. JSON: one
+row with the numbers of flown and refused worlds, and one for each failure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from quad_swarm import PRESETS, SCENARIOS, QuadSwarmEnv, QuadSwarmVectorEnv
+from quad_swarm.evaluation.rows import write_rows
+from quad_swarm.quadrotor import POSITION
+from quad_swarm.vehicles import VEHICLES
+from quad_swarm.world.scenarios import DoesNotFit
+
+_TOLERANCE = 1e-9
+Rng = np.random.Generator
+
+
+def _between(rng: Rng, low: float, high: float) -> float:
+    """Draw a number, often one of the limits, and positive numbers evenly in their logarithm."""
+    if rng.random() < 0.2:
+        return float(rng.choice([low, high]))
+    if low > 0 and high / low > 100:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    return float(rng.uniform(low, high))
+
+
+def _some(rng: Rng, fields: Mapping[str, Any], share: float) -> dict[str, Any]:
+    """Draw some of the fields; values are functions of the generator."""
+    return {name: draw(rng) for name, draw in fields.items() if rng.random() < share}
+
+
+def _real(low: float, high: float) -> Any:
+    return lambda rng: _between(rng, low, high)
+
+
+def _whole(low: int, high: int) -> Any:
+    return lambda rng: int(rng.choice([low, high])) if rng.random() < 0.2 else int(rng.integers(low, high + 1))
+
+
+def _range(low: float, high: float) -> Any:
+    return lambda rng: sorted(_between(rng, low, high) for _ in range(2))
+
+
+def _corner(low: float, high: float) -> Any:
+    return lambda rng: [_between(rng, low, high) for _ in range(3)]
+
+
+_FLAG = lambda rng: bool(rng.integers(2))  # noqa: E731
+_FIELDS: dict[str, dict[str, Any]] = {
+    "planner": {
+        "horizon": _whole(2, 40), "dt": _real(1e-3, 0.5), "separation": _real(0.05, 5), "max_tilt": _real(1e-6, 1.57),
+        "max_climb_rate": _real(1e-6, 1e4), "max_yaw_rate": _real(0, 100), "max_speed": _real(1e-3, 1e3),
+        "max_vertical_speed": _real(1e-3, 1e3), "workspace_low": _corner(-50, -1), "workspace_high": _corner(1, 50),
+        "goal_weight": _real(0, 1e4), "input_weight": _real(1e-4, 1e4), "repulsion_weight": _real(0, 1e3),
+        "right_of_way": _real(0, 2), "violation_weight": _real(1e-2, 1e6), "max_neighbours": _whole(1, 8),
+    },
+    "space": {
+        "half_width": _real(0.1, 1e4), "heights": _range(-1e4, 1e4), "spacing": _real(0, 5),
+        "circle_radius": _range(0, 50), "circle_jitter": _real(0, 5), "sector_radius": _range(0, 50),
+        "whole_sectors": _FLAG,
+    },
+    "noise": {
+        "pos": _real(0, 1), "vel": _real(0, 10), "attitude": _real(0, 3.14), "wind": _real(0, 1e3),
+        "gust": _real(0, 1e3), "gust_time": _real(0, 10),
+    },
+    "sensing": {
+        "pos": _real(0, 1e3), "vel": _real(0, 1e3), "attitude": _real(0, 3.14), "others_pos": _real(0, 1e3),
+        "others_vel": _real(0, 1e3), "correlation_time": _real(0, 10),
+    },
+    "radio": {
+        "loss": _real(0, 1), "delay": _whole(0, 30), "jitter": _whole(0, 10), "bursts": _real(0, 0.99),
+        "burst_length": _real(1, 100), "outage": _real(0, 1),
+    },
+    "neighbourhood": {"max_others": _whole(1, 16), "range": _real(0.1, 100), "look_ahead": _real(0, 5)},
+    "quadrotor": {
+        "gravity": _real(1e-2, 1e2), "drag_x": _real(0, 5), "drag_y": _real(0, 5), "roll_gain": _real(0.1, 3),
+        "pitch_gain": _real(0.1, 3), "climb_gain": _real(0.1, 3), "roll_time_constant": _real(0.02, 10),
+        "pitch_time_constant": _real(0.02, 10), "climb_time_constant": _real(0.02, 10),
+    },
+}  # fmt: skip
+_COMPILED = ("planner", "quadrotor", "neighbourhood")  # what kernels depend on
+_PLAIN: dict[str, Any] = {
+    "collision_tolerance": _real(0, 0.1), "goal_radius": _real(1e-3, 10),
+    "memory": _real(0, 1e4), "substeps": _whole(1, 10), "continuous_collisions": _FLAG, "mismatch": _real(0, 0.5),
+    "clock_skew": _real(0, 0.99),
+}  # fmt: skip
+
+
+def draw_world(seed: int, number: int) -> dict[str, Any]:
+    """Return the arguments of a `QuadSwarmEnv` in a random world. Ten consecutive ones share what the planner's kernel
+    depends on, because to compile one takes seconds."""
+    shared, rng = np.random.default_rng([seed, number // 10]), np.random.default_rng([seed, number, 1])
+    preset, n_robots = str(shared.choice(list(PRESETS))), int(shared.choice([2, 4, 8, 16, int(shared.integers(2, 65))]))
+    world: dict[str, Any] = {}
+    for source, names in ((shared, _COMPILED), (rng, [name for name in _FIELDS if name not in _COMPILED])):
+        share = float(source.choice([0.0, 0.1, 0.3]))
+        world |= {name: drawn for name in names if (drawn := _some(source, _FIELDS[name], share))}
+    if "quadrotor" not in world and shared.random() < 0.3:
+        world["quadrotor"] = str(shared.choice(list(VEHICLES)))
+    if shared.random() < 0.2:
+        world["radius"] = _between(shared, 1e-3, 3)
+    return {
+        "preset": preset,
+        "n_robots": n_robots,
+        "scenario": str(rng.choice([*SCENARIOS, "mixed"])),
+        "announcements": bool(rng.random() < 0.2),
+        "world": {**world, **_some(rng, _PLAIN, float(rng.choice([0.0, 0.1, 0.3])))},
+    }
+
+
+def _not_finite(where: str, value: Any) -> list[str]:
+    """Return the names of everything in nested results that is not finite."""
+    if isinstance(value, Mapping):
+        return [name for key, one in value.items() for name in _not_finite(f"{where}.{key}", one)]
+    array = np.asarray(value)
+    finite = array.dtype.kind not in "fc" or bool(np.isfinite(array).all())
+    # Empty places of a limited neighbourhood and separations of none are infinite by definition
+    return [] if finite or (where.endswith("separation") and not np.isnan(array).any()) else [where]
+
+
+def _misreports(swarm: Any, info: Mapping[str, Any]) -> list[str]:
+    """Return what a step reports of the swarms, but the states do not say."""
+    config, found = swarm.config, []
+    pos = swarm.state[..., POSITION]
+    distances = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1)
+    distances[:, np.arange(config.n_robots), np.arange(config.n_robots)] = np.inf
+    least = distances.min(axis=(1, 2))
+    contact = 2 * config.radius - config.collision_tolerance
+    scale = _TOLERANCE * max(1.0, float(np.abs(pos).max()))
+    if not np.allclose(least, info["min_separation"], rtol=_TOLERANCE, atol=scale):
+        found.append(f"min_separation is {info['min_separation']}, but {least}")
+    sure = np.abs(least - contact) > scale
+    if ((least < contact) != info["collision"])[sure].any():
+        found.append(f"collision is {info['collision']} at {least}")
+    if (np.asarray(info["min_separation_continuous"]) > np.asarray(info["min_separation"]) + scale).any():
+        found.append("the least separation during the step exceeds that after it")
+    at_goal = np.linalg.norm(pos - swarm.goal, axis=-1)
+    sure = np.abs(at_goal - config.goal_radius) > scale
+    if ((at_goal < config.goal_radius) != info["at_goal"])[sure].any():
+        found.append("at_goal is wrong")
+    return found
+
+
+def _same(one: Any, batch: Any, k: int) -> bool:
+    """Return whether a result of a swarm alone is, bit for bit, that of swarm ``k`` of a batch."""
+    if isinstance(one, Mapping):
+        return all(_same(value, batch[name], k) for name, value in one.items() if name in batch)
+    return np.asarray(one).tobytes() == np.asarray(batch)[k].astype(np.asarray(one).dtype).tobytes()
+
+
+def fly(arguments: Mapping[str, Any], seed: int, steps: int = 20, resets: int = 4, n_swarms: int = 3) -> list[str]:
+    """Create and fly a world, alone and in a batch.
+
+    :param arguments: see `draw_world`
+    :param seed: seed of the episodes and actions
+    :param steps: number of steps
+    :param resets: number of further resets
+    :param n_swarms: number of swarms of the batch
+    :return: what is wrong
+    :raises ValueError: if the world is refused
+    """
+    alone, batch = QuadSwarmEnv(**arguments), QuadSwarmVectorEnv(n_swarms, **arguments)
+    wrong: list[str] = []
+    rng = np.random.default_rng(seed)
+    try:
+        for k in range(resets):
+            alone.reset(seed=seed + 1000 + k)
+        which = n_swarms - 1
+        seen, _ = batch.reset(seed=seed)
+        own, _ = alone.reset(seed=seed + which)
+        wrong += _not_finite("observation", seen)
+        for _ in range(steps):
+            actions = rng.integers(0, 2, batch.action_space.shape)
+            goals, running = batch.task.swarm.goal.copy(), np.ones(n_swarms, dtype=bool)
+            own, reward, terminated, truncated, info = alone.step(actions[which])
+            wrong += _misreports(
+                alone.task.swarm, {key: np.asarray(value)[None] for key, value in info.items() if key != "planner"}
+            )
+            seen, rewards, ended, cut, infos = batch.step(actions)
+            running &= ~(ended | cut)
+            wrong += _not_finite("observation", seen) + _not_finite("reward", rewards)
+            wrong += _not_finite("state", batch.task.swarm.state) + _not_finite("info", info)
+            if not np.array_equal(goals[running], batch.task.swarm.goal[running]):
+                wrong.append("goals changed in flight")
+            last = infos["final_obs"][which] if terminated or truncated else seen[which]
+            same = own.tobytes() == last.tobytes() and reward == rewards[which]
+            results = {name: info[name] for name in ("min_separation", "collision", "at_goal", "belief_source")}
+            if not (same and _same(results, infos, which)):
+                wrong.append("a swarm flies otherwise alone than in a batch")
+            if terminated or truncated:
+                own, _ = alone.reset()
+            if wrong:
+                break
+    except Exception:
+        wrong.append(traceback.format_exc()[-600:])
+    finally:
+        alone.close()
+        batch.close()
+    return wrong
+
+
+def attempt(arguments: Mapping[str, Any], seed: int, steps: int = 20) -> tuple[str, list[str]]:
+    """Fly a world.
+
+    :return: "flown", "refused" or "wrong", and what is wrong
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            wrong = fly(arguments, seed, steps)
+        except (ValueError, DoesNotFit) as error:
+            told = str(error)
+            return ("wrong", [f"several lines: {told}"]) if "\n" in told else ("refused", [told])
+        except Exception:
+            return "wrong", [traceback.format_exc()[-600:]]
+    return ("wrong", wrong) if wrong else ("flown", [])
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=1000)
+    parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    tally, wrong = Counter[str](), []
+    for k in tqdm(range(args.count), disable=not sys.stderr.isatty()):
+        arguments = draw_world(args.seed, k)
+        outcome, told = attempt(arguments, k, args.steps)
+        tally[outcome] += 1
+        if outcome == "wrong":
+            wrong.append({"world": k, "arguments": arguments, "errors": told})
+            print(f"world {k}: {arguments}\n  {told[0]}")
+    print(f"{args.count} worlds: {tally['flown']} flown, {tally['refused']} refused, {len(wrong)} failures")
+    if args.json:
+        write_rows(args.json, [{"seed": args.seed, "steps": args.steps, **tally}, *wrong])
+    sys.exit(bool(wrong))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""Fields that do not fit each other: what is warned of, and that the warnings' numbers are those of flights."""
+
+import math
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+from quad_swarm.evaluation.flight import Condition
+from quad_swarm.task.request_task import make_task
+from quad_swarm.vehicles import VEHICLES
+from quad_swarm.world.doubts import DoubtfulWorld, axes, doubts, far_goals, standing_offset
+from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+from quad_swarm.world.swarm import Swarm
+
+HUGE = {"workspace_low": (-2000, -2000, 0.48), "workspace_high": (2000, 2000, 2.4)}
+
+
+def flown(config: SwarmConfig, distance: float, steps: int) -> Swarm:
+    """Two robots that fly side by side without seeing each other, or stand if the distance is 0."""
+    swarm = Swarm(config)
+    starts = np.array([[0, 0, 1.5], [0, 9, 1.5]])
+    swarm.reset(0, starts, starts + np.array([distance, 0, 0]))
+    for _ in range(steps):
+        swarm.step(np.zeros((1, 2, 1), bool))
+    return swarm
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_raise_no_doubts(preset):
+    assert list(doubts(PRESETS[preset])) == []
+
+
+@pytest.mark.parametrize("preset", ["paper", "dense", "flight"])
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_vehicles_raise_no_doubts(preset, vehicle):
+    assert list(doubts(make_config(preset, quadrotor=vehicle))) == []
+
+
+@pytest.mark.parametrize(
+    ("planner", "quadrotor", "wind"),
+    [({}, {}, 1.0), ({}, {}, 3.0), ({"goal_weight": 80}, {}, 2.0), ({"horizon": 20, "dt": 0.05}, {}, 1.5),
+     ({}, {"drag_x": 0.1, "drag_y": 0.1}, 2.0)],
+)  # fmt: skip
+def test_robots_stand_in_the_wind_where_it_is_said(planner, quadrotor, wind):
+    planner = {**planner, "workspace_low": (-9, -9, 0.48), "workspace_high": (9, 12, 2.4)}
+    config = make_config("paper", n_robots=2, planner=planner, noise={"wind": wind}, world={"quadrotor": quadrotor})
+    swarm = flown(config, 0, 150)
+    offsets = np.linalg.norm(swarm.pos[0] - swarm.goal[0], axis=1)
+    calm = make_config("paper", planner=planner, world={"quadrotor": quadrotor})
+    both = [axis.offset(wind) for axis in axes(config.planner, config.quadrotor)]
+    assert 0.95 * min(both) <= offsets.min() <= offsets.max() <= 1.05 * max(both)
+    assert standing_offset(config) == max(both)
+    assert standing_offset(calm) == 0
+
+
+def test_who_is_blown_away_stands_nowhere():
+    with pytest.warns(DoubtfulWorld, match=r"noise\.wind=8: .* hold their place in at most 7\.1 m/s"):
+        config = make_config("paper", noise={"wind": 8})
+    assert math.isinf(standing_offset(config))
+
+
+@pytest.mark.parametrize("preset", ["paper", "flight"])
+def test_far_goals_are_reached_at_full_speed_with_the_weight_that_is_said(preset):
+    calm = {"noise": {"wind": 0, "gust": 0, "vel": 0, "attitude": 0}, "n_robots": 2}
+    config = make_config(preset, planner=HUGE, **calm)
+    distance, warning = far_goals(config)
+    per_metre = float(warning.split("raise it to ")[1].split()[0])
+    steps = round(12 / config.planner.dt)
+    near = flown(config, distance, steps)
+    assert near.vel[0, :, 0].min() > 1.8, "half of the possible 4 m/s"
+    with pytest.warns(DoubtfulWorld, match=r"planner\.goal_weight=8 is divided by the squared distance"):
+        slow = flown(config, 6 * distance, steps)
+    fast = flown(
+        make_config(preset, planner={**HUGE, "goal_weight": 6 * distance * per_metre}, **calm), 6 * distance, steps
+    )
+    assert slow.vel[0, :, 0].max() < 1.2
+    assert fast.vel[0, :, 0].min() > 3.5
+
+
+@pytest.mark.parametrize(
+    ("preset", "world", "message"),
+    [
+        ("flight", {"goal_radius": 0.16}, r"goal_radius=0\.16: .* stand 0\.13 m"),
+        ("flight", {"goal_radius": 0.08, "noise": {"wind": 0}}, r"goal_radius=0\.08: .*gust=0\.5.* moved away"),
+        ("paper", {"radius": 0.05}, r"radius=0\.05: .* 0\.4 m in a step .* use continuous_collisions=true"),
+        ("flight", {"goal_radius": 0.1}, r"goal_radius=0\.1: in noise\.wind=1 .* 0\.13 m .* goal_radius=0\.21"),
+        ("paper", {"goal_radius": 30}, r"goal_radius=30 exceeds the distance of the goals"),
+        ("paper", {"sensing": {"pos": 5}}, r"sensing\.pos=5 is in metres and exceeds radius=0\.3"),
+        ("paper", {"noise": {"pos": 0.5}}, r"noise\.pos=0\.5 is in metres"),
+        ("paper", {"space": {"circle_radius": [60, 70]}, "max_steps": 999}, r"goals are more than 41 m away"),
+        ("paper", {"planner": {"right_of_way": 30}}, r"right_of_way=30 is in metres and exceeds .*separation=0\.6"),
+        ("paper", {"memory": 30}, r"memory=30: .* off by more than .* 0\.6 m"),
+        ("paper", {"radio": {"delay": 50}}, r"radio\.delay=50 .* in steps of 0\.1 s.* at most 8 together"),
+        ("flight", {"radio": {"delay": 18}}, r"radio\.delay=18 and radio\.jitter=1 .* 20 steps old"),
+        ("paper", {"planner": {"dt": 0.02}}, r"planner\.horizon=10 .* 0\.2 s ahead.* use planner\.horizon=36"),
+        ("paper", {"quadrotor": {"roll_time_constant": 2}}, r"quadrotor\.roll_time_constant=2 s.*planner\.horizon=60"),
+        ("paper", {"planner": {"max_climb_rate": 100}}, r"max_climb_rate=100: .* faster than they would fall"),
+        ("paper", {"planner": {"max_yaw_rate": 30}}, r"max_yaw_rate=30 is in rad/s.*0\.524"),
+        ("paper", {"planner": {"max_speed": 40}}, r"max_speed=40 is in m/s: .* reaches 7\.1 m/s"),
+        ("paper", {"planner": {"max_speed": 0.01}}, r"max_steps=100: episodes of 10 s are too short"),
+        ("paper", {"planner": {"max_climb_rate": 1e-6}}, r"max_steps=100: .* vertically"),
+        ("paper", {"planner": {"goal_weight": 0}}, r"goal_weight=0: robots do not fly to their goals"),
+        ("paper", {"space": {"half_width": 60}, "max_steps": 999}, r"goals are more than 41 m away.* 0\.39 per metre"),
+        ("paper", {"neighbourhood": {"range": 1}}, r"neighbourhood\.range=1: .* use at least 2\.4"),
+        ("paper", {"planner": {"separation": 3}, "space": {"spacing": 1}}, r"space\.spacing=1: .* use at least 2\.6"),
+    ],
+)  # fmt: skip
+def test_what_is_doubtful_is_warned_of_in_one_line(preset, world, message):
+    for make in (lambda: make_config(preset, world), lambda: make_config(preset, **world)):
+        with pytest.warns(DoubtfulWorld) as caught:
+            make()
+        assert len(caught) == 1
+        assert "\n" not in str(caught[0].message)
+        with pytest.raises(DoubtfulWorld, match=message):
+            raise caught[0].message
+
+
+def test_what_is_recommended_is_not_doubtful():
+    worlds = [
+        ("flight", {"goal_radius": 0.21}), ("flight", {"goal_radius": 0.18}), ("paper", {"noise": {"wind": 2}}),
+        ("flight", {"goal_radius": 0.1, "noise": {"wind": 0}}), ("paper", {"radius": 0.1}),
+        ("paper", {"planner": {"dt": 0.02, "horizon": 36}, "max_steps": 500}),
+        ("paper", {"radio": {"delay": 8}}), ("paper", {"neighbourhood": {"range": 2.4}}),
+        ("paper", {"quadrotor": {"roll_time_constant": 2}, "planner": {"horizon": 60}}),
+        ("paper", {"planner": {"separation": 3}}),
+    ]  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for preset, world in worlds:
+            make_config(preset, world)
+
+
+def test_short_episodes_are_doubtful_wherever_they_are_asked_for():
+    with pytest.warns(DoubtfulWorld, match="max_steps=3: episodes of 0.3 s are too short"):
+        make_task(max_steps=3)
+    with pytest.warns(DoubtfulWorld, match="max_steps=3: episodes of 0.3 s are too short"):
+        Condition("none", "random", PRESETS["paper"], max_steps=3)
+
+
+def test_a_command_says_it_once_in_one_line():
+    code = "import warnings; from quad_swarm.evaluation.command import main; main(); warnings.resetwarnings(); main()"
+    command = ["--policy", "none", "full", "--scenario", "random", "--episodes", "2", "--world", "memory=30"]
+    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0
+    (line,) = (line for line in done.stderr.splitlines() if "memory" in line)
+    assert "DoubtfulWorld: memory=30: " in line
+    assert done.stdout.count("memory=30") == 2, "the tables are printed"
+
+
+EXTREMES = {
+    "planner": {"input_weight": (1e-300, 1e300), "goal_weight": (0, 1e300), "max_speed": (5e-324, 1e300),
+                "max_vertical_speed": (5e-324, 1e300), "max_tilt": (1e-6, 1.3), "max_climb_rate": (1e-6, 1e4)},
+    "quadrotor": {"drag_x": (0, 1e-300, 5), "gravity": (1e-300, 1e4), "roll_gain": (1e-300, 1),
+                  "climb_gain": (1e-300, 9), "climb_time_constant": (0.1, 1e300), "roll_time_constant": (0.1, 1e300)},
+    "noise": {"wind": (0, 1e3), "gust": (0, 1e3), "vel": (0, 1e3)},
+    "neighbourhood": {"range": (0.8, 1e4)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.filterwarnings("error::RuntimeWarning", "ignore::quad_swarm.world.doubts.DoubtfulWorld")
+def test_extreme_worlds_are_accepted_or_refused_in_one_line(seed):
+    rng = np.random.default_rng(seed)
+    accepted = 0
+    for _ in range(200):
+        world = {
+            part: {name: float(rng.choice(values)) for name, values in fields.items() if rng.random() < 0.3}
+            for part, fields in EXTREMES.items()
+        }
+        try:
+            accepted += isinstance(make_config("paper", world), SwarmConfig)
+        except ValueError as error:
+            if "\n" in str(error):
+                raise
+    assert 20 < accepted < 200
