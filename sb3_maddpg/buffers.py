@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg.team import InfoKey, Team, heads_of
-from sb3_maddpg.utils import all_finite, not_finite_at, shown
+from sb3_maddpg.utils import all_finite, integers_problem, not_finite_at, shown
 from sb3_maddpg.validation import PriorityArguments, ReplayBufferArguments, validated
 
 
@@ -347,6 +347,10 @@ class TeamReplayBuffer(ReplayBuffer):
             self._refuse_numbers(infos)
 
         pos = self.pos
+        if self.optimize_memory_usage:
+            # This observation takes the place of the last next observation. Where another episode begins although the
+            # last one did not end, the last transition is treated as its end, like a time limit.
+            self.dones[pos - 1][(self.observations[pos] != obs).any(axis=(1, 2))] = 1
         self.observations[pos] = obs
         if self.optimize_memory_usage:
             self.observations[(pos + 1) % self.buffer_size] = next_obs
@@ -380,6 +384,8 @@ class TeamReplayBuffer(ReplayBuffer):
             )
         values = values.reshape(shape)
         if (index := not_finite_at(values)) is None:
+            if what != "action" and self.observations.dtype.kind in "iu":
+                self._check_integers(what, values)
             return
         env, *place = index
         agent, column = place if what != "action" else self._place_of_action(place[0])
@@ -387,6 +393,11 @@ class TeamReplayBuffer(ReplayBuffer):
             f"The {what} of agent {agent} ({self.team.names[agent]}) is {values[index]} in column {column}, "
             f"{self._where(env)}: it must be finite. {_REMEDY_ACTION if what == 'action' else _REMEDY}"
         )
+
+    def _check_integers(self, what: str, values: np.ndarray) -> None:
+        for env, rows in enumerate(values):
+            if (problem := integers_problem(rows, self.observations.dtype)) is not None:
+                raise ValueError(f"The {what} of agent {problem} {self._where(env)}. {_REMEDY}")
 
     def _place_of_action(self, column: int) -> tuple[int, int]:
         """:return: the agent that a column of the joint action belongs to, and the column in its own action"""

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import shown
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env import BorderEnv, GymnasiumVecEnv
 
 _BEFORE = ".before"
 
@@ -125,6 +125,8 @@ def _told(env: Any) -> Any:
 
 
 def _env_state(env: gymnasium.Env) -> dict[str, Any]:
+    if isinstance(env, BorderEnv):  # has no state
+        return _env_state(env.env)
     own = {"class": type(env).__name__}
     if isinstance(env, Replayable):  # replaying does not restore all attributes of inner wrappers
         return {**own, "told": env.state_dict(), "layers": [_layer(one) for one in _layers(env.env)]}
@@ -138,6 +140,8 @@ def _env_state(env: gymnasium.Env) -> dict[str, Any]:
 
 
 def _load_env_state(env: gymnasium.Env, state: dict[str, Any]) -> None:
+    if isinstance(env, BorderEnv):
+        return _load_env_state(env.env, state)
     _take(env, state)
     if "inner" in state:
         _load_env_state(env.env, state["inner"])  # type: ignore[attr-defined]

@@ -24,10 +24,16 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TensorDict,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
     VecEnv,
     VecFrameStack,
     VecNormalize,
@@ -70,7 +76,7 @@ from sb3_maddpg.validation import (
     TrainingArguments,
     validated,
 )
-from sb3_maddpg.vec_env import check_single_envs
+from sb3_maddpg.vec_env import ArrivalCheck, check_vec_env
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
@@ -272,6 +278,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.action_cost: float | np.ndarray | None = None
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
+        self._stopped = False
         self.normalized_observations = False  # whether VecNormalize normalises the observations of the networks
         self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
         self.algorithm = type(self).__name__
@@ -839,18 +846,51 @@ class MADDPG(OffPolicyAlgorithm):
             missing = "the optimizers' state" if self.lean == "critic" else "critics and the optimizers' state"
             warnings.warn(f"This model was saved without {missing}, which are initialised afresh.", stacklevel=2)
             self.lean = None
-        super().learn(
-            total_timesteps=math.ceil(given["total_timesteps"]),
-            callback=given["callback"],
-            log_interval=given["log_interval"],
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        self._arrivals = ArrivalCheck(self.n_envs)
+        broken_off = True
+        try:
+            super().learn(
+                total_timesteps=math.ceil(given["total_timesteps"]),
+                callback=given["callback"],
+                log_interval=given["log_interval"],
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+            broken_off = self._stopped
+        finally:
+            # SB3 would take the environment, which has stepped or failed, for still being where the last transition
+            # ended. Without last observations, it begins new episodes.
+            if broken_off:
+                self._last_obs = None
         # Log the episodes since SB3's last log, which are all of them in a short training
         if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
         return self
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        rollout = super().collect_rollouts(*args, **kwargs)
+        self._stopped = not rollout.continue_training  # by a callback, after a step that is not stored
+        return rollout
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        normalizer = self._vec_normalize_env
+        self._arrivals.check(
+            reward if normalizer is None else normalizer.get_original_reward(),
+            cast(np.ndarray, new_obs),
+            dones,
+            infos,
+            reads_parts=self.use_action_cost or getattr(replay_buffer, "n_pairs", 0) > 0,
+        )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         check_success(infos)
@@ -1142,7 +1182,7 @@ class MADDPG(OffPolicyAlgorithm):
         # The last observations of many environments are larger than the networks, and loading starts new episodes
         last = ["_last_obs", "_last_original_obs"]
         networks = ["actor", "critic", "actor_target", "critic_target"]
-        return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded"]
+        return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded", "_arrivals", "_stopped"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
@@ -1156,7 +1196,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     :param verbose: see SB3's ``BaseAlgorithm``
     :param monitor_wrapper: see SB3's ``BaseAlgorithm``
     :return: the vectorised environment
-    :raises ValueError: if the spaces do not describe a team, or see ``check_single_envs``
+    :raises ValueError: if the spaces do not describe a team, or see ``check_vec_env``
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
         raise ValueError(
@@ -1166,8 +1206,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-    if type(vec_env.unwrapped) is DummyVecEnv:  # subclasses may step other things than their envs
-        check_single_envs(vec_env.unwrapped.envs)
+    check_vec_env(vec_env)
     # SB3's own error would suggest policies that do not exist here
     Team.from_spaces(vec_env.observation_space, vec_env.action_space)
     return vec_env

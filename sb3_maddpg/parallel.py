@@ -142,6 +142,11 @@ class TeamEnv(gymnasium.Env):
         """:return: the attribute of this wrapper, or else of the PettingZoo environment"""
         return getattr(self if hasattr(self, name) else self.parallel_env, name)
 
+    @property
+    def team_spaces(self) -> tuple[TeamObservation, Any]:
+        """The spaces of observation and joint action, also behind wrappers and in other processes."""
+        return self.observation_space, self.action_space
+
     def _lay_out(self, action_spaces: Sequence[Any]) -> None:
         ends = np.cumsum([len(heads_of(space)) for space in action_spaces]).tolist()
         self._actions = []
@@ -245,7 +250,8 @@ class TeamEnv(gymnasium.Env):
             ]
             if successes:
                 info["is_success"] = all(successes)
-        reward = sum(rewards) / n_agents
+        reward = info["team_reward"] = sum(rewards) / n_agents
+        info["episode_step"] = self._steps
         return self._observe(self._with_masks(observations, infos), seen), reward, over and not cut, cut, info
 
     def render(self) -> Any:

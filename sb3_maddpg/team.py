@@ -43,6 +43,11 @@ class TeamInfo(TypedDict, total=False):
     """Whether the episode succeeded, in its last step. Used by ``rollout/success_rate`` and ``CurriculumCallback``."""
     metrics: dict[str, float]
     """Numbers whose means are logged under their keys."""
+    team_reward: float
+    """The reward that ``step`` returns, from which the algorithm sees that a wrapper changed it. Required if there are
+    ``agent_rewards`` and the team's reward is neither their mean nor their sum."""
+    episode_step: int
+    """Number of the step in its episode, from 1, from which the algorithm sees that a wrapper skipped steps."""
 
 
 InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards", "pair_terminated"]

@@ -2,12 +2,14 @@
 
 import copy
 import re
+from contextlib import suppress
 
 import gymnasium
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -408,8 +410,9 @@ def test_extreme_prices_stay_finite(price):
 def test_a_training_that_diverges_stops_and_says_whose(clip):
     class Exploding(OwnBit):
         def step(self, action):
-            *rest, info = super().step(action)
-            return *rest, {**info, "agent_rewards": np.float32([1e25 if self._steps == 5 else 0, 0, 0])}
+            obs, _, *ends, info = super().step(action)
+            rewards = np.float32([1e25 if self._steps == 5 else 0, 0, 0])
+            return obs, float(rewards.mean()), *ends, {**info, "agent_rewards": rewards}
 
     message = (
         r"diverged at step \d+ \(update \d+\): the loss of the critic of agent_0 is inf\. Lower learning_rate=0.01"
@@ -569,3 +572,94 @@ def test_steps_and_folders_may_come_in_other_types(tmp_path):
     assert model.tensorboard_log == str(tmp_path)
     model.save(tmp_path / "model")
     assert MADDPG.load(tmp_path / "model").num_timesteps == 25
+
+
+class Clock(OwnBit):
+    """Observes the number of its episode and the step; fails, or is stopped, where it is told to."""
+
+    fail_at: tuple[str, int] | None = None
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Box(0, 1000, (3, 2), np.float32)
+        self.episode, self.calls = 0, 0
+
+    def look(self):
+        return np.tile(np.float32([self.episode, self._steps]), (3, 1))
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        self.fail("reset")
+        self.episode += 1
+        return self.look(), {}
+
+    def step(self, action):
+        self.fail("before")
+        _, *rest = super().step(action)
+        self.calls += 1
+        self.fail("after")
+        return self.look(), *rest
+
+    def fail(self, where):
+        if self.fail_at == (where, self.calls):
+            self.fail_at = None
+            raise RuntimeError("fails once")
+
+
+class StopAt(BaseCallback):
+    """Ends the training in a step, by returning False or by raising."""
+
+    def __init__(self, at, error=None):
+        super().__init__()
+        self.at, self.error = at, error
+
+    def _on_step(self):
+        if self.num_timesteps < self.at:
+            return True
+        if self.error is not None:
+            raise self.error
+        return False
+
+
+@pytest.mark.parametrize("optimize_memory_usage", [False, True])
+@pytest.mark.parametrize(
+    ("callback", "fail_at"),
+    [
+        (StopAt(14), None),
+        (StopAt(14, KeyError("key")), None),
+        (StopAt(14, KeyboardInterrupt()), None),
+        (StopTrainingOnMaxEpisodes(1), None),
+        (None, ("before", 14)),
+        (None, ("after", 14)),
+        (None, ("reset", 10)),
+    ],
+)
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_an_episode_that_was_broken_off_leaves_no_transition(callback, fail_at, n_envs, optimize_memory_usage):
+    envs = DummyVecEnv([Clock for _ in range(n_envs)])
+    arguments = {**SMALL, "learning_starts": 1000}
+    if optimize_memory_usage:
+        arguments |= {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    model = MADDPG("MlpPolicy", envs, **arguments)
+    envs.envs[0].unwrapped.fail_at = fail_at
+    with suppress(RuntimeError, KeyError, KeyboardInterrupt):
+        model.learn(60, callback=callback)
+    model.learn(60, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    rows = np.arange(buffer.size() - 1)
+    now = buffer.observations[rows, :, 0]
+    then = buffer.observations[rows + 1, :, 0] if optimize_memory_usage else buffer.next_observations[rows, :, 0]
+    goes_on = (now[..., 0] == then[..., 0]) & (now[..., 1] + 1 == then[..., 1])
+    if optimize_memory_usage:
+        goes_on |= buffer.dones[rows] > 0
+    assert goes_on.all()
+    assert len(rows) >= 50 / n_envs
+
+
+def test_a_training_that_was_not_broken_off_goes_on_in_its_episode():
+    env = Clock()
+    model = MADDPG("MlpPolicy", env, **{**SMALL, "learning_starts": 1000}).learn(14)
+    model.learn(14, reset_num_timesteps=False)
+    before, after = model.replay_buffer.next_observations[13, 0, 0], model.replay_buffer.observations[14, 0, 0]
+    assert before.tolist() == after.tolist()
+    assert before[1] == 4

@@ -50,8 +50,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     truncated after `max_steps`.
 
     ## Info
-    `reward_terms`, `pair_rewards` (n, n - 1; the part of a robot's reward that belongs to one of the others),
-    `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
+    `team_reward`, `reward_terms`, `pair_rewards` (n, n - 1; the part of a robot's reward that belongs to one of the
+    others), `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
     `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and `metrics`. In the last
     step of an episode also `is_success` and further `metrics`. With a limited neighbourhood also `neighbours` (n, m),
     the index of the robot in each slot of the action and of the entries about others, -1 for an empty slot, and
