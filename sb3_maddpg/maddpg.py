@@ -65,7 +65,7 @@ from sb3_maddpg.networks import polyak_update
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
-from sb3_maddpg.team import ACTION_SPACES, Team, into_box
+from sb3_maddpg.team import ACTION_SPACES, MixedActions, Team, into_box, plain_joint_space
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import arguments_of, as_numbers, atomic_write, describe_env, shown, suggest
 from sb3_maddpg.validation import (
@@ -974,6 +974,12 @@ class MADDPG(OffPolicyAlgorithm):
                     )
                 if name not in (known := {*data, *arguments_of(cls)}):
                     raise ValueError(suggest("argument of load", name, {one for one in known if one[0] != "_"}))
+            space = None if env is None else env.action_space
+            # Files of earlier versions hold the agents' spaces without shape and data type
+            if isinstance(space, MixedActions) and plain_joint_space(space.agent_spaces) == values.get("action_space"):
+                values["action_space"] = space
+            if env is not None and env.has_attr("image_columns") and isinstance(values.get("policy_kwargs"), dict):
+                values["policy_kwargs"] = {"image_columns": None, **values["policy_kwargs"]}  # nor divided images
             if "policy_kwargs" in kwargs:
                 _check_same_policy(kwargs.pop("policy_kwargs"), values.get("policy_kwargs"), values.get("policy_class"))
             with _remedy_for_other_team(), NetworkLimit(path, trust):

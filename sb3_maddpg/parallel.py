@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatten, flatten_space
+from gymnasium.spaces.utils import flatdim, flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
 from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
@@ -60,7 +61,9 @@ class TeamEnv(gymnasium.Env):
     wrapper: ``evaluate_policy(model, Monitor(TeamEnv(env)))``, and likewise ``EvalCallback``.
 
     If all agents observe images of the same size, the attribute ``image_space`` is the space of one image, which
-    ``CnnPolicy`` reads.
+    ``CnnPolicy`` reads. If an agent observes an image, also as a part of a ``Dict``, the attribute ``image_columns``
+    lists first and end of the images' columns for each agent and for the state, by which ``MlpPolicy`` divides images
+    by 255.
 
     Other attributes of the environment, such as ``observation_layout`` or a curriculum, are available through
     Gymnasium's ``get_wrapper_attr``, and thus through ``get_attr`` and ``env_method`` of SB3's vectorised environments.
@@ -127,6 +130,9 @@ class TeamEnv(gymnasium.Env):
         )
         self.action_space = joint_action_space(action_spaces)
         self._state_space: Any = env.state_space if state else None
+        image_columns = [*map(_image_columns, (*self._observation_spaces, self._state_space))]
+        if any(image_columns):
+            self.image_columns = image_columns
         self._metric_names = _names_of_returns(self.agent_names)
         self._lay_out(action_spaces)
         self._live: list[int] = []
@@ -757,9 +763,20 @@ def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
 def _image_space(observations: Sequence[spaces.Space]) -> spaces.Box | None:
     """:return: the space of an agent's image, None if the agents' spaces differ or are not images"""
     first = observations[0]
-    if isinstance(first, spaces.Box) and len(first.shape) == 3 and all(space == first for space in observations):
+    if isinstance(first, spaces.Box) and len(first.shape) in (2, 3) and all(space == first for space in observations):
         return first
     return None
+
+
+def _image_columns(space: spaces.Space | None, first: int = 0) -> list[list[int]]:
+    """:return: first and end of the columns of a flat observation that hold each image, as SB3 defines images"""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parts, found = space.values() if isinstance(space, spaces.Dict) else space, []
+        for part in parts:
+            found += _image_columns(part, first)
+            first += flatdim(part)
+        return found
+    return [[first, first + flatdim(space)]] if space is not None and is_image_space(space) else []
 
 
 def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:

@@ -238,10 +238,24 @@ def into_box(space: spaces.Box, actions: np.ndarray) -> np.ndarray:
 def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
     """
     Return the joint action space of a team, flat, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` if
-    all agents have such a space of the same length, else ``MixedActions``. Categories count from 0.
+    all agents have such a space of the same length, else ``MixedActions``. Categories count from 0. ``MultiBinary`` and
+    ``Box`` would lose shapes and data types of the agents' spaces, if they are not flat and float32.
 
     :param agent_spaces: each agent's action space
     :return: the joint action space
+    """
+    is_plain = all(
+        isinstance(space, (spaces.Discrete, spaces.MultiDiscrete))
+        or (len(space.shape) == 1 and space.dtype in (np.float32, np.int8))
+        for space in agent_spaces
+    )
+    return plain_joint_space(agent_spaces) if is_plain else MixedActions(agent_spaces)
+
+
+def plain_joint_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
+    """
+    :param agent_spaces: each agent's action space
+    :return: the joint action space, in which agents that act alike lose shape and data type of their own spaces
     """
     kinds = {type(space) for space in agent_spaces}
     sizes = [heads_of(space) for space in agent_spaces]
@@ -427,5 +441,9 @@ def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActi
         return tuple(spaces.MultiBinary(k) for _ in range(n_agents))
     if isinstance(action_space, spaces.MultiDiscrete):
         return tuple(spaces.MultiDiscrete(nvec) for nvec in action_space.nvec.reshape(n_agents, k))
-    lows, highs = (bound.reshape(n_agents, k) for bound in _bounds(action_space))
-    return tuple(spaces.Box(low, high, dtype=np.float32) for low, high in zip(lows, highs, strict=True))
+    # The networks' single precision serves for all but integers and half precision
+    in_float = action_space.dtype in (np.float32, np.float64)
+    dtype = np.float32 if in_float else action_space.dtype.type
+    bounds = _bounds(action_space) if in_float else (action_space.low, action_space.high)
+    lows, highs = (bound.reshape(n_agents, k) for bound in bounds)
+    return tuple(spaces.Box(low, high, dtype=dtype) for low, high in zip(lows, highs, strict=True))
