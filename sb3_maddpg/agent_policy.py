@@ -19,6 +19,7 @@ from sb3_maddpg.team import AgentActionSpace, into_box
 from sb3_maddpg.utils import as_numbers, atomic_write, shown
 
 if TYPE_CHECKING:
+    from sb3_maddpg.normalization import ObservationStatistics
     from sb3_maddpg.policies import MADDPGPolicy
 
 _TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
@@ -36,6 +37,8 @@ class AgentPolicy(nn.Module):
     :param obs_dim: length of the agent's observation
     :param threshold: threshold of binary actions, see ``Binary``
     :param mask: columns of the observation that hold the action mask, see ``TeamObservation``; empty without one
+    :param statistics: mean and standard deviation of observations, (obs_dim,), and the limit of normalised ones, None
+        for observations that are not normalised
     """
 
     columns: th.Tensor
@@ -45,6 +48,8 @@ class AgentPolicy(nn.Module):
     own_low: th.Tensor
     own_high: th.Tensor
     start: th.Tensor
+    mean: th.Tensor
+    std: th.Tensor
 
     def __init__(
         self,
@@ -55,8 +60,13 @@ class AgentPolicy(nn.Module):
         obs_dim: int,
         threshold: float,
         mask: Sequence[int] = (),
+        statistics: tuple[np.ndarray, np.ndarray, float] | None = None,
     ):
         super().__init__()
+        self.limit = None if statistics is None else statistics[2]
+        if statistics is not None:
+            self.register_buffer("mean", th.as_tensor(statistics[0]).double())
+            self.register_buffer("std", th.as_tensor(statistics[1]).double())
         self.name = name
         self.network = network
         self.action_space = action_space
@@ -72,7 +82,8 @@ class AgentPolicy(nn.Module):
         if isinstance(self.kind, Categorical):
             start = th.as_tensor(np.ravel(getattr(action_space, "start", 0)), dtype=th.int64)
             self.register_buffer("start", start)
-        self.flat = isinstance(action_space, spaces.Discrete) or len(action_space.shape) == 1
+        self.flat = isinstance(action_space, spaces.Discrete) or len(action_space.shape or ()) == 1
+        self.shape: tuple[int, ...] = action_space.shape or ()
         self.dtype = th.as_tensor(np.zeros(1, action_space.dtype)).dtype
         self.whole = isinstance(action_space, spaces.Box) and np.issubdtype(action_space.dtype, np.integer)
         if isinstance(action_space, spaces.Box):
@@ -82,12 +93,13 @@ class AgentPolicy(nn.Module):
                 self.register_buffer(f"own_{bound}", th.as_tensor(_as_double(limit, bound)))
 
     @classmethod
-    def of(cls, policy: MADDPGPolicy, agent: str | int) -> AgentPolicy:
+    def of(cls, policy: MADDPGPolicy, agent: str | int, statistics: ObservationStatistics | None = None) -> AgentPolicy:
         """
         Extract an agent's policy from the team's.
 
         :param policy: policy of the team
         :param agent: name or index of the agent
+        :param statistics: how ``VecNormalize`` normalises the team's observations, None if it does not
         :return: the agent's policy
         :raises ValueError: if there is no such agent, or parameters are not finite
         """
@@ -97,7 +109,11 @@ class AgentPolicy(nn.Module):
         network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
         columns, space = policy.actions.columns_of(index), team.action_spaces[index]
         mask = team.masks[index] if team.masks else ()
-        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask)
+        own = None
+        if statistics is not None:
+            mean, var = (part[index, : team.obs_dims[index]] for part in (statistics.mean, statistics.var))
+            own = (mean, np.sqrt(var + statistics.epsilon), statistics.clip)
+        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask, own)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
@@ -105,6 +121,8 @@ class AgentPolicy(nn.Module):
         :return: actions in the environment's units, in the data type of the agent's action space and within its bounds:
             (batch, *shape of the space), but (batch, 1) for ``Discrete``
         """
+        if self.limit is not None:
+            obs = ((obs - self.mean) / self.std).clamp(-self.limit, self.limit).float()
         logits = self.network(obs)[:, self.columns].unsqueeze(1)
         if self.has_mask:
             logits = self.kind.mask(logits, (obs[:, self.mask] > 0).unsqueeze(1))
@@ -118,7 +136,7 @@ class AgentPolicy(nn.Module):
             actions = (actions.unflatten(-1, self.kind.shape).argmax(dim=-1) + self.start).to(self.dtype)
         else:
             actions = actions.to(self.dtype)
-        return actions if self.flat else actions.reshape(-1, *self.action_space.shape)
+        return actions if self.flat else actions.reshape(-1, *self.shape)
 
     def predict(self, observation: np.ndarray) -> np.ndarray:
         """

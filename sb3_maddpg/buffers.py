@@ -87,8 +87,8 @@ class TeamReplayBuffer(ReplayBuffer):
     newest transition, and when an agent is truncated (inactive without having terminated). It stops for all agents,
     because they share the next observation. When an agent terminates, only its own sum stops.
 
-    ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running standard deviation of the team's
-    return.
+    ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running standard deviation of the agents'
+    returns, see ``TeamVecNormalize``.
 
     ``add`` refuses NaN and infinity and leaves the buffer unchanged.
 
@@ -503,16 +503,35 @@ class TeamReplayBuffer(ReplayBuffer):
                 next_obs = self.observations[(batch_inds + 1) % self.buffer_size, env_inds]
             else:
                 next_obs = batch["next_observations"]
+        observations = batch["observations"]
+        if env is not None and env.norm_obs:
+            columns = self._columns(batch["numbers"])
+            observations = self._normalized(observations, env, columns.agent_active == 0)
+            if self.n_steps > 1:
+                columns = self._columns(self._read("numbers", last * self.n_envs + env_inds))
+            next_obs = self._normalized(next_obs, env, (columns.agent_active == 0) | (columns.agent_terminated > 0))
         rest: dict[str, Any] = {
             name: self.to_torch(value) if isinstance(value, np.ndarray) else value for name, value in data.items()
         }
         return TeamReplayBufferSamples(
-            observations=self.to_torch(self._normalize_obs(batch["observations"], env)),  # type: ignore[arg-type]
+            observations=self.to_torch(observations),
             actions=self.to_torch(batch["actions"]),
-            next_observations=self.to_torch(self._normalize_obs(next_obs, env)),  # type: ignore[arg-type]
+            next_observations=self.to_torch(next_obs),
             active=None if self.all_active else self.to_torch(self._columns(batch["numbers"]).agent_active),
             **rest,
         )
+
+    def _normalized(self, obs: np.ndarray, env: VecNormalize, gone: np.ndarray) -> np.ndarray:
+        """
+        :param obs: observations, (batch, n_agents, columns)
+        :param env: normalises observations
+        :param gone: which agents take no part, (batch, n_agents)
+        :return: the normalised observations, in which the zeros of those agents stay zeros
+        """
+        normalized = np.asarray(self._normalize_obs(obs, env))
+        own = self.team.obs_dim
+        normalized[..., :own][gone & ~obs[..., :own].any(axis=2)] = 0.0
+        return normalized
 
     def _read(self, name: str, index: np.ndarray) -> np.ndarray:
         """

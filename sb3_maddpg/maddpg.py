@@ -62,6 +62,7 @@ from sb3_maddpg.model_files import (
     trusted,
 )
 from sb3_maddpg.networks import polyak_update
+from sb3_maddpg.normalization import ObservationStatistics, for_team
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
@@ -280,6 +281,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.env_spec: dict[str, Any] | None = None
         self._stopped = False
         self.normalized_observations = False  # whether VecNormalize normalises the observations of the networks
+        self.observation_statistics: dict[str, Any] | None = None  # of a loaded file, see ObservationStatistics
         self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
         self.algorithm = type(self).__name__
         self.file_format = FILE_FORMAT
@@ -336,6 +338,8 @@ class MADDPG(OffPolicyAlgorithm):
         self.env_spec, self.action_cost = describe_env(env), self._action_cost_of(env)
         self.policy_kwargs = dict(self.policy_kwargs)
         for name in self.policy_class.env_attributes:
+            if name == "image_columns" and _normalizer_of_observations(env) is not None:
+                continue  # as in SB3: normalised images are no bytes
             if name not in self.policy_kwargs and env.has_attr(name):
                 self.policy_kwargs[name] = env.get_attr(name, indices=0)[0]
         layout = self.policy_kwargs.get("observation_layout")
@@ -348,6 +352,17 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _check_normalization(self, env: GymEnv) -> None:
         layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
+        if self.normalized_observations and self.num_timesteps:
+            self._check_statistics(normalizer)
+        if (
+            normalizer is not None
+            and "image_space" in self.policy_kwargs
+            and self.policy_kwargs.get("normalize_images", True)
+        ):
+            raise ValueError(
+                "VecNormalize(norm_obs=True) normalises images, which CnnPolicy also divides by 255: set "
+                "norm_obs=False or policy_kwargs={'normalize_images': False}."
+            )
         if normalizer is not None and any(getattr(normalizer.observation_space, "masks", ())):
             raise ValueError(
                 "VecNormalize(norm_obs=True) shifts the action masks in the observations, which must be positive where "
@@ -359,6 +374,43 @@ class MADDPG(OffPolicyAlgorithm):
                 "all look present. Set norm_obs=False and scale observations in the environment; or, if every "
                 "neighbour is always present, set `complete: True` in the environment's observation_layout."
             )
+
+    def _check_statistics(self, normalizer: VecNormalize | None) -> None:
+        """
+        Check that an environment normalises observations as they were in training, and complete statistics that are
+        empty by those of the model's file.
+
+        :param normalizer: the environment's wrapper that normalises observations
+        :raises ValueError: if there is none, or it has no statistics and the file neither
+        """
+        remedy = (
+            "load the statistics of the training, SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env). If the "
+            "environment normalises by itself, load the model with normalized_observations=False."
+        )
+        stored = self._stored_statistics()
+        if normalizer is None:
+            if stored is not None:
+                remedy = f"wrap it in VecNormalize, which the statistics in the model's file then complete, or {remedy}"
+            raise ValueError(
+                "The model was trained with VecNormalize(norm_obs=True), but this environment does not normalise "
+                f"observations: {remedy}"
+            )
+        if ObservationStatistics.of(normalizer) is None:
+            if stored is None:
+                raise ValueError(
+                    "The model was trained with VecNormalize(norm_obs=True), but this environment's VecNormalize has "
+                    f"not seen any observation yet, and the model's file holds no statistics: {remedy}"
+                )
+            stored.fill(normalizer)
+
+    def _stored_statistics(self) -> ObservationStatistics | None:
+        return None if self.observation_statistics is None else ObservationStatistics(**self.observation_statistics)
+
+    def _present_statistics(self) -> ObservationStatistics | None:
+        """:return: how observations are normalised: by the environment, or else as the model's file says"""
+        normalizer = _normalizer_of_observations(self.env)
+        present = None if normalizer is None else ObservationStatistics.of(normalizer)
+        return self._stored_statistics() if present is None else present
 
     def _action_cost_of(self, env: VecEnv) -> Any:
         """:return: the environment's ``action_cost``, None if it is not used"""
@@ -758,19 +810,22 @@ class MADDPG(OffPolicyAlgorithm):
 
     def agent_policy(self, agent: str | int) -> AgentPolicy:
         """
-        Extract the policy of one agent, which acts without the rest of the team and without critics.
+        Extract the policy of one agent, which acts without the rest of the team and without critics. If the model was
+        trained with ``VecNormalize``, the policy normalises observations itself.
 
         :param agent: name or index of the agent
         :return: the agent's policy
-        :raises ValueError: if there is no such agent, or its parameters are not finite
+        :raises ValueError: if there is no such agent, its parameters are not finite, or the statistics of observations
+            are unknown
         """
-        if self.normalized_observations:
-            warnings.warn(
-                "The model was trained with VecNormalize(norm_obs=True), whose statistics are not part of the agent's "
-                "policy: normalise observations in the same way before passing them to it.",
-                stacklevel=2,
+        statistics = self._present_statistics() if self.normalized_observations else None
+        if self.normalized_observations and self.num_timesteps and statistics is None:
+            raise ValueError(
+                "The model was trained with VecNormalize(norm_obs=True), but neither its file nor an environment holds "
+                "the statistics: load it with env=SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env), or with "
+                "normalized_observations=False if you normalise observations yourself."
             )
-        return AgentPolicy.of(self.policy, agent)
+        return AgentPolicy.of(self.policy, agent, statistics)
 
     def set_threshold(self, threshold: float) -> None:
         """
@@ -883,14 +938,24 @@ class MADDPG(OffPolicyAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         normalizer = self._vec_normalize_env
-        self._arrivals.check(
-            reward if normalizer is None else normalizer.get_original_reward(),
-            cast(np.ndarray, new_obs),
-            dones,
-            infos,
-            reads_parts=self.use_action_cost or getattr(replay_buffer, "n_pairs", 0) > 0,
-        )
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if normalizer is None:
+            self._last_original_obs, original_obs = self._last_obs, new_obs
+        else:  # the replay buffer holds what is not normalised
+            original_obs, reward = normalizer.get_original_obs(), normalizer.get_original_reward()
+        assert isinstance(original_obs, np.ndarray)
+        reads_parts = self.use_action_cost or getattr(replay_buffer, "n_pairs", 0) > 0
+        self._arrivals.check(reward, original_obs, dones, infos, reads_parts)
+        next_obs = original_obs.copy()
+        for k in np.flatnonzero(dones):
+            info = infos[k]
+            # VecNormalize keeps the original besides the normalised one, which may have been clipped
+            last = info.get("original_terminal_observation", info.get("terminal_observation"))
+            if last is not None:
+                next_obs[k] = last
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
+        self._last_obs = new_obs
+        if normalizer is not None:
+            self._last_original_obs = original_obs
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         check_success(infos)
@@ -974,6 +1039,9 @@ class MADDPG(OffPolicyAlgorithm):
                     )
                 if name not in (known := {*data, *arguments_of(cls)}):
                     raise ValueError(suggest("argument of load", name, {one for one in known if one[0] != "_"}))
+            if (statistics := values.get("observation_statistics")) is not None:
+                shape = values["observation_space"].shape
+                values["observation_statistics"] = ObservationStatistics.checked(statistics, shape, str(path))._asdict()
             space = None if env is None else env.action_space
             # Files of earlier versions hold the agents' spaces without shape and data type
             if isinstance(space, MixedActions) and plain_joint_space(space.agent_spaces) == values.get("action_space"):
@@ -985,6 +1053,13 @@ class MADDPG(OffPolicyAlgorithm):
             with _remedy_for_other_team(), NetworkLimit(path, trust):
                 model = super().load(path, env, device, values, print_system_info, force_reset, **kwargs)
             check_attributes(model, path)
+            if model.normalized_observations and env is None:
+                warnings.warn(
+                    f"{path} was trained with VecNormalize(norm_obs=True): predict() expects observations that are "
+                    "normalised in the same way, as by env=VecNormalize(..., training=False) passed to load. Policies "
+                    "of single agents (agent_policy) normalise observations themselves.",
+                    stacklevel=2,
+                )
         model.file_format = FILE_FORMAT
         return model
 
@@ -1015,6 +1090,8 @@ class MADDPG(OffPolicyAlgorithm):
             )
         if problem := self._not_finite(self.get_parameters()):
             raise ValueError(f"This model cannot be saved: {problem}")
+        statistics = self._present_statistics() if self.normalized_observations else None
+        self.observation_statistics = None if statistics is None else statistics._asdict()
         write = super().save if pickle else functools.partial(self._save_without_pickle, lean=lean)
         if not isinstance(path, (str, os.PathLike)):
             return write(path, exclude, include)
@@ -1187,6 +1264,8 @@ class MADDPG(OffPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         # The last observations of many environments are larger than the networks, and loading starts new episodes
         last = ["_last_obs", "_last_original_obs"]
+        if self.observation_statistics is None:
+            last.append("observation_statistics")
         networks = ["actor", "critic", "actor_target", "critic_target"]
         return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded", "_arrivals", "_stopped"]
 
@@ -1212,6 +1291,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+    for_team(vec_env)
     check_vec_env(vec_env)
     # SB3's own error would suggest policies that do not exist here
     Team.from_spaces(vec_env.observation_space, vec_env.action_space)

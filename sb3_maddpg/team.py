@@ -441,6 +441,7 @@ def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActi
         return tuple(spaces.MultiBinary(k) for _ in range(n_agents))
     if isinstance(action_space, spaces.MultiDiscrete):
         return tuple(spaces.MultiDiscrete(nvec) for nvec in action_space.nvec.reshape(n_agents, k))
+    assert isinstance(action_space, spaces.Box)
     # The networks' single precision serves for all but integers and half precision
     in_float = action_space.dtype in (np.float32, np.float64)
     dtype = np.float32 if in_float else action_space.dtype.type

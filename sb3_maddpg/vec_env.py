@@ -352,7 +352,7 @@ class ArrivalCheck:
     ) -> None:
         """
         :param rewards: the team's rewards as they arrived, not normalised, (n_envs,)
-        :param observations: observations after the step, or the first of the next episode, (n_envs, ...)
+        :param observations: observations after the step or first ones of next episodes, not normalised, (n_envs, ...)
         :param dones: which episodes ended, (n_envs,)
         :param infos: infos of the environments
         :param reads_parts: whether the algorithm reads parts of the team's reward even if agents have none of their
@@ -373,7 +373,8 @@ class ArrivalCheck:
                 )
             self._steps[k] = 0 if dones[k] else step
             if dones[k] and self._firsts[k] is not None:
-                self._check_end(k, observations[k], info.get("terminal_observation"))
+                last = info.get("original_terminal_observation", info.get("terminal_observation"))
+                self._check_end(k, observations[k], last)
 
     @staticmethod
     def _check_reward(env: int, arrived: float, info: Mapping[str, Any]) -> None:

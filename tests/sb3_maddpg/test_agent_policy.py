@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from sb3_maddpg import MADDPG
@@ -346,10 +345,3 @@ def test_a_policy_that_is_not_finite_is_not_exported(tmp_path):
         with pytest.raises(ValueError, match=r"holds NaN or infinity"):
             export()
     assert not list(tmp_path.iterdir())
-
-
-def test_warns_where_an_agent_would_miss_the_statistics_of_observations():
-    env = VecNormalize(DummyVecEnv([lambda: TeamEnv(Toy("binary"))]))
-    model = MADDPG("MlpPolicy", env, **SMALL)
-    with pytest.warns(UserWarning, match=r"VecNormalize.*not part of the agent's policy"):
-        model.agent_policy(0)
