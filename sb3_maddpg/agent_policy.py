@@ -15,6 +15,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.actions import ActionKind, Categorical, Continuous, make_kinds
+from sb3_maddpg.networks import single_precision
 from sb3_maddpg.team import AgentActionSpace, into_box
 from sb3_maddpg.utils import as_numbers, atomic_write, shown
 
@@ -93,6 +94,7 @@ class AgentPolicy(nn.Module):
                 self.register_buffer(f"own_{bound}", th.as_tensor(_as_double(limit, bound)))
 
     @classmethod
+    @single_precision()
     def of(cls, policy: MADDPGPolicy, agent: str | int, statistics: ObservationStatistics | None = None) -> AgentPolicy:
         """
         Extract an agent's policy from the team's.
@@ -138,6 +140,7 @@ class AgentPolicy(nn.Module):
             actions = actions.to(self.dtype)
         return actions if self.flat else actions.reshape(-1, *self.shape)
 
+    @single_precision()
     def predict(self, observation: np.ndarray) -> np.ndarray:
         """
         Choose the action for an observation.
@@ -176,6 +179,7 @@ class AgentPolicy(nn.Module):
             return actions
         return actions[0, 0] if isinstance(space, spaces.Discrete) else actions[0].reshape(space.shape)
 
+    @single_precision()
     def export(self, path: str | os.PathLike[str]) -> None:
         """
         Export the policy as a program that runs without this package. The program maps float32 observations of shape

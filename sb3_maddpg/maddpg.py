@@ -61,7 +61,7 @@ from sb3_maddpg.model_files import (
     read_data,
     trusted,
 )
-from sb3_maddpg.networks import polyak_update
+from sb3_maddpg.networks import polyak_update, single_precision
 from sb3_maddpg.normalization import ObservationStatistics, for_team
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
@@ -604,6 +604,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
 
+    @single_precision()
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -656,6 +657,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         return self.actor_target.act(next_obs)
 
+    @single_precision()
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_maddpg.actions import TeamActions
-from sb3_maddpg.networks import StackedMLP
+from sb3_maddpg.networks import StackedMLP, single_precision
 from sb3_maddpg.team import MixedActions, Team, into_box
 from sb3_maddpg.utils import all_finite, as_numbers, shown
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
@@ -707,6 +707,7 @@ class MADDPGPolicy(BasePolicy):
         self.image_columns = arguments["image_columns"]
         self._build(lr_schedule)
 
+    @single_precision()
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor, self.critic = self._make_networks(*get_actor_critic_arch(self.net_arch))
         if self.image_columns is not None and self.normalize_images:
@@ -832,6 +833,7 @@ class MADDPGPolicy(BasePolicy):
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
 
+    @single_precision()
     def flat_actions(self, obs: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """
         Choose actions in the format of the replay buffer.

@@ -186,7 +186,7 @@ def test_a_model_without_its_statistics_is_not_published(tmp_path):
     model.save(run / "ENV.zip", exclude=["observation_statistics"])  # as earlier versions did
     with pytest.warns(UserWarning, match="normalised in the same way"):
         loaded = MADDPG.load(run / "ENV.zip")
-    with pytest.raises(ValueError, match="neither its file nor a vecnormalize.pkl of its run holds the statistics"):
+    with pytest.raises(ValueError, match=r"neither its file nor a vecnormalize\.pkl of its run holds the statistics"):
         hub.write_model_folder(loaded, tmp_path / "out", "me/a-model", run)
     SafeVecNormalize.save(env, str(run / "ENV" / "vecnormalize.pkl"))
     hub.write_model_folder(loaded, tmp_path / "out", "me/a-model", run)

@@ -663,3 +663,26 @@ def test_a_training_that_was_not_broken_off_goes_on_in_its_episode():
     before, after = model.replay_buffer.next_observations[13, 0, 0], model.replay_buffer.observations[14, 0, 0]
     assert before.tolist() == after.tolist()
     assert before[1] == 4
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_pytorch_s_default_of_double_precision_changes_nothing(estimator, tmp_path):
+    models = []
+    for default in (th.float32, th.float64):
+        th.set_default_dtype(default)
+        try:
+            model = learned(Toy("mixed"), 60, estimator=estimator)
+            robot = model.agent_policy(0)
+            robot.export(tmp_path / "robot.pt")
+            model.save(tmp_path / "model")
+            loaded = MADDPG.load(tmp_path / "model")
+            obs = np.zeros(model.observation_space.shape)
+            assert np.array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+            models.append((parameters(model), robot.predict(np.zeros(robot.obs_dim))))
+            assert th.get_default_dtype() is default
+        finally:
+            th.set_default_dtype(th.float32)
+    (parameters_32, action_32), (parameters_64, action_64) = models
+    assert parameters_64.dtype == np.float32
+    assert np.array_equal(parameters_32, parameters_64)
+    assert np.array_equal(action_32, action_64)
