@@ -30,6 +30,8 @@ class TeamReplayBufferSamples(NamedTuple):
     :param active: 1 if the agent acted, (batch, n_agents); ``None`` if every agent always has
     :param next_active: 1 if the agent is still active at the end of the window, (batch, n_agents); ``None`` if every
         agent always has been active
+    :param next_truncated: 1 if the agent was truncated at the end of the window although others go on, (batch,
+        n_agents); ``None`` if no agent was. Only its own critic counts its next action.
     :param pair_rewards: discounted sums of pair rewards, (batch, n_agents, n_pairs); ``None`` if they are not stored
     :param pair_goes_on: 1 if the next observation is about the same pair, (batch, n_agents, n_pairs); ``None`` if pairs
         never end before their agents
@@ -45,10 +47,14 @@ class TeamReplayBufferSamples(NamedTuple):
     discounts: th.Tensor | float
     active: th.Tensor | None = None
     next_active: th.Tensor | None = None
+    next_truncated: th.Tensor | None = None
     pair_rewards: th.Tensor | None = None
     pair_goes_on: th.Tensor | None = None
     indices: np.ndarray | None = None
     weights: th.Tensor | None = None
+
+
+_TRUNCATED = 2.0
 
 
 class _Columns(NamedTuple):
@@ -57,6 +63,7 @@ class _Columns(NamedTuple):
     agent_rewards: np.ndarray
     agent_terminated: np.ndarray
     agent_active: np.ndarray
+    """1 if the agent acted, `_TRUNCATED` if it acted and was truncated although others go on, else 0"""
     rewards: np.ndarray
     dones: np.ndarray
     timeouts: np.ndarray
@@ -67,7 +74,16 @@ class _Columns(NamedTuple):
 
 
 # Attributes that are not pickled, because they are views of the records or derived from them
-_VIEWS = {"observations", "next_observations", "actions", "numbers", *_Columns._fields, "_new", "_new_columns"}
+_VIEWS = {
+    "observations",
+    "next_observations",
+    "actions",
+    "numbers",
+    *_Columns._fields,
+    "_new",
+    "_new_columns",
+    "_truncated",
+}
 _REMEDY = "Look there for a division by zero or a diverging simulation; end the episode earlier, or clip the value."
 _REMEDY_ACTION = "Look for diverged networks (lower learning_rate) or a Box whose bounds are equal or too large."
 
@@ -78,6 +94,7 @@ class TeamReplayBuffer(ReplayBuffer):
 
     - ``agent_rewards``, (n_agents,): the agents' rewards, by default the team's reward for every agent;
     - ``agent_terminated``, (n_agents,): whether each agent terminated, by default none terminates before the team;
+    - ``agent_truncated``, (n_agents,): whether each agent was truncated although others go on, by default none was;
     - ``agent_active``, (n_agents,): whether each agent acted, by default all did;
     - ``pair_rewards``, (n_agents, n_pairs), required if ``n_pairs`` is set: the part of an agent's reward that belongs
       to each of its neighbours.
@@ -200,6 +217,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self.pair_terminated = columns.pair_terminated
         # The numbers of the transition being added, which are stored only if they are finite
         self._new = np.zeros(self.numbers.shape[1:], np.float32)
+        self._truncated = np.zeros((self.n_envs, self.n_agents), np.float32)
         self._new_columns = self._columns(self._new)
 
     def _columns(self, numbers: np.ndarray) -> _Columns:
@@ -339,6 +357,10 @@ class TeamReplayBuffer(ReplayBuffer):
         self._read_infos("agent_rewards", new.agent_rewards, infos, new.rewards[:, None])
         self._read_infos("agent_terminated", new.agent_terminated, infos, 0.0)
         some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
+        if self._read_infos("agent_truncated", self._truncated, infos, 0.0) and self._truncated.any():
+            early = (self._truncated > 0) & (new.agent_active > 0) & (new.dones[:, None] == 0)
+            new.agent_active[early] = _TRUNCATED
+            self.all_active &= not early.any()
         if self.n_pairs:
             self._read_infos("pair_rewards", new.pair_rewards, infos, None)
         if self.pairs_end:
@@ -517,7 +539,9 @@ class TeamReplayBuffer(ReplayBuffer):
             observations=self.to_torch(observations),
             actions=self.to_torch(batch["actions"]),
             next_observations=self.to_torch(next_obs),
-            active=None if self.all_active else self.to_torch(self._columns(batch["numbers"]).agent_active),
+            active=None
+            if self.all_active
+            else self.to_torch(np.minimum(self._columns(batch["numbers"]).agent_active, 1)),
             **rest,
         )
 
@@ -559,9 +583,24 @@ class TeamReplayBuffer(ReplayBuffer):
             "dones": np.maximum(terminated, team_done[:, None]),
             "rewards": self._normalize_reward(columns.agent_rewards, env),
             "discounts": self.gamma,
-            "next_active": None if self.all_active else columns.agent_active * (1 - terminated),
+            **self._next_active(columns.agent_active, terminated),
             "pair_rewards": self._normalize_reward(columns.pair_rewards, env) if self.n_pairs else None,
             "pair_goes_on": 1 - columns.pair_terminated if self.pairs_end else None,
+        }
+
+    def _next_active(self, active: np.ndarray, terminated: np.ndarray) -> dict[str, np.ndarray | None]:
+        """
+        :param active: column ``agent_active`` of the last transitions of the windows, (batch, n_agents)
+        :param terminated: which agents terminated there, (batch, n_agents)
+        :return: the fields ``next_active`` and ``next_truncated`` of the samples
+        """
+        if self.all_active:
+            return {"next_active": None, "next_truncated": None}
+        truncated = active == _TRUNCATED
+        goes_on = (active > 0) & (terminated == 0)
+        return {
+            "next_active": goes_on.astype(np.float32),
+            "next_truncated": (truncated & goes_on).astype(np.float32) if truncated.any() else None,
         }
 
     def _windows(
@@ -609,7 +648,7 @@ class TeamReplayBuffer(ReplayBuffer):
             "dones": np.maximum(gone, team_done[:, None]),
             "rewards": total,
             "discounts": discounts,
-            "next_active": None if self.all_active else (active & ~terminated)[at_end].astype(np.float32),
+            **self._next_active(columns.agent_active[at_end], terminated[at_end]),
             "pair_rewards": pair_total if self.n_pairs else None,
             "pair_goes_on": same_pair.astype(np.float32) if self.pairs_end else None,
         }

@@ -21,7 +21,7 @@ from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
 from sb3_maddpg.vec_env import ArrivalCheck, check_wrappers
 
 _SCALARS = {"is_success", "metrics", "team_reward", "episode_step"}
-_FLAGS = ("agent_terminated", "agent_active", "pair_terminated")
+_FLAGS = ("agent_terminated", "agent_truncated", "agent_active", "pair_terminated")
 
 
 def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed: int = 0) -> Team:

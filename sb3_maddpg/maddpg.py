@@ -727,10 +727,8 @@ class MADDPG(OffPolicyAlgorithm):
             next_actions = self._target_actions(next_obs)
             if replay_data.next_active is not None:
                 next_actions = next_actions * replay_data.next_active.unsqueeze(2)
-            # Compute the next Q-values: min over all target critics
-            next_q_values = self.critic_target(next_obs, next_actions).amin(dim=0)
+            next_q_values = self._next_q_values(next_obs, next_actions, replay_data.next_truncated, action_cost)
             if action_cost is not None:
-                next_q_values = next_q_values - critic.known_cost(next_actions, action_cost)
                 rewards = rewards + critic.known_cost(actions, action_cost)
             discounts = critic.per_value((1 - replay_data.dones) * replay_data.discounts)
             if pair_goes_on is not None:
@@ -748,6 +746,29 @@ class MADDPG(OffPolicyAlgorithm):
             self.replay_buffer.update_priorities(replay_data.indices, td_errors.sum(dim=1).sqrt().cpu().numpy())
         losses = _mean_over_batch(errors, active, replay_data.weights)
         return losses, critic.sum_by_agent(current_q_values[0].detach()).mean(dim=0)
+
+    def _next_q_values(
+        self, obs: th.Tensor, actions: th.Tensor, truncated: th.Tensor | None, action_cost: th.Tensor | None
+    ) -> th.Tensor:
+        """
+        :param obs: next observations, (batch, n_agents, obs_dim)
+        :param actions: next actions, (batch, n_agents, width)
+        :param truncated: see ``TeamReplayBufferSamples.next_truncated``
+        :param action_cost: cost of the actions, (n_agents, width), None if it is unknown
+        :return: next Q-values: min over all target critics, without the known cost, (batch, n_values)
+        """
+        if truncated is not None:
+            # The others go on without the agents that were truncated, which go on in their own targets
+            values = self._next_q_values(obs, actions * (1 - truncated.unsqueeze(2)), None, action_cost)
+            for agent in truncated.any(dim=0).nonzero().flatten().tolist():
+                rows, heads = truncated[:, agent].nonzero().flatten(), self.critic.heads_of(agent)
+                kept = 1 - truncated[rows]
+                kept[:, agent] = 1
+                own = self._next_q_values(obs[rows], actions[rows] * kept.unsqueeze(2), None, action_cost)
+                values[rows.unsqueeze(1), heads] = own[:, heads]
+            return values
+        values = self.critic_target(obs, actions).amin(dim=0)
+        return values if action_cost is None else values - self.critic.known_cost(actions, action_cost)
 
     def _actor_loss(
         self, replay_data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor

@@ -192,7 +192,8 @@ class TeamEnv(gymnasium.Env):
         self._taking_part = self._live
         self._returns = [0.0] * len(self._agents)
         info = _agent_infos(infos)
-        info["agent_active"] = np.isin(np.arange(len(self._agents)), self._live)
+        if len(self._live) < len(self._agents):
+            info["agent_active"] = np.isin(np.arange(len(self._agents)), self._live)
         return self._observe(self._with_masks(observations, infos), self._live), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

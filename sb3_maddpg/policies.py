@@ -246,6 +246,13 @@ class Critic(nn.Module):
         """
         return self.agent_of_value[values]
 
+    def heads_of(self, agent: int) -> th.Tensor:
+        """
+        :param agent: index of an agent
+        :return: indices of the value heads that predict this agent's rewards alone, (n,)
+        """
+        return (self.agent_of_value == agent).nonzero().flatten()
+
     def cost_of_factors(self, action_cost: th.Tensor) -> th.Tensor:
         """
         :param action_cost: costs of the agents' actions, (n_agents, width)
@@ -316,6 +323,11 @@ class FeaturesCritic(Critic):
         super().__init__(head.factors, head.n_agents, n_critics=head.n_critics)
         self.features = features
         self.head = head
+
+        self.agent_of_value = head.agent_of_value
+        # Whose values the heads are
+        for name in ("rewards", "per_value", "owners", "heads_of", "cost_of_factors", "sum_by_agent", "known_cost"):
+            setattr(self, name, getattr(head, name))
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         return self.head(self.features(obs), actions)
@@ -576,6 +588,9 @@ class TeamCritic(StackedCritic):
 
     def owners(self, values: th.Tensor) -> th.Tensor:
         return th.arange(self.n_agents)
+
+    def heads_of(self, agent: int) -> th.Tensor:
+        return th.empty(0, dtype=th.long, device=self.agent_of_value.device)
 
     def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
         return values.expand(*values.shape[:-1], self.n_agents)

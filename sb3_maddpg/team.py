@@ -31,6 +31,9 @@ class TeamInfo(TypedDict, total=False):
     agent_terminated: np.ndarray
     """Whether each agent terminated in this step, (n_agents,) bool. Truncation does not count. By default, no agent
     terminates before the team."""
+    agent_truncated: np.ndarray
+    """Whether each agent was truncated in this step, (n_agents,) bool, although others go on. It bootstraps from its
+    last observation, while the others go on without it. By default, no agent is truncated before the team."""
     agent_active: np.ndarray
     """Whether each agent acted in this step, (n_agents,) bool. By default, all agents acted."""
     pair_rewards: np.ndarray
@@ -50,7 +53,9 @@ class TeamInfo(TypedDict, total=False):
     """Number of the step in its episode, from 1, from which the algorithm sees that a wrapper skipped steps."""
 
 
-InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards", "pair_terminated"]
+InfoKey = Literal[
+    "agent_rewards", "agent_terminated", "agent_truncated", "agent_active", "pair_rewards", "pair_terminated"
+]
 
 
 class TeamEnvironment(Protocol):

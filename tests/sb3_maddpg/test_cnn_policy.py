@@ -278,3 +278,25 @@ def test_pictures_without_an_axis_of_channels():
 
 def _without_kwargs(arguments: dict) -> dict:
     return {name: value for name, value in arguments.items() if name != "policy_kwargs"}
+
+
+def test_a_team_s_single_value_is_fitted_to_the_team_s_reward():
+    class Paid(Pictures):
+        def step(self, actions):
+            seen, rewards, *rest = super().step(actions)
+            return seen, {agent: 3.0 * index for index, agent in enumerate(rewards)}, *rest
+
+    image = spaces.Box(0, 255, (1, 40, 40), np.uint8)
+    kwargs = {"share_critic": "team", "net_arch": [8]}
+    arguments = {
+        **_without_kwargs(SMALL),
+        "gamma": 0.0,
+        "learning_rate": 1e-2,
+        "train_freq": 1,
+        "policy_kwargs": kwargs,
+    }
+    model = MADDPG("CnnPolicy", Paid(image, image), **arguments).learn(150)
+    obs = th.as_tensor(TeamEnv(Paid(image, image)).reset(seed=0)[0][None])
+    values = model.critic(obs, model.actor.act(obs))
+    assert values.shape == (1, 1, 1)
+    assert values.item() == pytest.approx(1.5, abs=0.3), "the mean of 0 and 3"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from pettingzoo import ParallelEnv
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
@@ -17,7 +18,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
-from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg import IDDPG, MADDPG, MATD3, parallel
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.callbacks import MetricsCallback
 from sb3_maddpg.estimators import ESTIMATORS
@@ -686,3 +687,89 @@ def test_pytorch_s_default_of_double_precision_changes_nothing(estimator, tmp_pa
     assert parameters_64.dtype == np.float32
     assert np.array_equal(parameters_32, parameters_64)
     assert np.array_equal(action_32, action_64)
+
+
+class Ends(ParallelEnv):
+    """
+    Agent a leaves in step 3, b in step 5; the reward is 1 per step, and they see the step.
+
+    :param a: how a ends, "terminated" or "truncated"
+    :param whole: both are truncated in step 5 only
+    """
+
+    metadata = {"name": "ends"}  # noqa: RUF012
+
+    def __init__(self, a: str, whole: bool = False):
+        self.possible_agents, self.a, self.whole = ["a", "b"], a, whole
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 1, (6,))
+
+    def action_space(self, agent):
+        return spaces.Discrete(1)
+
+    def look(self, agents):
+        return {agent: np.eye(6, dtype=np.float32)[self.t] for agent in agents}
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.t = ["a", "b"], 0
+        return self.look(self.agents), {}
+
+    def step(self, actions):
+        self.t += 1
+        acted = self.agents
+        last = {"a": 5 if self.whole else 3, "b": 5}
+        out = {agent: self.t == last[agent] for agent in acted}
+        gone = {agent: out[agent] and not self.whole and (agent == "b" or self.a == "terminated") for agent in acted}
+        self.agents = [agent for agent in acted if not out[agent]]
+        cut = {agent: out[agent] and not gone[agent] for agent in acted}
+        return self.look(acted), dict.fromkeys(acted, 1.0), gone, cut, {}
+
+
+class EndsForGymnasium(gymnasium.Wrapper):
+    """The same team, told by a Gymnasium environment's infos alone."""
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        names = ("agent_rewards", "agent_terminated", "agent_truncated", "agent_active", "team_reward")
+        return obs, reward, terminated, truncated, {name: info[name] for name in names}
+
+
+@pytest.mark.parametrize("a", ["terminated", "truncated"])
+@pytest.mark.parametrize(
+    ("algorithm", "kwargs", "expected"),
+    [
+        (MADDPG, {}, 4.0951),
+        (MADDPG, {"n_steps": 3}, 4.0951),
+        (MADDPG, {"replay_buffer_class": PrioritizedTeamReplayBuffer}, 4.0951),
+        (MADDPG, {"policy_kwargs": {"share_critic": "team"}}, (2.71 + 4.0951) / 2),
+        (MATD3, {"target_policy_noise": 0.0}, 4.0951),
+        (IDDPG, {}, 4.0951),
+    ],
+)
+def test_who_goes_on_is_worth_what_it_gets(algorithm, kwargs, expected, a):
+    """1 + 0.9 + ... over five steps, whether the other one terminates or is truncated after three."""
+    arguments = {"gamma": 0.9, "learning_rate": 3e-3, "tau": 0.05, "learning_starts": 100, "train_freq": 2, "seed": 0}
+    env = EndsForGymnasium(parallel.TeamEnv(Ends(a)))
+    model = algorithm("MlpPolicy", env, batch_size=256, **arguments, **kwargs).learn(3000)
+    obs = th.as_tensor(parallel.TeamEnv(Ends(a)).reset()[0][None])
+    assert model.critic(obs, model.actor.act(obs))[0, 0, -1].item() == pytest.approx(expected, abs=0.15)
+
+
+def test_a_team_that_is_truncated_as_a_whole_goes_on_as_a_whole():
+    model = MADDPG("MlpPolicy", Ends("truncated", whole=True), **SMALL).learn(30)
+    batch = model.replay_buffer.sample(64)
+    assert batch.active is batch.next_active is batch.next_truncated is None
+
+
+def test_an_agent_that_is_truncated_counts_in_its_own_target_only():
+    model = MADDPG("MlpPolicy", Toy("continuous"), **SMALL)
+    obs, actions = th.rand(4, 3, 4) - 0.5, th.rand(4, 3, 2) - 0.5
+    truncated = th.tensor([[0.0, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0]])
+    found = model._next_q_values(obs, actions, truncated, None)
+    for row in range(4):
+        for agent in range(3):
+            keeps = 1 - truncated[row]
+            keeps[agent] = 1
+            alone = model.critic_target(obs[[row]], actions[[row]] * keeps[None, :, None])[0, 0, agent]
+            assert found[row, agent].item() == pytest.approx(alone.item(), abs=1e-6)
