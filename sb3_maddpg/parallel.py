@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -76,8 +77,10 @@ class TeamEnv(gymnasium.Env):
     - ``agent_terminated``, ``agent_truncated``: whether the agent was terminated or truncated in this step
     - ``agent_active``: whether the agent acted in this step
     - ``agent_infos``: the environment's infos by agent name, left out if they are all empty
-    - ``metrics``: at the end of an episode, ``rollout/ep_rew_NAME`` of each agent that took part
-      (``rollout/ep_rew_agent_mean`` of an agent called "mean", since ``rollout/ep_rew_mean`` is the team's)
+    - ``metrics``: the means of the numbers in the agents' ``infos[agent]["metrics"]``, and at the end of an episode
+      ``rollout/ep_rew_NAME`` of each agent that took part (``rollout/ep_rew_agent_mean`` of an agent called "mean",
+      since ``rollout/ep_rew_mean`` is the team's) and, where agents end before others, ``rollout/ep_len_NAME``
+    - ``is_success``: at the end of an episode, whether all agents succeeded whose infos say so, each as it said last
 
     Rewards of agents that have already ended are ignored with a warning, as are action masks in infos without
     ``info_mask``.
@@ -138,6 +141,10 @@ class TeamEnv(gymnasium.Env):
         self._live: list[int] = []
         self._taking_part: list[int] = []
         self._returns = [0.0] * len(agents)
+        # Of agents that have ended in this episode, and whether they succeeded as far as they said
+        self._lengths: dict[int, int] = {}
+        self._successes: dict[Any, bool] = {}
+        self._unequal = False
         self._warned: set[str] = set()
 
     def has_wrapper_attr(self, name: str) -> bool:
@@ -147,6 +154,11 @@ class TeamEnv(gymnasium.Env):
     def get_wrapper_attr(self, name: str) -> Any:
         """:return: the attribute of this wrapper, or else of the PettingZoo environment"""
         return getattr(self if hasattr(self, name) else self.parallel_env, name)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all agents have ended, or no episode has begun."""
+        return not self._live
 
     @property
     def team_spaces(self) -> tuple[TeamObservation, Any]:
@@ -191,6 +203,7 @@ class TeamEnv(gymnasium.Env):
             )
         self._taking_part = self._live
         self._returns = [0.0] * len(self._agents)
+        self._lengths, self._successes = {}, {}
         info = _agent_infos(infos)
         if len(self._live) < len(self._agents):
             info["agent_active"] = np.isin(np.arange(len(self._agents)), self._live)
@@ -250,18 +263,57 @@ class TeamEnv(gymnasium.Env):
         info["agent_active"] = np.array(active)
         over = not live
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
+        self._read_agents_infos(infos, info)
+        self._lengths |= dict.fromkeys(set(acted).difference(live), self._steps)
         if over:
-            info["metrics"] = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
-            successes = [
-                self._flag(agent, "is_success", one["is_success"])
-                for agent, one in infos.items()
-                if one and one.get("is_success") is not None
-            ]
-            if successes:
-                info["is_success"] = all(successes)
+            self.end_info(info)
         reward = info["team_reward"] = sum(rewards) / n_agents
         info["episode_step"] = self._steps
         return self._observe(self._with_masks(observations, infos), seen), reward, over and not cut, cut, info
+
+    def _read_agents_infos(self, infos: Mapping[Any, Any], info: dict[str, Any]) -> None:
+        """Keep whether agents have succeeded so far, and add the means of their metrics to the team's info."""
+        metrics: dict[str, list[float]] = {}
+        for agent, one in infos.items():
+            if not one or agent not in self._rows:
+                continue
+            if one.get("is_success") is not None:
+                self._successes[agent] = self._flag(agent, "is_success", one["is_success"])
+            own = one.get("metrics") or {}
+            if not isinstance(own, Mapping):
+                raise ValueError(
+                    f"infos[{agent!r}]['metrics'] of {self.parallel_env} is {shown(own)} {self._when}: it must be a "
+                    "dict of numbers by name."
+                )
+            for name, value in own.items():
+                number = math.nan
+                with suppress(TypeError, ValueError, OverflowError):
+                    number = float(value)
+                if not math.isfinite(number):
+                    raise ValueError(
+                        f"infos[{agent!r}]['metrics'][{name!r}] of {self.parallel_env} is {shown(value)} {self._when}: "
+                        "a metric must be a finite number."
+                    )
+                metrics.setdefault(str(name), []).append(number)
+        if metrics:
+            info["metrics"] = {name: sum(values) / len(values) for name, values in metrics.items()}
+
+    def end_info(self, info: dict[str, Any]) -> None:
+        """
+        Complete the info of an episode's last step, also if a wrapper such as ``TimeLimit`` ends the episode.
+
+        :param info: the info, which gets ``metrics`` and, if agents report it, ``is_success``
+        """
+        returns = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
+        info["metrics"] = {**info.get("metrics", {}), **returns}
+        lengths = {row: self._lengths.get(row, self._steps) for row in self._taking_part}
+        # Lengths tell something only where agents end before others, and then in every episode
+        self._unequal = self._unequal or len(set(lengths.values())) > 1
+        if self._unequal:
+            names = {row: self._metric_names[row].replace("ep_rew_", "ep_len_", 1) for row in lengths}
+            info["metrics"] |= {names[row]: float(length) for row, length in lengths.items()}
+        if self._successes:
+            info["is_success"] = all(self._successes.values())
 
     def render(self) -> Any:
         """Render the environment."""

@@ -1,5 +1,6 @@
 """Who takes part in an episode of a PettingZoo environment, how it ends, and what is refused."""
 
+import csv
 import pickle
 import warnings
 
@@ -9,7 +10,9 @@ import pytest
 from gymnasium import spaces
 from mpe2 import simple_spread_v3
 from pettingzoo import AECEnv, ParallelEnv
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_maddpg import MADDPG
@@ -95,7 +98,11 @@ def test_an_agent_that_dies_early_by_hand():
         assert [info["agent_active"].tolist() for info in infos[4:6]] == [[1, 1], [0, 1]]
         assert all("metrics" not in info and "agent_infos" not in info for info in infos[:9])
         # 1 + ... + 5 and 2 (1 + ... + 10); their mean is the team's return
-        assert infos[9]["metrics"] == {"rollout/ep_rew_a0": 15.0, "rollout/ep_rew_a1": 110.0}
+        returns, lengths = {"a0": 15.0, "a1": 110.0}, {"a0": 5.0, "a1": 10.0}
+        assert infos[9]["metrics"] == {
+            **{f"rollout/ep_rew_{agent}": value for agent, value in returns.items()},
+            **{f"rollout/ep_len_{agent}": value for agent, value in lengths.items()},
+        }
         assert sum(rewards) == 62.5
         assert [sorted(actions) for actions in script.sent[-10:]] == [["a0", "a1"]] * 5 + [["a1"]] * 5
     with pytest.raises(gymnasium.error.ResetNeeded):
@@ -127,7 +134,11 @@ def test_agents_that_sit_an_episode_out():
     assert len(steps) == 4
     assert not any(step[0][1].any() or step[4]["agent_active"][1] for step in steps)
     assert steps[0][1] == (1 + 0 + 3) / 3
-    assert steps[-1][4]["metrics"] == {"rollout/ep_rew_a": 3.0, "rollout/ep_rew_c": 30.0}
+    returns, lengths = {"a": 3.0, "c": 30.0}, {"a": 2.0, "c": 4.0}
+    assert steps[-1][4]["metrics"] == {
+        **{f"rollout/ep_rew_{agent}": value for agent, value in returns.items()},
+        **{f"rollout/ep_len_{agent}": value for agent, value in lengths.items()},
+    }
 
 
 def test_what_else_an_environment_offers_is_reached_through_the_adapter():
@@ -249,6 +260,65 @@ def test_the_return_of_an_agent_called_mean_is_not_that_of_the_team():
     assert metrics == {
         "rollout/ep_rew_agent_agent_mean": 3.0, "rollout/ep_rew_agent_mean": 6.0, "rollout/ep_rew_b": 9.0
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("said", "success"),
+    [
+        ({2: {"a": False}, 4: {"b": True}}, False),
+        ({2: {"a": True}, 4: {"b": True}}, True),
+        ({1: {"a": False, "b": False}, 2: {"a": True}, 4: {"b": True}}, True),  # each as it said last
+        ({2: {"a": True}}, True),
+        ({4: {"b": np.bool_(False)}}, False),
+        ({}, None),
+    ],
+)
+def test_agents_that_ended_before_the_others_count_as_successes_or_not(said, success):
+    def spoil(env, *parts):
+        parts[4].update({agent: {"is_success": flag} for agent, flag in said.get(env.time, {}).items()})
+
+    env = TeamEnv(Broken(spoil, {"a": (2, TERMINATED), "b": (4, TRUNCATED)}))
+    for _ in range(2):
+        infos = [step[4] for step in play(env)]
+        assert not any("is_success" in info for info in infos[:-1])
+        assert infos[-1].get("is_success") is success
+
+
+def test_metrics_of_agents_are_averaged_and_logged(tmp_path):
+    def spoil(env, *parts):
+        acted = {"a": 1.0, "b": 4.0} if env.time <= 2 else {"b": 4.0}
+        parts[4].update({agent: {"metrics": {"env/drag": np.float32(value)}} for agent, value in acted.items()})
+
+    env = Broken(spoil, {"a": (2, TERMINATED), "b": (4, TRUNCATED)})
+    assert [step[4]["metrics"]["env/drag"] for step in play(TeamEnv(env))] == [2.5, 2.5, 4.0, 4.0]
+    model = MADDPG("MlpPolicy", env, learning_starts=1000)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(40, log_interval=1)
+    with (tmp_path / "progress.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {float(row["env/drag"]) for row in rows} == {3.25}
+    assert {float(row["rollout/ep_len_a"]) for row in rows} == {2.0}
+
+
+@pytest.mark.parametrize("metrics", [{"x": "fast"}, {"x": np.nan}, {"x": [1, 2]}, 3.0, {"x": {}}])
+def test_metrics_that_are_no_numbers_are_refused(metrics):
+    env = TeamEnv(Broken(lambda env, *parts: parts[4].update(a={"metrics": metrics}), {"a": (2, TERMINATED)}))
+    with pytest.raises(ValueError, match=r"infos\['a'\]\['metrics'\].* of .* in step 1 of the episode.*must be a"):
+        play(env)
+
+
+def test_returns_are_logged_where_a_wrapper_ends_the_episodes():
+    env = gymnasium.wrappers.TimeLimit(TeamEnv(Script({"a": (5, TRUNCATED), "b": (8, TRUNCATED)})), 3)
+    keys = []
+
+    class Keys(BaseCallback):
+        def _on_step(self):
+            keys.extend(info["metrics"] for info in self.locals["infos"] if "metrics" in info)
+            return True
+
+    MADDPG("MlpPolicy", env, learning_starts=1000).learn(6, callback=Keys())
+    assert len(keys) >= 2
+    assert all(metrics == {"rollout/ep_rew_a": 6.0, "rollout/ep_rew_b": 12.0} for metrics in keys)
 
 
 def test_a_terminated_agent_need_not_see_its_end():
