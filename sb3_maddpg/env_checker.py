@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import gymnasium
@@ -14,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.callbacks import check_success
-from sb3_maddpg.parallel import TeamEnv, layers_of
+from sb3_maddpg.parallel import TeamEnv, explained_reset
 from sb3_maddpg.relational import NeighbourViews, check_layout
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
@@ -45,7 +44,8 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
     team = Team.from_spaces(env.observation_space, env.action_space, names)
     space, legal = env.observation_space, _LegalActions(env, team)
     assert isinstance(space, spaces.Box)
-    _check_reset(legal, seed)
+    with explained_reset(env):
+        legal.reset(seed=seed)
     with th.random.fork_rng(devices=[]):  # legal actions are drawn by PyTorch
         th.manual_seed(seed)
         try:
@@ -85,32 +85,6 @@ class _LegalActions(gymnasium.Wrapper):
         returned = self.env.step(action)
         self.obs = returned[0] if isinstance(returned, tuple) and returned else None
         return returned
-
-
-def _check_reset(env: gymnasium.Env, seed: int) -> None:
-    try:
-        env.reset(seed=seed)
-    except TypeError as error:
-        for inner in layers_of(env) if "unexpected keyword argument" in str(error) else ():
-            if missing := [f"`{name}`" for name in ("seed", "options") if not _takes(inner.reset, name)]:
-                raise ValueError(
-                    f"reset() of {inner} takes no {' and no '.join(missing)}: declare it as "
-                    "`def reset(self, seed=None, options=None)`."
-                ) from error
-        raise
-
-
-def _takes(method: Any, name: str) -> bool:
-    """:return: whether a method takes a keyword argument, also if its signature is unknown"""
-    try:
-        parameters = inspect.signature(method).parameters
-    except (TypeError, ValueError):
-        return True
-    kinds = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return any(
-        one.kind is inspect.Parameter.VAR_KEYWORD or (one.name == name and one.kind in kinds)
-        for one in parameters.values()
-    )
 
 
 def _out_of_bounds(space: spaces.Box, obs: np.ndarray, team: Team) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -122,14 +123,14 @@ class TeamEnv(gymnasium.Env):
         self.parallel_env = env
         self.metadata = {"render_modes": [], **_metadata_of(env)}
         self.render_mode = getattr(env, "render_mode", None)
-        self.agent_names = tuple(map(str, agents))
+        self.agent_names = _names_of(agents)
         self.observation_space = TeamObservation(
             {
-                str(agent): _flat_space(space, f"agent {agent!r} observes")
-                for agent, space in zip(agents, self._observation_spaces, strict=True)
+                name: _flat_space(space, f"agent {name!r} observes")
+                for name, space in zip(self.agent_names, self._observation_spaces, strict=True)
             },
             _state_space(env) if state else None,
-            {str(agent): _mask_columns(s) for agent, s in zip(agents, self._observation_spaces, strict=True)},
+            {name: _mask_columns(s) for name, s in zip(self.agent_names, self._observation_spaces, strict=True)},
         )
         self.action_space = joint_action_space(action_spaces)
         self._state_space: Any = env.state_space if state else None
@@ -146,6 +147,22 @@ class TeamEnv(gymnasium.Env):
         self._successes: dict[Any, bool] = {}
         self._unequal = False
         self._warned: set[str] = set()
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """
+        Set an attribute where ``get_wrapper_attr`` finds it.
+
+        :param name: name of the attribute
+        :param value: new value
+        :param force: whether to set it here if it does not exist
+        :return: whether it was set
+        """
+        layers = layers_of(self.parallel_env) if not hasattr(self, name) else ()
+        owner = next((one for one in layers if name in vars(one) or hasattr(type(one), name)), None)
+        if owner is None and not (force or hasattr(self, name)):
+            return False
+        setattr(self if owner is None else owner, name, value)
+        return True
 
     def has_wrapper_attr(self, name: str) -> bool:
         """:return: whether this wrapper or the PettingZoo environment has the attribute"""
@@ -192,7 +209,9 @@ class TeamEnv(gymnasium.Env):
         seed = as_seed(seed)
         super().reset(seed=seed)
         self._live, self._steps = [], 0
-        observations, infos = self._parts("reset", self.parallel_env.reset(seed=seed, options=options))
+        with explained_reset(self.parallel_env):
+            returned = self.parallel_env.reset(seed=seed, options=options)
+        observations, infos = self._parts("reset", returned)
         present = self._present()
         if unknown := present - self._rows.keys():
             raise ValueError(self._unknown(unknown))
@@ -536,8 +555,8 @@ class TeamEnv(gymnasium.Env):
         for row in live:
             if (agent := self._agents[row]) not in left:
                 raise ValueError(
-                    f"Agent {agent!r} left {self.parallel_env} without termination or truncation: set one of them in "
-                    "the step that removes the agent from `agents`."
+                    f"Agent {agent!r} left {self.parallel_env} without termination or truncation{self._by_wrappers()}: "
+                    "set one of them in the step that removes the agent from `agents`."
                 )
         for agent in left - {self._agents[row] for row in acted}:
             # An environment may keep an agent in `agents` as long as it reports it as terminated or truncated
@@ -547,6 +566,11 @@ class TeamEnv(gymnasium.Env):
                     f"Agent {agent!r} {how} in the middle of an episode: only agents that {self.parallel_env} lists "
                     "after reset() may take part, until they are terminated or truncated."
                 )
+
+    def _by_wrappers(self) -> str:
+        """:return: the wrappers that may be to blame, for error messages"""
+        wrappers = [type(layer).__name__ for layer in layers_of(self.parallel_env)][:-1]
+        return f", or one of its wrappers ({', '.join(wrappers)}) took them away" if wrappers else ""
 
     def _unknown(self, agents: Iterable[Any]) -> str:
         names = ", ".join(sorted(map(repr, agents)))
@@ -754,6 +778,14 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
     return agents
 
 
+def _names_of(agents: Sequence[Any]) -> tuple[str, ...]:
+    """:return: the agents' names, their numbers if Python would name them by their addresses"""
+    plain = [type(agent).__str__ is object.__str__ and type(agent).__repr__ is object.__repr__ for agent in agents]
+    return tuple(
+        f"agent_{i}" if without else str(agent) for i, (agent, without) in enumerate(zip(agents, plain, strict=True))
+    )
+
+
 def _metadata_of(env: ParallelEnv | AECEnv) -> Mapping[str, Any]:
     metadata = getattr(env, "metadata", None) or {}
     if not isinstance(metadata, Mapping):
@@ -772,6 +804,39 @@ def layers_of(env: Any) -> Iterator[Any]:
         seen.append(env)
         attributes = getattr(env, "__dict__", {})  # unlike getattr, not those that a wrapper passes on
         env = next((attributes[name] for name in ("parallel_env", "env", "aec_env") if name in attributes), None)
+
+
+@contextmanager
+def explained_reset(env: Any) -> Iterator[None]:
+    """
+    Explain the error of an environment whose ``reset`` takes too few arguments.
+
+    :param env: an environment of Gymnasium or PettingZoo that is reset
+    :raises ValueError: instead of the TypeError
+    """
+    try:
+        yield
+    except TypeError as error:
+        for inner in layers_of(env) if "unexpected keyword argument" in str(error) else ():
+            if missing := [f"`{name}`" for name in ("seed", "options") if not _takes(inner.reset, name)]:
+                raise ValueError(
+                    f"reset() of {inner} takes no {' and no '.join(missing)}: declare it as "
+                    "`def reset(self, seed=None, options=None)`."
+                ) from error
+        raise
+
+
+def _takes(method: Any, name: str) -> bool:
+    """:return: whether a method takes a keyword argument, also if its signature is unknown"""
+    try:
+        parameters = inspect.signature(method).parameters
+    except (TypeError, ValueError):
+        return True
+    kinds = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return any(
+        one.kind is inspect.Parameter.VAR_KEYWORD or (one.name == name and one.kind in kinds)
+        for one in parameters.values()
+    )
 
 
 def _refuse_black_death(env: Any) -> None:
@@ -842,14 +907,21 @@ def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:
 
 def _mask_columns(space: spaces.Space) -> list[int]:
     """:return: the columns of a flat observation that hold the action mask, PettingZoo's dict entry of that name"""
-    if not isinstance(space, spaces.Dict) or MASK not in space.spaces:
-        return []
-    begin = 0
-    for name, part in space.spaces.items():
-        if name == MASK:
-            return list(range(begin, begin + spaces.flatdim(part)))
-        begin += spaces.flatdim(part)
-    raise AssertionError
+    found = list(_masks_in(space))
+    if len(found) > 1:
+        raise ValueError(f"The observation space {space} holds {len(found)} parts called {MASK!r}: rename all but one.")
+    return found[0] if found else []
+
+
+def _masks_in(space: spaces.Space, begin: int = 0) -> Iterator[list[int]]:
+    """:return: the columns of each action mask, at any depth"""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        for name, part in space.items() if isinstance(space, spaces.Dict) else enumerate(space):
+            if name == MASK:
+                yield list(range(begin, begin + flatdim(part)))
+            else:
+                yield from _masks_in(part, begin)
+            begin += flatdim(part)
 
 
 def _state_space(env: Any) -> spaces.Box:
@@ -933,7 +1005,9 @@ def find_module(name: str) -> ModuleType | None:
     except ImportError as error:
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             return None
-        raise ValueError(f"{name} cannot be imported: {error}. Install its dependencies.") from error
+        told = str(error).rstrip(".")
+        remedy = "" if "install" in told.lower() else ". Install what it needs"
+        raise ValueError(f"{name} cannot be imported: {told}{remedy}.") from error
 
 
 def find_parallel_env(entry: str) -> Callable[..., ParallelEnv | AECEnv]:

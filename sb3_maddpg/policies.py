@@ -812,6 +812,12 @@ class MADDPGPolicy(BasePolicy):
             actions.set_threshold(threshold)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        alone = "For one agent alone: model.agent_policy(NAME).predict(its observation)."
+        if isinstance(observation, Mapping):
+            raise ValueError(
+                f"observation={shown(observation)} is a dict, but a team observes an array of shape "
+                f"{self.observation_space.shape}, as sb3_maddpg.TeamEnv(env) returns it. {alone}"
+            )
         try:
             numbers = as_numbers(observation)
         except ValueError:
@@ -819,6 +825,11 @@ class MADDPGPolicy(BasePolicy):
                 f"observation={shown(observation)} is not an array of numbers of shape {self.observation_space.shape} "
                 "or a batch of them."
             ) from None
+        if numbers.shape[-2:] != self.observation_space.shape or numbers.ndim > 3:
+            raise ValueError(
+                f"The observation has shape {numbers.shape}, but a team observes {self.observation_space.shape}, or a "
+                f"batch of it. {alone}"
+            )
         self.check_finite(numbers)
         return super().obs_to_tensor(numbers)
 

@@ -307,14 +307,15 @@ class Team:
         :return: the agent's index
         :raises ValueError: if there is no such agent
         """
-        if isinstance(agent, str) and agent in self.names:
-            return self.names.index(agent)
+        if not isinstance(agent, bool) and str(agent) in self.names:  # also an environment's own ids, such as (0, 1)
+            return self.names.index(str(agent))
         named_by_integers = all(_INTEGER.fullmatch(name) for name in self.names)
         numbers = list(map(int, self.names)) if named_by_integers else range(self.n_agents)
         if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and agent in numbers:
             return numbers.index(agent)
         positions = "" if named_by_integers else f", or 0 to {self.n_agents - 1}"
-        raise ValueError(f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}{positions}.")
+        names = ", ".join(self.names if named_by_integers else map(repr, self.names))
+        raise ValueError(f"There is no agent {shown(agent)}: the agents are {names}{positions}.")
 
     def homogeneous(self, agent: int, other: int) -> bool:
         """
@@ -347,8 +348,9 @@ class Team:
             )
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 2:
             raise ValueError(
-                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. "
-                "Stack the agents' observations along a first axis; pad them if they differ in length."
+                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. Pass a PettingZoo "
+                "environment itself, without vectorising it, or stack the agents' observations along a first axis. For "
+                "a single agent, use an algorithm of Stable-Baselines3, such as TD3 or DQN."
             )
         if not all(observation_space.shape):
             raise ValueError(

@@ -14,7 +14,7 @@ from gymnasium.wrappers import NormalizeReward
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_maddpg.parallel import TeamEnv, layers_of
+from sb3_maddpg.parallel import TeamEnv, explained_reset, layers_of
 from sb3_maddpg.team import MixedActions, TeamObservation
 from sb3_maddpg.utils import as_seed, integers_problem, not_finite_at, shown
 
@@ -182,8 +182,8 @@ class BorderEnv(Wrapper):
     """
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        # Not every environment has options
-        observation, info = self.env.reset(seed=seed, **({} if options is None else {"options": options}))
+        with explained_reset(self.env):  # not every environment has options
+            observation, info = self.env.reset(seed=seed, **({} if options is None else {"options": options}))
         self._check(observation, "after reset()")
         return observation, info
 
@@ -217,6 +217,8 @@ def check_vec_env(vec_env: VecEnv) -> None:
     :raises ValueError: if wrappers change the spaces or only the team's reward, see ``check_single_envs``
     """
     inner = vec_env.unwrapped
+    if not isinstance(inner, VecEnv):
+        return  # SuperSuit's wrapper has environments of another kind, whose spaces are refused
     # Subclasses may step other things than their envs
     envs = inner.envs if type(inner) is DummyVecEnv else _single_envs(inner)
     if envs:

@@ -1,19 +1,24 @@
 """Who takes part in an episode of a PettingZoo environment, how it ends, and what is refused."""
 
 import csv
+import enum
 import pickle
+import re
 import warnings
 
 import gymnasium
 import numpy as np
 import pytest
+import supersuit
 from gymnasium import spaces
 from mpe2 import simple_spread_v3
 from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.parallel import TeamEnv
@@ -640,3 +645,137 @@ def test_the_mover_is_among_the_agents():
 def test_a_reward_of_a_game_with_turns_is_a_number():
     with pytest.raises(ValueError, match=r"reward of None for agent 'a' in step 1 .*must be a number"):
         play(TeamEnv(Turns(reward=None)))
+
+
+class Named(Toy):
+    """Agents with names of any kind."""
+
+    def __init__(self, *names):
+        super().__init__("categorical")
+        self.possible_agents = list(names)
+
+
+class Thing:
+    """Its repr is an address."""
+
+
+class Colour(enum.IntEnum):
+    RED = 1
+    BLUE = 2
+
+
+@pytest.mark.parametrize(
+    "names", [((0, 0), (0, 1)), (1, 2), (np.int64(3), np.int64(7)), tuple(Colour), (Thing(), Thing()), ("a b", "c,d")]
+)
+def test_agents_are_found_by_the_environment_s_own_ids(names, tmp_path):
+    model = MADDPG("MlpPolicy", Named(*names), policy_kwargs={"share_actor": [[names[0]], [names[1]]]})
+    assert len(set(model.policy.team.names)) == 2
+    if isinstance(names[0], Thing):  # as no file could name them
+        assert model.policy.team.names == ("agent_0", "agent_1")
+        return
+    for agent in names:
+        assert model.agent_policy(agent).name == str(agent)
+    with pytest.raises(ValueError, match=f"There is no agent 'x': the agents are .*{re.escape(str(names[1]))}"):
+        model.agent_policy("x")
+
+
+def test_agents_without_names_fit_files_of_others_of_their_kind(tmp_path):
+    MADDPG("MlpPolicy", Named(Thing(), Thing())).save(tmp_path / "model")
+    MADDPG.load(tmp_path / "model", env=Named(Thing(), Thing()))
+
+
+MASKED = spaces.Dict({"action_mask": spaces.Box(0, 1, (3,), np.int8), "seen": spaces.Box(-1, 1, (2,))})
+
+
+@pytest.mark.parametrize(
+    ("space", "columns"),
+    [
+        (MASKED, (0, 1, 2)),
+        (spaces.Dict({"a": spaces.Discrete(4), "inner": MASKED}), (4, 5, 6)),
+        (spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Dict({"z": MASKED}))), (2, 3, 4)),
+    ],
+)
+def test_action_masks_are_found_at_any_depth(space, columns):
+    class Deep(Named):
+        def observation_space(self, agent):
+            return space
+
+        def action_space(self, agent):
+            return spaces.Discrete(3)
+
+    assert TeamEnv(Deep("a", "b")).observation_space.masks == (columns, columns)
+
+
+def test_two_action_masks_of_one_agent_are_refused():
+    class Two(Named):
+        def observation_space(self, agent):
+            return spaces.Dict({"left": MASKED, "right": MASKED})
+
+    with pytest.raises(ValueError, match="holds 2 parts called 'action_mask'"):
+        TeamEnv(Two("a", "b"))
+
+
+def test_attributes_are_set_where_they_are_found():
+    class Wind(Toy):
+        wind = 0.0
+
+    inner = Wind("binary")
+    env = TeamEnv(BaseParallelWrapper(inner))
+    gymnasium.wrappers.OrderEnforcing(env).set_wrapper_attr("wind", 3.0)
+    assert inner.wind == env.get_wrapper_attr("wind") == 3.0
+    env.set_wrapper_attr("new", 1)
+    assert env.new == 1
+    assert not env.set_wrapper_attr("newer", 1, force=False)
+    envs = DummyVecEnv([lambda: env])
+    envs.env_method("set_wrapper_attr", "wind", 5.0)
+    assert inner.wind == 5.0
+
+
+class NoOptions(Toy):
+    def reset(self, seed=None):
+        return super().reset(seed)
+
+
+def test_a_reset_without_options_is_explained_in_training():
+    message = (
+        r"reset\(\) of .*NoOptions.* takes no `options`: declare it as `def reset\(self, seed=None, options=None\)`"
+    )
+    with pytest.raises(ValueError, match=message):
+        MADDPG("MlpPolicy", NoOptions("binary")).learn(20)
+
+
+def test_what_is_no_observation_of_a_team_is_explained():
+    env = Toy("binary")
+    model = MADDPG("MlpPolicy", env)
+    observations, _ = env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"is a dict, .*TeamEnv\(env\) returns it.*agent_policy"):
+        model.predict(observations)
+    with pytest.raises(ValueError, match=r"has shape \(2,\), but a team observes \(3, 4\).*agent_policy"):
+        model.predict(observations["binary_0"])
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        lambda: gymnasium.make("CartPole-v1"),
+        lambda: supersuit.concat_vec_envs_v1(
+            supersuit.pettingzoo_env_to_vec_env_v1(simple_spread_v3.parallel_env()), 2, base_class="stable_baselines3"
+        ),
+    ],
+)
+def test_what_is_no_team_is_explained(env):
+    with pytest.raises(ValueError, match=r"Pass a PettingZoo environment itself.*For a single agent, use"):
+        MADDPG("MlpPolicy", env())
+
+
+def test_wrappers_that_take_agents_away_are_named():
+    class Hides(BaseParallelWrapper):
+        def step(self, actions):
+            *rest, infos = super().step(actions)
+            self.env.agents = self.agents = self.env.agents[1:]
+            return *rest, infos
+
+    env = TeamEnv(Hides(Toy("binary")))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"without termination or truncation, or one of its wrappers \(Hides\) took"):
+        env.step(np.zeros(6))
