@@ -27,4 +27,10 @@ for n_robots in (4, 6):
         over = terminated or truncated or (quick and len(pictures) == 10)
     everybody = n_robots * (n_robots - 1) * len(pictures)
     print(f"{n_robots} robots: {requests} requests of {everybody} possible, collision: {info['collision']}")
-    pictures[0].save(f"swarm_{n_robots}.gif", save_all=True, append_images=pictures[1:], duration=100, loop=0)
+    pictures[0].save(
+        f"swarm_{n_robots}.gif",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=1000 / env.metadata["render_fps"],
+        loop=0,
+    )

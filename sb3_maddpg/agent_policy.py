@@ -15,10 +15,12 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.actions import ActionKind, Categorical, Continuous, make_kinds
+from sb3_maddpg.networks import single_precision
 from sb3_maddpg.team import AgentActionSpace, into_box
 from sb3_maddpg.utils import as_numbers, atomic_write, shown
 
 if TYPE_CHECKING:
+    from sb3_maddpg.normalization import ObservationStatistics
     from sb3_maddpg.policies import MADDPGPolicy
 
 _TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
@@ -36,13 +38,19 @@ class AgentPolicy(nn.Module):
     :param obs_dim: length of the agent's observation
     :param threshold: threshold of binary actions, see ``Binary``
     :param mask: columns of the observation that hold the action mask, see ``TeamObservation``; empty without one
+    :param statistics: mean and standard deviation of observations, (obs_dim,), and the limit of normalised ones, None
+        for observations that are not normalised
     """
 
     columns: th.Tensor
     mask: th.Tensor
     low: th.Tensor
     high: th.Tensor
+    own_low: th.Tensor
+    own_high: th.Tensor
     start: th.Tensor
+    mean: th.Tensor
+    std: th.Tensor
 
     def __init__(
         self,
@@ -53,8 +61,13 @@ class AgentPolicy(nn.Module):
         obs_dim: int,
         threshold: float,
         mask: Sequence[int] = (),
+        statistics: tuple[np.ndarray, np.ndarray, float] | None = None,
     ):
         super().__init__()
+        self.limit = None if statistics is None else statistics[2]
+        if statistics is not None:
+            self.register_buffer("mean", th.as_tensor(statistics[0]).double())
+            self.register_buffer("std", th.as_tensor(statistics[1]).double())
         self.name = name
         self.network = network
         self.action_space = action_space
@@ -70,18 +83,25 @@ class AgentPolicy(nn.Module):
         if isinstance(self.kind, Categorical):
             start = th.as_tensor(np.ravel(getattr(action_space, "start", 0)), dtype=th.int64)
             self.register_buffer("start", start)
+        self.flat = isinstance(action_space, spaces.Discrete) or len(action_space.shape or ()) == 1
+        self.shape: tuple[int, ...] = action_space.shape or ()
+        self.dtype = th.as_tensor(np.zeros(1, action_space.dtype)).dtype
         self.whole = isinstance(action_space, spaces.Box) and np.issubdtype(action_space.dtype, np.integer)
         if isinstance(action_space, spaces.Box):
             for bound in ("low", "high"):
-                self.register_buffer(bound, th.as_tensor(getattr(action_space, bound)).float().flatten())
+                limit = np.ravel(getattr(action_space, bound))
+                self.register_buffer(bound, th.as_tensor(limit).float())
+                self.register_buffer(f"own_{bound}", th.as_tensor(_as_double(limit, bound)))
 
     @classmethod
-    def of(cls, policy: MADDPGPolicy, agent: str | int) -> AgentPolicy:
+    @single_precision()
+    def of(cls, policy: MADDPGPolicy, agent: str | int, statistics: ObservationStatistics | None = None) -> AgentPolicy:
         """
         Extract an agent's policy from the team's.
 
         :param policy: policy of the team
         :param agent: name or index of the agent
+        :param statistics: how ``VecNormalize`` normalises the team's observations, None if it does not
         :return: the agent's policy
         :raises ValueError: if there is no such agent, or parameters are not finite
         """
@@ -91,33 +111,44 @@ class AgentPolicy(nn.Module):
         network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
         columns, space = policy.actions.columns_of(index), team.action_spaces[index]
         mask = team.masks[index] if team.masks else ()
-        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask)
+        own = None
+        if statistics is not None:
+            mean, var = (part[index, : team.obs_dims[index]] for part in (statistics.mean, statistics.var))
+            own = (mean, np.sqrt(var + statistics.epsilon), statistics.clip)
+        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask, own)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
         :param obs: observations, (batch, obs_dim)
-        :return: actions in the environment's units, (batch, length of the action), as int8 if binary, float32 if
-            continuous and int64 if categorical. Continuous actions lie within their bounds in single precision, and are
-            whole numbers if the space holds integers
+        :return: actions in the environment's units, in the data type of the agent's action space and within its bounds:
+            (batch, *shape of the space), but (batch, 1) for ``Discrete``
         """
+        if self.limit is not None:
+            obs = ((obs - self.mean) / self.std).clamp(-self.limit, self.limit).float()
         logits = self.network(obs)[:, self.columns].unsqueeze(1)
         if self.has_mask:
             logits = self.kind.mask(logits, (obs[:, self.mask] > 0).unsqueeze(1))
         actions = self.kind.act(logits, deterministic=True).squeeze(1)
         if isinstance(self.kind, Continuous):
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
-            return (actions.round() if self.whole else actions).clamp(self.low, self.high)
-        if isinstance(self.kind, Categorical):
-            return actions.unflatten(-1, self.kind.shape).argmax(dim=-1) + self.start
-        return actions.to(th.int8)
+            actions = (actions.round() if self.whole else actions).clamp(self.low, self.high)
+            if self.dtype != th.float32:  # bounds may not be numbers of single precision
+                actions = actions.double().clamp(self.own_low, self.own_high).to(self.dtype)
+        elif isinstance(self.kind, Categorical):
+            actions = (actions.unflatten(-1, self.kind.shape).argmax(dim=-1) + self.start).to(self.dtype)
+        else:
+            actions = actions.to(self.dtype)
+        return actions if self.flat else actions.reshape(-1, *self.shape)
 
+    @single_precision()
     def predict(self, observation: np.ndarray) -> np.ndarray:
         """
         Choose the action for an observation.
 
-        :param observation: a flat observation, (obs_dim,), or a batch of them, (batch, obs_dim), flattened as by
-            Gymnasium's ``flatten``
-        :return: an action of the agent's action space, or a batch of flat ones, (batch, length of the action)
+        :param observation: an array, such as an image, or a flat observation, (obs_dim,), or a batch of flat ones,
+            (batch, obs_dim), flattened as by Gymnasium's ``flatten``
+        :return: an action of the agent's action space, or a batch of them, (batch, *shape of the space), but (batch, 1)
+            for ``Discrete``
         :raises ValueError: if the observation has another length or holds NaN or infinity
         """
         flatten = (
@@ -130,6 +161,8 @@ class AgentPolicy(nn.Module):
             raise ValueError(
                 f"The observation of {self.name} is not an array of numbers: {shown(observation)}. {flatten}"
             ) from None
+        if obs.numel() == self.obs_dim and obs.shape[-1:] != (self.obs_dim,):
+            obs = obs.flatten()
         if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
             raise ValueError(
                 f"An observation of {self.name} has shape ({self.obs_dim},), not {tuple(obs.shape)}. {flatten}"
@@ -140,12 +173,13 @@ class AgentPolicy(nn.Module):
             actions = self(obs.reshape(-1, self.obs_dim)).numpy()
         space = self.action_space
         if isinstance(space, spaces.Box):
-            actions = into_box(space, actions.reshape(-1, *space.shape)).reshape(actions.shape)
+            actions = into_box(space, actions)
         actions = actions.astype(space.dtype, copy=False)
         if obs.dim() == 2:
             return actions
         return actions[0, 0] if isinstance(space, spaces.Discrete) else actions[0].reshape(space.shape)
 
+    @single_precision()
     def export(self, path: str | os.PathLike[str]) -> None:
         """
         Export the policy as a program that runs without this package. The program maps float32 observations of shape
@@ -204,3 +238,15 @@ class AgentPolicy(nn.Module):
             logger.setLevel(level)
         assert program is not None
         return program.model_proto.SerializeToString()
+
+
+def _as_double(limits: np.ndarray, bound: str) -> np.ndarray:
+    """:return: the limits in double precision, not beyond those of large integers"""
+    double = limits.astype(np.float64)
+    if limits.dtype.kind not in "iu":
+        return double
+    beyond = [
+        int(one) > limit if bound == "high" else int(one) < limit
+        for one, limit in zip(double, limits.tolist(), strict=True)
+    ]
+    return np.where(beyond, np.nextafter(double, 0.0), double)

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg.team import InfoKey, Team, heads_of
-from sb3_maddpg.utils import all_finite, not_finite_at, shown
+from sb3_maddpg.utils import all_finite, integers_problem, not_finite_at, shown
 from sb3_maddpg.validation import PriorityArguments, ReplayBufferArguments, validated
 
 
@@ -30,6 +30,8 @@ class TeamReplayBufferSamples(NamedTuple):
     :param active: 1 if the agent acted, (batch, n_agents); ``None`` if every agent always has
     :param next_active: 1 if the agent is still active at the end of the window, (batch, n_agents); ``None`` if every
         agent always has been active
+    :param next_truncated: 1 if the agent was truncated at the end of the window although others go on, (batch,
+        n_agents); ``None`` if no agent was. Only its own critic counts its next action.
     :param pair_rewards: discounted sums of pair rewards, (batch, n_agents, n_pairs); ``None`` if they are not stored
     :param pair_goes_on: 1 if the next observation is about the same pair, (batch, n_agents, n_pairs); ``None`` if pairs
         never end before their agents
@@ -45,10 +47,14 @@ class TeamReplayBufferSamples(NamedTuple):
     discounts: th.Tensor | float
     active: th.Tensor | None = None
     next_active: th.Tensor | None = None
+    next_truncated: th.Tensor | None = None
     pair_rewards: th.Tensor | None = None
     pair_goes_on: th.Tensor | None = None
     indices: np.ndarray | None = None
     weights: th.Tensor | None = None
+
+
+_TRUNCATED = 2.0
 
 
 class _Columns(NamedTuple):
@@ -57,6 +63,7 @@ class _Columns(NamedTuple):
     agent_rewards: np.ndarray
     agent_terminated: np.ndarray
     agent_active: np.ndarray
+    """1 if the agent acted, `_TRUNCATED` if it acted and was truncated although others go on, else 0"""
     rewards: np.ndarray
     dones: np.ndarray
     timeouts: np.ndarray
@@ -67,7 +74,16 @@ class _Columns(NamedTuple):
 
 
 # Attributes that are not pickled, because they are views of the records or derived from them
-_VIEWS = {"observations", "next_observations", "actions", "numbers", *_Columns._fields, "_new", "_new_columns"}
+_VIEWS = {
+    "observations",
+    "next_observations",
+    "actions",
+    "numbers",
+    *_Columns._fields,
+    "_new",
+    "_new_columns",
+    "_truncated",
+}
 _REMEDY = "Look there for a division by zero or a diverging simulation; end the episode earlier, or clip the value."
 _REMEDY_ACTION = "Look for diverged networks (lower learning_rate) or a Box whose bounds are equal or too large."
 
@@ -78,6 +94,7 @@ class TeamReplayBuffer(ReplayBuffer):
 
     - ``agent_rewards``, (n_agents,): the agents' rewards, by default the team's reward for every agent;
     - ``agent_terminated``, (n_agents,): whether each agent terminated, by default none terminates before the team;
+    - ``agent_truncated``, (n_agents,): whether each agent was truncated although others go on, by default none was;
     - ``agent_active``, (n_agents,): whether each agent acted, by default all did;
     - ``pair_rewards``, (n_agents, n_pairs), required if ``n_pairs`` is set: the part of an agent's reward that belongs
       to each of its neighbours.
@@ -87,8 +104,8 @@ class TeamReplayBuffer(ReplayBuffer):
     newest transition, and when an agent is truncated (inactive without having terminated). It stops for all agents,
     because they share the next observation. When an agent terminates, only its own sum stops.
 
-    ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running standard deviation of the team's
-    return.
+    ``VecNormalize`` with ``norm_reward=True`` divides agents' rewards by the running standard deviation of the agents'
+    returns, see ``TeamVecNormalize``.
 
     ``add`` refuses NaN and infinity and leaves the buffer unchanged.
 
@@ -200,6 +217,7 @@ class TeamReplayBuffer(ReplayBuffer):
         self.pair_terminated = columns.pair_terminated
         # The numbers of the transition being added, which are stored only if they are finite
         self._new = np.zeros(self.numbers.shape[1:], np.float32)
+        self._truncated = np.zeros((self.n_envs, self.n_agents), np.float32)
         self._new_columns = self._columns(self._new)
 
     def _columns(self, numbers: np.ndarray) -> _Columns:
@@ -339,6 +357,10 @@ class TeamReplayBuffer(ReplayBuffer):
         self._read_infos("agent_rewards", new.agent_rewards, infos, new.rewards[:, None])
         self._read_infos("agent_terminated", new.agent_terminated, infos, 0.0)
         some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
+        if self._read_infos("agent_truncated", self._truncated, infos, 0.0) and self._truncated.any():
+            early = (self._truncated > 0) & (new.agent_active > 0) & (new.dones[:, None] == 0)
+            new.agent_active[early] = _TRUNCATED
+            self.all_active &= not early.any()
         if self.n_pairs:
             self._read_infos("pair_rewards", new.pair_rewards, infos, None)
         if self.pairs_end:
@@ -347,6 +369,10 @@ class TeamReplayBuffer(ReplayBuffer):
             self._refuse_numbers(infos)
 
         pos = self.pos
+        if self.optimize_memory_usage:
+            # This observation takes the place of the last next observation. Where another episode begins although the
+            # last one did not end, the last transition is treated as its end, like a time limit.
+            self.dones[pos - 1][(self.observations[pos] != obs).any(axis=(1, 2))] = 1
         self.observations[pos] = obs
         if self.optimize_memory_usage:
             self.observations[(pos + 1) % self.buffer_size] = next_obs
@@ -380,6 +406,8 @@ class TeamReplayBuffer(ReplayBuffer):
             )
         values = values.reshape(shape)
         if (index := not_finite_at(values)) is None:
+            if what != "action" and self.observations.dtype.kind in "iu":
+                self._check_integers(what, values)
             return
         env, *place = index
         agent, column = place if what != "action" else self._place_of_action(place[0])
@@ -387,6 +415,11 @@ class TeamReplayBuffer(ReplayBuffer):
             f"The {what} of agent {agent} ({self.team.names[agent]}) is {values[index]} in column {column}, "
             f"{self._where(env)}: it must be finite. {_REMEDY_ACTION if what == 'action' else _REMEDY}"
         )
+
+    def _check_integers(self, what: str, values: np.ndarray) -> None:
+        for env, rows in enumerate(values):
+            if (problem := integers_problem(rows, self.observations.dtype)) is not None:
+                raise ValueError(f"The {what} of agent {problem} {self._where(env)}. {_REMEDY}")
 
     def _place_of_action(self, column: int) -> tuple[int, int]:
         """:return: the agent that a column of the joint action belongs to, and the column in its own action"""
@@ -492,16 +525,37 @@ class TeamReplayBuffer(ReplayBuffer):
                 next_obs = self.observations[(batch_inds + 1) % self.buffer_size, env_inds]
             else:
                 next_obs = batch["next_observations"]
+        observations = batch["observations"]
+        if env is not None and env.norm_obs:
+            columns = self._columns(batch["numbers"])
+            observations = self._normalized(observations, env, columns.agent_active == 0)
+            if self.n_steps > 1:
+                columns = self._columns(self._read("numbers", last * self.n_envs + env_inds))
+            next_obs = self._normalized(next_obs, env, (columns.agent_active == 0) | (columns.agent_terminated > 0))
         rest: dict[str, Any] = {
             name: self.to_torch(value) if isinstance(value, np.ndarray) else value for name, value in data.items()
         }
         return TeamReplayBufferSamples(
-            observations=self.to_torch(self._normalize_obs(batch["observations"], env)),  # type: ignore[arg-type]
+            observations=self.to_torch(observations),
             actions=self.to_torch(batch["actions"]),
-            next_observations=self.to_torch(self._normalize_obs(next_obs, env)),  # type: ignore[arg-type]
-            active=None if self.all_active else self.to_torch(self._columns(batch["numbers"]).agent_active),
+            next_observations=self.to_torch(next_obs),
+            active=None
+            if self.all_active
+            else self.to_torch(np.minimum(self._columns(batch["numbers"]).agent_active, 1)),
             **rest,
         )
+
+    def _normalized(self, obs: np.ndarray, env: VecNormalize, gone: np.ndarray) -> np.ndarray:
+        """
+        :param obs: observations, (batch, n_agents, columns)
+        :param env: normalises observations
+        :param gone: which agents take no part, (batch, n_agents)
+        :return: the normalised observations, in which the zeros of those agents stay zeros
+        """
+        normalized = np.asarray(self._normalize_obs(obs, env))
+        own = self.team.obs_dim
+        normalized[..., :own][gone & ~obs[..., :own].any(axis=2)] = 0.0
+        return normalized
 
     def _read(self, name: str, index: np.ndarray) -> np.ndarray:
         """
@@ -529,9 +583,24 @@ class TeamReplayBuffer(ReplayBuffer):
             "dones": np.maximum(terminated, team_done[:, None]),
             "rewards": self._normalize_reward(columns.agent_rewards, env),
             "discounts": self.gamma,
-            "next_active": None if self.all_active else columns.agent_active * (1 - terminated),
+            **self._next_active(columns.agent_active, terminated),
             "pair_rewards": self._normalize_reward(columns.pair_rewards, env) if self.n_pairs else None,
             "pair_goes_on": 1 - columns.pair_terminated if self.pairs_end else None,
+        }
+
+    def _next_active(self, active: np.ndarray, terminated: np.ndarray) -> dict[str, np.ndarray | None]:
+        """
+        :param active: column ``agent_active`` of the last transitions of the windows, (batch, n_agents)
+        :param terminated: which agents terminated there, (batch, n_agents)
+        :return: the fields ``next_active`` and ``next_truncated`` of the samples
+        """
+        if self.all_active:
+            return {"next_active": None, "next_truncated": None}
+        truncated = active == _TRUNCATED
+        goes_on = (active > 0) & (terminated == 0)
+        return {
+            "next_active": goes_on.astype(np.float32),
+            "next_truncated": (truncated & goes_on).astype(np.float32) if truncated.any() else None,
         }
 
     def _windows(
@@ -579,7 +648,7 @@ class TeamReplayBuffer(ReplayBuffer):
             "dones": np.maximum(gone, team_done[:, None]),
             "rewards": total,
             "discounts": discounts,
-            "next_active": None if self.all_active else (active & ~terminated)[at_end].astype(np.float32),
+            **self._next_active(columns.agent_active[at_end], terminated[at_end]),
             "pair_rewards": pair_total if self.n_pairs else None,
             "pair_goes_on": same_pair.astype(np.float32) if self.pairs_end else None,
         }

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
-from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy, MLPActor, StackedCritic
+from sb3_maddpg.policies import Actor, Critic, FeaturesActor, FeaturesCritic, MADDPGPolicy, MLPActor, StackedCritic
 from sb3_maddpg.utils import shown
 
 
@@ -19,7 +20,7 @@ class ImageFeatures(nn.Module):
     """
     Features extractor of a team, which replaces each agent's image by its features. All agents share it.
 
-    :param space: space of an agent's image, channels first or last
+    :param space: space of an agent's image, channels first or last, or without an axis of channels
     :param extractor_class: features extractor of Stable-Baselines3, which reads images with channels first
     :param extractor_kwargs: keyword arguments to pass to the features extractor
     :param normalize: whether to divide images by 255
@@ -33,6 +34,7 @@ class ImageFeatures(nn.Module):
         normalize: bool,
     ):
         super().__init__()
+        space = _with_channels(space)
         self.shape = space.shape
         self.obs_dim = int(th.Size(space.shape).numel())
         self.channels_last = len(space.shape) == 3 and not is_image_space_channels_first(space)
@@ -54,55 +56,16 @@ class ImageFeatures(nn.Module):
         features = self.extractor(images).reshape(*obs.shape[:-1], -1)
         return th.cat([features, obs[..., self.obs_dim :]], dim=-1)
 
-
-class CnnActor(Actor):
-    """
-    Actors that read the features of their agents' images.
-
-    :param features: the features extractor
-    :param head: actors that read features
-    """
-
-    def __init__(self, features: ImageFeatures, head: MLPActor):
-        super().__init__(head.actions)
-        self.features = features
-        self.head = head
-
-    def logits(self, obs: th.Tensor) -> th.Tensor:
-        return self.head.logits(self.features(obs))
-
-    def single(self, agent: int) -> nn.Module:
-        return nn.Sequential(self.features, self.head.single(agent))
-
-    def clip_grad_norm_(self, max_norm: float) -> None:
-        nn.utils.clip_grad_norm_(self.features.parameters(), max_norm)
-        self.head.clip_grad_norm_(max_norm)
+    def single(self, agent: int) -> ImageFeatures:
+        """:return: this module, which all agents share"""
+        return self
 
 
-class CnnCritic(Critic):
-    """
-    Centralised critics that read the features of all agents' images, and all actions.
-
-    :param features: the features extractor
-    :param head: critics that read features
-    """
-
-    def __init__(self, features: ImageFeatures, head: StackedCritic):
-        super().__init__(head.factors, head.n_agents, n_critics=head.n_critics)
-        self.features = features
-        self.head = head
-
-    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        return self.head(self.features(obs), actions)
-
-    def forward_alternatives(
-        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
-    ) -> th.Tensor:
-        return self.head.forward_alternatives(self.features(obs), actions, own, factors)
-
-    def clip_grad_norm_(self, max_norm: float) -> None:
-        nn.utils.clip_grad_norm_(self.features.parameters(), max_norm)
-        self.head.clip_grad_norm_(max_norm)
+def _with_channels(space: spaces.Box) -> spaces.Box:
+    """:return: the space of images with an axis of channels, which comes first if there was none"""
+    if len(space.shape) != 2:
+        return space
+    return spaces.Box(space.low[np.newaxis], space.high[np.newaxis], dtype=space.dtype.type)
 
 
 class CnnPolicy(MADDPGPolicy):
@@ -111,8 +74,8 @@ class CnnPolicy(MADDPGPolicy):
     for the actors and another for the critics; the networks of ``MADDPGPolicy`` read the features.
 
     :param args: see ``MADDPGPolicy``
-    :param image_space: ``Box`` of an agent's image, (height, width, channels) or (channels, height, width); by default
-        MADDPG reads it from the environment
+    :param image_space: ``Box`` of an agent's image, (height, width, channels), (channels, height, width) or (height,
+        width); by default MADDPG reads it from the environment
     :param features_extractor_class: features extractor, see Stable-Baselines3
     :param features_extractor_kwargs: keyword arguments to pass to the features extractor, such as ``features_dim``
     :param kwargs: see ``MADDPGPolicy``; ``normalize_images`` says whether to divide images by 255
@@ -131,8 +94,8 @@ class CnnPolicy(MADDPGPolicy):
     ):
         if image_space is None:
             raise ValueError(
-                "CnnPolicy needs agents that observe images of the same size, or an `image_space` in policy_kwargs. "
-                "Use MlpPolicy for other observations."
+                "CnnPolicy needs agents that observe images of the same size, each a Box of two or three axes, or an "
+                "`image_space` in policy_kwargs. Use MlpPolicy for other observations."
             )
         if not isinstance(features_extractor_class, type) or not issubclass(
             features_extractor_class, BaseFeaturesExtractor
@@ -162,14 +125,14 @@ class CnnPolicy(MADDPGPolicy):
         self.team = team
         assert isinstance(actor, MLPActor)
         assert isinstance(critic, StackedCritic)
-        return CnnActor(of_actor, actor), CnnCritic(of_critic, critic)
+        return FeaturesActor(of_actor, actor), FeaturesCritic(of_critic, critic)
 
     def _make_features(self) -> ImageFeatures:
         if self._extractor_class is NatureCNN:
-            if not is_image_space(self.image_space, normalized_image=not self.normalize_images):
+            if not is_image_space(_with_channels(self.image_space), normalized_image=not self.normalize_images):
                 raise ValueError(
-                    f"image_space={self.image_space} is not an image for NatureCNN, which needs three axes and uint8 "
-                    "from 0 to 255. For images of floats, set normalize_images=False or write your own "
+                    f"image_space={self.image_space} is not an image for NatureCNN, which needs two or three axes and "
+                    "uint8 from 0 to 255. For images of floats, set normalize_images=False or write your own "
                     "features_extractor_class."
                 )
             self._extractor_kwargs.setdefault("normalized_image", not self.normalize_images)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import gymnasium
@@ -14,12 +13,14 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.callbacks import check_success
-from sb3_maddpg.parallel import TeamEnv, layers_of
+from sb3_maddpg.parallel import TeamEnv, explained_reset
 from sb3_maddpg.relational import NeighbourViews, check_layout
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
+from sb3_maddpg.vec_env import ArrivalCheck, check_wrappers
 
-_FLAGS = ("agent_terminated", "agent_active", "pair_terminated")
+_SCALARS = {"is_success", "metrics", "team_reward", "episode_step"}
+_FLAGS = ("agent_terminated", "agent_truncated", "agent_active", "pair_terminated")
 
 
 def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed: int = 0) -> Team:
@@ -38,11 +39,13 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
         env = TeamEnv(env)
     if not isinstance(env, gymnasium.Env):
         raise ValueError(f"{shown(env)} is neither a Gymnasium environment nor a PettingZoo ParallelEnv.")
+    check_wrappers(env)
     names = env.get_wrapper_attr("agent_names") if env.has_wrapper_attr("agent_names") else None
     team = Team.from_spaces(env.observation_space, env.action_space, names)
     space, legal = env.observation_space, _LegalActions(env, team)
     assert isinstance(space, spaces.Box)
-    _check_reset(legal, seed)
+    with explained_reset(env):
+        legal.reset(seed=seed)
     with th.random.fork_rng(devices=[]):  # legal actions are drawn by PyTorch
         th.manual_seed(seed)
         try:
@@ -82,32 +85,6 @@ class _LegalActions(gymnasium.Wrapper):
         returned = self.env.step(action)
         self.obs = returned[0] if isinstance(returned, tuple) and returned else None
         return returned
-
-
-def _check_reset(env: gymnasium.Env, seed: int) -> None:
-    try:
-        env.reset(seed=seed)
-    except TypeError as error:
-        for inner in layers_of(env) if "unexpected keyword argument" in str(error) else ():
-            if missing := [f"`{name}`" for name in ("seed", "options") if not _takes(inner.reset, name)]:
-                raise ValueError(
-                    f"reset() of {inner} takes no {' and no '.join(missing)}: declare it as "
-                    "`def reset(self, seed=None, options=None)`."
-                ) from error
-        raise
-
-
-def _takes(method: Any, name: str) -> bool:
-    """:return: whether a method takes a keyword argument, also if its signature is unknown"""
-    try:
-        parameters = inspect.signature(method).parameters
-    except (TypeError, ValueError):
-        return True
-    kinds = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return any(
-        one.kind is inspect.Parameter.VAR_KEYWORD or (one.name == name and one.kind in kinds)
-        for one in parameters.values()
-    )
 
 
 def _out_of_bounds(space: spaces.Box, obs: np.ndarray, team: Team) -> str:
@@ -156,15 +133,19 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         )
     env.action_space.seed(seed)
     gone = np.zeros(team.n_agents, bool)
+    arrivals, kept = ArrivalCheck(1), _Kept()
     for step in range(1, max_steps + 1):
         obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
         where = f"in step {step}"
+        kept.check("step()")
+        kept.keep(observation=obs, **{f"info[{name!r}]": value for name, value in info.items()})
         if (index := not_finite_at(np.asarray(obs))) is not None:
             raise ValueError(f"The observation of agent {team.names[index[0]]} {where} holds NaN or infinity.")
         _check_numbers_of_neighbours(env, np.asarray(obs), team, where)
         if not all_finite(np.asarray(reward, float)):
             raise ValueError(f"The team's reward {where} is {reward}: it must be finite, also in single precision.")
         _check_info(info, team, where)
+        arrivals.check(np.array([reward], np.float32), np.asarray(obs)[np.newaxis], np.zeros(1, bool), [info], True)
         acts = np.asarray(info.get("agent_active", ~gone), bool)
         if (acts & gone).any():
             name = team.names[np.flatnonzero(acts & gone)[0]]
@@ -175,7 +156,33 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         if terminated or truncated:
             if env.has_wrapper_attr("n_curriculum_levels") and "is_success" not in info:
                 raise ValueError('CurriculumCallback needs info["is_success"] in the last step of an episode.')
+            env.reset()
+            kept.check("reset()")
             return
+
+
+class _Kept:
+    """What the environment returned last, with copies. It must not change later: vectorised environments keep it."""
+
+    def __init__(self) -> None:
+        self._returned: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def keep(self, **values: Any) -> None:
+        """:param values: what was returned, by name"""
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        self._returned = {name: (array, array.copy()) for name, array in arrays.items()}
+
+    def check(self, call: str) -> None:
+        """
+        :param call: the call that may have changed what was kept
+        :raises ValueError: if it did
+        """
+        for name, (array, before) in self._returned.items():
+            if not np.array_equal(array, before, equal_nan=array.dtype.kind == "f"):
+                raise ValueError(
+                    f"{call} wrote into an array that step() had returned, {name}, which vectorised environments keep "
+                    "over the end of an episode: return a copy, for example `array.copy()`."
+                )
 
 
 def _check_numbers_of_neighbours(env: gymnasium.Env, obs: np.ndarray, team: Team, where: str) -> None:
@@ -194,7 +201,7 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
     for name in info.keys() - known:
         if name.lower().replace("_", "").rstrip("s") in {key.replace("_", "").rstrip("s") for key in known}:
             raise ValueError(f"info {where}: {suggest('entry', name, known)}")
-    for name in known & info.keys() - {"is_success", "metrics"}:
+    for name in known & info.keys() - _SCALARS:
         value = np.asarray(info[name])
         of_pairs = name in ("pair_rewards", "pair_terminated")
         shape = value.shape[:1] if of_pairs and value.ndim == 2 else value.shape
@@ -207,6 +214,9 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
             raise ValueError(f"info['{name}'] of agent {team.names[index[0]]} {where} is not finite.")
         if name in _FLAGS and not np.isin(value, (0, 1)).all():
             raise ValueError(f"info['{name}'] {where} is {value.tolist()}: it must hold True or False for each agent.")
+    for name in {"team_reward", "episode_step"} & info.keys():
+        if not _is_number(info[name]):
+            raise ValueError(f"info['{name}'] {where} is {shown(info[name])}: it must be a finite number.")
     metrics = info.get("metrics", {})
     if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
         raise ValueError(f"info['metrics'] {where} is {shown(metrics)}: it must be a flat dict of finite numbers.")

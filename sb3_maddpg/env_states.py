@@ -17,13 +17,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
+from sb3_maddpg.normalization import TeamVecNormalize
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import shown
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env import BorderEnv, GymnasiumVecEnv
 
 _BEFORE = ".before"
 
@@ -84,7 +85,7 @@ def vec_env_state(env: VecEnv) -> dict[str, Any]:
     :return: the environment's state, see ``load_vec_env_state``
     :raises NoStateError: if a part of the environment does not provide its state
     """
-    own = {"class": type(env).__name__, "values": plain_values(env), **_written(env)}
+    own = {"class": _class_name(env), "values": plain_values(env), **_written(env)}
     if isinstance(env, VecEnvWrapper):
         return {**own, "inner": vec_env_state(env.venv)}
     if isinstance(env, GymnasiumVecEnv):
@@ -125,6 +126,8 @@ def _told(env: Any) -> Any:
 
 
 def _env_state(env: gymnasium.Env) -> dict[str, Any]:
+    if isinstance(env, BorderEnv):  # has no state
+        return _env_state(env.env)
     own = {"class": type(env).__name__}
     if isinstance(env, Replayable):  # replaying does not restore all attributes of inner wrappers
         return {**own, "told": env.state_dict(), "layers": [_layer(one) for one in _layers(env.env)]}
@@ -138,6 +141,8 @@ def _env_state(env: gymnasium.Env) -> dict[str, Any]:
 
 
 def _load_env_state(env: gymnasium.Env, state: dict[str, Any]) -> None:
+    if isinstance(env, BorderEnv):
+        return _load_env_state(env.env, state)
     _take(env, state)
     if "inner" in state:
         _load_env_state(env.env, state["inner"])  # type: ignore[attr-defined]
@@ -158,9 +163,14 @@ def _layer(env: gymnasium.Env) -> dict[str, Any]:
     return {"class": type(env).__name__, "values": plain_values(env), **_written(env)}
 
 
+def _class_name(owner: Any) -> str:
+    """:return: the name under which states are written; a plain ``VecNormalize`` changes its class in training"""
+    return VecNormalize.__name__ if type(owner) is TeamVecNormalize else type(owner).__name__
+
+
 def _take(owner: Any, state: dict[str, Any]) -> None:
-    if state["class"] != type(owner).__name__:
-        raise ValueError(f"The state belongs to a {state['class']}, but this is a {type(owner).__name__}.")
+    if state["class"] != _class_name(owner):
+        raise ValueError(f"The state belongs to a {state['class']}, but this is a {_class_name(owner)}.")
     set_plain_values(owner, state.get("values", {}))
     if "written" in state and (writer := getattr(owner, "results_writer", None)) is not None:
         _write_again(Path(writer.file_handler.name), writer.file_handler, state["written"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,14 @@ import numpy as np
 import yaml
 
 from sb3_maddpg.maddpg import MADDPG, Lean
-from sb3_maddpg.utils import shown
+from sb3_maddpg.normalization import read_observation_statistics
+from sb3_maddpg.utils import arguments_of, shown
 
-_BESIDE = ("config.yml", "evaluations.npz")  # files of a run's folder that belong to its model
+_MOST_BYTES = 2**24  # of a file beside the model, also when it is read
+# Keys of a recipe that are no arguments of an algorithm
+_RECIPE = {"algo", "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps"}
+_RECIPE |= {"noise_std", "noise_type", "normalize", "policy", "vec_env_wrapper", "vec_env", "eval_env_kwargs"}
+_CURVES = {"timesteps", "results", "ep_lengths", "successes"}
 
 
 def write_model_folder(
@@ -29,15 +35,15 @@ def write_model_folder(
     :param repo_id: id of the repository, for the model card
     :param run: folder of the run that trained the model
     :param lean: see ``MADDPG.save``; None keeps everything that training needs to resume
-    :raises ValueError: if the model cannot be saved without pickle
+    :raises ValueError: if the model cannot be saved without pickle, or was trained with ``VecNormalize`` and its
+        statistics are not known
     """
+    recipe, curve, statistics = _recipe_of(model, run), _curves_of(run), _statistics_of(model, run)
     folder.mkdir(parents=True, exist_ok=True)
+    model.observation_statistics = statistics
     model.save(folder / "model.zip", lean=lean)
-    curve = None
-    for path in _beside(run):
+    for path in filter(None, (recipe, curve)):
         shutil.copy(path, folder / path.name)
-        if path.name == "evaluations.npz":
-            curve = path
     (folder / "README.md").write_text(model_card(model, repo_id, curve), encoding="utf-8")
 
 
@@ -77,13 +83,19 @@ def model_card(model: MADDPG, repo_id: str, evaluations: Path | None = None) -> 
         "```python",
         "from huggingface_hub import hf_hub_download",
         f"from sb3_maddpg import {algorithm}",
-        "",
-        f'model = {algorithm}.load(hf_hub_download("{repo_id}", "model.zip"))',
-        "```",
-        "",
-        "The file holds JSON and weights, and runs no code when it is loaded.",
-        "",
     ]
+    download = f'hf_hub_download("{repo_id}", "model.zip")'
+    if model.normalized_observations:
+        lines += [
+            "from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize",
+            "",
+            "# make_env creates the environment; the statistics of observations are in the file",
+            "env = VecNormalize(DummyVecEnv([make_env]), training=False, norm_reward=False)",
+            f"model = {algorithm}.load({download}, env=env)",
+        ]
+    else:
+        lines += ["", f"model = {algorithm}.load({download})"]
+    lines += ["```", "", "The file holds JSON and weights, and runs no code when it is loaded.", ""]
     if spec.get("kwargs"):
         # A model is useless without its environment's arguments
         lines += ["The environment's arguments:", "", "```yaml", yaml.safe_dump(_plain(spec["kwargs"])).rstrip(), "```"]
@@ -135,20 +147,74 @@ def publish(
     return f"https://huggingface.co/{repo_id}"
 
 
-def _beside(run: Path | None) -> list[Path]:
-    """:return: the files of a run's folder that belong to its model"""
+def _folders(run: Path | None) -> list[Path]:
+    """:return: a run's folder and those in it, where rl_zoo3 writes recipes and statistics, without links"""
     if run is None:
         return []
-    places = [
-        run,
-        *(path for path in run.iterdir() if path.is_dir()),
-    ]  # rl_zoo3 writes the recipe into a subfolder
-    return [path for name in _BESIDE for place in places if (path := place / name).is_file()]
+    return [run, *(path for path in sorted(run.iterdir()) if path.is_dir() and not path.is_symlink())]
+
+
+def _is_small_file(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink() and path.stat().st_size <= _MOST_BYTES
+
+
+def _recipe_of(model: MADDPG, run: Path | None) -> Path | None:
+    """:return: the recipe of a run: the only ``config.yml`` that holds arguments of the algorithm and nothing else"""
+    known = arguments_of(type(model)) | _RECIPE
+    found = []
+    for path in (folder / "config.yml" for folder in _folders(run)):
+        if _is_small_file(path):
+            with contextlib.suppress(OSError, ValueError, yaml.YAMLError, RecursionError):
+                content = yaml.safe_load(path.read_text(encoding="utf-8"))
+                if isinstance(content, list):  # rl_zoo3 writes pairs
+                    content = dict(content)
+                recipes = [content]
+                if isinstance(content, dict) and all(isinstance(part, dict) for part in content.values()):
+                    recipes = list(content.values())  # by environment
+                if recipes and all(isinstance(one, dict) and one and set(one) <= known for one in recipes):
+                    found.append(path)
+    return found[0] if len(found) == 1 else None
+
+
+def _curves_of(run: Path | None) -> Path | None:
+    """:return: the evaluations of a run, if they are arrays of a plausible size"""
+    path = None if run is None else run / "evaluations.npz"
+    if path is None or not _is_small_file(path):
+        return None
+    with contextlib.suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        names = {member.filename.removesuffix(".npy") for member in members}
+        if "results" in names <= _CURVES and sum(member.file_size for member in members) <= _MOST_BYTES:
+            return path
+    return None
+
+
+def _statistics_of(model: MADDPG, run: Path | None) -> dict[str, Any] | None:
+    """
+    :return: the statistics with which the model's observations were normalised, None if they were not
+    :raises ValueError: if they are not known
+    """
+    if not model.normalized_observations:
+        return None
+    present = model._present_statistics()
+    shape = model.observation_space.shape
+    assert shape is not None
+    for path in (folder / "vecnormalize.pkl" for folder in _folders(run)):
+        if present is None and _is_small_file(path):
+            present = read_observation_statistics(path, shape)
+    if present is None:
+        raise ValueError(
+            "The model was trained with VecNormalize(norm_obs=True), and neither its file nor a vecnormalize.pkl of "
+            "its run holds the statistics, without which it is useless: load it with "
+            "env=SafeVecNormalize.load(PATH, env) and pass it to sb3_maddpg.hub.publish."
+        )
+    return present._asdict()
 
 
 def _result(evaluations: Path) -> str | None:
-    with contextlib.suppress(OSError, ValueError, KeyError, IndexError), np.load(evaluations) as curves:
-        last = np.asarray(curves["results"], dtype=float)[-1]
+    with contextlib.suppress(OSError, ValueError, KeyError, IndexError, TypeError, zipfile.BadZipFile):
+        with np.load(evaluations) as curves:
+            last = np.asarray(curves["results"], dtype=float)[-1]
         return f"{last.mean():.2f} +/- {last.std():.2f}"
     return None
 

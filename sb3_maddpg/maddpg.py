@@ -24,10 +24,16 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TensorDict,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
     VecEnv,
     VecFrameStack,
     VecNormalize,
@@ -55,11 +61,12 @@ from sb3_maddpg.model_files import (
     read_data,
     trusted,
 )
-from sb3_maddpg.networks import polyak_update
+from sb3_maddpg.networks import polyak_update, single_precision
+from sb3_maddpg.normalization import ObservationStatistics, for_team
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
-from sb3_maddpg.team import ACTION_SPACES, Team, into_box
+from sb3_maddpg.team import ACTION_SPACES, MixedActions, Team, into_box, plain_joint_space
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import arguments_of, as_numbers, atomic_write, describe_env, shown, suggest
 from sb3_maddpg.validation import (
@@ -70,7 +77,7 @@ from sb3_maddpg.validation import (
     TrainingArguments,
     validated,
 )
-from sb3_maddpg.vec_env import check_single_envs
+from sb3_maddpg.vec_env import ArrivalCheck, check_vec_env
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
@@ -272,7 +279,9 @@ class MADDPG(OffPolicyAlgorithm):
         self.action_cost: float | np.ndarray | None = None
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
+        self._stopped = False
         self.normalized_observations = False  # whether VecNormalize normalises the observations of the networks
+        self.observation_statistics: dict[str, Any] | None = None  # of a loaded file, see ObservationStatistics
         self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
         self.algorithm = type(self).__name__
         self.file_format = FILE_FORMAT
@@ -329,6 +338,8 @@ class MADDPG(OffPolicyAlgorithm):
         self.env_spec, self.action_cost = describe_env(env), self._action_cost_of(env)
         self.policy_kwargs = dict(self.policy_kwargs)
         for name in self.policy_class.env_attributes:
+            if name == "image_columns" and _normalizer_of_observations(env) is not None:
+                continue  # as in SB3: normalised images are no bytes
             if name not in self.policy_kwargs and env.has_attr(name):
                 self.policy_kwargs[name] = env.get_attr(name, indices=0)[0]
         layout = self.policy_kwargs.get("observation_layout")
@@ -341,6 +352,17 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _check_normalization(self, env: GymEnv) -> None:
         layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
+        if self.normalized_observations and self.num_timesteps:
+            self._check_statistics(normalizer)
+        if (
+            normalizer is not None
+            and "image_space" in self.policy_kwargs
+            and self.policy_kwargs.get("normalize_images", True)
+        ):
+            raise ValueError(
+                "VecNormalize(norm_obs=True) normalises images, which CnnPolicy also divides by 255: set "
+                "norm_obs=False or policy_kwargs={'normalize_images': False}."
+            )
         if normalizer is not None and any(getattr(normalizer.observation_space, "masks", ())):
             raise ValueError(
                 "VecNormalize(norm_obs=True) shifts the action masks in the observations, which must be positive where "
@@ -352,6 +374,43 @@ class MADDPG(OffPolicyAlgorithm):
                 "all look present. Set norm_obs=False and scale observations in the environment; or, if every "
                 "neighbour is always present, set `complete: True` in the environment's observation_layout."
             )
+
+    def _check_statistics(self, normalizer: VecNormalize | None) -> None:
+        """
+        Check that an environment normalises observations as they were in training, and complete statistics that are
+        empty by those of the model's file.
+
+        :param normalizer: the environment's wrapper that normalises observations
+        :raises ValueError: if there is none, or it has no statistics and the file neither
+        """
+        remedy = (
+            "load the statistics of the training, SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env). If the "
+            "environment normalises by itself, load the model with normalized_observations=False."
+        )
+        stored = self._stored_statistics()
+        if normalizer is None:
+            if stored is not None:
+                remedy = f"wrap it in VecNormalize, which the statistics in the model's file then complete, or {remedy}"
+            raise ValueError(
+                "The model was trained with VecNormalize(norm_obs=True), but this environment does not normalise "
+                f"observations: {remedy}"
+            )
+        if ObservationStatistics.of(normalizer) is None:
+            if stored is None:
+                raise ValueError(
+                    "The model was trained with VecNormalize(norm_obs=True), but this environment's VecNormalize has "
+                    f"not seen any observation yet, and the model's file holds no statistics: {remedy}"
+                )
+            stored.fill(normalizer)
+
+    def _stored_statistics(self) -> ObservationStatistics | None:
+        return None if self.observation_statistics is None else ObservationStatistics(**self.observation_statistics)
+
+    def _present_statistics(self) -> ObservationStatistics | None:
+        """:return: how observations are normalised: by the environment, or else as the model's file says"""
+        normalizer = _normalizer_of_observations(self.env)
+        present = None if normalizer is None else ObservationStatistics.of(normalizer)
+        return self._stored_statistics() if present is None else present
 
     def _action_cost_of(self, env: VecEnv) -> Any:
         """:return: the environment's ``action_cost``, None if it is not used"""
@@ -545,6 +604,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
 
+    @single_precision()
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -597,6 +657,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         return self.actor_target.act(next_obs)
 
+    @single_precision()
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
@@ -666,10 +727,8 @@ class MADDPG(OffPolicyAlgorithm):
             next_actions = self._target_actions(next_obs)
             if replay_data.next_active is not None:
                 next_actions = next_actions * replay_data.next_active.unsqueeze(2)
-            # Compute the next Q-values: min over all target critics
-            next_q_values = self.critic_target(next_obs, next_actions).amin(dim=0)
+            next_q_values = self._next_q_values(next_obs, next_actions, replay_data.next_truncated, action_cost)
             if action_cost is not None:
-                next_q_values = next_q_values - critic.known_cost(next_actions, action_cost)
                 rewards = rewards + critic.known_cost(actions, action_cost)
             discounts = critic.per_value((1 - replay_data.dones) * replay_data.discounts)
             if pair_goes_on is not None:
@@ -687,6 +746,29 @@ class MADDPG(OffPolicyAlgorithm):
             self.replay_buffer.update_priorities(replay_data.indices, td_errors.sum(dim=1).sqrt().cpu().numpy())
         losses = _mean_over_batch(errors, active, replay_data.weights)
         return losses, critic.sum_by_agent(current_q_values[0].detach()).mean(dim=0)
+
+    def _next_q_values(
+        self, obs: th.Tensor, actions: th.Tensor, truncated: th.Tensor | None, action_cost: th.Tensor | None
+    ) -> th.Tensor:
+        """
+        :param obs: next observations, (batch, n_agents, obs_dim)
+        :param actions: next actions, (batch, n_agents, width)
+        :param truncated: see ``TeamReplayBufferSamples.next_truncated``
+        :param action_cost: cost of the actions, (n_agents, width), None if it is unknown
+        :return: next Q-values: min over all target critics, without the known cost, (batch, n_values)
+        """
+        if truncated is not None:
+            # The others go on without the agents that were truncated, which go on in their own targets
+            values = self._next_q_values(obs, actions * (1 - truncated.unsqueeze(2)), None, action_cost)
+            for agent in truncated.any(dim=0).nonzero().flatten().tolist():
+                rows, heads = truncated[:, agent].nonzero().flatten(), self.critic.heads_of(agent)
+                kept = 1 - truncated[rows]
+                kept[:, agent] = 1
+                own = self._next_q_values(obs[rows], actions[rows] * kept.unsqueeze(2), None, action_cost)
+                values[rows.unsqueeze(1), heads] = own[:, heads]
+            return values
+        values = self.critic_target(obs, actions).amin(dim=0)
+        return values if action_cost is None else values - self.critic.known_cost(actions, action_cost)
 
     def _actor_loss(
         self, replay_data: TeamReplayBufferSamples, obs: th.Tensor, actions: th.Tensor
@@ -751,19 +833,22 @@ class MADDPG(OffPolicyAlgorithm):
 
     def agent_policy(self, agent: str | int) -> AgentPolicy:
         """
-        Extract the policy of one agent, which acts without the rest of the team and without critics.
+        Extract the policy of one agent, which acts without the rest of the team and without critics. If the model was
+        trained with ``VecNormalize``, the policy normalises observations itself.
 
         :param agent: name or index of the agent
         :return: the agent's policy
-        :raises ValueError: if there is no such agent, or its parameters are not finite
+        :raises ValueError: if there is no such agent, its parameters are not finite, or the statistics of observations
+            are unknown
         """
-        if self.normalized_observations:
-            warnings.warn(
-                "The model was trained with VecNormalize(norm_obs=True), whose statistics are not part of the agent's "
-                "policy: normalise observations in the same way before passing them to it.",
-                stacklevel=2,
+        statistics = self._present_statistics() if self.normalized_observations else None
+        if self.normalized_observations and self.num_timesteps and statistics is None:
+            raise ValueError(
+                "The model was trained with VecNormalize(norm_obs=True), but neither its file nor an environment holds "
+                "the statistics: load it with env=SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env), or with "
+                "normalized_observations=False if you normalise observations yourself."
             )
-        return AgentPolicy.of(self.policy, agent)
+        return AgentPolicy.of(self.policy, agent, statistics)
 
     def set_threshold(self, threshold: float) -> None:
         """
@@ -839,18 +924,61 @@ class MADDPG(OffPolicyAlgorithm):
             missing = "the optimizers' state" if self.lean == "critic" else "critics and the optimizers' state"
             warnings.warn(f"This model was saved without {missing}, which are initialised afresh.", stacklevel=2)
             self.lean = None
-        super().learn(
-            total_timesteps=math.ceil(given["total_timesteps"]),
-            callback=given["callback"],
-            log_interval=given["log_interval"],
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        self._arrivals = ArrivalCheck(self.n_envs)
+        broken_off = True
+        try:
+            super().learn(
+                total_timesteps=math.ceil(given["total_timesteps"]),
+                callback=given["callback"],
+                log_interval=given["log_interval"],
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+            broken_off = self._stopped
+        finally:
+            # SB3 would take the environment, which has stepped or failed, for still being where the last transition
+            # ended. Without last observations, it begins new episodes.
+            if broken_off:
+                self._last_obs = None
         # Log the episodes since SB3's last log, which are all of them in a short training
         if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
         return self
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        rollout = super().collect_rollouts(*args, **kwargs)
+        self._stopped = not rollout.continue_training  # by a callback, after a step that is not stored
+        return rollout
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        normalizer = self._vec_normalize_env
+        if normalizer is None:
+            self._last_original_obs, original_obs = self._last_obs, new_obs
+        else:  # the replay buffer holds what is not normalised
+            original_obs, reward = normalizer.get_original_obs(), normalizer.get_original_reward()
+        assert isinstance(original_obs, np.ndarray)
+        reads_parts = self.use_action_cost or getattr(replay_buffer, "n_pairs", 0) > 0
+        self._arrivals.check(reward, original_obs, dones, infos, reads_parts)
+        next_obs = original_obs.copy()
+        for k in np.flatnonzero(dones):
+            info = infos[k]
+            # VecNormalize keeps the original besides the normalised one, which may have been clipped
+            last = info.get("original_terminal_observation", info.get("terminal_observation"))
+            if last is not None:
+                next_obs[k] = last
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
+        self._last_obs = new_obs
+        if normalizer is not None:
+            self._last_original_obs = original_obs
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         check_success(infos)
@@ -934,11 +1062,27 @@ class MADDPG(OffPolicyAlgorithm):
                     )
                 if name not in (known := {*data, *arguments_of(cls)}):
                     raise ValueError(suggest("argument of load", name, {one for one in known if one[0] != "_"}))
+            if (statistics := values.get("observation_statistics")) is not None:
+                shape = values["observation_space"].shape
+                values["observation_statistics"] = ObservationStatistics.checked(statistics, shape, str(path))._asdict()
+            space = None if env is None else env.action_space
+            # Files of earlier versions hold the agents' spaces without shape and data type
+            if isinstance(space, MixedActions) and plain_joint_space(space.agent_spaces) == values.get("action_space"):
+                values["action_space"] = space
+            if env is not None and env.has_attr("image_columns") and isinstance(values.get("policy_kwargs"), dict):
+                values["policy_kwargs"] = {"image_columns": None, **values["policy_kwargs"]}  # nor divided images
             if "policy_kwargs" in kwargs:
                 _check_same_policy(kwargs.pop("policy_kwargs"), values.get("policy_kwargs"), values.get("policy_class"))
             with _remedy_for_other_team(), NetworkLimit(path, trust):
                 model = super().load(path, env, device, values, print_system_info, force_reset, **kwargs)
             check_attributes(model, path)
+            if model.normalized_observations and env is None:
+                warnings.warn(
+                    f"{path} was trained with VecNormalize(norm_obs=True): predict() expects observations that are "
+                    "normalised in the same way, as by env=VecNormalize(..., training=False) passed to load. Policies "
+                    "of single agents (agent_policy) normalise observations themselves.",
+                    stacklevel=2,
+                )
         model.file_format = FILE_FORMAT
         return model
 
@@ -969,6 +1113,8 @@ class MADDPG(OffPolicyAlgorithm):
             )
         if problem := self._not_finite(self.get_parameters()):
             raise ValueError(f"This model cannot be saved: {problem}")
+        statistics = self._present_statistics() if self.normalized_observations else None
+        self.observation_statistics = None if statistics is None else statistics._asdict()
         write = super().save if pickle else functools.partial(self._save_without_pickle, lean=lean)
         if not isinstance(path, (str, os.PathLike)):
             return write(path, exclude, include)
@@ -1141,8 +1287,10 @@ class MADDPG(OffPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         # The last observations of many environments are larger than the networks, and loading starts new episodes
         last = ["_last_obs", "_last_original_obs"]
+        if self.observation_statistics is None:
+            last.append("observation_statistics")
         networks = ["actor", "critic", "actor_target", "critic_target"]
-        return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded"]
+        return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded", "_arrivals", "_stopped"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
@@ -1156,7 +1304,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     :param verbose: see SB3's ``BaseAlgorithm``
     :param monitor_wrapper: see SB3's ``BaseAlgorithm``
     :return: the vectorised environment
-    :raises ValueError: if the spaces do not describe a team, or see ``check_single_envs``
+    :raises ValueError: if the spaces do not describe a team, or see ``check_vec_env``
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
         raise ValueError(
@@ -1166,8 +1314,8 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-    if type(vec_env.unwrapped) is DummyVecEnv:  # subclasses may step other things than their envs
-        check_single_envs(vec_env.unwrapped.envs)
+    for_team(vec_env)
+    check_vec_env(vec_env)
     # SB3's own error would suggest policies that do not exist here
     Team.from_spaces(vec_env.observation_space, vec_env.action_space)
     return vec_env

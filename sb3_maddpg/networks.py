@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain, pairwise
 
 import torch as th
 from torch import nn
+
+
+@contextmanager
+def single_precision() -> Iterator[None]:
+    """Create tensors in single precision, whatever ``torch.set_default_dtype`` says. Also a decorator."""
+    default = th.get_default_dtype()
+    if default is th.float32:
+        yield
+        return
+    th.set_default_dtype(th.float32)
+    try:
+        yield
+    finally:
+        th.set_default_dtype(default)
 
 
 class StackedMLP(nn.Module):

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatten, flatten_space
+from gymnasium.spaces.utils import flatdim, flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
 from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
@@ -60,7 +63,9 @@ class TeamEnv(gymnasium.Env):
     wrapper: ``evaluate_policy(model, Monitor(TeamEnv(env)))``, and likewise ``EvalCallback``.
 
     If all agents observe images of the same size, the attribute ``image_space`` is the space of one image, which
-    ``CnnPolicy`` reads.
+    ``CnnPolicy`` reads. If an agent observes an image, also as a part of a ``Dict``, the attribute ``image_columns``
+    lists first and end of the images' columns for each agent and for the state, by which ``MlpPolicy`` divides images
+    by 255.
 
     Other attributes of the environment, such as ``observation_layout`` or a curriculum, are available through
     Gymnasium's ``get_wrapper_attr``, and thus through ``get_attr`` and ``env_method`` of SB3's vectorised environments.
@@ -73,8 +78,10 @@ class TeamEnv(gymnasium.Env):
     - ``agent_terminated``, ``agent_truncated``: whether the agent was terminated or truncated in this step
     - ``agent_active``: whether the agent acted in this step
     - ``agent_infos``: the environment's infos by agent name, left out if they are all empty
-    - ``metrics``: at the end of an episode, ``rollout/ep_rew_NAME`` of each agent that took part
-      (``rollout/ep_rew_agent_mean`` of an agent called "mean", since ``rollout/ep_rew_mean`` is the team's)
+    - ``metrics``: the means of the numbers in the agents' ``infos[agent]["metrics"]``, and at the end of an episode
+      ``rollout/ep_rew_NAME`` of each agent that took part (``rollout/ep_rew_agent_mean`` of an agent called "mean",
+      since ``rollout/ep_rew_mean`` is the team's) and, where agents end before others, ``rollout/ep_len_NAME``
+    - ``is_success``: at the end of an episode, whether all agents succeeded whose infos say so, each as it said last
 
     Rewards of agents that have already ended are ignored with a warning, as are action masks in infos without
     ``info_mask``.
@@ -116,23 +123,46 @@ class TeamEnv(gymnasium.Env):
         self.parallel_env = env
         self.metadata = {"render_modes": [], **_metadata_of(env)}
         self.render_mode = getattr(env, "render_mode", None)
-        self.agent_names = tuple(map(str, agents))
+        self.agent_names = _names_of(agents)
         self.observation_space = TeamObservation(
             {
-                str(agent): _flat_space(space, f"agent {agent!r} observes")
-                for agent, space in zip(agents, self._observation_spaces, strict=True)
+                name: _flat_space(space, f"agent {name!r} observes")
+                for name, space in zip(self.agent_names, self._observation_spaces, strict=True)
             },
             _state_space(env) if state else None,
-            {str(agent): _mask_columns(s) for agent, s in zip(agents, self._observation_spaces, strict=True)},
+            {name: _mask_columns(s) for name, s in zip(self.agent_names, self._observation_spaces, strict=True)},
         )
         self.action_space = joint_action_space(action_spaces)
         self._state_space: Any = env.state_space if state else None
+        image_columns = [*map(_image_columns, (*self._observation_spaces, self._state_space))]
+        if any(image_columns):
+            self.image_columns = image_columns
         self._metric_names = _names_of_returns(self.agent_names)
         self._lay_out(action_spaces)
         self._live: list[int] = []
         self._taking_part: list[int] = []
         self._returns = [0.0] * len(agents)
+        # Of agents that have ended in this episode, and whether they succeeded as far as they said
+        self._lengths: dict[int, int] = {}
+        self._successes: dict[Any, bool] = {}
+        self._unequal = False
         self._warned: set[str] = set()
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """
+        Set an attribute where ``get_wrapper_attr`` finds it.
+
+        :param name: name of the attribute
+        :param value: new value
+        :param force: whether to set it here if it does not exist
+        :return: whether it was set
+        """
+        layers = layers_of(self.parallel_env) if not hasattr(self, name) else ()
+        owner = next((one for one in layers if name in vars(one) or hasattr(type(one), name)), None)
+        if owner is None and not (force or hasattr(self, name)):
+            return False
+        setattr(self if owner is None else owner, name, value)
+        return True
 
     def has_wrapper_attr(self, name: str) -> bool:
         """:return: whether this wrapper or the PettingZoo environment has the attribute"""
@@ -141,6 +171,16 @@ class TeamEnv(gymnasium.Env):
     def get_wrapper_attr(self, name: str) -> Any:
         """:return: the attribute of this wrapper, or else of the PettingZoo environment"""
         return getattr(self if hasattr(self, name) else self.parallel_env, name)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all agents have ended, or no episode has begun."""
+        return not self._live
+
+    @property
+    def team_spaces(self) -> tuple[TeamObservation, Any]:
+        """The spaces of observation and joint action, also behind wrappers and in other processes."""
+        return self.observation_space, self.action_space
 
     def _lay_out(self, action_spaces: Sequence[Any]) -> None:
         ends = np.cumsum([len(heads_of(space)) for space in action_spaces]).tolist()
@@ -169,7 +209,9 @@ class TeamEnv(gymnasium.Env):
         seed = as_seed(seed)
         super().reset(seed=seed)
         self._live, self._steps = [], 0
-        observations, infos = self._parts("reset", self.parallel_env.reset(seed=seed, options=options))
+        with explained_reset(self.parallel_env):
+            returned = self.parallel_env.reset(seed=seed, options=options)
+        observations, infos = self._parts("reset", returned)
         present = self._present()
         if unknown := present - self._rows.keys():
             raise ValueError(self._unknown(unknown))
@@ -180,7 +222,11 @@ class TeamEnv(gymnasium.Env):
             )
         self._taking_part = self._live
         self._returns = [0.0] * len(self._agents)
-        return self._observe(self._with_masks(observations, infos), self._live), _agent_infos(infos)
+        self._lengths, self._successes = {}, {}
+        info = _agent_infos(infos)
+        if len(self._live) < len(self._agents):
+            info["agent_active"] = np.isin(np.arange(len(self._agents)), self._live)
+        return self._observe(self._with_masks(observations, infos), self._live), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
@@ -236,17 +282,57 @@ class TeamEnv(gymnasium.Env):
         info["agent_active"] = np.array(active)
         over = not live
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
+        self._read_agents_infos(infos, info)
+        self._lengths |= dict.fromkeys(set(acted).difference(live), self._steps)
         if over:
-            info["metrics"] = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
-            successes = [
-                self._flag(agent, "is_success", one["is_success"])
-                for agent, one in infos.items()
-                if one and one.get("is_success") is not None
-            ]
-            if successes:
-                info["is_success"] = all(successes)
-        reward = sum(rewards) / n_agents
+            self.end_info(info)
+        reward = info["team_reward"] = sum(rewards) / n_agents
+        info["episode_step"] = self._steps
         return self._observe(self._with_masks(observations, infos), seen), reward, over and not cut, cut, info
+
+    def _read_agents_infos(self, infos: Mapping[Any, Any], info: dict[str, Any]) -> None:
+        """Keep whether agents have succeeded so far, and add the means of their metrics to the team's info."""
+        metrics: dict[str, list[float]] = {}
+        for agent, one in infos.items():
+            if not one or agent not in self._rows:
+                continue
+            if one.get("is_success") is not None:
+                self._successes[agent] = self._flag(agent, "is_success", one["is_success"])
+            own = one.get("metrics") or {}
+            if not isinstance(own, Mapping):
+                raise ValueError(
+                    f"infos[{agent!r}]['metrics'] of {self.parallel_env} is {shown(own)} {self._when}: it must be a "
+                    "dict of numbers by name."
+                )
+            for name, value in own.items():
+                number = math.nan
+                with suppress(TypeError, ValueError, OverflowError):
+                    number = float(value)
+                if not math.isfinite(number):
+                    raise ValueError(
+                        f"infos[{agent!r}]['metrics'][{name!r}] of {self.parallel_env} is {shown(value)} {self._when}: "
+                        "a metric must be a finite number."
+                    )
+                metrics.setdefault(str(name), []).append(number)
+        if metrics:
+            info["metrics"] = {name: sum(values) / len(values) for name, values in metrics.items()}
+
+    def end_info(self, info: dict[str, Any]) -> None:
+        """
+        Complete the info of an episode's last step, also if a wrapper such as ``TimeLimit`` ends the episode.
+
+        :param info: the info, which gets ``metrics`` and, if agents report it, ``is_success``
+        """
+        returns = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
+        info["metrics"] = {**info.get("metrics", {}), **returns}
+        lengths = {row: self._lengths.get(row, self._steps) for row in self._taking_part}
+        # Lengths tell something only where agents end before others, and then in every episode
+        self._unequal = self._unequal or len(set(lengths.values())) > 1
+        if self._unequal:
+            names = {row: self._metric_names[row].replace("ep_rew_", "ep_len_", 1) for row in lengths}
+            info["metrics"] |= {names[row]: float(length) for row, length in lengths.items()}
+        if self._successes:
+            info["is_success"] = all(self._successes.values())
 
     def render(self) -> Any:
         """Render the environment."""
@@ -469,8 +555,8 @@ class TeamEnv(gymnasium.Env):
         for row in live:
             if (agent := self._agents[row]) not in left:
                 raise ValueError(
-                    f"Agent {agent!r} left {self.parallel_env} without termination or truncation: set one of them in "
-                    "the step that removes the agent from `agents`."
+                    f"Agent {agent!r} left {self.parallel_env} without termination or truncation{self._by_wrappers()}: "
+                    "set one of them in the step that removes the agent from `agents`."
                 )
         for agent in left - {self._agents[row] for row in acted}:
             # An environment may keep an agent in `agents` as long as it reports it as terminated or truncated
@@ -480,6 +566,11 @@ class TeamEnv(gymnasium.Env):
                     f"Agent {agent!r} {how} in the middle of an episode: only agents that {self.parallel_env} lists "
                     "after reset() may take part, until they are terminated or truncated."
                 )
+
+    def _by_wrappers(self) -> str:
+        """:return: the wrappers that may be to blame, for error messages"""
+        wrappers = [type(layer).__name__ for layer in layers_of(self.parallel_env)][:-1]
+        return f", or one of its wrappers ({', '.join(wrappers)}) took them away" if wrappers else ""
 
     def _unknown(self, agents: Iterable[Any]) -> str:
         names = ", ".join(sorted(map(repr, agents)))
@@ -687,6 +778,14 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
     return agents
 
 
+def _names_of(agents: Sequence[Any]) -> tuple[str, ...]:
+    """:return: the agents' names, their numbers if Python would name them by their addresses"""
+    plain = [type(agent).__str__ is object.__str__ and type(agent).__repr__ is object.__repr__ for agent in agents]
+    return tuple(
+        f"agent_{i}" if without else str(agent) for i, (agent, without) in enumerate(zip(agents, plain, strict=True))
+    )
+
+
 def _metadata_of(env: ParallelEnv | AECEnv) -> Mapping[str, Any]:
     metadata = getattr(env, "metadata", None) or {}
     if not isinstance(metadata, Mapping):
@@ -705,6 +804,39 @@ def layers_of(env: Any) -> Iterator[Any]:
         seen.append(env)
         attributes = getattr(env, "__dict__", {})  # unlike getattr, not those that a wrapper passes on
         env = next((attributes[name] for name in ("parallel_env", "env", "aec_env") if name in attributes), None)
+
+
+@contextmanager
+def explained_reset(env: Any) -> Iterator[None]:
+    """
+    Explain the error of an environment whose ``reset`` takes too few arguments.
+
+    :param env: an environment of Gymnasium or PettingZoo that is reset
+    :raises ValueError: instead of the TypeError
+    """
+    try:
+        yield
+    except TypeError as error:
+        for inner in layers_of(env) if "unexpected keyword argument" in str(error) else ():
+            if missing := [f"`{name}`" for name in ("seed", "options") if not _takes(inner.reset, name)]:
+                raise ValueError(
+                    f"reset() of {inner} takes no {' and no '.join(missing)}: declare it as "
+                    "`def reset(self, seed=None, options=None)`."
+                ) from error
+        raise
+
+
+def _takes(method: Any, name: str) -> bool:
+    """:return: whether a method takes a keyword argument, also if its signature is unknown"""
+    try:
+        parameters = inspect.signature(method).parameters
+    except (TypeError, ValueError):
+        return True
+    kinds = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return any(
+        one.kind is inspect.Parameter.VAR_KEYWORD or (one.name == name and one.kind in kinds)
+        for one in parameters.values()
+    )
 
 
 def _refuse_black_death(env: Any) -> None:
@@ -751,9 +883,20 @@ def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
 def _image_space(observations: Sequence[spaces.Space]) -> spaces.Box | None:
     """:return: the space of an agent's image, None if the agents' spaces differ or are not images"""
     first = observations[0]
-    if isinstance(first, spaces.Box) and len(first.shape) == 3 and all(space == first for space in observations):
+    if isinstance(first, spaces.Box) and len(first.shape) in (2, 3) and all(space == first for space in observations):
         return first
     return None
+
+
+def _image_columns(space: spaces.Space | None, first: int = 0) -> list[list[int]]:
+    """:return: first and end of the columns of a flat observation that hold each image, as SB3 defines images"""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parts, found = space.values() if isinstance(space, spaces.Dict) else space, []
+        for part in parts:
+            found += _image_columns(part, first)
+            first += flatdim(part)
+        return found
+    return [[first, first + flatdim(space)]] if space is not None and is_image_space(space) else []
 
 
 def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:
@@ -764,14 +907,21 @@ def _masked_space(observation: spaces.Space, action: Any) -> spaces.Dict:
 
 def _mask_columns(space: spaces.Space) -> list[int]:
     """:return: the columns of a flat observation that hold the action mask, PettingZoo's dict entry of that name"""
-    if not isinstance(space, spaces.Dict) or MASK not in space.spaces:
-        return []
-    begin = 0
-    for name, part in space.spaces.items():
-        if name == MASK:
-            return list(range(begin, begin + spaces.flatdim(part)))
-        begin += spaces.flatdim(part)
-    raise AssertionError
+    found = list(_masks_in(space))
+    if len(found) > 1:
+        raise ValueError(f"The observation space {space} holds {len(found)} parts called {MASK!r}: rename all but one.")
+    return found[0] if found else []
+
+
+def _masks_in(space: spaces.Space, begin: int = 0) -> Iterator[list[int]]:
+    """:return: the columns of each action mask, at any depth"""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        for name, part in space.items() if isinstance(space, spaces.Dict) else enumerate(space):
+            if name == MASK:
+                yield list(range(begin, begin + flatdim(part)))
+            else:
+                yield from _masks_in(part, begin)
+            begin += flatdim(part)
 
 
 def _state_space(env: Any) -> spaces.Box:
@@ -855,7 +1005,9 @@ def find_module(name: str) -> ModuleType | None:
     except ImportError as error:
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             return None
-        raise ValueError(f"{name} cannot be imported: {error}. Install its dependencies.") from error
+        told = str(error).rstrip(".")
+        remedy = "" if "install" in told.lower() else ". Install what it needs"
+        raise ValueError(f"{name} cannot be imported: {told}{remedy}.") from error
 
 
 def find_parallel_env(entry: str) -> Callable[..., ParallelEnv | AECEnv]:

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_maddpg.actions import TeamActions
-from sb3_maddpg.networks import StackedMLP
+from sb3_maddpg.networks import StackedMLP, single_precision
 from sb3_maddpg.team import MixedActions, Team, into_box
 from sb3_maddpg.utils import all_finite, as_numbers, shown
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
@@ -246,6 +246,13 @@ class Critic(nn.Module):
         """
         return self.agent_of_value[values]
 
+    def heads_of(self, agent: int) -> th.Tensor:
+        """
+        :param agent: index of an agent
+        :return: indices of the value heads that predict this agent's rewards alone, (n,)
+        """
+        return (self.agent_of_value == agent).nonzero().flatten()
+
     def cost_of_factors(self, action_cost: th.Tensor) -> th.Tensor:
         """
         :param action_cost: costs of the agents' actions, (n_agents, width)
@@ -277,6 +284,122 @@ class Critic(nn.Module):
             return cost
         values_per_agent = len(self.agent_of_value) // self.n_agents
         return self.per_value(self.sum_by_agent(cost)) / values_per_agent
+
+
+class FeaturesActor(Actor):
+    """
+    Actors that read features of their agents' observations.
+
+    :param features: features extractor of a team, with a method ``single`` for one agent's
+    :param head: actors that read features
+    """
+
+    def __init__(self, features: nn.Module, head: MLPActor):
+        super().__init__(head.actions)
+        self.features = features
+        self.head = head
+
+    def logits(self, obs: th.Tensor) -> th.Tensor:
+        return self.head.logits(self.features(obs))
+
+    def single(self, agent: int) -> nn.Module:
+        return nn.Sequential(self.features.single(agent), self.head.single(agent))  # type: ignore[operator]
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        if parameters := [*self.features.parameters()]:
+            nn.utils.clip_grad_norm_(parameters, max_norm)
+        self.head.clip_grad_norm_(max_norm)
+
+
+class FeaturesCritic(Critic):
+    """
+    Centralised critics that read the features of all agents' observations, and all actions.
+
+    :param features: see ``FeaturesActor``
+    :param head: critics that read features
+    """
+
+    def __init__(self, features: nn.Module, head: StackedCritic):
+        super().__init__(head.factors, head.n_agents, n_critics=head.n_critics)
+        self.features = features
+        self.head = head
+
+        self.agent_of_value = head.agent_of_value
+        # Whose values the heads are
+        for name in ("rewards", "per_value", "owners", "heads_of", "cost_of_factors", "sum_by_agent", "known_cost"):
+            setattr(self, name, getattr(head, name))
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return self.head(self.features(obs), actions)
+
+    def forward_alternatives(
+        self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None
+    ) -> th.Tensor:
+        return self.head.forward_alternatives(self.features(obs), actions, own, factors)
+
+    def clip_grad_norm_(self, max_norm: float) -> None:
+        if parameters := [*self.features.parameters()]:
+            nn.utils.clip_grad_norm_(parameters, max_norm)
+        self.head.clip_grad_norm_(max_norm)
+
+
+class ImageScale(nn.Module):
+    """
+    Division of the images in the observations by 255, as SB3 preprocesses them.
+
+    :param factors: factor of each column, (n_agents, columns)
+    """
+
+    factors: th.Tensor
+
+    def __init__(self, factors: th.Tensor):
+        super().__init__()
+        self.register_buffer("factors", factors, persistent=False)  # follows from the policy's arguments
+
+    @classmethod
+    def of(cls, columns: Sequence[Sequence[Sequence[int]]], team: Team) -> ImageScale:
+        """
+        :param columns: see ``MADDPGPolicy``
+        :param team: the team
+        :return: the module
+        :raises ValueError: if columns do not exist
+        """
+        own = th.ones(team.n_agents, team.obs_dim)
+        state = th.ones(team.n_agents * -(-team.state_dim // team.n_agents))
+        lengths = [*team.obs_dims, team.state_dim]
+        if len(columns) != len(lengths):
+            raise ValueError(
+                f"image_columns={shown(columns)} must hold lists for the {team.n_agents} agents and for the state."
+            )
+        for row, images, length in zip([*own, state], columns, lengths, strict=True):
+            for first, end in images:
+                if not 0 <= first < end <= length:
+                    raise ValueError(f"image_columns={shown(columns)}: an observation has columns 0 to {length - 1}.")
+                row[first:end] = 1 / 255
+        return cls(th.cat([own, state.view(team.n_agents, -1)], dim=1))
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: observations, (..., n_agents, columns)
+        :return: the observations with scaled images
+        """
+        return obs * self.factors[:, : obs.shape[-1]]
+
+    def single(self, agent: int) -> nn.Module:
+        """
+        :param agent: index of the agent
+        :return: the module for the agent's own observations without padding
+        """
+        return _OwnScale(self.factors[agent])
+
+
+class _OwnScale(nn.Module):
+    def __init__(self, factors: th.Tensor):
+        super().__init__()
+        self.register_buffer("factors", factors.clone())
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return obs * self.factors[: obs.shape[-1]]  # type: ignore[index]
 
 
 class StackedCritic(Critic):
@@ -466,6 +589,9 @@ class TeamCritic(StackedCritic):
     def owners(self, values: th.Tensor) -> th.Tensor:
         return th.arange(self.n_agents)
 
+    def heads_of(self, agent: int) -> th.Tensor:
+        return th.empty(0, dtype=th.long, device=self.agent_of_value.device)
+
     def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
         return values.expand(*values.shape[:-1], self.n_agents)
 
@@ -529,13 +655,15 @@ class MADDPGPolicy(BasePolicy):
         are delta
     :param n_critics: number of critics per agent
     :param agent_names: names of the agents, by default those of the observation space, or agent_0, agent_1, ...
-    :param normalize_images: ignored, exists for compatibility with Stable-Baselines3
+    :param image_columns: for each agent and for the state, first and end of the columns that hold an image of bytes
+        (uint8 from 0 to 255, three axes); by default MADDPG reads them from the environment
+    :param normalize_images: whether to divide such images by 255
     :param optimizer_class: the optimizer, ``th.optim.Adam`` by default, which runs fused
     :param optimizer_kwargs: additional keyword arguments, excluding the learning rate, to pass to the optimizer
     """
 
     # Attributes of the environment that are arguments of the policy, see MADDPG
-    env_attributes: ClassVar[tuple[str, ...]] = ("agent_names",)
+    env_attributes: ClassVar[tuple[str, ...]] = ("agent_names", "image_columns")
     actor: Actor
     actor_target: Actor
     critic: Critic
@@ -557,6 +685,7 @@ class MADDPGPolicy(BasePolicy):
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
+        image_columns: Sequence[Sequence[Sequence[int]]] | None = None,
     ):
         arguments = validated(
             PolicyArguments,
@@ -569,6 +698,7 @@ class MADDPGPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             agent_names=agent_names,
             normalize_images=normalize_images,
+            image_columns=image_columns,
         )
         optimizer_kwargs = dict(optimizer_kwargs or {})
         if optimizer_class is th.optim.Adam:
@@ -589,10 +719,17 @@ class MADDPGPolicy(BasePolicy):
         self.threshold = arguments["threshold"]
         self.random_thresholds = arguments["random_thresholds"]
         self.n_critics = arguments["n_critics"]
+        self.image_columns = arguments["image_columns"]
         self._build(lr_schedule)
 
+    @single_precision()
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor, self.critic = self._make_networks(*get_actor_critic_arch(self.net_arch))
+        if self.image_columns is not None and self.normalize_images:
+            assert isinstance(self.actor, MLPActor)
+            assert isinstance(self.critic, StackedCritic)
+            scales = (ImageScale.of(self.image_columns, self.team) for _ in range(2))
+            self.actor, self.critic = FeaturesActor(next(scales), self.actor), FeaturesCritic(next(scales), self.critic)
         self.actions = self.actor.actions
         self.actor_target = deepcopy(self.actor)
         self.critic_target = deepcopy(self.critic)
@@ -638,6 +775,7 @@ class MADDPGPolicy(BasePolicy):
             "random_thresholds": self.random_thresholds,
             "n_critics": self.n_critics,
             "agent_names": self.team.names,
+            **({} if self.image_columns is None else {"image_columns": self.image_columns}),
             "optimizer_class": self.optimizer_class,
             "optimizer_kwargs": self.optimizer_kwargs,
         }
@@ -674,6 +812,12 @@ class MADDPGPolicy(BasePolicy):
             actions.set_threshold(threshold)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        alone = "For one agent alone: model.agent_policy(NAME).predict(its observation)."
+        if isinstance(observation, Mapping):
+            raise ValueError(
+                f"observation={shown(observation)} is a dict, but a team observes an array of shape "
+                f"{self.observation_space.shape}, as sb3_maddpg.TeamEnv(env) returns it. {alone}"
+            )
         try:
             numbers = as_numbers(observation)
         except ValueError:
@@ -681,6 +825,11 @@ class MADDPGPolicy(BasePolicy):
                 f"observation={shown(observation)} is not an array of numbers of shape {self.observation_space.shape} "
                 "or a batch of them."
             ) from None
+        if numbers.shape[-2:] != self.observation_space.shape or numbers.ndim > 3:
+            raise ValueError(
+                f"The observation has shape {numbers.shape}, but a team observes {self.observation_space.shape}, or a "
+                f"batch of it. {alone}"
+            )
         self.check_finite(numbers)
         return super().obs_to_tensor(numbers)
 
@@ -710,6 +859,7 @@ class MADDPGPolicy(BasePolicy):
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
 
+    @single_precision()
     def flat_actions(self, obs: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """
         Choose actions in the format of the replay buffer.

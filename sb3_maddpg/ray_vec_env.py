@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from sb3_maddpg.env_states import NoStateError, Replayable, load_vec_env_state, tells_state, vec_env_state
 from sb3_maddpg.ray_cluster import connect
+from sb3_maddpg.vec_env import BorderEnv
 
 Call = tuple[str, tuple[Any, ...]]
 
@@ -195,7 +196,7 @@ class _Shard:
     def __init__(self, make: Callable[[], VecEnv], snapshot: dict[str, Any] | None, done: Sequence[Call]):
         self.env = make()
         if isinstance(self.env, DummyVecEnv):
-            self.env.envs = [one if tells_state(one) else Replayable(one) for one in self.env.envs]
+            self.env.envs = [BorderEnv(one if tells_state(one) else Replayable(one)) for one in self.env.envs]
         if snapshot is not None:
             load_vec_env_state(self.env, deepcopy(snapshot))  # Ray's arrays are read-only
         for call in done:
@@ -212,7 +213,7 @@ class _Shard:
         return self.env.reset(), self.env.reset_infos
 
     def _step(self, actions: np.ndarray) -> tuple[Any, ...]:
-        observations, rewards, dones, infos = self.env.step(actions)
+        observations, rewards, dones, infos = self.env.step(np.array(actions))  # Ray's arrays are read-only
         return np.array(observations), np.array(rewards), np.array(dones), infos, self.env.reset_infos
 
     def _state(self) -> dict[str, Any]:

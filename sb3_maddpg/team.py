@@ -31,6 +31,9 @@ class TeamInfo(TypedDict, total=False):
     agent_terminated: np.ndarray
     """Whether each agent terminated in this step, (n_agents,) bool. Truncation does not count. By default, no agent
     terminates before the team."""
+    agent_truncated: np.ndarray
+    """Whether each agent was truncated in this step, (n_agents,) bool, although others go on. It bootstraps from its
+    last observation, while the others go on without it. By default, no agent is truncated before the team."""
     agent_active: np.ndarray
     """Whether each agent acted in this step, (n_agents,) bool. By default, all agents acted."""
     pair_rewards: np.ndarray
@@ -43,9 +46,16 @@ class TeamInfo(TypedDict, total=False):
     """Whether the episode succeeded, in its last step. Used by ``rollout/success_rate`` and ``CurriculumCallback``."""
     metrics: dict[str, float]
     """Numbers whose means are logged under their keys."""
+    team_reward: float
+    """The reward that ``step`` returns, from which the algorithm sees that a wrapper changed it. Required if there are
+    ``agent_rewards`` and the team's reward is neither their mean nor their sum."""
+    episode_step: int
+    """Number of the step in its episode, from 1, from which the algorithm sees that a wrapper skipped steps."""
 
 
-InfoKey = Literal["agent_rewards", "agent_terminated", "agent_active", "pair_rewards", "pair_terminated"]
+InfoKey = Literal[
+    "agent_rewards", "agent_terminated", "agent_truncated", "agent_active", "pair_rewards", "pair_terminated"
+]
 
 
 class TeamEnvironment(Protocol):
@@ -233,10 +243,24 @@ def into_box(space: spaces.Box, actions: np.ndarray) -> np.ndarray:
 def joint_action_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
     """
     Return the joint action space of a team, flat, agent after agent: ``MultiBinary``, ``Box`` or ``MultiDiscrete`` if
-    all agents have such a space of the same length, else ``MixedActions``. Categories count from 0.
+    all agents have such a space of the same length, else ``MixedActions``. Categories count from 0. ``MultiBinary`` and
+    ``Box`` would lose shapes and data types of the agents' spaces, if they are not flat and float32.
 
     :param agent_spaces: each agent's action space
     :return: the joint action space
+    """
+    is_plain = all(
+        isinstance(space, (spaces.Discrete, spaces.MultiDiscrete))
+        or (len(space.shape) == 1 and space.dtype in (np.float32, np.int8))
+        for space in agent_spaces
+    )
+    return plain_joint_space(agent_spaces) if is_plain else MixedActions(agent_spaces)
+
+
+def plain_joint_space(agent_spaces: Sequence[AgentActionSpace]) -> spaces.Space:
+    """
+    :param agent_spaces: each agent's action space
+    :return: the joint action space, in which agents that act alike lose shape and data type of their own spaces
     """
     kinds = {type(space) for space in agent_spaces}
     sizes = [heads_of(space) for space in agent_spaces]
@@ -283,14 +307,15 @@ class Team:
         :return: the agent's index
         :raises ValueError: if there is no such agent
         """
-        if isinstance(agent, str) and agent in self.names:
-            return self.names.index(agent)
+        if not isinstance(agent, bool) and str(agent) in self.names:  # also an environment's own ids, such as (0, 1)
+            return self.names.index(str(agent))
         named_by_integers = all(_INTEGER.fullmatch(name) for name in self.names)
         numbers = list(map(int, self.names)) if named_by_integers else range(self.n_agents)
         if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and agent in numbers:
             return numbers.index(agent)
         positions = "" if named_by_integers else f", or 0 to {self.n_agents - 1}"
-        raise ValueError(f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}{positions}.")
+        names = ", ".join(self.names if named_by_integers else map(repr, self.names))
+        raise ValueError(f"There is no agent {shown(agent)}: the agents are {names}{positions}.")
 
     def homogeneous(self, agent: int, other: int) -> bool:
         """
@@ -323,8 +348,9 @@ class Team:
             )
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 2:
             raise ValueError(
-                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. "
-                "Stack the agents' observations along a first axis; pad them if they differ in length."
+                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. Pass a PettingZoo "
+                "environment itself, without vectorising it, or stack the agents' observations along a first axis. For "
+                "a single agent, use an algorithm of Stable-Baselines3, such as TD3 or DQN."
             )
         if not all(observation_space.shape):
             raise ValueError(
@@ -422,5 +448,10 @@ def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActi
         return tuple(spaces.MultiBinary(k) for _ in range(n_agents))
     if isinstance(action_space, spaces.MultiDiscrete):
         return tuple(spaces.MultiDiscrete(nvec) for nvec in action_space.nvec.reshape(n_agents, k))
-    lows, highs = (bound.reshape(n_agents, k) for bound in _bounds(action_space))
-    return tuple(spaces.Box(low, high, dtype=np.float32) for low, high in zip(lows, highs, strict=True))
+    assert isinstance(action_space, spaces.Box)
+    # The networks' single precision serves for all but integers and half precision
+    in_float = action_space.dtype in (np.float32, np.float64)
+    dtype = np.float32 if in_float else action_space.dtype.type
+    bounds = _bounds(action_space) if in_float else (action_space.low, action_space.high)
+    lows, highs = (bound.reshape(n_agents, k) for bound in bounds)
+    return tuple(spaces.Box(low, high, dtype=dtype) for low, high in zip(lows, highs, strict=True))

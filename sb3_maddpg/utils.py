@@ -203,6 +203,24 @@ def not_finite_at(values: np.ndarray) -> tuple[int, ...] | None:
         return tuple(np.argwhere(~np.isfinite(values.astype(np.float32)))[0].tolist())
 
 
+def integers_problem(values: np.ndarray, dtype: np.dtype) -> str | None:
+    """
+    Describe the first value that would change if the array were cast to integers.
+
+    :param values: an array of at least one axis
+    :param dtype: the type of integers
+    :return: index and value, None if all values stay what they are
+    """
+    if values.dtype == dtype or values.dtype.kind not in "biuf":
+        return None
+    limits = np.iinfo(dtype)
+    fits = (values >= limits.min) & (values <= limits.max) & (values == np.rint(values))
+    if fits.all():
+        return None
+    index = tuple(np.argwhere(~fits)[0].tolist())
+    return f"{index[0]} is {values[index]} in column {', '.join(map(str, index[1:]))}, no integer of {dtype},"
+
+
 def as_numbers(values: Any) -> np.ndarray:
     """
     Convert numbers to an array.

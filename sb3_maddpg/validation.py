@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch as th
+from annotated_types import Len
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, InstanceOf, ValidationError, field_validator
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
@@ -180,6 +181,9 @@ class PolicyArguments(ThresholdArgument):
     optimizer_kwargs: dict[str, Any] | None = Field(description="a dict of the optimizer's arguments, or None")
     agent_names: list[str] | tuple[str, ...] | None = Field(description="a list of names, one per agent, or None")
     normalize_images: bool = Field(description="True or False")
+    image_columns: Sequence[Sequence[Annotated[Sequence[NaturalOrZero], Len(2, 2)]]] | None = Field(
+        description="for each agent and for the state, a list of first and end of the columns of an image, or None"
+    )
 
     @field_validator("activation_fn")
     @classmethod

@@ -1,17 +1,29 @@
 """Vectorised environments: an adapter from Gymnasium's, and checks of environments that are stepped together."""
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from gymnasium import Env, RewardWrapper, Wrapper
+from gymnasium import Env, RewardWrapper, Wrapper, spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import NormalizeReward
+from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_maddpg.parallel import TeamEnv, layers_of
-from sb3_maddpg.utils import as_seed, not_finite_at, shown
+from sb3_maddpg.parallel import TeamEnv, explained_reset, layers_of
+from sb3_maddpg.team import MixedActions, TeamObservation
+from sb3_maddpg.utils import as_seed, integers_problem, not_finite_at, shown
+
+_REWARD_WRAPPERS = (RewardWrapper, NormalizeReward)
+_SAME_ENDS = 3  # episodes, after which it is no coincidence that one ends where the next begins
+_REMEDY = (
+    "Wrap the PettingZoo environment instead (pettingzoo.utils.BaseParallelWrapper, SuperSuit) and put TeamEnv around "
+    "it, or change step() of a Gymnasium environment of your own."
+)
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -49,7 +61,7 @@ class GymnasiumVecEnv(VecEnv):
         self.reset_infos = unbatch(infos, self.num_envs)
         self._reset_seeds()
         self._begun = True
-        return observations
+        return _own(observations)
 
     def step_async(self, actions: np.ndarray) -> None:
         """
@@ -86,7 +98,7 @@ class GymnasiumVecEnv(VecEnv):
             rows[k] = {**rows[k].get("final_info", {}), "terminal_observation": rows[k]["final_obs"]}
         for row, timeout in zip(rows, (truncations & ~terminations).tolist(), strict=True):
             row["TimeLimit.truncated"] = timeout
-        return observations, rewards.astype(np.float32), dones, rows
+        return _own(observations), rewards.astype(np.float32), dones, rows
 
     def close(self) -> None:
         self.envs.close()
@@ -148,6 +160,139 @@ def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
     return rows
 
 
+# References to an array that only its caller knows: the caller's, the argument of `_own`, and that of getrefcount
+_REFERENCES = 3
+
+
+def _own(observations: np.ndarray) -> np.ndarray:
+    """:return: the observations in an array that the environments cannot overwrite: a copy if they still know it"""
+    if observations.base is None and sys.getrefcount(observations) <= _REFERENCES:
+        return observations
+    return observations.copy()
+
+
+class BorderEnv(Wrapper):
+    """
+    Outermost wrapper of an environment that SB3's vectorised environments step. It hands on what they would spoil:
+    observations of integers are checked before they are cast, and what came with the end of an episode is copied before
+    the environment is reset, which may write into the same arrays.
+
+    :param env: a team environment
+    :raises ValueError: in ``reset`` and ``step``, if an observation does not fit an observation space of integers
+    """
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        with explained_reset(self.env):  # not every environment has options
+            observation, info = self.env.reset(seed=seed, **({} if options is None else {"options": options}))
+        self._check(observation, "after reset()")
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._check(observation, "after step()")
+        team_env = self.env.unwrapped
+        if truncated and isinstance(team_env, TeamEnv) and not team_env.is_over:
+            info = dict(info)
+            team_env.end_info(info)
+        if terminated or truncated:
+            observation, info = np.array(observation), deepcopy(info)
+        else:  # environments that are stepped one after the other may share arrays, too
+            info = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in info.items()}
+        return observation, reward, terminated, truncated, info
+
+    def _check(self, observation: Any, when: str) -> None:
+        space = self.env.observation_space
+        if space.dtype is not None and space.dtype.kind in "iu":
+            problem = integers_problem(np.asarray(observation), space.dtype)
+            if problem is not None:
+                raise ValueError(f"The observation of agent {problem} {when} of {self.env}, whose space is {space}.")
+
+
+def check_vec_env(vec_env: VecEnv) -> None:
+    """
+    Check what wrappers do to a team, in whichever process they do it, and let ``BorderEnv`` watch the environments of a
+    ``DummyVecEnv``.
+
+    :param vec_env: a vectorised team environment
+    :raises ValueError: if wrappers change the spaces or only the team's reward, see ``check_single_envs``
+    """
+    inner = vec_env.unwrapped
+    if not isinstance(inner, VecEnv):
+        return  # SuperSuit's wrapper has environments of another kind, whose spaces are refused
+    # Subclasses may step other things than their envs
+    envs = inner.envs if type(inner) is DummyVecEnv else _single_envs(inner)
+    if envs:
+        check_single_envs(envs)
+    if type(inner) is DummyVecEnv:
+        inner.envs = [env if isinstance(env, BorderEnv) else BorderEnv(env) for env in inner.envs]
+    _check_spaces(f"Wrappers of {shown(inner)} change", _spaces_of(vec_env), _spaces_of(inner))
+    if isinstance(inner, GymnasiumVecEnv):
+        base = inner.envs.unwrapped
+        own = (base.single_observation_space, base.single_action_space)
+        _check_spaces(f"Wrappers of {base} change", _spaces_of(inner), own)
+    if not envs:
+        for own in _team_spaces(inner):
+            _check_spaces("A Gymnasium wrapper changes", _spaces_of(inner), own, always=True)
+            for wrapper in _REWARD_WRAPPERS:
+                with suppress(NotImplementedError):
+                    if any(inner.env_is_wrapped(wrapper)):
+                        raise _only_team_reward(wrapper.__name__)
+
+
+def _single_envs(vec_env: VecEnv) -> Sequence[Env]:
+    """:return: the environments that Gymnasium's ``SyncVectorEnv`` steps in this process"""
+    inner = vec_env.envs.unwrapped if isinstance(vec_env, GymnasiumVecEnv) else None
+    envs = getattr(inner, "envs", ())
+    return envs if isinstance(envs, (list, tuple)) and all(isinstance(env, Env) for env in envs) else ()
+
+
+def _team_spaces(vec_env: VecEnv) -> list[tuple[spaces.Space, spaces.Space]]:
+    """:return: the spaces of each ``TeamEnv`` in other processes"""
+    inner: Any = vec_env
+    if isinstance(vec_env, GymnasiumVecEnv):
+        inner = vec_env.envs.unwrapped
+        if not hasattr(inner, "call") or not all(inner.call("has_wrapper_attr", "team_spaces")):
+            return []
+        return list(inner.get_attr("team_spaces"))
+    with suppress(NotImplementedError):
+        if inner.has_attr("team_spaces"):
+            return inner.get_attr("team_spaces")
+    return []
+
+
+def _spaces_of(env: Env | VecEnv) -> tuple[spaces.Space, spaces.Space]:
+    return env.observation_space, env.action_space
+
+
+def _check_spaces(what: str, outer: Any, inner: Any, always: bool = False) -> None:
+    """
+    :param what: begin of the message
+    :param outer: spaces of the observation and the joint action that the algorithm sees
+    :param inner: those that the environment has
+    :param always: whether all spaces must stay, or only those that say what belongs to which agent
+    :raises ValueError: if they differ
+    """
+    for name, seen, own, of_agents in zip(
+        ("observations", "actions"), outer, inner, (TeamObservation, MixedActions), strict=True
+    ):
+        if seen != own and (always or isinstance(own, of_agents)):
+            lost = (
+                "names, padding and action masks of the agents"
+                if name == "observations"
+                else "which numbers belong to which agent"
+            )
+            raise ValueError(
+                f"{what} the {name} of the team, from {shown(own)} to {shown(seen)}: {lost} would be lost. {_REMEDY}"
+            )
+
+
+def _only_team_reward(wrapper: str) -> ValueError:
+    return ValueError(
+        f"{wrapper} changes only the team's reward, but the algorithm learns from the agents' rewards in `info`. "
+        f"{_REMEDY}"
+    )
+
+
 def check_single_envs(envs: Sequence[Env]) -> None:
     """
     Check environments that are stepped together.
@@ -164,6 +309,7 @@ def check_single_envs(envs: Sequence[Env]) -> None:
                 f"Environments 0 and {index} are of different teams: {shown(first)} and {shown(spaces_of_env)}. Create "
                 "all environments with the same arguments."
             )
+        check_wrappers(env)
         team_env = env.unwrapped
         if not isinstance(team_env, TeamEnv):
             continue
@@ -172,19 +318,101 @@ def check_single_envs(envs: Sequence[Env]) -> None:
                 f"Environments {other} and {index} step the same PettingZoo environment, {team_env.parallel_env}: "
                 "create one for each, for example DummyVecEnv([lambda: TeamEnv(make_env()) for _ in range(2)])."
             )
-        _check_wrappers(env, team_env)
 
 
-def _check_wrappers(env: Env, team_env: TeamEnv) -> None:
-    remedy = "Wrap the PettingZoo environment instead, for example with SuperSuit, and then TeamEnv around it."
-    if env.observation_space != team_env.observation_space:
-        raise ValueError(
-            f"A Gymnasium wrapper changes the observations of TeamEnv, {env}: names, padding and action masks of the "
-            f"agents would be lost. {remedy}"
-        )
-    for layer in layers_of(env):
-        if isinstance(layer, (RewardWrapper, NormalizeReward)):
+def check_wrappers(env: Env) -> None:
+    """
+    Check that wrappers around an environment leave what belongs to single agents as it is.
+
+    :param env: a team environment, which may be wrapped
+    :raises ValueError: if wrappers change which numbers belong to which agent, or rewards of the team alone
+    """
+    of_pettingzoo = isinstance(env.unwrapped, TeamEnv)
+    _check_spaces(f"A Gymnasium wrapper, {env}, changes", _spaces_of(env), _spaces_of(env.unwrapped), of_pettingzoo)
+    for layer in layers_of(env) if of_pettingzoo else ():
+        if isinstance(layer, _REWARD_WRAPPERS):
+            raise _only_team_reward(type(layer).__name__)
+
+
+class ArrivalCheck:
+    """
+    Compares the transitions that arrive at the algorithm with what the environments say they gave. Wrappers in any
+    process may have changed or added up the team's reward, skipped steps, or kept arrays that were overwritten.
+
+    :param n_envs: number of environments
+    """
+
+    def __init__(self, n_envs: int):
+        # Number of each environment's last step in its episode, 0 if it is not known
+        self._steps = [0] * n_envs
+        # First observations of episodes that equal the last ones of the episodes before, None if one differed
+        self._firsts: list[list[np.ndarray] | None] = [[] for _ in range(n_envs)]
+
+    def check(
+        self,
+        rewards: np.ndarray,
+        observations: np.ndarray,
+        dones: np.ndarray,
+        infos: Sequence[Mapping[str, Any]],
+        reads_parts: bool = False,
+    ) -> None:
+        """
+        :param rewards: the team's rewards as they arrived, not normalised, (n_envs,)
+        :param observations: observations after the step or first ones of next episodes, not normalised, (n_envs, ...)
+        :param dones: which episodes ended, (n_envs,)
+        :param infos: infos of the environments
+        :param reads_parts: whether the algorithm reads parts of the team's reward even if agents have none of their
+            own, as with ``pair_credit`` and ``use_action_cost``
+        :raises ValueError: if ``info["team_reward"]``, or without it both mean and sum of ``info["agent_rewards"]``,
+            differ from the reward that arrived, ``info["episode_step"]`` skips steps, or the last observations of
+            episodes are the first ones of the next episodes
+        """
+        for k, info in enumerate(infos):
+            if reads_parts or "agent_rewards" in info:
+                self._check_reward(k, float(rewards[k]), info)
+            step = info.get("episode_step", 0)
+            if step and self._steps[k] and step != self._steps[k] + 1:
+                raise ValueError(
+                    f"Environment {k} went from step {self._steps[k]} to step {step} of its episode, so that what "
+                    "happened to its agents in between is lost: a wrapper skips steps or resets the environment "
+                    f"itself. {_REMEDY}"
+                )
+            self._steps[k] = 0 if dones[k] else step
+            if dones[k] and self._firsts[k] is not None:
+                last = info.get("original_terminal_observation", info.get("terminal_observation"))
+                self._check_end(k, observations[k], last)
+
+    @staticmethod
+    def _check_reward(env: int, arrived: float, info: Mapping[str, Any]) -> None:
+        # Rewards arrive in single precision
+        own: Any = info.get("team_reward")
+        if own is not None and abs(arrived - own) <= 1e-5 * max(abs(own), 1e-3):
+            return
+        agents = np.asarray(info.get("agent_rewards", ()), float)
+        given = [] if agents.size == 0 else [agents.mean(), agents.sum()]
+        if own is not None:
+            given = [own]
+        error = 1e-5 * max(abs(arrived), 1e-3, *np.abs(agents).flat)
+        if given and not any(abs(arrived - value) <= error for value in given):
+            remedy = _REMEDY
+            if own is None:
+                remedy += " If the team's reward is meant so, return it in info['team_reward'], too."
+            gave = f"{given[0]:g}{f' (agents: {shown(agents.tolist())})' if agents.size else ''}"
             raise ValueError(
-                f"{type(layer).__name__} changes only the team's reward, but the algorithm learns from the agents' "
-                f"rewards in `info`. {remedy}"
+                f"The team's reward of environment {env} arrived as {arrived:g}, but the environment gave {gave}: a "
+                "wrapper changes only the team's reward or adds up those of several steps, while the algorithm learns "
+                f"from its parts in `info`, or the environment writes into arrays that it has returned. {remedy}"
+            )
+
+    def _check_end(self, env: int, first: np.ndarray, last: Any) -> None:
+        firsts = self._firsts[env]
+        if last is None or not np.array_equal(first, last):
+            self._firsts[env] = None
+            return
+        assert firsts is not None
+        firsts.append(first.copy())
+        if len(firsts) >= _SAME_ENDS and any((one != first).any() for one in firsts):
+            raise ValueError(
+                f"The last observations of {len(firsts)} episodes of environment {env} are the first ones of the next "
+                "episodes: the environment writes into an array that it has returned. Return a copy, `obs.copy()`."
             )

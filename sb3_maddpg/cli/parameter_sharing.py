@@ -51,9 +51,13 @@ class AgentsVecEnv(VecEnv):
             raise ValueError(
                 "state:True is for critics of MADDPG and MATD3: a shared policy only sees its own agent's observation."
             )
+        if env_kwargs.get("info_mask"):
+            raise ValueError("info_mask:True is for MADDPG, MATD3 and IDDPG: a shared policy reads no action masks.")
         self.spec = copy.deepcopy(gymnasium.spec(env_id))
         self.spec.kwargs.update(env_kwargs)
-        env = parallel.make_parallel_env(**{key: one for key, one in self.spec.kwargs.items() if key != "state"})
+        env = parallel.make_parallel_env(
+            **{key: one for key, one in self.spec.kwargs.items() if key not in ("state", "info_mask")}
+        )
         self.agents = _homogeneous_agents(env_id, env)
         with warnings.catch_warnings():  # SuperSuit expects a Gymnasium environment
             warnings.filterwarnings("ignore", module="supersuit")
@@ -151,10 +155,12 @@ def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
         first = space_of(agents[0])
         for agent in agents:
             if space_of(agent) != first:
+                remedy = "train with --algo maddpg, matd3 or iddpg"
+                if type(space_of(agent)) is type(first) and isinstance(first, (spaces.Box, spaces.Discrete)):
+                    remedy = f"add supersuit.{wrapper} to `wrappers` of env_kwargs, or {remedy}"
                 raise ValueError(
                     f"{env_id} has heterogeneous agents: the {kind} space of {agents[0]} is {first}, that of {agent} "
-                    f"is {space_of(agent)}. A shared policy needs equal spaces: add supersuit.{wrapper} "
-                    "to `wrappers` of env_kwargs, or train with --algo maddpg or matd3."
+                    f"is {space_of(agent)}. A shared policy needs equal spaces: {remedy}."
                 )
     return agents
 

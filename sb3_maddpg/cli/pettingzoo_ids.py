@@ -6,7 +6,7 @@ import re
 
 import gymnasium
 
-from sb3_maddpg.parallel import ENTRY_POINT, find_module, find_parallel_env
+from sb3_maddpg.parallel import ENTRY_POINT, find_module, find_parallel_env, make
 
 
 def register(env_id: str) -> bool:
@@ -62,5 +62,6 @@ def arguments(entry: str) -> set[str] | None:
         if callable(function):
             parameters = inspect.signature(function).parameters.values()
             if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters):
-                return {parameter.name for parameter in parameters} | {"state", "wrappers"}
+                own = inspect.signature(make).parameters.keys() - {"entry", "kwargs"}
+                return {parameter.name for parameter in parameters} | own
     return None

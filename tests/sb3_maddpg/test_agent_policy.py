@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from sb3_maddpg import MADDPG
@@ -187,11 +186,75 @@ def test_actions_lie_within_their_space_and_those_of_integers_are_whole(tmp_path
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             program = th.jit.load(tmp_path / "a.pt")
-        low, high = np.float32(space.low).ravel(), np.float32(space.high).ravel()
+        low, high = space.low, space.high
         for exported in (program(th.from_numpy(obs)).numpy(), session.run(None, {"observation": obs})[0]):
             assert ((exported >= low) & (exported <= high)).all()
-            assert (np.abs(exported - actions.astype(float)) <= 1e-5 * (high - low)).all()
+            assert (np.abs(exported - actions.astype(float)) <= 1e-5 * (high - low.astype(float))).all()
     assert saturated > 20
+
+
+class Alike(Toy):
+    """Two agents with the same action space."""
+
+    def __init__(self, space):
+        super().__init__("continuous")
+        self.spaces = (space, space)
+        self.possible_agents = ["agent_0", "agent_1"]
+
+    def step(self, actions):
+        for space, action in zip(self.spaces, actions.values(), strict=True):
+            assert space.contains(action), (space, action)
+        return super().step(actions)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        *(spaces.Box(0, 9, (2,), dtype) for dtype in (np.uint8, np.int16, np.int32, np.int64, np.float16, np.float64)),
+        spaces.Box(-1.5, 0.3, (2, 3), np.float64),
+        spaces.Box(-1, 1, ()),
+        spaces.Box(0, 5, (2, 2), np.int8),
+        spaces.MultiBinary(3),
+        spaces.MultiBinary([2, 3]),
+        spaces.MultiDiscrete([[2, 3], [4, 5]]),
+        spaces.MultiDiscrete([2, 3], start=[1, -4], dtype=np.int32),
+        spaces.Discrete(4, start=-2),
+        spaces.Discrete(4, dtype=np.int32),
+    ],
+    ids=str,
+)
+def test_an_agent_of_a_homogeneous_team_acts_in_its_own_space(space, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    model = varied(lambda: MADDPG("MlpPolicy", Alike(space), **SMALL)).learn(30)
+    obs = np.random.default_rng(0).uniform(-1, 1, (6, 3)).astype(np.float32)
+    policy = model.agent_policy("agent_1")
+    assert policy.action_space == space
+    assert all(space.contains(policy.predict(row)) for row in obs)
+    batch = policy.predict(obs)
+    policy.export(tmp_path / "a.pt")
+    policy.export(tmp_path / "a.onnx")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        program = th.jit.load(tmp_path / "a.pt")(th.from_numpy(obs)).numpy()
+    session = onnxruntime.InferenceSession(str(tmp_path / "a.onnx"), providers=["CPUExecutionProvider"])
+    for actions in (program, session.run(None, {"observation": obs})[0]):
+        assert actions.dtype == space.dtype
+        assert np.allclose(actions.astype(float), batch.astype(float), atol=1e-2 if space.dtype == np.float16 else 1e-5)
+        for action in actions:
+            assert space.contains(action[0] if isinstance(space, spaces.Discrete) else action)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float16])
+def test_an_agent_of_a_gymnasium_team_acts_in_the_data_type_of_the_team(dtype):
+    class Joint(Neighbours):
+        def __init__(self):
+            super().__init__()
+            self.action_space = spaces.Box(0, 7, (8,), dtype)
+
+    policy = varied(lambda: MADDPG("MlpPolicy", Joint(), **SMALL)).agent_policy(1)
+    action = policy.predict(np.zeros(policy.obs_dim))
+    assert action.dtype == dtype
+    assert spaces.Box(0, 7, (2,), dtype).contains(action)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
@@ -282,10 +345,3 @@ def test_a_policy_that_is_not_finite_is_not_exported(tmp_path):
         with pytest.raises(ValueError, match=r"holds NaN or infinity"):
             export()
     assert not list(tmp_path.iterdir())
-
-
-def test_warns_where_an_agent_would_miss_the_statistics_of_observations():
-    env = VecNormalize(DummyVecEnv([lambda: TeamEnv(Toy("binary"))]))
-    model = MADDPG("MlpPolicy", env, **SMALL)
-    with pytest.warns(UserWarning, match=r"VecNormalize.*not part of the agent's policy"):
-        model.agent_policy(0)

@@ -11,7 +11,7 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 
 from sb3_maddpg import MADDPG, MATD3, CnnPolicy, TeamEnv, allow_in_files
-from toys import Toy
+from toys import SMALL, Toy
 
 SIDE = 8
 
@@ -193,3 +193,110 @@ def test_what_does_not_fit_is_refused():
     floats = gymnasium.spaces.Box(0, 1, (SIDE, SIDE, 1))
     with pytest.raises(ValueError, match="normalize_images=False"):
         made(features_extractor_class=NatureCNN, image_space=floats)
+
+
+class Pictures(ParallelEnv):
+    """Agents that see different things; the reward tells which half of a picture is brighter."""
+
+    metadata: dict = {"name": "pictures"}  # noqa: RUF012
+
+    def __init__(self, *seen: spaces.Space):
+        self.seen = dict(zip("abc", seen, strict=False))
+        self.possible_agents = list(self.seen)
+        self.state_space = spaces.Box(0, 255, (4, 4, 3), np.uint8)
+
+    def observation_space(self, agent):
+        return self.seen[agent]
+
+    def action_space(self, agent):
+        return spaces.Discrete(2)
+
+    def state(self):
+        return np.full((4, 4, 3), 255, np.uint8)
+
+    def reset(self, seed=None, options=None):
+        self.agents = list(self.possible_agents)
+        return {agent: self.seen[agent].sample() for agent in self.agents}, {}
+
+    def step(self, actions):
+        rewards = dict.fromkeys(self.agents, 0.0)
+        ends = dict.fromkeys(self.agents, False)
+        return {agent: self.seen[agent].sample() for agent in self.agents}, rewards, ends, ends, {}
+
+
+PICTURE = spaces.Box(0, 255, (4, 4, 3), np.uint8)
+
+
+@pytest.mark.parametrize("normalize_images", [True, False])
+@pytest.mark.parametrize("share_critic", [False, "team"])
+def test_mlp_policies_divide_images_of_bytes_like_stable_baselines3(normalize_images, share_critic):
+    """Networks whose first layers hold their inputs apart would see 0 to 1 instead of 0 to 255, and nothing else."""
+    part = spaces.Dict({"camera": PICTURE, "far": spaces.Box(0, 255, (5,), np.uint8), "own": spaces.Discrete(3)})
+    env = TeamEnv(Pictures(PICTURE, spaces.Box(-1, 1, (2,)), part), state=True)
+    kwargs = {"normalize_images": normalize_images, "share_critic": share_critic}
+    model = MADDPG("MlpPolicy", env, policy_kwargs=kwargs, **_without_kwargs(SMALL))
+    plain = MADDPG(
+        "MlpPolicy", env, policy_kwargs={**kwargs, "image_columns": [[], [], [], []]}, **_without_kwargs(SMALL)
+    )
+    obs, _ = env.reset(seed=0)
+    scaled = obs.copy()
+    if normalize_images:
+        scaled[0, :48] /= 255
+        scaled[2, :48] /= 255  # its camera, in the order of Gymnasium's flatten
+        scaled[:, 56:] /= 255  # the state
+    assert scaled[:, 56:].max() == (1.0 if normalize_images else 255.0)
+    batch, unscaled = th.as_tensor(scaled[None]), th.as_tensor(obs[None])
+    assert th.allclose(model.actor.logits(unscaled), plain.actor.logits(batch), atol=1e-6)
+    actions = model.actor(unscaled)
+    assert th.allclose(model.critic(unscaled, actions), plain.critic(batch, actions), atol=1e-5)
+    own = model.actor.actions.columns_of(0)
+    alone = model.agent_policy("a").network(unscaled[:, 0, :48])[:, own]
+    assert th.allclose(alone, model.actor.logits(unscaled)[:, 0, own], atol=1e-6)
+
+
+def test_mlp_policies_with_images_are_saved_and_loaded(tmp_path):
+    env = Pictures(PICTURE, PICTURE)
+    model = MADDPG("MlpPolicy", env, **SMALL).learn(40)
+    model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model", env=env)
+    obs = TeamEnv(env).reset(seed=0)[0]
+    assert np.array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+    assert th.equal(model.actor.logits(th.as_tensor(obs[None])), loaded.actor.logits(th.as_tensor(obs[None])))
+    loaded.learn(20, reset_num_timesteps=False)
+
+
+def test_pictures_without_an_axis_of_channels():
+    grey = spaces.Box(0, 255, (40, 40), np.uint8)
+    model = MADDPG("CnnPolicy", Pictures(grey, grey), **SMALL).learn(30)
+    three = MADDPG("CnnPolicy", Pictures(*[spaces.Box(0, 255, (1, 40, 40), np.uint8)] * 2), **SMALL)
+    three.policy.load_state_dict(model.policy.state_dict())
+    picture = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
+    action = model.agent_policy("a").predict(picture)
+    assert action == three.agent_policy("a").predict(picture[None])
+    assert spaces.Discrete(2).contains(action)
+
+
+def _without_kwargs(arguments: dict) -> dict:
+    return {name: value for name, value in arguments.items() if name != "policy_kwargs"}
+
+
+def test_a_team_s_single_value_is_fitted_to_the_team_s_reward():
+    class Paid(Pictures):
+        def step(self, actions):
+            seen, rewards, *rest = super().step(actions)
+            return seen, {agent: 3.0 * index for index, agent in enumerate(rewards)}, *rest
+
+    image = spaces.Box(0, 255, (1, 40, 40), np.uint8)
+    kwargs = {"share_critic": "team", "net_arch": [8]}
+    arguments = {
+        **_without_kwargs(SMALL),
+        "gamma": 0.0,
+        "learning_rate": 1e-2,
+        "train_freq": 1,
+        "policy_kwargs": kwargs,
+    }
+    model = MADDPG("CnnPolicy", Paid(image, image), **arguments).learn(150)
+    obs = th.as_tensor(TeamEnv(Paid(image, image)).reset(seed=0)[0][None])
+    values = model.critic(obs, model.actor.act(obs))
+    assert values.shape == (1, 1, 1)
+    assert values.item() == pytest.approx(1.5, abs=0.3), "the mean of 0 and 3"

@@ -7,11 +7,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import ClipReward, MaxAndSkipObservation, TransformObservation
 from mpe2 import simple_spread_v3
 from pettingzoo.utils import BaseParallelWrapper
 
 import quad_swarm
-from sb3_maddpg import check_team_env, team_tasks
+from sb3_maddpg import TeamEnv, check_team_env, team_tasks
 from sb3_maddpg.team import TeamAttributes, TeamInfo
 from toys import AGENT_SPACES, Neighbours, Toy
 
@@ -150,6 +151,68 @@ def test_observations_out_of_bounds_are_reported_in_one_line():
     ) as raised:
         check_team_env(Bright("binary"))
     assert len(str(raised.value)) < 250
+
+
+class Reused(team_tasks.OwnBit):
+    """What is named is one array that every step and reset write into."""
+
+    def __init__(self, name):
+        super().__init__()
+        self.name, self.kept = name, None
+
+    def reset(self, **kwargs):
+        obs, info = super().reset(**kwargs)
+        if self.kept is not None and self.name != "observation":
+            self.kept[...] = 0
+        return (self.same(obs) if self.name == "observation" else obs), info
+
+    def step(self, action):
+        obs, *rest, info = super().step(action)
+        if self.name == "observation":
+            return self.same(obs), *rest, info
+        return obs, *rest, {**info, self.name: self.same(info["agent_rewards"])}
+
+    def same(self, value):
+        self.kept = np.array(value) if self.kept is None else self.kept
+        self.kept[...] = value
+        return self.kept
+
+
+@pytest.mark.parametrize("name", ["observation", "agent_rewards"])
+def test_arrays_that_are_written_into_again_are_named(name):
+    with pytest.raises(ValueError, match=rf"wrote into an array that step\(\) had returned, .*{name}.*return a copy"):
+        check_team_env(Reused(name))
+
+
+class Own(gymnasium.Wrapper):
+    """Changes what a step returns, in the most common style."""
+
+    def __init__(self, env, change):
+        super().__init__(env)
+        self.change = change
+
+    def step(self, action):
+        return self.change(*self.env.step(action))
+
+
+@pytest.mark.parametrize(
+    ("wrap", "message"),
+    [
+        (lambda env: Own(env, lambda obs, reward, *rest: (obs, reward + 0.5, *rest)), "team's reward .* arrived as"),
+        (lambda env: MaxAndSkipObservation(env, 2), "team's reward .* arrived as|went from step"),
+        (lambda env: ClipReward(env, -0.1, 0.1), "changes only the team's reward|team's reward .* arrived as"),
+        (
+            lambda env: TransformObservation(env, lambda obs: obs, spaces.Box(-9, 9, env.observation_space.shape)),
+            "changes the obs",
+        ),
+    ],
+)
+@pytest.mark.parametrize("make", [lambda: TeamEnv(Toy("mixed")), team_tasks.OwnBit])
+def test_wrappers_whose_changes_would_be_lost_are_refused(make, wrap, message):
+    if make is team_tasks.OwnBit and "obs" in message:
+        pytest.skip("a plain Box says nothing of agents: the algorithm sees it as it is")
+    with pytest.raises(ValueError, match=message):
+        check_team_env(wrap(make()))
 
 
 def test_the_tables_of_the_convention_name_what_the_contract_does():

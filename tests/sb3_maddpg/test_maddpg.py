@@ -2,12 +2,15 @@
 
 import copy
 import re
+from contextlib import suppress
 
 import gymnasium
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from pettingzoo import ParallelEnv
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -15,7 +18,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
-from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg import IDDPG, MADDPG, MATD3, parallel
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.callbacks import MetricsCallback
 from sb3_maddpg.estimators import ESTIMATORS
@@ -408,8 +411,9 @@ def test_extreme_prices_stay_finite(price):
 def test_a_training_that_diverges_stops_and_says_whose(clip):
     class Exploding(OwnBit):
         def step(self, action):
-            *rest, info = super().step(action)
-            return *rest, {**info, "agent_rewards": np.float32([1e25 if self._steps == 5 else 0, 0, 0])}
+            obs, _, *ends, info = super().step(action)
+            rewards = np.float32([1e25 if self._steps == 5 else 0, 0, 0])
+            return obs, float(rewards.mean()), *ends, {**info, "agent_rewards": rewards}
 
     message = (
         r"diverged at step \d+ \(update \d+\): the loss of the critic of agent_0 is inf\. Lower learning_rate=0.01"
@@ -569,3 +573,203 @@ def test_steps_and_folders_may_come_in_other_types(tmp_path):
     assert model.tensorboard_log == str(tmp_path)
     model.save(tmp_path / "model")
     assert MADDPG.load(tmp_path / "model").num_timesteps == 25
+
+
+class Clock(OwnBit):
+    """Observes the number of its episode and the step; fails, or is stopped, where it is told to."""
+
+    fail_at: tuple[str, int] | None = None
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Box(0, 1000, (3, 2), np.float32)
+        self.episode, self.calls = 0, 0
+
+    def look(self):
+        return np.tile(np.float32([self.episode, self._steps]), (3, 1))
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        self.fail("reset")
+        self.episode += 1
+        return self.look(), {}
+
+    def step(self, action):
+        self.fail("before")
+        _, *rest = super().step(action)
+        self.calls += 1
+        self.fail("after")
+        return self.look(), *rest
+
+    def fail(self, where):
+        if self.fail_at == (where, self.calls):
+            self.fail_at = None
+            raise RuntimeError("fails once")
+
+
+class StopAt(BaseCallback):
+    """Ends the training in a step, by returning False or by raising."""
+
+    def __init__(self, at, error=None):
+        super().__init__()
+        self.at, self.error = at, error
+
+    def _on_step(self):
+        if self.num_timesteps < self.at:
+            return True
+        if self.error is not None:
+            raise self.error
+        return False
+
+
+@pytest.mark.parametrize("optimize_memory_usage", [False, True])
+@pytest.mark.parametrize(
+    ("callback", "fail_at"),
+    [
+        (StopAt(14), None),
+        (StopAt(14, KeyError("key")), None),
+        (StopAt(14, KeyboardInterrupt()), None),
+        (StopTrainingOnMaxEpisodes(1), None),
+        (None, ("before", 14)),
+        (None, ("after", 14)),
+        (None, ("reset", 10)),
+    ],
+)
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_an_episode_that_was_broken_off_leaves_no_transition(callback, fail_at, n_envs, optimize_memory_usage):
+    envs = DummyVecEnv([Clock for _ in range(n_envs)])
+    arguments = {**SMALL, "learning_starts": 1000}
+    if optimize_memory_usage:
+        arguments |= {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    model = MADDPG("MlpPolicy", envs, **arguments)
+    envs.envs[0].unwrapped.fail_at = fail_at
+    with suppress(RuntimeError, KeyError, KeyboardInterrupt):
+        model.learn(60, callback=callback)
+    model.learn(60, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    rows = np.arange(buffer.size() - 1)
+    now = buffer.observations[rows, :, 0]
+    then = buffer.observations[rows + 1, :, 0] if optimize_memory_usage else buffer.next_observations[rows, :, 0]
+    goes_on = (now[..., 0] == then[..., 0]) & (now[..., 1] + 1 == then[..., 1])
+    if optimize_memory_usage:
+        goes_on |= buffer.dones[rows] > 0
+    assert goes_on.all()
+    assert len(rows) >= 50 / n_envs
+
+
+def test_a_training_that_was_not_broken_off_goes_on_in_its_episode():
+    env = Clock()
+    model = MADDPG("MlpPolicy", env, **{**SMALL, "learning_starts": 1000}).learn(14)
+    model.learn(14, reset_num_timesteps=False)
+    before, after = model.replay_buffer.next_observations[13, 0, 0], model.replay_buffer.observations[14, 0, 0]
+    assert before.tolist() == after.tolist()
+    assert before[1] == 4
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_pytorch_s_default_of_double_precision_changes_nothing(estimator, tmp_path):
+    models = []
+    for default in (th.float32, th.float64):
+        th.set_default_dtype(default)
+        try:
+            model = learned(Toy("mixed"), 60, estimator=estimator)
+            robot = model.agent_policy(0)
+            robot.export(tmp_path / "robot.pt")
+            model.save(tmp_path / "model")
+            loaded = MADDPG.load(tmp_path / "model")
+            obs = np.zeros(model.observation_space.shape)
+            assert np.array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+            models.append((parameters(model), robot.predict(np.zeros(robot.obs_dim))))
+            assert th.get_default_dtype() is default
+        finally:
+            th.set_default_dtype(th.float32)
+    (parameters_32, action_32), (parameters_64, action_64) = models
+    assert parameters_64.dtype == np.float32
+    assert np.array_equal(parameters_32, parameters_64)
+    assert np.array_equal(action_32, action_64)
+
+
+class Ends(ParallelEnv):
+    """
+    Agent a leaves in step 3, b in step 5; the reward is 1 per step, and they see the step.
+
+    :param a: how a ends, "terminated" or "truncated"
+    :param whole: both are truncated in step 5 only
+    """
+
+    metadata = {"name": "ends"}  # noqa: RUF012
+
+    def __init__(self, a: str, whole: bool = False):
+        self.possible_agents, self.a, self.whole = ["a", "b"], a, whole
+
+    def observation_space(self, agent):
+        return spaces.Box(0, 1, (6,))
+
+    def action_space(self, agent):
+        return spaces.Discrete(1)
+
+    def look(self, agents):
+        return {agent: np.eye(6, dtype=np.float32)[self.t] for agent in agents}
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.t = ["a", "b"], 0
+        return self.look(self.agents), {}
+
+    def step(self, actions):
+        self.t += 1
+        acted = self.agents
+        last = {"a": 5 if self.whole else 3, "b": 5}
+        out = {agent: self.t == last[agent] for agent in acted}
+        gone = {agent: out[agent] and not self.whole and (agent == "b" or self.a == "terminated") for agent in acted}
+        self.agents = [agent for agent in acted if not out[agent]]
+        cut = {agent: out[agent] and not gone[agent] for agent in acted}
+        return self.look(acted), dict.fromkeys(acted, 1.0), gone, cut, {}
+
+
+class EndsForGymnasium(gymnasium.Wrapper):
+    """The same team, told by a Gymnasium environment's infos alone."""
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        names = ("agent_rewards", "agent_terminated", "agent_truncated", "agent_active", "team_reward")
+        return obs, reward, terminated, truncated, {name: info[name] for name in names}
+
+
+@pytest.mark.parametrize("a", ["terminated", "truncated"])
+@pytest.mark.parametrize(
+    ("algorithm", "kwargs", "expected"),
+    [
+        (MADDPG, {}, 4.0951),
+        (MADDPG, {"n_steps": 3}, 4.0951),
+        (MADDPG, {"replay_buffer_class": PrioritizedTeamReplayBuffer}, 4.0951),
+        (MADDPG, {"policy_kwargs": {"share_critic": "team"}}, (2.71 + 4.0951) / 2),
+        (MATD3, {"target_policy_noise": 0.0}, 4.0951),
+        (IDDPG, {}, 4.0951),
+    ],
+)
+def test_who_goes_on_is_worth_what_it_gets(algorithm, kwargs, expected, a):
+    """1 + 0.9 + ... over five steps, whether the other one terminates or is truncated after three."""
+    arguments = {"gamma": 0.9, "learning_rate": 3e-3, "tau": 0.05, "learning_starts": 100, "train_freq": 2, "seed": 0}
+    env = EndsForGymnasium(parallel.TeamEnv(Ends(a)))
+    model = algorithm("MlpPolicy", env, batch_size=256, **arguments, **kwargs).learn(3000)
+    obs = th.as_tensor(parallel.TeamEnv(Ends(a)).reset()[0][None])
+    assert model.critic(obs, model.actor.act(obs))[0, 0, -1].item() == pytest.approx(expected, abs=0.15)
+
+
+def test_a_team_that_is_truncated_as_a_whole_goes_on_as_a_whole():
+    model = MADDPG("MlpPolicy", Ends("truncated", whole=True), **SMALL).learn(30)
+    batch = model.replay_buffer.sample(64)
+    assert batch.active is batch.next_active is batch.next_truncated is None
+
+
+def test_an_agent_that_is_truncated_counts_in_its_own_target_only():
+    model = MADDPG("MlpPolicy", Toy("continuous"), **SMALL)
+    obs, actions = th.rand(4, 3, 4) - 0.5, th.rand(4, 3, 2) - 0.5
+    truncated = th.tensor([[0.0, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0]])
+    found = model._next_q_values(obs, actions, truncated, None)
+    for row in range(4):
+        for agent in range(3):
+            keeps = 1 - truncated[row]
+            keeps[agent] = 1
+            alone = model.critic_target(obs[[row]], actions[[row]] * keeps[None, :, None])[0, 0, agent]
+            assert found[row, agent].item() == pytest.approx(alone.item(), abs=1e-6)

@@ -1,16 +1,24 @@
 """Who takes part in an episode of a PettingZoo environment, how it ends, and what is refused."""
 
+import csv
+import enum
 import pickle
+import re
 import warnings
 
 import gymnasium
 import numpy as np
 import pytest
+import supersuit
 from gymnasium import spaces
 from mpe2 import simple_spread_v3
 from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.parallel import TeamEnv
@@ -95,7 +103,11 @@ def test_an_agent_that_dies_early_by_hand():
         assert [info["agent_active"].tolist() for info in infos[4:6]] == [[1, 1], [0, 1]]
         assert all("metrics" not in info and "agent_infos" not in info for info in infos[:9])
         # 1 + ... + 5 and 2 (1 + ... + 10); their mean is the team's return
-        assert infos[9]["metrics"] == {"rollout/ep_rew_a0": 15.0, "rollout/ep_rew_a1": 110.0}
+        returns, lengths = {"a0": 15.0, "a1": 110.0}, {"a0": 5.0, "a1": 10.0}
+        assert infos[9]["metrics"] == {
+            **{f"rollout/ep_rew_{agent}": value for agent, value in returns.items()},
+            **{f"rollout/ep_len_{agent}": value for agent, value in lengths.items()},
+        }
         assert sum(rewards) == 62.5
         assert [sorted(actions) for actions in script.sent[-10:]] == [["a0", "a1"]] * 5 + [["a1"]] * 5
     with pytest.raises(gymnasium.error.ResetNeeded):
@@ -127,7 +139,11 @@ def test_agents_that_sit_an_episode_out():
     assert len(steps) == 4
     assert not any(step[0][1].any() or step[4]["agent_active"][1] for step in steps)
     assert steps[0][1] == (1 + 0 + 3) / 3
-    assert steps[-1][4]["metrics"] == {"rollout/ep_rew_a": 3.0, "rollout/ep_rew_c": 30.0}
+    returns, lengths = {"a": 3.0, "c": 30.0}, {"a": 2.0, "c": 4.0}
+    assert steps[-1][4]["metrics"] == {
+        **{f"rollout/ep_rew_{agent}": value for agent, value in returns.items()},
+        **{f"rollout/ep_len_{agent}": value for agent, value in lengths.items()},
+    }
 
 
 def test_what_else_an_environment_offers_is_reached_through_the_adapter():
@@ -249,6 +265,65 @@ def test_the_return_of_an_agent_called_mean_is_not_that_of_the_team():
     assert metrics == {
         "rollout/ep_rew_agent_agent_mean": 3.0, "rollout/ep_rew_agent_mean": 6.0, "rollout/ep_rew_b": 9.0
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("said", "success"),
+    [
+        ({2: {"a": False}, 4: {"b": True}}, False),
+        ({2: {"a": True}, 4: {"b": True}}, True),
+        ({1: {"a": False, "b": False}, 2: {"a": True}, 4: {"b": True}}, True),  # each as it said last
+        ({2: {"a": True}}, True),
+        ({4: {"b": np.bool_(False)}}, False),
+        ({}, None),
+    ],
+)
+def test_agents_that_ended_before_the_others_count_as_successes_or_not(said, success):
+    def spoil(env, *parts):
+        parts[4].update({agent: {"is_success": flag} for agent, flag in said.get(env.time, {}).items()})
+
+    env = TeamEnv(Broken(spoil, {"a": (2, TERMINATED), "b": (4, TRUNCATED)}))
+    for _ in range(2):
+        infos = [step[4] for step in play(env)]
+        assert not any("is_success" in info for info in infos[:-1])
+        assert infos[-1].get("is_success") is success
+
+
+def test_metrics_of_agents_are_averaged_and_logged(tmp_path):
+    def spoil(env, *parts):
+        acted = {"a": 1.0, "b": 4.0} if env.time <= 2 else {"b": 4.0}
+        parts[4].update({agent: {"metrics": {"env/drag": np.float32(value)}} for agent, value in acted.items()})
+
+    env = Broken(spoil, {"a": (2, TERMINATED), "b": (4, TRUNCATED)})
+    assert [step[4]["metrics"]["env/drag"] for step in play(TeamEnv(env))] == [2.5, 2.5, 4.0, 4.0]
+    model = MADDPG("MlpPolicy", env, learning_starts=1000)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(40, log_interval=1)
+    with (tmp_path / "progress.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {float(row["env/drag"]) for row in rows} == {3.25}
+    assert {float(row["rollout/ep_len_a"]) for row in rows} == {2.0}
+
+
+@pytest.mark.parametrize("metrics", [{"x": "fast"}, {"x": np.nan}, {"x": [1, 2]}, 3.0, {"x": {}}])
+def test_metrics_that_are_no_numbers_are_refused(metrics):
+    env = TeamEnv(Broken(lambda env, *parts: parts[4].update(a={"metrics": metrics}), {"a": (2, TERMINATED)}))
+    with pytest.raises(ValueError, match=r"infos\['a'\]\['metrics'\].* of .* in step 1 of the episode.*must be a"):
+        play(env)
+
+
+def test_returns_are_logged_where_a_wrapper_ends_the_episodes():
+    env = gymnasium.wrappers.TimeLimit(TeamEnv(Script({"a": (5, TRUNCATED), "b": (8, TRUNCATED)})), 3)
+    keys = []
+
+    class Keys(BaseCallback):
+        def _on_step(self):
+            keys.extend(info["metrics"] for info in self.locals["infos"] if "metrics" in info)
+            return True
+
+    MADDPG("MlpPolicy", env, learning_starts=1000).learn(6, callback=Keys())
+    assert len(keys) >= 2
+    assert all(metrics == {"rollout/ep_rew_a": 6.0, "rollout/ep_rew_b": 12.0} for metrics in keys)
 
 
 def test_a_terminated_agent_need_not_see_its_end():
@@ -570,3 +645,137 @@ def test_the_mover_is_among_the_agents():
 def test_a_reward_of_a_game_with_turns_is_a_number():
     with pytest.raises(ValueError, match=r"reward of None for agent 'a' in step 1 .*must be a number"):
         play(TeamEnv(Turns(reward=None)))
+
+
+class Named(Toy):
+    """Agents with names of any kind."""
+
+    def __init__(self, *names):
+        super().__init__("categorical")
+        self.possible_agents = list(names)
+
+
+class Thing:
+    """Its repr is an address."""
+
+
+class Colour(enum.IntEnum):
+    RED = 1
+    BLUE = 2
+
+
+@pytest.mark.parametrize(
+    "names", [((0, 0), (0, 1)), (1, 2), (np.int64(3), np.int64(7)), tuple(Colour), (Thing(), Thing()), ("a b", "c,d")]
+)
+def test_agents_are_found_by_the_environment_s_own_ids(names, tmp_path):
+    model = MADDPG("MlpPolicy", Named(*names), policy_kwargs={"share_actor": [[names[0]], [names[1]]]})
+    assert len(set(model.policy.team.names)) == 2
+    if isinstance(names[0], Thing):  # as no file could name them
+        assert model.policy.team.names == ("agent_0", "agent_1")
+        return
+    for agent in names:
+        assert model.agent_policy(agent).name == str(agent)
+    with pytest.raises(ValueError, match=f"There is no agent 'x': the agents are .*{re.escape(str(names[1]))}"):
+        model.agent_policy("x")
+
+
+def test_agents_without_names_fit_files_of_others_of_their_kind(tmp_path):
+    MADDPG("MlpPolicy", Named(Thing(), Thing())).save(tmp_path / "model")
+    MADDPG.load(tmp_path / "model", env=Named(Thing(), Thing()))
+
+
+MASKED = spaces.Dict({"action_mask": spaces.Box(0, 1, (3,), np.int8), "seen": spaces.Box(-1, 1, (2,))})
+
+
+@pytest.mark.parametrize(
+    ("space", "columns"),
+    [
+        (MASKED, (0, 1, 2)),
+        (spaces.Dict({"a": spaces.Discrete(4), "inner": MASKED}), (4, 5, 6)),
+        (spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Dict({"z": MASKED}))), (2, 3, 4)),
+    ],
+)
+def test_action_masks_are_found_at_any_depth(space, columns):
+    class Deep(Named):
+        def observation_space(self, agent):
+            return space
+
+        def action_space(self, agent):
+            return spaces.Discrete(3)
+
+    assert TeamEnv(Deep("a", "b")).observation_space.masks == (columns, columns)
+
+
+def test_two_action_masks_of_one_agent_are_refused():
+    class Two(Named):
+        def observation_space(self, agent):
+            return spaces.Dict({"left": MASKED, "right": MASKED})
+
+    with pytest.raises(ValueError, match="holds 2 parts called 'action_mask'"):
+        TeamEnv(Two("a", "b"))
+
+
+def test_attributes_are_set_where_they_are_found():
+    class Wind(Toy):
+        wind = 0.0
+
+    inner = Wind("binary")
+    env = TeamEnv(BaseParallelWrapper(inner))
+    gymnasium.wrappers.OrderEnforcing(env).set_wrapper_attr("wind", 3.0)
+    assert inner.wind == env.get_wrapper_attr("wind") == 3.0
+    env.set_wrapper_attr("new", 1)
+    assert env.new == 1
+    assert not env.set_wrapper_attr("newer", 1, force=False)
+    envs = DummyVecEnv([lambda: env])
+    envs.env_method("set_wrapper_attr", "wind", 5.0)
+    assert inner.wind == 5.0
+
+
+class NoOptions(Toy):
+    def reset(self, seed=None):
+        return super().reset(seed)
+
+
+def test_a_reset_without_options_is_explained_in_training():
+    message = (
+        r"reset\(\) of .*NoOptions.* takes no `options`: declare it as `def reset\(self, seed=None, options=None\)`"
+    )
+    with pytest.raises(ValueError, match=message):
+        MADDPG("MlpPolicy", NoOptions("binary")).learn(20)
+
+
+def test_what_is_no_observation_of_a_team_is_explained():
+    env = Toy("binary")
+    model = MADDPG("MlpPolicy", env)
+    observations, _ = env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"is a dict, .*TeamEnv\(env\) returns it.*agent_policy"):
+        model.predict(observations)
+    with pytest.raises(ValueError, match=r"has shape \(2,\), but a team observes \(3, 4\).*agent_policy"):
+        model.predict(observations["binary_0"])
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        lambda: gymnasium.make("CartPole-v1"),
+        lambda: supersuit.concat_vec_envs_v1(
+            supersuit.pettingzoo_env_to_vec_env_v1(simple_spread_v3.parallel_env()), 2, base_class="stable_baselines3"
+        ),
+    ],
+)
+def test_what_is_no_team_is_explained(env):
+    with pytest.raises(ValueError, match=r"Pass a PettingZoo environment itself.*For a single agent, use"):
+        MADDPG("MlpPolicy", env())
+
+
+def test_wrappers_that_take_agents_away_are_named():
+    class Hides(BaseParallelWrapper):
+        def step(self, actions):
+            *rest, infos = super().step(actions)
+            self.env.agents = self.agents = self.env.agents[1:]
+            return *rest, infos
+
+    env = TeamEnv(Hides(Toy("binary")))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"without termination or truncation, or one of its wrappers \(Hides\) took"):
+        env.step(np.zeros(6))

@@ -193,7 +193,7 @@ def test_groups_by_name_and_number():
 @pytest.mark.parametrize(
     ("share", "message"),
     [
-        ([["mixed_0", "mixed_9"]], "There is no agent 'mixed_9'.*mixed_0, mixed_1"),
+        ([["mixed_0", "mixed_9"]], "There is no agent 'mixed_9'.*'mixed_0', 'mixed_1'"),
         ([[0, 6]], "There is no agent 6.*0 to 5"),
         ([["mixed_0", 1], [0]], "share_actor.* names an agent twice"),
         ([[2, 2]], "names an agent twice"),
@@ -259,7 +259,7 @@ def test_a_threshold_outside_the_scores_is_refused(threshold):
 
 @pytest.mark.parametrize("kind", ["datetime64[s]", "timedelta64[s]", "U4", "S4", "complex64"])
 def test_an_observation_of_other_things_than_numbers_is_refused(kind):
-    for observation in (np.zeros((N, D), kind), 10**400, "x", {}, [[0.0], [0.0, 1.0]], None, [[None] * D] * N):
+    for observation in (np.zeros((N, D), kind), 10**400, "x", [[0.0], [0.0, 1.0]], None, [[None] * D] * N):
         with pytest.raises(ValueError, match=r"observation=.* is not an array of numbers of shape \(4, 5\)"):
             policy().predict(observation)
 

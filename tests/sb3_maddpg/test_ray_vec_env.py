@@ -99,6 +99,25 @@ def test_what_is_seen_is_what_the_shards_would_return_here(make, local, kill_at)
     assert any(one.dtype == bool and one.any() for one in there), "episodes end"
 
 
+class WritesIntoActions(OwnBit):
+    def step(self, action):
+        returned = super().step(action)
+        action[:] = 0
+        return returned
+
+
+def test_environments_may_write_into_their_actions():
+    actions = np.ones((1, 9), np.int8)
+    env = RayVecEnv([lambda: DummyVecEnv([WritesIntoActions])])
+    try:
+        env.reset()
+        _, _, _, infos = env.step(actions)
+    finally:
+        env.close()
+    assert infos[0]["metrics"] == {"task/mean_action": 1.0}
+    assert actions.all()
+
+
 def test_what_is_learned_is_the_same_to_the_last_bit():
     digests = []
     for env in (RayVecEnv([swarms, swarms], snapshot_every=7), Together(swarms)):

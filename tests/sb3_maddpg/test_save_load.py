@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
+from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.team import plain_joint_space
 from sb3_maddpg.team_tasks import OtherBit, OwnBit
+from toys import Toy
 
 SMALL = {"learning_starts": 20, "batch_size": 16, "train_freq": 5, "buffer_size": 1000, "seed": 0}
 OBS = np.random.default_rng(0).choice([-1.0, 1.0], (50, 3, 3)).astype(np.float32)
@@ -416,3 +420,23 @@ def test_a_model_remembers_that_its_observations_were_normalised(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         MADDPG.load(tmp_path / "plain").agent_policy(0)
+
+
+def test_files_whose_joint_action_space_lost_data_types_still_load(tmp_path, monkeypatch):
+    """As files of earlier versions have them."""
+
+    class Integers(Toy):
+        def __init__(self):
+            super().__init__("continuous")
+            self.spaces = tuple(spaces.Box(0, 9, (2,), np.int64) for _ in self.spaces)
+
+    with monkeypatch.context() as earlier:
+        earlier.setattr("sb3_maddpg.parallel.joint_action_space", plain_joint_space)
+        model = MADDPG("MlpPolicy", Integers(), **SMALL)
+        model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model", env=Integers())
+    obs = TeamEnv(Integers()).reset(seed=0)[0]
+    before, after = (one.predict(obs, deterministic=True)[0] for one in (model, loaded))
+    assert np.abs(before - after).max() <= 0.5  # rounded now
+    assert loaded.agent_policy(0).predict(obs[0, :2]).dtype == np.int64
+    loaded.learn(30)

@@ -52,14 +52,17 @@ def test_spaces_in_double_precision_are_taken_without_a_warning():
     ("agent_spaces", "joint"),
     [
         ([spaces.MultiBinary(3)] * 2, spaces.MultiBinary(6)),
-        ([spaces.MultiBinary((2, 2)), spaces.MultiBinary(4)], spaces.MultiBinary(8)),
+        ([spaces.MultiBinary((2, 2)), spaces.MultiBinary(4)], None),
         ([spaces.Discrete(3, start=1), spaces.Discrete(5)], spaces.MultiDiscrete([3, 5])),
         ([spaces.MultiDiscrete([2, 3]), spaces.MultiDiscrete([4, 5])], spaces.MultiDiscrete([2, 3, 4, 5])),
         ([spaces.Discrete(2), spaces.MultiDiscrete([7])], spaces.MultiDiscrete([2, 7])),
         (
-            [spaces.Box(-1, 2, (2, 1)), spaces.Box(0, 3, (2,))],
+            [spaces.Box(-1, 2, (2,)), spaces.Box(0, 3, (2,))],
             spaces.Box(np.float32([-1, -1, 0, 0]), np.float32([2, 2, 3, 3])),
         ),
+        # A plain Box would lose the agents' shapes and data types
+        ([spaces.Box(-1, 2, (2, 1)), spaces.Box(0, 3, (2,))], None),
+        ([spaces.Box(0, 9, (2,), np.int64)] * 2, None),
         ([spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (3,))], None),
         ([spaces.MultiBinary(2), spaces.MultiDiscrete([2, 2])], None),
         (MIXED, None),

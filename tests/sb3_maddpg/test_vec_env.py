@@ -1,16 +1,39 @@
 """Gymnasium's vector environments under Stable-Baselines3: the same transitions as its own DummyVecEnv."""
 
+from copy import deepcopy
+
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import (
+    ClipReward,
+    MaxAndSkipObservation,
+    NormalizeReward,
+    OrderEnforcing,
+    PassiveEnvChecker,
+    RecordEpisodeStatistics,
+    TimeLimit,
+    TransformReward,
+)
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnvWrapper,
+    VecMonitor,
+    VecNormalize,
+)
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from sb3_maddpg import MADDPG
 from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.team_tasks import OwnBit
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 from toys import Toy
 
@@ -182,7 +205,7 @@ def renamed(env: Toy) -> Toy:
 @pytest.mark.parametrize(
     ("wrap", "message"),
     [
-        (gymnasium.wrappers.NormalizeObservation, "changes the observations of TeamEnv.*action masks"),
+        (gymnasium.wrappers.NormalizeObservation, "changes the observations of the team.*action masks"),
         (gymnasium.wrappers.NormalizeReward, "NormalizeReward changes only the team's reward"),
         (lambda env: gymnasium.wrappers.TransformReward(env, np.negative), "TransformReward changes only the team's"),
     ],
@@ -191,3 +214,283 @@ def test_wrappers_that_would_have_no_effect_are_refused(wrap, message):
     with pytest.raises(ValueError, match=message):
         MADDPG("MlpPolicy", wrap(TeamEnv(Toy("binary"))))
     MADDPG("MlpPolicy", gymnasium.wrappers.TimeLimit(TeamEnv(Toy("binary")), 5))
+
+
+SMALL = {"learning_starts": 20, "batch_size": 16, "train_freq": 10, "buffer_size": 1000, "seed": 0}
+
+
+class Shaped(gymnasium.Wrapper):
+    """The most common style of changing a reward."""
+
+    def step(self, action):
+        obs, reward, *rest = self.env.step(action)
+        return obs, reward - 0.5, *rest
+
+
+class ShapedVec(VecEnvWrapper):
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        return obs, rewards - 0.5, dones, infos
+
+
+def toy():
+    return TeamEnv(Toy("categorical"))
+
+
+def of_one_kind(env: str):
+    """Module-level, so that other processes can import them."""
+    make = {"toy": toy, "own": OwnBit, "swarm": lambda: gymnasium.make("QuadSwarm-v0", n_robots=3, max_steps=5)}[env]
+    return make
+
+
+@pytest.mark.parametrize("of", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize(
+    ("wrap", "message"),
+    [
+        (Shaped, "team's reward of environment 0 arrived as"),
+        (
+            lambda env: ClipReward(env, -0.1, 0.1),
+            "changes only the team's reward|team's reward of environment 0 arrived",
+        ),
+        (lambda env: TransformReward(env, lambda reward: 7 * reward), "only the team's reward|team's reward of env"),
+        (NormalizeReward, "changes only the team's reward|team's reward of environment 0 arrived"),
+        (lambda env: MaxAndSkipObservation(env, skip=4), "team's reward of environment 0 arrived as"),
+    ],
+)
+@pytest.mark.parametrize("env", ["toy", "own"])
+def test_rewards_that_a_wrapper_changed_arrive_or_are_refused(env, wrap, message, of):
+    kwargs = {"start_method": "fork"} if of is SubprocVecEnv else {}
+    make = of_one_kind(env)
+    envs = of([lambda: wrap(make())], **kwargs)
+    try:
+        with pytest.raises(ValueError, match=message):
+            MADDPG("MlpPolicy", envs, **SMALL).learn(40)
+    finally:
+        envs.close()
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_rewards_that_a_vec_env_wrapper_changed_are_refused(normalized):
+    envs = ShapedVec(DummyVecEnv([toy]))
+    if normalized:
+        envs = VecNormalize(envs)
+    with pytest.raises(ValueError, match="team's reward of environment 0 arrived as"):
+        MADDPG("MlpPolicy", envs, **SMALL).learn(40)
+
+
+def test_a_reward_that_every_agent_gets_arrives_as_it_was_changed():
+    make = of_one_kind("swarm")
+    model = MADDPG("MlpPolicy", Shaped(make()), **SMALL)
+    model.learn(10)
+    assert np.array_equal(
+        model.replay_buffer.agent_rewards[:10], np.repeat(model.replay_buffer.rewards[:10], 3, 0).reshape(10, 1, 3)
+    )
+    assert model.replay_buffer.rewards[:10].max() < 1.3 - 0.4
+    parts = {"policy_kwargs": {"pair_credit": True}}
+    swarm = gymnasium.make("QuadSwarm-v0", n_robots=3, max_steps=5, observation="state+approach")
+    with pytest.raises(ValueError, match="team's reward of environment 0 arrived as"):
+        MADDPG("PairPolicy", Shaped(swarm), **SMALL, **parts).learn(10)
+
+
+def test_a_team_s_own_way_of_adding_up_rewards_is_named():
+    class Worst(OwnBit):
+        named = False
+
+        def step(self, action):
+            obs, _, *ends, info = super().step(action)
+            reward = float(info["agent_rewards"].min())
+            return obs, reward, *ends, {**info, "team_reward": reward} if self.named else info
+
+    with pytest.raises(ValueError, match=r"return it in info\['team_reward'\], too"):
+        MADDPG("MlpPolicy", Worst(), **SMALL).learn(40)
+    env = Worst()
+    env.named = True
+    MADDPG("MlpPolicy", env, **SMALL).learn(40)
+
+
+def test_steps_that_a_wrapper_skips_are_noticed_without_rewards():
+    class Skip(gymnasium.Wrapper):
+        def step(self, action):
+            self.env.step(action)
+            return self.env.step(action)
+
+    with pytest.raises(ValueError, match="Environment 0 went from step 2 to step 4 of its episode"):
+        MADDPG("MlpPolicy", Skip(toy()), **SMALL).learn(40)
+
+
+class Rescaled(gymnasium.ActionWrapper):
+    """Of ``Box`` actions alone, whatever the agents had."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        length = len(env.action_space.sample())
+        self.action_space = spaces.Box(-1, 1, (length,), np.float32)
+
+    def action(self, action):
+        return np.zeros(len(action))
+
+
+@pytest.mark.parametrize("of", [DummyVecEnv, SubprocVecEnv, "sync", "async"])
+@pytest.mark.parametrize("kind", ["heterogeneous", "continuous", "binary"])
+def test_actions_are_not_divided_among_the_agents_anew(kind, of):
+    def make():
+        return Rescaled(TeamEnv(Toy(kind)))
+
+    if isinstance(of, str):
+        vector = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}[of]
+        envs = GymnasiumVecEnv(vector([make], **SAME_STEP))
+    else:
+        envs = of([make], **({"start_method": "fork"} if of is SubprocVecEnv else {}))
+    try:
+        with pytest.raises(ValueError, match="changes the actions of the team"):
+            MADDPG("MlpPolicy", envs, **SMALL)
+    finally:
+        envs.close()
+
+
+def test_wrappers_that_change_nothing_of_a_team_train(tmp_path):
+    env = TimeLimit(RecordEpisodeStatistics(OrderEnforcing(PassiveEnvChecker(toy()))), 7)
+    envs = VecCheckNan(VecMonitor(DummyVecEnv([lambda: Monitor(env, str(tmp_path / "run"))])))
+    model = MADDPG("MlpPolicy", envs, **SMALL).learn(40)
+    assert np.allclose(model.replay_buffer.agent_rewards[:40].mean(axis=2), model.replay_buffer.rewards[:40], atol=1e-6)
+    assert np.flatnonzero(model.replay_buffer.dones[:40, 0]).tolist() == [6, 13, 20, 27, 34]
+
+
+class Counting(gymnasium.Env):
+    """
+    Observes episode and step. Everything it returns is in arrays that it writes into again, also in ``reset``.
+
+    :param dtype: of the observation
+    :param spoil: value of the observation in the third step of an episode
+    """
+
+    def __init__(self, dtype=np.float32, spoil=None):
+        self.observation_space = spaces.Box(0, 200, (2, 2), dtype)
+        self.action_space = spaces.MultiBinary(2)
+        self.spoil, self.episode = spoil, 0
+        self.obs = np.zeros((2, 2), dtype)
+        self.info = {
+            "agent_rewards": np.zeros(2),
+            "agent_terminated": np.zeros(2, bool),
+            "agent_active": np.ones(2, bool),
+        }
+
+    def look(self):
+        self.obs[:] = self.episode, self.t
+        if self.spoil is not None and self.t == 3:
+            return np.where(self.obs < 0, 0, self.spoil)
+        return self.obs
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.episode, self.t = self.episode + 1, 0
+        self.info["agent_rewards"][:] = 0
+        self.info["agent_terminated"][:] = False
+        self.info["agent_active"][:] = True
+        return self.look(), {}
+
+    def step(self, action):
+        self.t += 1
+        self.info["agent_rewards"][:] = self.t
+        self.info["agent_terminated"][0] = self.t >= 6
+        self.info["agent_active"][0] = self.t <= 6
+        return self.look(), float(self.t), False, self.t == 7, self.info
+
+
+class CountingVector(VectorEnv):
+    """Several ``Counting`` in one observation array, as environments without copies have it."""
+
+    def __init__(self, num_envs, **kwargs):
+        self.envs, self.num_envs = [Counting() for _ in range(num_envs)], num_envs
+        self.metadata = SAME_STEP
+        self.single_observation_space, self.single_action_space = self.envs[0].observation_space, spaces.MultiBinary(2)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.obs = np.zeros((num_envs, 2, 2), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.obs[:] = [env.reset()[0] for env in self.envs]
+        return self.obs, {}
+
+    def step(self, actions):
+        obs, rewards, _, ends, infos = zip(*[env.step(None) for env in self.envs], strict=True)
+        batch = {name: np.stack([info[name] for info in infos]) for name in infos[0]}
+        batch |= {
+            "final_obs": np.stack(obs),
+            "_final_obs": np.array(ends),
+            "final_info": dict(batch),
+            "_final_info": np.array(ends),
+        }
+        self.obs[:] = [env.reset()[0] if end else one for env, one, end in zip(self.envs, obs, ends, strict=True)]
+        return self.obs, np.array(rewards), np.zeros(len(obs), bool), np.array(ends), batch
+
+
+def check_counted(model, n_envs: int) -> None:
+    """Every row is what ``Counting`` gave."""
+    buffer, steps = model.replay_buffer, np.arange(21) % 7
+    for env in range(n_envs):
+        assert buffer.observations[:21, env, 0, 1].tolist() == steps.tolist()
+        assert buffer.next_observations[:21, env, 0, 1].tolist() == (steps + 1).tolist()
+        assert (buffer.observations[:21, env, :, 0] == buffer.next_observations[:21, env, :, 0]).all()
+        assert buffer.agent_rewards[:21, env, 1].tolist() == (steps + 1).tolist()
+        assert buffer.agent_terminated[:21, env, 0].tolist() == (steps >= 5).tolist()
+        assert buffer.agent_active[:21, env, 0].tolist() == (steps <= 5).tolist()
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("vector", ["DummyVecEnv", "CountingVector", "SyncVectorEnv"])
+def test_arrays_that_environments_write_into_again_arrive_as_they_were(vector, n_envs):
+    if vector == "DummyVecEnv":
+        envs = DummyVecEnv([Counting for _ in range(n_envs)])
+    elif vector == "CountingVector":
+        envs = GymnasiumVecEnv(CountingVector(n_envs))
+    else:
+        envs = GymnasiumVecEnv(SyncVectorEnv([SameButCopied] * n_envs, copy=False, **SAME_STEP))
+    model = MADDPG("MlpPolicy", envs, **SMALL).learn(21 * n_envs)
+    check_counted(model, n_envs)
+
+
+class SameButCopied(Counting):
+    """Gymnasium's vector environments themselves need environments that return copies."""
+
+    def step(self, action):
+        obs, *rest, info = super().step(action)
+        return obs.copy(), *rest, deepcopy(info)
+
+
+class SameButInfos(Counting):
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, deepcopy(info)
+
+
+@pytest.mark.parametrize("env", [Counting, SameButInfos])
+def test_arrays_that_are_written_into_in_another_process_are_noticed(env):
+    envs = SubprocVecEnv([env], start_method="fork")
+    try:
+        with pytest.raises(ValueError, match=r"writes into (an array|arrays) that it has returned"):
+            MADDPG("MlpPolicy", envs, **SMALL).learn(60)
+    finally:
+        envs.close()
+
+
+@pytest.mark.parametrize("of", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.int64])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, 0.5, 2.0**70])
+def test_integer_observations_hold_integers(value, dtype, of):
+    envs = of([lambda: Counting(dtype, value)], **({"start_method": "fork"} if of is SubprocVecEnv else {}))
+    try:
+        with pytest.raises(ValueError, match=r"bservation of agent 0 .*is (nan|inf|1e\+300|0.5|1.18.*e.21)"):
+            MADDPG("MlpPolicy", envs, **SMALL).learn(10)
+    finally:
+        envs.close()
+
+
+@pytest.mark.parametrize("value", [300, -7, 300.0])
+def test_integer_observations_do_not_wrap_around(value):
+    with pytest.raises(ValueError, match=rf"observation of agent 0 is {value} in column 0, no integer of uint8"):
+        MADDPG("MlpPolicy", Counting(np.uint8, value), **SMALL).learn(10)
+    MADDPG("MlpPolicy", Counting(np.uint8, 7.0), **SMALL).learn(10)

@@ -21,6 +21,8 @@ from quad_swarm.figures.render import Renderer
 from quad_swarm.geometry import length
 from quad_swarm.world.beliefs import other_indices
 
+_SHORTEST_FRAME = 0.02  # players slow down shorter frames of a GIF (s)
+
 
 def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition], seed: int, folder: Path) -> list[Path]:
     """Draw all figures as PNG and PDF files, and a flight as an animation.
@@ -146,19 +148,27 @@ def draw_flights(
 
 
 def animate(condition: Condition, flight: Flight, path: Path) -> None:
-    """Write a flight as an animated GIF in real time, until shortly after all robots have arrived."""
+    """Write a flight as an animated GIF in real time, until shortly after all robots have arrived.
+
+    Steps that are shorter than `_SHORTEST_FRAME` share an image.
+    """
     renderer = Renderer(flight.config)
     steps = len(flight.requests) if flight.arrival is None else min(flight.arrival + 9, len(flight.requests))
+    dt = flight.config.planner.dt
+    stride = math.ceil(_SHORTEST_FRAME / dt - 1e-9)
+    shown = range(0, steps, stride)
+    # GIF counts hundredths of a second: rounding the times, not the durations, keeps the film in real time
+    times = np.rint(100 * dt * np.array([*shown, steps])).astype(int)
     frames = []
-    for k in range(steps):
+    for k in shown:
         lines = [
             f"{short_name(condition.policy)}, {condition.scenario}",
             f"step {k + 1}   {'plans sent' if flight.announced.any() else 'requests'} {flight.requests[k].sum()}",
         ]
         picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
         frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
-    duration = round(1000 * flight.config.planner.dt)
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    durations = (10 * np.diff(times)).tolist()
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
 def draw_flight(axes: Axes, flight: Flight) -> None:

@@ -51,8 +51,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     truncated after `max_steps`.
 
     ## Info
-    `reward_terms`, `pair_rewards` (n, n - 1; the part of a robot's reward that belongs to one of the others),
-    `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
+    `team_reward`, `reward_terms`, `pair_rewards` (n, n - 1; the part of a robot's reward that belongs to one of the
+    others), `n_requests`, `min_separation`, `min_separation_continuous`, `collision`, `collision_continuous`,
     `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and `metrics`. In the last
     step of an episode also `is_success` and further `metrics`. With a limited neighbourhood also `neighbours` (n, m),
     the index of the robot in each slot of the action and of the entries about others, -1 for an empty slot, and
@@ -138,6 +138,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
+        # An image per step: videos and windows show real time at whatever rate the robots plan
+        self.metadata = {**type(self).metadata, "render_fps": 1 / self.config.planner.dt}
         self._renderer: Any = None
         self._requests = np.zeros((n, n - 1), dtype=bool)
         self._is_reset = False
@@ -237,6 +239,10 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
             self._renderer.show(self.metadata["render_fps"])
             return None
         return picture
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies and pickles hold: everything but the renderer, which a copy creates when it renders."""
+        return {**self.__dict__, "_renderer": None}
 
     def close(self) -> None:
         """Close the window and free the renderer."""

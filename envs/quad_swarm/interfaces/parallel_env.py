@@ -31,6 +31,7 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
     def __init__(self, render_mode: str | None = None, **kwargs: Any):
         self.team = QuadSwarmEnv(render_mode=render_mode, **kwargs)
         self.render_mode = render_mode
+        self.metadata = {**type(self).metadata, "render_fps": self.team.metadata["render_fps"]}
         self.task = self.team.task
         n, size = self.n_agents, self.task.observation_size
         self.possible_agents = list(self.team.agent_names)

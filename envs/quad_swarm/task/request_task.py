@@ -309,6 +309,7 @@ class RequestTask:
         who = {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
         return who | {
             "scenario": np.array(self.scenario),
+            "team_reward": outcome.reward,
             "pair_rewards": outcome.pair_rewards,
             "reward_terms": outcome.reward_terms,
             "n_requests": outcome.n_requests,

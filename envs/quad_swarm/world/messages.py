@@ -6,6 +6,8 @@ import struct
 
 import numpy as np
 
+from quad_swarm.errors import shown
+
 _HEADER = struct.Struct("<BBI")  # sender, receiver, step
 REQUEST_BYTES = _HEADER.size
 _MILLIMETRES = 1e-3
@@ -19,8 +21,18 @@ def pack_plan(sender: int, receiver: int, step: int, positions: np.ndarray) -> b
     :param receiver: robot that requested it, 0 to 255
     :param step: step in which the plan was made
     :param positions: positions at stages 0..N, (N + 1, 3), world frame, within 32.7 m (m)
-    :raises ValueError: if a position is not finite or too far away
+    :raises ValueError: if a position is not finite or too far away, or another value does not fit into a message
     """
+    for name, value, largest in (("sender", sender, 255), ("receiver", receiver, 255), ("step", step, 2**32 - 1)):
+        # A bool is an int, but no number of a robot; NumPy's integers are as good as Python's
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= largest:
+            raise ValueError(f"{name}={shown(value)}: messages hold an integer from 0 to {largest}.")
+    positions = np.asarray(positions)
+    if positions.ndim != 2 or positions.shape[1] != 3 or not len(positions) or positions.dtype.kind not in "fiu":
+        raise ValueError(
+            f"positions have shape {positions.shape} and type {positions.dtype}: a plan holds positions at stages "
+            "0..N, (N + 1, 3)."
+        )
     if not (np.abs(positions) <= _FARTHEST).all():
         farthest = float(np.abs(positions).max())
         raise ValueError(f"A plan reaches {farthest} m: messages hold coordinates of up to {_FARTHEST:.1f} m.")

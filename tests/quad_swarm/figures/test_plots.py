@@ -128,6 +128,21 @@ def test_the_animation_ends_shortly_after_all_have_arrived(flown, tmp_path):
     assert duration == 100 * (flight.arrival + 9) < 100 * len(flight.requests)
 
 
+@pytest.mark.parametrize("dt", [0.1, 0.05, 0.025, 0.03, 0.004])
+def test_animations_play_in_real_time(dt, tmp_path):
+    config = make_config(planner={"dt": dt}, max_steps=30)
+    flight = fly(Condition("none", "symmetric_swap", config), seed=0)
+    steps = len(flight.requests)
+    plots.animate(Condition("none", "symmetric_swap", config), flight, tmp_path / "swarm.gif")
+    durations = []
+    with Image.open(tmp_path / "swarm.gif") as film:
+        for frame in range(film.n_frames):
+            film.seek(frame)
+            durations.append(film.info["duration"])
+    assert sum(durations) == pytest.approx(1000 * dt * steps, abs=5)  # to a hundredth of a second
+    assert min(durations) >= 20
+
+
 def test_drawing_leaves_the_backend_of_matplotlib_alone():
     code = (
         "import matplotlib; matplotlib.use('svg'); import quad_swarm.figures.plots, quad_swarm.figures.dashboard; "

@@ -1,5 +1,6 @@
 """The Gymnasium interface: upstream's checkers, exact repetition, observations, info, videos, and bad input."""
 
+import copy
 import pickle
 import warnings
 
@@ -9,9 +10,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
 
 import quad_swarm
 from quad_swarm.interfaces.env import QuadSwarmEnv
+from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 
 
@@ -170,6 +173,31 @@ def test_videos_are_recorded(tmp_path):
     env.close()
     (video,) = tmp_path.glob("*.mp4")
     assert video.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("arguments", [{}, {"preset": "flight"}, {"planner": {"dt": 0.02}}, {"planner": {"dt": 0.03}}])
+def test_videos_show_real_time(arguments, tmp_path):
+    steps, dt = 6, make_config(arguments.get("preset", "paper"), planner=arguments.get("planner")).planner.dt
+    recorded = RecordVideo(
+        gymnasium.make("QuadSwarm-v0", render_mode="rgb_array", max_steps=steps, **arguments), str(tmp_path)
+    )
+    assert recorded.frames_per_sec * dt == pytest.approx(1)
+    batch = VecVideoRecorder(DummyVecEnv([lambda: recorded]), str(tmp_path), lambda step: False)
+    assert batch.frames_per_sec * dt == pytest.approx(1)
+    assert quad_swarm.parallel_env(**arguments).metadata["render_fps"] * dt == pytest.approx(1)
+    assert QuadSwarmEnv.metadata["render_fps"] == 10, "the class's own is that of the preset 'paper'"
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("make", [QuadSwarmEnv, quad_swarm.parallel_env])
+def test_survives_copying_after_it_was_rendered(make, copied):
+    env = make(render_mode="rgb_array")
+    env.reset(seed=2)
+    picture = env.render()
+    twin = copied(env)
+    assert np.array_equal(twin.render(), picture)
+    twin.close()
+    assert np.array_equal(env.render(), picture), "closing a copy leaves the original's renderer"
 
 
 def test_survives_pickling_in_the_middle_of_an_episode():

@@ -25,6 +25,38 @@ def test_a_plan_that_does_not_fit_is_refused(bad):
         pack_plan(0, 1, 0, np.full((3, 3), bad))
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        (256, 0, 0),
+        (0, 256, 0),
+        (-1, 0, 0),
+        (0, -1, 0),
+        (0, 1, -1),
+        (0, 1, 2**32),
+        (0, 1, 5.0),
+        (True, 1, 0),
+        ("0", 1, 0),
+    ],
+)
+def test_numbers_that_do_not_fit_are_refused(header):
+    with pytest.raises(ValueError, match="messages hold an integer from 0 to"):
+        pack_plan(*header, np.zeros((3, 3)))
+
+
+def test_numbers_of_numpy_and_the_largest_ones_come_back():
+    message = pack_plan(np.uint8(255), np.int64(254), 2**32 - 1, [[1, 2, 3]])
+    assert unpack_plan(message)[:3] == (255, 254, 2**32 - 1)
+
+
+@pytest.mark.parametrize(
+    "positions", [np.zeros((0, 3)), np.zeros((3, 2)), np.zeros(3), np.zeros((1, 3), object), "abc"]
+)
+def test_positions_of_another_form_are_refused(positions):
+    with pytest.raises(ValueError, match=r"positions have shape .* stages 0..N, \(N \+ 1, 3\)"):
+        pack_plan(0, 1, 0, positions)
+
+
 @pytest.mark.parametrize("message", [b"", b"123456", b"1234567"])
 def test_what_is_no_plan_is_refused(message):
     with pytest.raises(ValueError, match="is not a plan"):
