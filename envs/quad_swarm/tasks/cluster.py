@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from quad_swarm.errors import shown
-from quad_swarm.tasks.journal import machine
+from quad_swarm.tasks.journal import differences, machine, origin
 
 # Number of times that Ray retries a piece whose process or machine died
 _RETRIES = 3
@@ -28,6 +28,7 @@ class Cluster(Executor):
 
     If the process or machine of a piece dies, the piece is repeated elsewhere, so it must be a pure function of its
     arguments. Every machine needs the same version of this package, and the files that pieces name at the same paths.
+    Results of other sources of this package or of ``modules`` are refused.
 
     :param jobs: number of processes on this machine, unused if ``address`` names a cluster
     :param modules: modules that each process imports first
@@ -60,6 +61,7 @@ class Cluster(Executor):
                 )
             except (OSError, OverflowError, ValueError, RuntimeError) as error:
                 raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
+        self._code = _code(self._modules)
         self._run = ray.remote(_run).options(max_retries=_RETRIES, num_cpus=1)
         self._open: dict[Future[Any], Any] = {}
         self._lock = threading.RLock()  # Ray settles results in threads of its own
@@ -86,7 +88,7 @@ class Cluster(Executor):
 
     def _set(self, result: Future[Any], done: Future[Any]) -> None:
         try:
-            value, error, trace, where = done.result()
+            value, error, trace, where, *code = done.result()
         except self._ray.exceptions.RayError as lost:
             message = f"{_RETRIES + 1} processes died in the same piece of work, or it was cancelled: {lost}"
             result.set_exception(ValueError(message))
@@ -94,6 +96,8 @@ class Cluster(Executor):
         if error is not None:
             error.__cause__ = RuntimeError(f"in a process of the cluster:\n{trace}")
             result.set_exception(error)
+        elif names := differences(code[0] if code else {}, self._code):  # earlier versions return no digests
+            result.set_exception(other_code(names))
         elif where != machine() and not self._mixed:
             message = (
                 f"A piece was computed on a machine that differs from this one, so its last bits may differ: {where}, "
@@ -124,16 +128,33 @@ class Cluster(Executor):
         return None
 
 
-def _run(piece: bytes, modules: Sequence[str]) -> tuple[Any, Exception | None, str, str]:
-    """Run a piece and return its value, its error and traceback, and the machine."""
+def other_code(names: Sequence[str]) -> ValueError:
+    """Create the error for a result of other code.
+
+    :param names: what differs, see `differences`
+    """
+    return ValueError(
+        f"A piece was computed with another content of {', '.join(names)} than this command began with: leave code and "
+        "models alone while it runs; on a cluster, give all machines the same ones and restart Ray after changes."
+    )
+
+
+def _code(modules: Sequence[str]) -> dict[str, str]:
+    return origin(["quad_swarm", *modules])
+
+
+def _run(piece: bytes, modules: Sequence[str]) -> tuple[Any, Exception | None, str, str, dict[str, str]]:
+    """Run a piece and return its value, its error and traceback, the machine, and digests of the sources."""
+    code: dict[str, str] = {}
     try:
+        code = _code(modules)
         for module in modules:
             importlib.import_module(module)
-        return pickle.loads(piece)(), None, "", machine()
+        return pickle.loads(piece)(), None, "", machine(), code
     except Exception as error:  # passed on to the caller
         trace = traceback.format_exc()
         try:
             pickle.loads(pickle.dumps(error))
         except Exception:  # some exceptions can be pickled but not unpickled
             error = RuntimeError(repr(error))
-        return None, error, trace, machine()
+        return None, error, trace, machine(), code

@@ -134,6 +134,29 @@ def test_machines_of_another_kind_are_refused_unless_asked_for(monkeypatch):
         assert executor.submit(square, 2).result(timeout=60) == 4
 
 
+def test_results_of_other_code_are_refused_in_any_case(monkeypatch):
+    monkeypatch.setattr(cluster, "_code", lambda modules: {"quad_swarm": "digest of sources with one line changed"})
+    for mixed in (False, True):
+        with (
+            Cluster(2, mixed=mixed) as executor,
+            pytest.raises(ValueError, match="computed with another content of quad_swarm than this command"),
+        ):
+            executor.submit(square, 2).result(timeout=60)
+
+
+def test_a_module_or_model_that_is_another_there_is_noticed(tmp_path, monkeypatch):
+    """The processes of the cluster import other modules of the same name, and read another file."""
+    for folder, text in (("here", "A = 1"), ("there", "A = 2")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "module_of_a_user.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path / "here")
+    executor = Cluster(2, ["module_of_a_user"])
+    with_path = ray.remote(cluster._run).options(runtime_env={"env_vars": {"PYTHONPATH": str(tmp_path / "there")}})
+    executor._run = with_path
+    with executor, pytest.raises(ValueError, match="another content of module_of_a_user"):
+        executor.submit(len, ()).result(timeout=120)
+
+
 def test_an_exception_stops_what_runs():
     futures = []
 
