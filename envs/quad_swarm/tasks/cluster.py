@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
 import os
@@ -52,6 +53,7 @@ class Cluster(Executor):
                 if address is not None and (found := re.fullmatch(r"([^/]+):(\d+)", address)):
                     # Ray would wait for minutes
                     socket.create_connection((found[1], int(found[2])), timeout=5.0).close()
+                    _use_token()
                 ray.init(
                     address=address or "local",  # None would follow RAY_ADDRESS or a cluster found here
                     num_cpus=None if address else jobs,
@@ -59,8 +61,11 @@ class Cluster(Executor):
                     log_to_driver=False,
                     logging_level=logging.WARNING,
                 )
-            except (OSError, OverflowError, ValueError, RuntimeError) as error:
-                raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
+            except (OSError, OverflowError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
+                raise ValueError(
+                    f"address={shown(address)}: no Ray cluster responds there ({shown(str(error))[1:-1]}). If it asks "
+                    "for a token, put the cluster's token into ~/.ray/auth_token and set RAY_AUTH_MODE=token."
+                ) from error
         self._code = _code(self._modules)
         self._run = ray.remote(_run).options(max_retries=_RETRIES, num_cpus=1)
         self._open: dict[Future[Any], Any] = {}
@@ -126,6 +131,14 @@ class Cluster(Executor):
     ) -> bool | None:
         self.shutdown(cancel_futures=kind is not None)
         return None
+
+
+def _use_token() -> None:
+    """Use the user's token if there is one, as Ray does only for clusters that it finds on this machine."""
+    with contextlib.suppress(ImportError):  # Ray before 2.56 uses none unless RAY_AUTH_MODE says so
+        from ray._private.authentication import authentication_token_setup
+
+        authentication_token_setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
 
 
 def other_code(names: Sequence[str]) -> ValueError:
