@@ -9,6 +9,7 @@ files are synced to disk, then a manifest with their checksums is written, and r
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import io
 import json
 import math
@@ -21,14 +22,13 @@ import threading
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import stable_baselines3 as sb3
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from stable_baselines3.common.type_aliases import GymEnv
@@ -37,6 +37,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.env_states import (
     NoStateError,
+    layers,
     load_vec_env_state,
     plain_entries,
     plain_values,
@@ -48,7 +49,7 @@ from sb3_maddpg.env_states import (
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.model_files import as_damage, check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
-from sb3_maddpg.utils import arguments_of, is_full_disk, shown, sync_folder
+from sb3_maddpg.utils import arguments_of, is_full_disk, shown, sources_of, sync_folder
 
 _FORMAT = 2
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
@@ -403,8 +404,8 @@ def resume(
     with as_damage(path, "checkpoint"):
         arrays, state = _read_state(path)
         plain = decode(state, f"{path}: state", arrays)
-        _compare_fingerprints(plain["fingerprint"])
         model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
+        _compare_fingerprints(plain["fingerprint"], fingerprint(model.env))
         n_envs = len(plain["last"]["_last_episode_starts"])
         if model.n_envs != n_envs:
             raise ValueError(
@@ -496,8 +497,7 @@ def _state_of(
     buffer = model.replay_buffer
     assert isinstance(buffer, TeamReplayBuffer)
     _, counters, arrays = buffer.contents()
-    for name in buffer.records.dtype.names or ():  # those are in the segments
-        del arrays[name]
+    in_segments = buffer.records.dtype.names or ()
     inexact, env = _env_state_or_reason(cast(VecEnv, model.env))
     states = []
     for one in callbacks:
@@ -510,13 +510,11 @@ def _state_of(
         states.append({"class": type(one).__name__, **values, "eval_env": evaluation})
     return {
         "format": _FORMAT,
-        "fingerprint": fingerprint(),
+        "fingerprint": fingerprint(model.env),
         "inexact": inexact,
         "every": next(one.every for one in callbacks if isinstance(one, RunCheckpoint)),
         "counters": counters,
-        "buffer_arrays": {
-            name: array for name, array in arrays.items() if name not in (buffer.records.dtype.names or ())
-        },
+        "buffer_arrays": {name: one for name, one in arrays.items() if name not in in_segments},
         "last": {name: getattr(model, name) for name in _LAST},
         "action_noise": model.action_noise,
         "random": _random_state(),
@@ -651,28 +649,52 @@ def _callbacks(root: BaseCallback) -> list[BaseCallback]:
     return [*own, *(one for callback in inner if callback is not None for one in _callbacks(callback))]
 
 
-def fingerprint() -> dict[str, str]:
+# Distributions whose versions exact results depend on
+_DISTRIBUTIONS = ("sb3-maddpg", "stable-baselines3", "gymnasium", "pettingzoo")
+# Packages of environments that are named by their versions
+_BY_VERSION = {name.replace("-", "_") for name in _DISTRIBUTIONS}
+
+
+def fingerprint(env: VecEnv | None = None) -> dict[str, str]:
     """
-    :return: the hardware and software versions that the exact results of training depend on
+    :param env: the environment of a training
+    :return: the hardware, the versions and the sources that the exact results of training depend on: those of the
+        libraries, of this package, of the environment and its wrappers, and what the environment ``depends_on``
     """
+    parts = [] if env is None else list(layers(env))
+    modules = {type(one).__module__ for one in parts}
+    sources = {module.partition(".")[0]: sources_of(module) for module in sorted(modules)}
+    told = next((one for part in parts if isinstance(one := getattr(part, "depends_on", None), Mapping)), {})
     return {
         "processor": f"{platform.machine()} {platform.processor()} {th.backends.cpu.get_cpu_capability()}",
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
         "torch": str(th.__version__),
         "numpy": np.__version__,
-        "stable-baselines3": sb3.__version__,
+        **{name: version for name in _DISTRIBUTIONS if (version := _version(name))},
         "threads": str(th.get_num_threads()),
+        "sources of sb3_maddpg": sources_of("sb3_maddpg"),
+        **{f"sources of {name}": digest for name, digest in sources.items() if digest and name not in _BY_VERSION},
+        **{f"environment's {name}": str(value) for name, value in told.items()},
     }
 
 
-def _compare_fingerprints(written: dict[str, str]) -> None:
-    here = fingerprint()
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _compare_fingerprints(written: dict[str, str], here: dict[str, str]) -> None:
+    """Say in one line what differs from the fingerprint in a checkpoint, which earlier versions wrote shorter."""
     differ = [
-        f"{name}: {written.get(name)} before, {value} now" for name, value in here.items() if written.get(name) != value
+        f"{name}: {written.get(name, 'unknown')} before, {here.get(name, 'none')} now"
+        for name in {**here, **written}
+        if written.get(name) != here.get(name)
     ]
     if differ:
-        warnings.warn(f"The run continues, but will not be bit-identical: {'; '.join(differ)}.", stacklevel=3)
+        warnings.warn(f"The run continues, but may not be bit-identical: {'; '.join(differ)}.", stacklevel=3)
 
 
 def _columns(buffer: TeamReplayBuffer) -> dict[str, np.ndarray]:

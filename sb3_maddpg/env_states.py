@@ -279,6 +279,24 @@ def tells_state(env: gymnasium.Env) -> bool:
     return hasattr(inner, "state_dict") and hasattr(inner, "load_state_dict")
 
 
+def layers(env: Any) -> Iterator[Any]:
+    """
+    Yield all that an environment in this process consists of: wrappers, copies, and what adapters hold.
+
+    :param env: an environment of any kind
+    """
+    found: dict[int, Any] = {}
+    waiting = [env]
+    while waiting:
+        one = waiting.pop()
+        if id(one) in found or not hasattr(one, "__dict__"):
+            continue
+        found[id(one)] = one
+        yield one
+        for held in map(vars(one).get, ("venv", "env", "parallel_env", "envs")):
+            waiting += held if isinstance(held, (list, tuple)) else [held]
+
+
 def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
     """
     :param space: a space

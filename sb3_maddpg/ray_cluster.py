@@ -3,6 +3,7 @@
 import os
 import re
 import socket
+from contextlib import suppress
 from logging import WARNING
 from typing import Any
 
@@ -28,6 +29,7 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
     try:
         if address is not None and (found := re.fullmatch(r"([^/]+):(\d+)", address)):
             socket.create_connection((found[1], int(found[2])), timeout=5.0).close()  # Ray would wait for minutes
+            _use_token()
         ray.init(
             address=address or "local",  # None would follow RAY_ADDRESS or a cluster found here
             num_cpus=None if address else cpus,
@@ -35,6 +37,17 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
             log_to_driver=False,
             logging_level=WARNING,
         )
-    except (OSError, OverflowError, ValueError, RuntimeError) as error:
-        raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
+    except (OSError, OverflowError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
+        raise ValueError(
+            f"address={shown(address)}: no Ray cluster responds there ({shown(str(error))[1:-1]}). If it asks for a "
+            "token, put the cluster's token into ~/.ray/auth_token and set RAY_AUTH_MODE=token."
+        ) from error
     return ray, True
+
+
+def _use_token() -> None:
+    """Use the user's token if there is one, as Ray does only for clusters that it finds on this machine."""
+    with suppress(ImportError):  # Ray before 2.56 uses none unless RAY_AUTH_MODE says so
+        from ray._private.authentication import authentication_token_setup
+
+        authentication_token_setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)

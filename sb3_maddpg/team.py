@@ -92,6 +92,8 @@ class TeamAttributes(Protocol):
     action_cost: float | np.ndarray
     """Price of one unit of the encoded action, a number or (n_agents, width). The reward must contain the cost as a
     plain sum over the encoded action. Required for ``use_action_cost``."""
+    depends_on: Mapping[str, str]
+    """Names and versions of what exact results depend on besides the sources, such as a solver, for checkpoints."""
     n_curriculum_levels: int
     """Number of curriculum levels. Required for ``CurriculumCallback``, as is ``set_curriculum_level``."""
 

@@ -2,12 +2,15 @@
 
 import difflib
 import errno
+import functools
 import glob
+import hashlib
 import inspect
 import json
 import math
 import operator
 import os
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"}
 # A temporary file that has not been written to for this long is left over
 LEFT_OVER_SECONDS = 3600
+_SOURCES = {".py", ".pyx", ".c", ".cpp", ".h", ".hpp"}
 
 
 def shown(value: Any, most: int = 200) -> str:
@@ -159,6 +163,28 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@functools.lru_cache(maxsize=256)
+def sources_of(module: str) -> str:
+    """
+    Digest the sources that an imported module belongs to.
+
+    :param module: name of the module
+    :return: digest of the sources of its top-level package, or of its own file if that is a script or a namespace; ""
+        if there are none
+    """
+    package = sys.modules.get(module.partition(".")[0])
+    folders = getattr(package, "__path__", None) if getattr(package, "__file__", None) else None
+    if folders is None:
+        paths = [Path(str(getattr(sys.modules.get(module), "__file__", "")))]
+    else:
+        paths = sorted(path for folder in folders for path in Path(folder).rglob("*.*"))
+    digest = hashlib.sha256()
+    found = [path for path in paths if path.suffix in _SOURCES and path.is_file()]
+    for path in found:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12] if found else ""
 
 
 def arguments_of(cls: type) -> set[str]:

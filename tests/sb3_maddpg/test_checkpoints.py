@@ -1,13 +1,17 @@
 """Checkpoints: a run that is killed at any moment goes on bit for bit."""
 
 import errno
+import importlib
+import importlib.metadata
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import textwrap
 import time
+import warnings
 from pathlib import Path
 
 import gymnasium
@@ -29,6 +33,7 @@ from sb3_maddpg import MADDPG, CurriculumCallback, PrioritizedTeamReplayBuffer, 
 from sb3_maddpg.checkpoints import RunCheckpoint, digest, locked, newest, resume
 from sb3_maddpg.env_states import Replayable
 from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.utils import sources_of
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 SETTINGS = {"learning_starts": 60, "batch_size": 16, "seed": 0}
@@ -443,9 +448,37 @@ def test_what_tells_no_state_goes_on_with_new_episodes_and_says_so(tmp_path):
 
 def test_another_machine_is_named(tmp_path, monkeypatch):
     make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
-    monkeypatch.setattr(checkpoints, "fingerprint", lambda: {"torch": "3.0"})
-    with pytest.warns(UserWarning, match=r"will not be bit-identical: torch:? .* before, 3\.0 now"):
+    monkeypatch.setattr(checkpoints, "fingerprint", lambda env: {"torch": "3.0"})
+    with pytest.warns(UserWarning, match=r"may not be bit-identical: torch:? .* before, 3\.0 now"):
         resume(tmp_path, Replayable(OwnBit()))
+
+
+def test_an_upgrade_of_package_environment_or_solver_is_named_in_one_line(tmp_path, monkeypatch):
+    source = tmp_path / "own_env.py"
+    source.write_text(
+        "from sb3_maddpg.team_tasks import OwnBit\nclass Env(OwnBit):\n    depends_on = {'solver': 'fast'}\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    own = importlib.import_module("own_env")
+    run = tmp_path / "run"
+    MADDPG("MlpPolicy", Replayable(own.Env()), **SETTINGS).learn(250, callback=[RunCheckpoint(run, EVERY)])
+
+    def told() -> str:
+        sources_of.cache_clear()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            resume(run, Replayable(own.Env()))
+        return "".join(str(one.message) for one in caught)
+
+    assert told() == ""
+    monkeypatch.setattr(own.Env, "depends_on", {"solver": "slow"})
+    assert told() == "The run continues, but may not be bit-identical: environment's solver: fast before, slow now."
+    source.write_text(source.read_text() + "A = 1\n")
+    assert re.fullmatch(r".*: sources of own_env: \w{12} before, \w{12} now; environment's solver: .* now\.", told())
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "99.0")
+    assert "; gymnasium: " in told()
+    assert "sb3-maddpg: " in told()
+    assert "\n" not in told()
 
 
 def test_other_callbacks_and_other_environments_are_refused(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,9 +16,12 @@ from tqdm import tqdm
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model, make_policy
-from quad_swarm.task.episode_statistics import exchange_bytes
+from quad_swarm.planner import make_planner
+from quad_swarm.task.episode_statistics import exchange_bytes, is_row
 from quad_swarm.task.rules import RULES
 from quad_swarm.tasks import Journal, make_executor
+from quad_swarm.tasks.cluster import other_code
+from quad_swarm.tasks.journal import differences, origin
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -168,7 +171,8 @@ def _run_all(
 ) -> list[Rows]:
     """Return the statistics of each piece of work, in order. Pieces in the journal are not flown again."""
     keys = [_key(*piece) for piece in work]
-    done: dict[int, Rows] = {k: rows for k, key in enumerate(keys) if (rows := journal.fetch(key)) is not None}
+    found = {k: journal.fetch(key) for k, key in enumerate(keys)}
+    done: dict[int, Rows] = {k: rows for k, rows in found.items() if _fits(rows, work[k][1])}
     left = [k for k in range(len(work)) if k not in done]
     if done:
         print(f"{len(done)} of {len(work)} pieces were finished before this run.", file=sys.stderr)
@@ -184,27 +188,59 @@ def _run_all(
     return [done[k] for k in range(len(work))]
 
 
+def _fits(rows: Any, episodes: range) -> bool:
+    """Return whether a piece of the journal holds the statistics of these episodes."""
+    return isinstance(rows, list) and len(rows) == len(episodes) and all(map(is_row, rows))
+
+
 def _fly(
     work: Sequence[tuple[Condition, range]], left: Sequence[int], jobs: int, executor: Executor | None
 ) -> Iterator[tuple[int, Rows]]:
     """Yield the index and the statistics of each piece of work when it is finished."""
+    began = {condition: _origin(condition) for condition in {work[k][0] for k in left}}
+
+    def checked(k: int, there: dict[str, str], rows: Rows) -> tuple[int, Rows]:
+        if names := differences(there, began[work[k][0]]):
+            raise other_code(names)
+        return k, rows
+
     if executor is None and (jobs == 1 or len(left) < 2):
         for k in left:
-            yield k, run_episodes(*work[k])
+            yield checked(k, *_flown(run_episodes, *work[k]))
         return
     with make_pool(jobs) if executor is None else nullcontext(executor) as pool:
-        futures = {pool.submit(run_episodes, *work[k]): k for k in left}
+        futures = {pool.submit(_flown, run_episodes, *work[k]): k for k in left}
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            yield checked(futures[future], *future.result())
+
+
+def _flown(run: Callable[..., Rows], condition: Condition, episodes: range) -> tuple[dict[str, str], Rows]:
+    """Fly a piece of work, possibly on another machine, and return what made it, see `_origin`, and its rows."""
+    return _origin(condition), run(condition, episodes)
+
+
+def _depends_on(condition: Condition) -> tuple[set[str], list[Path]]:
+    """Return the packages and the files whose content the episodes of a condition are a function of."""
+    packages = {"quad_swarm", *user_modules()}
+    if not is_model(condition.policy):
+        return packages, []
+    return packages | {condition.algo.partition(":")[0]}, [Path(condition.policy.partition("@")[0])]
+
+
+def _solver(condition: Condition) -> str:
+    """Return the name of the solver that flies, which for "auto" depends on whether there is a compiler."""
+    config = condition.config
+    return make_planner(config.planner, config.quadrotor, config.n_others + 1, condition.solver).solver.name
+
+
+def _origin(condition: Condition) -> dict[str, str]:
+    """Return the code, files and solver that the episodes of a condition are a function of, by name, see `origin`."""
+    return {**origin(*_depends_on(condition)), "solver (is there a C++ compiler?)": _solver(condition)}
 
 
 def _key(condition: Condition, episodes: range) -> str:
     """Return the key of a piece of work, which includes the content of a model's file."""
-    packages, files = {"quad_swarm", *user_modules()}, []
-    if is_model(condition.policy):
-        packages.add(condition.algo.partition(":")[0])
-        files.append(Path(condition.policy.partition("@")[0]))
-    return Journal.key(repr((condition, episodes)), packages, files)
+    return Journal.key(repr((condition, episodes, _solver(condition))), *_depends_on(condition))
 
 
 def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixed: bool = False) -> Executor:

@@ -6,6 +6,7 @@ import operator
 from collections.abc import Mapping
 from typing import Any
 
+import casadi
 import gymnasium as gym
 import numpy as np
 
@@ -43,6 +44,11 @@ class TaskAttributes:
     def action_cost(self) -> float:
         """Cost of a request."""
         return self.task.action_cost
+
+    @property
+    def depends_on(self) -> dict[str, str]:
+        """What exact results depend on besides the sources: the solver that flies, and the version of CasADi."""
+        return {"solver": self.task.swarm.planner.solver.name, "casadi": casadi.__version__}
 
     # A callback sets the curriculum's level, the environment itself never does.
     @property

@@ -23,6 +23,14 @@ def exchange_bytes(config: SwarmConfig) -> int:
     return REQUEST_BYTES + plan_bytes(config.planner.horizon)
 
 
+def is_row(value: object) -> bool:
+    """Return whether a value, such as one from a file, has the names and types of `EpisodeStatistics.row`."""
+    if not isinstance(value, dict) or set(value) != set(_STATE):
+        return False
+    kinds = {name: {"b": bool, "i": int, "u": int, "f": float}[STATISTICS[name].kind] for name in _STATE}
+    return all(type(value[name]) is kind and value[name] == value[name] for name, kind in kinds.items())  # not NaN
+
+
 class EpisodeStatistics:
     """Statistics of the running episodes of E swarms, as arrays of length E.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
 import os
@@ -17,7 +18,7 @@ from types import TracebackType
 from typing import Any
 
 from quad_swarm.errors import shown
-from quad_swarm.tasks.journal import machine
+from quad_swarm.tasks.journal import differences, machine, origin
 
 # Number of times that Ray retries a piece whose process or machine died
 _RETRIES = 3
@@ -28,6 +29,7 @@ class Cluster(Executor):
 
     If the process or machine of a piece dies, the piece is repeated elsewhere, so it must be a pure function of its
     arguments. Every machine needs the same version of this package, and the files that pieces name at the same paths.
+    Results of other sources of this package or of ``modules`` are refused.
 
     :param jobs: number of processes on this machine, unused if ``address`` names a cluster
     :param modules: modules that each process imports first
@@ -51,6 +53,7 @@ class Cluster(Executor):
                 if address is not None and (found := re.fullmatch(r"([^/]+):(\d+)", address)):
                     # Ray would wait for minutes
                     socket.create_connection((found[1], int(found[2])), timeout=5.0).close()
+                    _use_token()
                 ray.init(
                     address=address or "local",  # None would follow RAY_ADDRESS or a cluster found here
                     num_cpus=None if address else jobs,
@@ -58,8 +61,12 @@ class Cluster(Executor):
                     log_to_driver=False,
                     logging_level=logging.WARNING,
                 )
-            except (OSError, OverflowError, ValueError, RuntimeError) as error:
-                raise ValueError(f"address={shown(address)}: no Ray cluster responds there ({error}).") from error
+            except (OSError, OverflowError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
+                raise ValueError(
+                    f"address={shown(address)}: no Ray cluster responds there ({shown(str(error))[1:-1]}). If it asks "
+                    "for a token, put the cluster's token into ~/.ray/auth_token and set RAY_AUTH_MODE=token."
+                ) from error
+        self._code = _code(self._modules)
         self._run = ray.remote(_run).options(max_retries=_RETRIES, num_cpus=1)
         self._open: dict[Future[Any], Any] = {}
         self._lock = threading.RLock()  # Ray settles results in threads of its own
@@ -86,7 +93,7 @@ class Cluster(Executor):
 
     def _set(self, result: Future[Any], done: Future[Any]) -> None:
         try:
-            value, error, trace, where = done.result()
+            value, error, trace, where, *code = done.result()
         except self._ray.exceptions.RayError as lost:
             message = f"{_RETRIES + 1} processes died in the same piece of work, or it was cancelled: {lost}"
             result.set_exception(ValueError(message))
@@ -94,6 +101,8 @@ class Cluster(Executor):
         if error is not None:
             error.__cause__ = RuntimeError(f"in a process of the cluster:\n{trace}")
             result.set_exception(error)
+        elif names := differences(code[0] if code else {}, self._code):  # earlier versions return no digests
+            result.set_exception(other_code(names))
         elif where != machine() and not self._mixed:
             message = (
                 f"A piece was computed on a machine that differs from this one, so its last bits may differ: {where}, "
@@ -124,16 +133,41 @@ class Cluster(Executor):
         return None
 
 
-def _run(piece: bytes, modules: Sequence[str]) -> tuple[Any, Exception | None, str, str]:
-    """Run a piece and return its value, its error and traceback, and the machine."""
+def _use_token() -> None:
+    """Use the user's token if there is one, as Ray does only for clusters that it finds on this machine."""
+    with contextlib.suppress(ImportError):  # Ray before 2.56 uses none unless RAY_AUTH_MODE says so
+        from ray._private.authentication import authentication_token_setup
+
+        authentication_token_setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
+
+
+def other_code(names: Sequence[str]) -> ValueError:
+    """Create the error for a result of other code.
+
+    :param names: what differs, see `differences`
+    """
+    return ValueError(
+        f"A piece was computed with another content of {', '.join(names)} than this command began with: leave code and "
+        "models alone while it runs; on a cluster, give all machines the same ones and restart Ray after changes."
+    )
+
+
+def _code(modules: Sequence[str]) -> dict[str, str]:
+    return origin(["quad_swarm", *modules])
+
+
+def _run(piece: bytes, modules: Sequence[str]) -> tuple[Any, Exception | None, str, str, dict[str, str]]:
+    """Run a piece and return its value, its error and traceback, the machine, and digests of the sources."""
+    code: dict[str, str] = {}
     try:
+        code = _code(modules)
         for module in modules:
             importlib.import_module(module)
-        return pickle.loads(piece)(), None, "", machine()
+        return pickle.loads(piece)(), None, "", machine(), code
     except Exception as error:  # passed on to the caller
         trace = traceback.format_exc()
         try:
             pickle.loads(pickle.dumps(error))
         except Exception:  # some exceptions can be pickled but not unpickled
             error = RuntimeError(repr(error))
-        return None, error, trace, machine()
+        return None, error, trace, machine(), code

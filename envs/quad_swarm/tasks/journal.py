@@ -14,13 +14,17 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from quad_swarm.native.build import cache_directory
 
-_VERSIONS = ("numpy", "torch", "casadi")
+# Distributions whose versions results depend on: the first two at least in their last bits, the simulators if they fly
+_VERSIONS = (
+    *("numpy", "torch", "casadi", "gymnasium", "pettingzoo", "stable-baselines3"),
+    *("rotorpy", "crazyflow", "jax"),
+)
 _DAYS = 30  # after which pieces are deleted
 _SOURCES = (".py", ".cpp", ".hpp")
 
@@ -33,7 +37,7 @@ def default_folder() -> Path:
 class Journal:
     """JSON values in one file each, by keys of everything that they depend on.
 
-    Files are written atomically. If writing fails, a warning is issued and pieces are no longer kept.
+    Files are written atomically, with a checksum. If writing fails, a warning is issued and pieces are no longer kept.
 
     :param folder: folder of the files; None keeps nothing
     """
@@ -52,17 +56,18 @@ class Journal:
         :param files: other files that it depends on, such as models
         """
         digest = hashlib.sha256(what.encode())
-        for part in (*(sources_digest(name) for name in sorted(set(packages))), *map(_content, files), machine()):
+        for part in (*origin(packages, files).values(), machine()):
             digest.update(b"\0" + part.encode())
         return digest.hexdigest()[:32]
 
     def fetch(self, key: str) -> Any:
-        """Return the value of a piece, None if there is none."""
+        """Return the value of a piece, None if there is none, or it is not what was kept under this key."""
         if self._folder is None:
             return None
         try:
-            return json.loads(self._path(key).read_text(encoding="utf-8"))["value"]
-        except (OSError, ValueError, KeyError, TypeError):  # absent, or damaged
+            found = json.loads(self._path(key).read_text(encoding="utf-8"))
+            return found["value"] if found["sha256"] == _checksum(key, found["value"]) else None
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):  # absent, or damaged
             return None
 
     def keep(self, key: str, value: Any) -> None:
@@ -75,7 +80,7 @@ class Journal:
                 "w", dir=self._folder, prefix=f"{key}.", suffix=".part", delete=False
             ) as file:
                 try:
-                    json.dump({"value": value}, file)
+                    json.dump({"value": value, "sha256": _checksum(key, value)}, file)
                     file.flush()
                     os.fsync(file.fileno())
                     file.close()
@@ -116,6 +121,25 @@ def _remove_old(folder: Path) -> None:
                 path.unlink()
 
 
+def origin(packages: Iterable[str], files: Iterable[Path] = ()) -> dict[str, str]:
+    """Return digests of what results are a function of, apart from arguments and `machine`.
+
+    :param packages: names of packages and modules, whose sources are digested wherever they are imported from
+    :param files: files, whose content is digested
+    """
+    sources = {name: sources_digest(name) for name in sorted({package.partition(".")[0] for package in packages})}
+    return sources | {str(path): _content(path) for path in files}
+
+
+def differences(there: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
+    """Return the names of what differs between two `origin`."""
+    return sorted(name for name in {*there, *here} if there.get(name) != here.get(name))
+
+
+def _checksum(key: str, value: Any) -> str:
+    return hashlib.sha256(json.dumps([key, value], sort_keys=True).encode()).hexdigest()
+
+
 @functools.lru_cache(maxsize=64)
 def sources_digest(name: str) -> str:
     """Return a digest of the sources of a package or a top-level module."""
@@ -125,7 +149,7 @@ def sources_digest(name: str) -> str:
     if spec is not None and spec.submodule_search_locations:
         paths = sorted(path for place in spec.submodule_search_locations for path in Path(place).rglob("*.*"))
         for path in paths:
-            if path.suffix in _SOURCES:
+            if path.suffix in _SOURCES and path.is_file():  # editors leave links to nowhere
                 digest.update(path.read_bytes())
     elif spec is not None and spec.origin is not None and Path(spec.origin).is_file():
         digest.update(Path(spec.origin).read_bytes())

@@ -1,7 +1,9 @@
 """The comparison of policies: its independence of processes, its figures, workers that die."""
 
 import importlib
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,9 +15,13 @@ import numpy as np
 import pytest
 
 from quad_swarm.evaluation import evaluation
+from quad_swarm.evaluation.command import paper_policies
 from quad_swarm.evaluation.evaluation import evaluate, fly_all, summarise
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
+from quad_swarm.native import BuildError
+from quad_swarm.planner import RtiSolver
 from quad_swarm.task.rules import RULES
+from quad_swarm.tasks import Journal
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -143,6 +149,67 @@ def test_finished_pieces_are_not_flown_again(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir()), "nothing is kept of what is done"
 
 
+def no_compiler(self) -> None:
+    raise BuildError("no compiler for this test of keys")  # each message is issued once only
+
+
+def as_rows(change):
+    """A piece whose rows were changed, with a checksum that fits."""
+
+    def damage(path: Path) -> None:
+        key, rows = path.stem, json.loads(path.read_text())["value"]
+        Journal(path.parent).keep(key, change(rows))
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_text(path.read_text().replace("true", "false")),
+        lambda path: path.write_text(path.read_text().replace("[{", "[[{").replace("}]", "}]]")),
+        as_rows(lambda rows: rows[:2]),
+        as_rows(lambda rows: []),
+        as_rows(lambda rows: {"rows": rows}),
+        as_rows(lambda rows: [{**row, "requests": str(row["requests"])} for row in rows]),
+        as_rows(lambda rows: [{**row, "path_length": float("nan")} for row in rows]),
+        as_rows(lambda rows: [{name: one for name, one in row.items() if name != "collided"} for row in rows]),
+        as_rows(lambda rows: [1, *rows[1:]]),
+    ],
+)
+def test_damaged_pieces_are_flown_again(damage, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "_CHUNK", 3)
+    flown = []
+
+    def dies_after_one(condition: Condition, episodes: range) -> list[dict[str, float]]:
+        if flown:
+            raise Killed
+        flown.append(episodes)
+        return run_episodes(condition, episodes)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "run_episodes", dies_after_one)
+        with pytest.raises(Killed):
+            fly_all([condition("none")], 6, journal=tmp_path)
+    (piece,) = tmp_path.iterdir()
+    damage(piece)
+    assert untimed(fly_all([condition("none")], 6, journal=tmp_path)) == untimed(fly_all([condition("none")], 6))
+
+
+def test_a_model_that_changes_under_way_makes_no_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "_CHUNK", 2)
+    model = tmp_path / "model.zip"
+    shutil.copy(paper_policies()[-1], model)
+
+    def trained_on(condition: Condition, episodes: range) -> list[dict[str, float]]:
+        model.write_bytes(model.read_bytes() + b"\0")
+        return run_episodes(replace(condition, policy="none"), episodes)
+
+    monkeypatch.setattr(evaluation, "run_episodes", trained_on)
+    with pytest.raises(ValueError, match=r"another content of .*model\.zip than this command began with"):
+        fly_all([condition(str(model))], 4)
+
+
 def test_pieces_are_told_apart_by_all_that_they_depend_on(tmp_path, monkeypatch):
     episodes = range(3)
     model = tmp_path / "model.zip"
@@ -153,6 +220,11 @@ def test_pieces_are_told_apart_by_all_that_they_depend_on(tmp_path, monkeypatch)
     keys.append(evaluation._key(one, range(4)))
     model.write_bytes(b"b")
     keys.append(evaluation._key(conditions[1], episodes))
+    keys.append(evaluation._key(replace(one, solver="fatrop"), episodes))
+    with monkeypatch.context() as without:  # "auto" then flies another solver
+        without.setattr(RtiSolver, "compile", no_compiler)
+        with pytest.warns(RuntimeWarning, match="plans with fatrop"):
+            keys.append(evaluation._key(one, episodes))
     monkeypatch.setattr("quad_swarm.tasks.journal.sources_digest", lambda name: "other code")
     keys.append(evaluation._key(one, episodes))
     monkeypatch.setattr("quad_swarm.tasks.journal.machine", lambda: "another machine")

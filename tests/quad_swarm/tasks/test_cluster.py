@@ -1,8 +1,12 @@
 """Ray as an executor: the same results, whatever dies."""
 
 import os
+import shutil
 import signal
+import socket
+import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -134,6 +138,29 @@ def test_machines_of_another_kind_are_refused_unless_asked_for(monkeypatch):
         assert executor.submit(square, 2).result(timeout=60) == 4
 
 
+def test_results_of_other_code_are_refused_in_any_case(monkeypatch):
+    monkeypatch.setattr(cluster, "_code", lambda modules: {"quad_swarm": "digest of sources with one line changed"})
+    for mixed in (False, True):
+        with (
+            Cluster(2, mixed=mixed) as executor,
+            pytest.raises(ValueError, match="computed with another content of quad_swarm than this command"),
+        ):
+            executor.submit(square, 2).result(timeout=60)
+
+
+def test_a_module_or_model_that_is_another_there_is_noticed(tmp_path, monkeypatch):
+    """The processes of the cluster import other modules of the same name, and read another file."""
+    for folder, text in (("here", "A = 1"), ("there", "A = 2")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "module_of_a_user.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path / "here")
+    executor = Cluster(2, ["module_of_a_user"])
+    with_path = ray.remote(cluster._run).options(runtime_env={"env_vars": {"PYTHONPATH": str(tmp_path / "there")}})
+    executor._run = with_path
+    with executor, pytest.raises(ValueError, match="another content of module_of_a_user"):
+        executor.submit(len, ()).result(timeout=120)
+
+
 def test_an_exception_stops_what_runs():
     futures = []
 
@@ -182,6 +209,33 @@ def test_a_machine_may_be_lost(tmp_path):
         ray.shutdown()
         machines.shutdown()
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="ends Ray by signal")
+def test_a_cluster_by_its_port_gets_the_users_token(tmp_path):
+    """Ray asks for a token as soon as the user has one, but sends it only to clusters that it finds by itself."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    (tmp_path / ".ray").mkdir()
+    (tmp_path / ".ray" / "auth_token").write_text("12345678-1234-1234-1234-123456789abc")
+    env = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    env |= {"HOME": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    start = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", f"--port={port}", "--num-cpus=1"]
+    folder = tempfile.mkdtemp(dir="/tmp")  # sockets need short paths
+    start += ["--include-dashboard=false", f"--temp-dir={folder}", "--object-store-memory=100000000", "--block"]
+    script = f"from quad_swarm.tasks import Cluster\nwith Cluster(1, address='127.0.0.1:{port}') as executor:\n"
+    script += "    print('there:', executor.submit(pow, 3, 2).result(timeout=100))"
+    head = subprocess.Popen(start, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        assert any("Ray runtime started" in line for line in head.stdout)
+        done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=200)
+        assert "there: 9" in done.stdout, done.stderr
+    finally:
+        head.terminate()
+        head.communicate(timeout=60)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def test_without_an_address_a_cluster_starts_here(monkeypatch):

@@ -22,10 +22,21 @@ def test_keeps_values_as_they_are(tmp_path):
     assert journal.fetch("key") is None
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"other": 1}', "\0\0", '{"value": [1'])
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"other": 1}', "\0\0", '{"value": [1', '{"value": 1}', "[" * 9999])
 def test_a_damaged_file_counts_as_none(content, tmp_path):
     (tmp_path / "key.json").write_text(content)
     assert Journal(tmp_path).fetch("key") is None
+
+
+def test_a_changed_value_counts_as_none(tmp_path):
+    journal = Journal(tmp_path)
+    journal.keep("key", [{"collided": True}])
+    whole = (tmp_path / "key.json").read_text()
+    (tmp_path / "key.json").write_text(whole.replace("true", "false"))
+    (tmp_path / "another.json").write_text(whole)
+    assert (journal.fetch("key"), journal.fetch("another")) == (None, None)
+    (tmp_path / "key.json").write_text(whole)
+    assert journal.fetch("key") == [{"collided": True}]
 
 
 def test_keeps_nothing_without_a_folder():
@@ -88,9 +99,10 @@ def test_two_that_do_the_same_work_may_both_finish(tmp_path, monkeypatch):
 
 
 def test_what_nobody_fetches_is_removed_after_a_month(tmp_path):
+    for name in ("old", "young"):
+        Journal(tmp_path).keep(name, 1)
     for name, days in (("old", 40), ("young", 1)):
         path = tmp_path / f"{name}.json"
-        path.write_text('{"value": 1}')
         os.utime(path, (time.time() - days * 86400,) * 2)
     journal = Journal(tmp_path)
     assert (journal.fetch("old"), journal.fetch("young")) == (None, 1)
