@@ -38,7 +38,8 @@ def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: in
 def _make_solver(problem: OptimalControlProblem, name: str) -> Solver:
     chosen = "rti" if name == "auto" else name
     solver = SOLVERS[chosen](problem)
-    if not callable(getattr(solver, "solve", None)) or not isinstance(getattr(solver, "name", None), str):
+    has_solve = callable(getattr(solver, "solve", None)) and not isinstance(solver, type)
+    if not has_solve or not isinstance(getattr(solver, "name", None), str):
         raise ValueError(
             f"SOLVERS[{chosen!r}] created {shown(solver)}, which is no solver: it needs a `name` and a method "
             "`solve(problems, x_guess, u_guess)`, see quad_swarm.planner.Solver."

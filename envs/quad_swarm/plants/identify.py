@@ -7,6 +7,7 @@ writes a vehicle file, which worlds accept as ``quadrotor``.
 from __future__ import annotations
 
 import argparse
+import importlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -108,8 +109,11 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
     parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
+    parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="modules to import first, with simulators")
     parser.add_argument("--out", type=Path, metavar="FILE", help="vehicle file to write, YAML")
     args = parser.parse_args(argv)
+    for name in args.gym_packages or ():  # `sb3-maddpg` has imported them before
+        importlib.import_module(name)
     found = identify(args.plant)
     print(f"{'parameter':22}{args.plant:>22}{'bebop2':>10}")
     for name in VEHICLE_PARAMETERS:
