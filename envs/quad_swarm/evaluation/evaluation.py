@@ -6,7 +6,7 @@ import contextlib
 import pickle
 import sys
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
@@ -208,18 +208,18 @@ def _fly(
             )
     additions = _additions()
     with make_pool(jobs) if executor is None else nullcontext(executor) as pool:
-        futures = {pool.submit(_run_there, additions, *work[k]): k for k in left}
+        futures = {pool.submit(_informed, additions, _fly_piece, *work[k]): k for k in left}
         for future in as_completed(futures):
             yield futures[future], future.result()
 
 
-def _run_there(additions: Sequence[bytes], condition: Condition, episodes: range) -> Rows:
-    """Fly a piece of work in another process, which gets what the registries hold in this one."""
+def _informed(additions: Sequence[bytes], function: Callable[..., Rows], *arguments: Any) -> Rows:
+    """Call a function in another process, which gets what the registries hold in this one."""
     for entry in additions:
         with contextlib.suppress(Exception):  # whatever does not exist there: it is missed only if it is used
             number, name, value = pickle.loads(entry)
             _REGISTRIES[number][name] = value
-    return _fly_piece(condition, episodes)
+    return function(*arguments)
 
 
 def _fly_piece(condition: Condition, episodes: range) -> Rows:
