@@ -18,16 +18,21 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from quad_swarm.native.build import cache_directory
+from quad_swarm.native.build import BuildError, cache_directory
 
 _VERSIONS = ("numpy", "torch", "casadi")
 _DAYS = 30  # after which pieces are deleted
 _SOURCES = (".py", ".cpp", ".hpp")
 
 
-def default_folder() -> Path:
-    """Return the default folder of pieces, in the same cache as the compiled libraries."""
-    return cache_directory() / "pieces"
+def default_folder() -> Path | None:
+    """Return the default folder of pieces, in the same cache as the compiled libraries; None, with a warning, if there
+    is none."""
+    try:
+        return cache_directory() / "pieces"
+    except BuildError as error:
+        warnings.warn(f"Finished pieces are not kept: {error}.", RuntimeWarning, stacklevel=2)
+        return None
 
 
 class Journal:
