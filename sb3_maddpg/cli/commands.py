@@ -1,17 +1,19 @@
 """The command ``sb3-maddpg`` with its subcommands for frequent tasks."""
 
 import argparse
+import functools
 import importlib
 import os
 import re
 import shutil
 import signal
 import sys
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import gymnasium
 import yaml
@@ -30,7 +32,7 @@ from sb3_maddpg.cli.overview import ALGORITHMS, overview
 from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
-from sb3_maddpg.utils import suggest
+from sb3_maddpg.utils import shown, suggest
 
 # Errors in the user's input and errors of the system. Their messages name the remedy, so no traceback is shown.
 USER_ERRORS = (
@@ -115,20 +117,32 @@ def _hand_over(group: str, argv: list[str]) -> int:
         print(f"Models: MODEL.zip, latest:LOGDIR, {', '.join(f'pretrained:{name}' for name in pretrained_models())}\n")
     rest = [_model(word, known.algo, known.env) for word in rest]
     if known.algo != "maddpg":
-        from rl_zoo3.utils import ALGOS
-
-        from sb3_maddpg.cli import zoo
-
-        zoo.register()
-        if known.algo not in ALGOS:
-            raise ValueError(suggest("algorithm", known.algo, ALGOS))
-        algorithm = ALGOS[known.algo]
-        if not issubclass(algorithm, MADDPG) and not trusted(None):
+        algorithm = _algorithm(known.algo)
+        ours = isinstance(algorithm, type) and issubclass(algorithm, MADDPG)
+        if not ours and not trusted(None):
             for word in rest:
-                if Path(path := word.partition("@")[0]).suffix == ".zip" and Path(path).is_file():
+                if Path(path := word.partition("@")[0]).is_file() and zipfile.is_zipfile(path):
                     refuse_pickled(path, {})
-        rest += ["--algo", f"{algorithm.__module__}:{algorithm.__qualname__}"]
+        rest += ["--algo", known.algo if ":" in known.algo else f"{algorithm.__module__}:{algorithm.__qualname__}"]
     return main(rest)
+
+
+def _algorithm(name: str) -> Any:
+    """Return the class that loads models: an algorithm of the zoo, or ``MODULE:CLASS`` of anything with a ``load``."""
+    module, colon, qualname = name.partition(":")
+    if colon:
+        try:
+            return functools.reduce(getattr, qualname.split("."), importlib.import_module(module))
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(f"--algo {shown(name)} is not an importable MODULE:CLASS ({error}).") from error
+    from rl_zoo3.utils import ALGOS
+
+    from sb3_maddpg.cli import zoo
+
+    zoo.register()
+    if name not in ALGOS:
+        raise ValueError(suggest("algorithm", name, ALGOS))
+    return ALGOS[name]
 
 
 def _model(word: str, algo: str, env_id: str) -> str:
@@ -149,11 +163,12 @@ def latest_model(word: str, algo: str, env_id: str) -> str:
     Find the newest model in a log folder.
 
     :param word: ``latest:LOGDIR``
-    :param algo: name of the algorithm
+    :param algo: name of the algorithm, or ``MODULE:CLASS``
     :param env_id: Gymnasium id
     :return: path of the final model of the newest run that has a model, or else of that run's best model so far
     :raises FileNotFoundError: if there is no model
     """
+    algo = algo.rpartition(":")[2].lower()  # of MODULE:CLASS
     folder, name = Path(word.removeprefix("latest:"), algo), env_id.replace("/", "-")  # as in rl_zoo3
     runs = [path for path in folder.glob(f"{name}_*") if path.name[len(name) + 1 :].isdigit()]
     for run in sorted(runs, key=lambda path: int(path.name[len(name) + 1 :]), reverse=True):

@@ -60,14 +60,16 @@ def import_packages(names: Iterable[str]) -> None:
 @contextmanager
 def importing_from(folder: Path | None, words: Sequence[str] = ()) -> Iterator[None]:
     """
-    Import the modules of a folder, after all others, only if ``--gym-packages`` or ``--env`` names one of them, so that
-    names in a recipe are never imported from there by accident. Nothing else is imported from the current folder.
+    Import the modules of a folder, after all others, only if ``--gym-packages``, ``--env`` or ``--algo MODULE:CLASS``
+    names one of them, so that names in a recipe are never imported from there by accident. Nothing else is imported
+    from the current folder.
 
     :param folder: the folder
     :param words: arguments of a command
     """
     known, _ = common_options().parse_known_args(words)
-    tops = {re.split(r"[./]", name)[0] for name in (*known.gym_packages, known.env or "")} - {""}
+    names = [*known.gym_packages, known.env or "", *([known.algo] if ":" in known.algo else [])]
+    tops = {re.split(r"[./:]", name)[0] for name in names} - {""}
     asked = folder is not None and any((folder / f"{top}.py").is_file() or (folder / top).is_dir() for top in tops)
     here, before = Path.cwd(), sys.path.copy()
     sys.path[:] = [path for path in before if Path(path).resolve() != here] + [str(folder)] * asked

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import importlib
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -19,7 +20,7 @@ from quad_swarm.evaluation.policies import is_model, load_model, short_name, sho
 from quad_swarm.evaluation.provenance import provenance
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_csv, write_rows, write_text
 from quad_swarm.planner import SOLVERS, BuildError
-from quad_swarm.plants.base import MODEL, simulated_vehicles
+from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
 from quad_swarm.task.rules import RULES
 from quad_swarm.tasks import ENGINES
 from quad_swarm.tasks.journal import default_folder
@@ -184,7 +185,10 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
     simulated = ", ".join(simulated_vehicles())
     parser.add_argument("--plant", help=f"simulated vehicle: {MODEL} (default), or one of a simulator ({simulated})")
     parser.add_argument(
-        "--gym-packages", nargs="+", metavar="MODULE", help="modules to import first, for custom scenarios and rules"
+        "--gym-packages",
+        nargs="+",
+        metavar="MODULE",
+        help="modules to import first, which add scenarios, rules, observations, solvers or simulators",
     )
     parser.add_argument(
         "--algo",
@@ -234,8 +238,10 @@ def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace)
     :return: exit status
     """
     try:
+        for name in args.gym_packages or ():  # `sb3-maddpg` has imported them before
+            importlib.import_module(name)
         command(args)
-    except (ValueError, FileNotFoundError, ImportError, BuildError) as error:
+    except (ValueError, FileNotFoundError, ImportError, BuildError, PlantError) as error:
         if args.debug:
             raise
         print(f"error: {error}", file=sys.stderr)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import pickle
 import sys
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from contextlib import nullcontext
@@ -15,9 +18,11 @@ from tqdm import tqdm
 
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.evaluation.inference import wilson_interval
-from quad_swarm.evaluation.policies import is_model, make_policy
-from quad_swarm.planner import make_planner
+from quad_swarm.evaluation.policies import is_model, make_policy, name_of
+from quad_swarm.planner import SOLVERS, make_planner
+from quad_swarm.plants.base import MODEL, SIMULATORS, PlantDied, parse_plant, simulator_of
 from quad_swarm.task.episode_statistics import exchange_bytes, is_row
+from quad_swarm.task.observation import GROUPS
 from quad_swarm.task.rules import RULES
 from quad_swarm.tasks import Journal, make_executor
 from quad_swarm.tasks.cluster import other_code
@@ -27,6 +32,8 @@ from quad_swarm.world.scenarios import SCENARIOS
 
 # Episodes per piece; fixed, so that batches and results do not depend on the number of processes
 _CHUNK = 250
+# Number of attempts before a piece is considered the cause of the deaths of a simulator's process
+_ATTEMPTS = 3
 # Depths of collisions that are counted separately (m), since many collisions beyond the tolerance of 1 mm are grazes
 DEPTHS = {"1cm": 0.01, "3cm": 0.03}
 
@@ -115,7 +122,7 @@ def evaluate(
     flown = fly_all(conditions, episodes, seed, jobs, journal=journal, executor=executor)
     table = []
     for condition, rows in flown.items():
-        row = {"policy": condition.policy, "scenario": condition.scenario, **summarise(rows, condition.config)}
+        row = {"policy": name_of(condition.policy), "scenario": condition.scenario, **summarise(rows, condition.config)}
         full = flown.get(replace(condition, policy="full"))
         table.append(
             row | (lost_against(full, rows, condition.config) if full else {}) | {"n_robots": condition.config.n_robots}
@@ -206,25 +213,37 @@ def _fly(
 
     if executor is None and (jobs == 1 or len(left) < 2):
         for k in left:
-            yield checked(k, *_flown(run_episodes, *work[k]))
+            yield checked(k, *_flown(*work[k]))
         return
+    for condition in dict.fromkeys(work[k][0] for k in left):
+        if _pickled(condition) is None:
+            raise ValueError(
+                f"The policy {name_of(condition.policy)} cannot be pickled and sent to other processes: choose jobs=1, "
+                "or define its class in a module."
+            )
+    additions = _additions()
     with make_pool(jobs) if executor is None else nullcontext(executor) as pool:
-        futures = {pool.submit(_flown, run_episodes, *work[k]): k for k in left}
+        futures = {pool.submit(_informed, additions, _flown, *work[k]): k for k in left}
         for future in as_completed(futures):
             yield checked(futures[future], *future.result())
 
 
-def _flown(run: Callable[..., Rows], condition: Condition, episodes: range) -> tuple[dict[str, str], Rows]:
+def _flown(condition: Condition, episodes: range) -> tuple[dict[str, str], Rows]:
     """Fly a piece of work, possibly on another machine, and return what made it, see `_origin`, and its rows."""
-    return _origin(condition), run(condition, episodes)
+    return _origin(condition), _fly_piece(condition, episodes)
 
 
 def _depends_on(condition: Condition) -> tuple[set[str], list[Path]]:
     """Return the packages and the files whose content the episodes of a condition are a function of."""
-    packages = {"quad_swarm", *user_modules()}
-    if not is_model(condition.policy):
-        return packages, []
-    return packages | {condition.algo.partition(":")[0]}, [Path(condition.policy.partition("@")[0])]
+    packages, files = {"quad_swarm", *user_modules()}, []
+    if (simulator := parse_plant(condition.config.plant)[0]) != MODEL:
+        packages.add(simulator_of(simulator).module)
+    if is_model(condition.policy):
+        packages.add(condition.algo.partition(":")[0])
+        files.append(Path(condition.policy.partition("@")[0]))
+    elif not isinstance(condition.policy, str):
+        packages.add(type(condition.policy).__module__)
+    return packages - {"__main__"}, files
 
 
 def _solver(condition: Condition) -> str:
@@ -238,9 +257,33 @@ def _origin(condition: Condition) -> dict[str, str]:
     return {**origin(*_depends_on(condition)), "solver (is there a C++ compiler?)": _solver(condition)}
 
 
+def _informed(additions: Sequence[bytes], function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in another process, which gets what the registries hold in this one."""
+    for entry in additions:
+        with contextlib.suppress(Exception):  # whatever does not exist there: it is missed only if it is used
+            number, name, value = pickle.loads(entry)
+            _REGISTRIES[number][name] = value
+    return function(*arguments)
+
+
+def _fly_piece(condition: Condition, episodes: range) -> Rows:
+    """Fly a piece of work. A simulator whose process dies costs only the piece, which is flown again.
+
+    :raises PlantError: if it dies again and again
+    """
+    for _ in range(_ATTEMPTS - 1):
+        with contextlib.suppress(PlantDied):
+            return run_episodes(condition, episodes)
+    return run_episodes(condition, episodes)
+
+
 def _key(condition: Condition, episodes: range) -> str:
-    """Return the key of a piece of work, which includes the content of a model's file."""
-    return Journal.key(repr((condition, episodes, _solver(condition))), *_depends_on(condition))
+    """Return the key of a piece of work, which includes the content of a model's file, or of a policy that is an
+    object."""
+    what: list[Any] = [replace(condition, policy=name_of(condition.policy)), episodes, _solver(condition), _additions()]
+    if not isinstance(condition.policy, str):
+        what.append(_pickled(condition.policy) or uuid.uuid4())  # what cannot be kept is flown again
+    return Journal.key(repr(what), *_depends_on(condition))
 
 
 def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixed: bool = False) -> Executor:
@@ -255,6 +298,24 @@ def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixe
 
 
 def user_modules() -> list[str]:
-    """Return the modules of all scenarios and rules, custom ones included."""
-    added = {function.__module__ for function in (*SCENARIOS.values(), *(make for make, _ in RULES.values()))}
-    return sorted(added - {"__main__"})
+    """Return the modules of what the registries hold, which other processes import first."""
+    made = [*SCENARIOS.values(), *(make for make, _ in RULES.values()), *GROUPS.values(), *SOLVERS.values()]
+    added = {getattr(one, "__module__", None) for one in made}
+    return sorted(name for name in added if isinstance(name, str) and name != "__main__")
+
+
+# What users add to by name
+_REGISTRIES: tuple[dict[str, Any], ...] = (SCENARIOS, RULES, GROUPS, SOLVERS, SIMULATORS)
+
+
+def _additions() -> list[bytes]:
+    """Return the entries of the registries, pickled. Others, such as lambdas, come with their modules."""
+    entries = [_pickled((k, *entry)) for k, registry in enumerate(_REGISTRIES) for entry in registry.items()]
+    return [entry for entry in entries if entry is not None]
+
+
+def _pickled(value: Any) -> bytes | None:
+    try:
+        return pickle.dumps(value)
+    except Exception:  # whatever a foreign object raises
+        return None

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.evaluation.policies import RequestPolicy, make_policy, policy_of
+from quad_swarm.errors import shown
+from quad_swarm.evaluation.policies import RequestPolicy, make_policy, name_of, policy_of
 from quad_swarm.geometry import length
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, requests_of
@@ -30,7 +32,8 @@ _FIRST_SEED = 10**9
 class Condition:
     """A policy in a scenario and a world.
 
-    :param policy: a rule or the path of a model's zip, as on the command line
+    :param policy: a rule or the path of a model's zip, as on the command line, or an object with ``predict``, see
+        `quad_swarm.evaluation.policies`. Conditions with objects are equal if their objects are the same
     :param scenario: a name of `SCENARIOS`
     :param config: the world
     :param max_steps: time limit (steps), by default the world's
@@ -38,10 +41,11 @@ class Condition:
     :param solver: see `make_planner`
     :param linger: number of steps to fly after all robots have reached their goals; None for flying until the time
         limit
-    :raises ValueError: if ``max_steps`` is less than 1, ``linger`` is negative, or the scenario does not fit the world
+    :raises ValueError: if the policy is neither text nor an object with ``predict``, ``max_steps`` is less than 1,
+        ``linger`` is negative, or the scenario does not fit the world
     """
 
-    policy: str
+    policy: Any
     scenario: str
     config: SwarmConfig
     max_steps: int | None = None
@@ -50,6 +54,15 @@ class Condition:
     linger: int | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.policy, os.PathLike):
+            object.__setattr__(self, "policy", os.fspath(self.policy))
+        if not isinstance(self.policy, str) and (
+            isinstance(self.policy, type) or not callable(getattr(self.policy, "predict", None))
+        ):
+            raise ValueError(
+                f"policy={shown(self.policy)}: it must be a rule, the path of a model's zip, or an object with "
+                "predict(observation)."
+            )
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
         ScenarioSampler(self.scenario, self.config.n_robots, self.config.space, self.config)
@@ -57,6 +70,17 @@ class Condition:
             warn(sentence)
         if self.linger is not None and self.linger < 0:
             raise ValueError(f"linger={self.linger} must be a number of steps, or None to fly until the time limit.")
+
+    def _identity(self) -> tuple[Any, ...]:
+        # Foreign objects may neither be hashable nor compare to one truth value
+        policy = self.policy if isinstance(self.policy, str) else id(self.policy)
+        return (policy, *(getattr(self, field.name) for field in fields(self) if field.name != "policy"))
+
+    def __eq__(self, other: object) -> bool:
+        return self._identity() == other._identity() if isinstance(other, Condition) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._identity())
 
 
 def first_episode(seed: int) -> int:
@@ -84,7 +108,7 @@ def begin(
     if model is None:
         policy, observation = make_policy(condition.policy, config, condition.algo)
     else:
-        policy, observation = policy_of(model, condition.policy, config)
+        policy, observation = policy_of(model, name_of(condition.policy), config)
     task = RequestTask(
         Swarm(config, len(episodes), condition.solver),
         ScenarioSampler(condition.scenario, config.n_robots, config.space, config),
@@ -244,7 +268,8 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     :param seed: index of the set of held-out episodes
     :param number: index of the episode in the set
     :param other_rule: a rule whose requests are also recorded, but not executed
-    :param model: model that flies instead of the condition's policy
+    :param model: model that flies instead of the condition's policy, or any object with ``predict``, see
+        `quad_swarm.evaluation.policies`
     """
     episode = first_episode(seed) + number
     policy, task, rngs = begin(condition, [episode], model)

@@ -1,7 +1,9 @@
-"""Policies by their names on the command line: rules, and models by the path of their zip.
+"""Policies by their names on the command line: rules, and models by the path of their zip; or as objects.
 
 For rules see `quad_swarm.task.rules`. The class ``algo`` loads models. ``MODEL.zip@0.3`` sets the model's threshold to
-0.3.
+0.3. An object needs a method ``predict(observation)``, which maps the observations of E swarms, (E, n, size), to their
+bits, (E, n (n - 1)), alone or as the first entry of a tuple as in Stable-Baselines3. Without the attributes of a model,
+``observation_space`` and ``env_spec``, it receives the paper's observation.
 """
 
 from __future__ import annotations
@@ -9,14 +11,16 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib
+import inspect
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from quad_swarm.errors import shown
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.task.request_task import RequestTask
 from quad_swarm.task.rules import parse_rule
@@ -31,13 +35,22 @@ RequestPolicy = Callable[[RequestTask, list[np.random.Generator]], np.ndarray]
 OBSERVATION_ARGUMENTS = ("observation", "scale_observation")
 
 
-def is_model(policy: str) -> bool:
-    """Return whether a policy is a model's file instead of a rule."""
-    return policy.partition("@")[0].endswith(".zip") or os.sep in policy
+def is_model(policy: Any) -> bool:
+    """Return whether a policy is a model's file instead of a rule or an object."""
+    return isinstance(policy, str) and (policy.partition("@")[0].endswith(".zip") or os.sep in policy)
 
 
-def short_name(policy: str) -> str:
+def name_of(policy: Any) -> str:
+    """Return a policy's name: text as it is, an object's ``name`` if that is text, or the name of its class."""
+    if isinstance(policy, str):
+        return policy
+    name = getattr(policy, "name", None)
+    return name if isinstance(name, str) else type(policy).__name__
+
+
+def short_name(policy: Any) -> str:
     """Return a short name: a rule as it is, a model's file name, or its folder's name if the file is model.zip."""
+    policy = name_of(policy)
     if not is_model(policy):
         return policy
     path, at, threshold = policy.partition("@")
@@ -60,8 +73,8 @@ def load_model(policy: str, algo: str) -> Any:
     """Load a trained model, from a cache if its file has not changed.
 
     :param policy: path of the model's zip, optionally with a threshold as in ``MODEL.zip@0.3``
-    :param algo: ``module:Class`` with a ``load(path, device=...)`` as in Stable-Baselines3, and with ``set_threshold``
-        if there is a threshold
+    :param algo: ``module:Class`` with a ``load(path)``, which may take ``device`` as in Stable-Baselines3. It returns
+        an object with ``predict``, see above, and with ``set_threshold`` if there is a threshold
     :raises FileNotFoundError: if there is no such file
     :raises ValueError: if the class does not exist or cannot read the file, the threshold is not a number, or a weight
         of the model is NaN or infinite
@@ -80,11 +93,12 @@ def _load(policy: str, algo: str, stamp: tuple[int, ...]) -> Any:
     path, at, threshold = policy.partition("@")
     module_name, _, class_name = algo.partition(":")
     try:
-        loader = getattr(importlib.import_module(module_name), class_name)
+        loader = functools.reduce(getattr, class_name.split("."), importlib.import_module(module_name))
+        load = loader.load  # type: ignore[attr-defined]
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"--algo {algo!r} is not an importable module:Class ({error}).") from error
+        raise ValueError(f"--algo {algo!r} is not an importable module:Class with a `load` ({error}).") from error
     try:
-        model = loader.load(path, device="cpu")
+        model = load(path, device="cpu") if _accepts(load, "device") else load(path)
     except Exception as error:  # whatever the loader raises for a damaged or foreign file
         raise ValueError(
             f"{path} cannot be loaded by {algo} ({type(error).__name__}: {error}). "
@@ -112,14 +126,16 @@ def _number(text: str, policy: str) -> float:
         raise ValueError(f"{policy}: the threshold {text!r} is not a number; write MODEL.zip@0.3.") from None
 
 
-def make_policy(policy: str, config: SwarmConfig, algo: str) -> tuple[RequestPolicy, Observation]:
+def make_policy(policy: Any, config: SwarmConfig, algo: str) -> tuple[RequestPolicy, Observation]:
     """Create a policy and its observation by name.
 
-    :param policy: a rule or a model's zip
+    :param policy: a rule, a model's zip or an object with ``predict``
     :param config: the world
     :param algo: see `load_model`
     :raises ValueError: if the rule is unknown, or the model was trained for another number of robots or another space
     """
+    if not isinstance(policy, str):
+        return policy_of(policy, name_of(policy), config)
     if is_model(policy):
         return policy_of(load_model(policy, algo), policy, config)
     try:
@@ -133,20 +149,25 @@ def make_policy(policy: str, config: SwarmConfig, algo: str) -> tuple[RequestPol
 
 
 def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:
-    """Create a policy and its observation from a model.
+    """Create a policy and its observation from a model, or from any object with ``predict``.
 
     :param model: the model
     :param name: name of the model, for error messages
     :param config: the world
-    :raises ValueError: if the model was trained for another number of robots or another space
+    :raises ValueError: if the model has no ``predict``, or was trained for another number of robots or another space.
+        The policy raises it if ``predict`` raises or answers with something else than bits
     """
+    if not callable(getattr(model, "predict", None)):
+        raise ValueError(f"{name}: {shown(model)} is no policy, since it has no predict(observation).")
     arguments = {k: v for k, v in trained_in(model).items() if k in OBSERVATION_ARGUMENTS}
     n, m = config.n_robots, config.n_others
     observation = make_observation(config, **arguments, critics=False)
-    expected, trained = (n, observation.size), tuple(model.observation_space.shape)
+    expected = (n, observation.size)
+    space = getattr(model, "observation_space", None)
+    trained = expected if space is None else tuple(space.shape)
     n_bits = 2 if trained_in(model).get("announcements") else 1
     predictor = model
-    fits_any_number = hasattr(model, "policy_for") and hasattr(model.policy, "observation_layout")
+    fits_any_number = hasattr(model, "policy_for") and hasattr(getattr(model, "policy", None), "observation_layout")
     if trained != expected or (config.is_limited and fits_any_number):
         if not fits_any_number:
             robots = f"{trained[0]} robots" if len(trained) == 2 else "another environment"
@@ -162,13 +183,40 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
             observation.layout,
         )
 
+    options = {"deterministic": True} if _accepts(predictor.predict, "deterministic") else {}
+
     def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
-        bits, _ = predictor.predict(task.observe(), deterministic=True)
-        return np.asarray(bits).reshape(-1, n, m, n_bits) > 0.5
+        observed = task.observe()
+        try:
+            answer = predictor.predict(observed, **options)
+            bits = np.asarray(answer[0] if isinstance(answer, tuple) else answer, dtype=float)
+        except Exception as error:  # whatever a foreign object raises
+            raise ValueError(
+                f"{name}: predict failed on the observations of {len(observed)} swarms, shape {observed.shape} "
+                f"({type(error).__name__}: {error})."
+            ) from error
+        if bits.size != len(observed) * n * m * n_bits or not np.isfinite(bits).all():
+            raise ValueError(
+                f"{name}: predict answered the observations of {len(observed)} swarms, shape {observed.shape}, with "
+                f"shape {bits.shape}; it must answer with {n * m * n_bits} finite bits for each swarm."
+            )
+        return bits.reshape(-1, n, m, n_bits) > 0.5
 
     return request, observation
 
 
+def _accepts(function: Any, argument: str) -> bool:
+    """Return whether a function can be called with a keyword argument; True if that cannot be told."""
+    try:
+        parameters = inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return True
+    kinds = {parameter.kind for parameter in parameters.values()}
+    named = argument in parameters and parameters[argument].kind is not inspect.Parameter.POSITIONAL_ONLY
+    return named or inspect.Parameter.VAR_KEYWORD in kinds
+
+
 def trained_in(model: Any) -> dict[str, Any]:
     """Return the arguments of the environment that a model was trained in, as far as its file contains them."""
-    return (getattr(model, "env_spec", None) or {}).get("kwargs", {})
+    spec = getattr(model, "env_spec", None)
+    return dict(spec.get("kwargs") or {}) if isinstance(spec, Mapping) else {}

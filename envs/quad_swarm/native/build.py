@@ -6,8 +6,10 @@ import contextlib
 import ctypes
 import functools
 import hashlib
+import itertools
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -33,14 +35,25 @@ class BuildError(RuntimeError):
 
 
 def cache_directory() -> Path:
-    """Return the directory of compiled libraries: ``QUAD_SWARM_CACHE``, or one in the user's cache directory."""
-    if chosen := os.environ.get("QUAD_SWARM_CACHE"):
-        return Path(chosen)
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
+    """Return the directory of compiled libraries: ``QUAD_SWARM_CACHE``, or one in the user's cache directory.
+
+    :return: its absolute path
+    :raises BuildError: if the user has no home directory, and no environment variable names another place
+    """
+    chosen, home = os.environ.get("QUAD_SWARM_CACHE"), Path("~")
+    if chosen:
+        directory = Path(chosen)
+    elif sys.platform == "win32":
+        directory = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local") / "quad_swarm"
     else:
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "quad_swarm"
+        directory = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "quad_swarm"
+    try:
+        # A path without a folder would be looked up where the system's libraries are
+        return Path(os.path.abspath(directory.expanduser()))
+    except (RuntimeError, OSError) as error:  # nobody's home, or a current folder that was removed
+        raise BuildError(
+            f"there is no cache {directory} ({error}); set QUAD_SWARM_CACHE to a writable directory"
+        ) from error
 
 
 def compiler() -> list[str]:
@@ -73,7 +86,8 @@ def build(name: str, main: str, sources: Mapping[str, str], defines: Sequence[st
     :param sources: text of each file by its name
     :param defines: macros, ``NAME=VALUE``
     :return: path of the library
-    :raises BuildError: if there is no compiler, it fails, or the cache cannot be written
+    :raises BuildError: if there is no compiler, it fails, the cache cannot be written, or another user's file is in the
+        library's place
     """
     options = [*_FLAGS, _native_flag(), *(f"-D{define}" for define in defines)]
     directory = cache_directory()
@@ -91,44 +105,72 @@ def build(name: str, main: str, sources: Mapping[str, str], defines: Sequence[st
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         _remove_leftovers(directory)
-        # In the cache's file system, so that the finished library can be moved there atomically
-        with tempfile.TemporaryDirectory(dir=directory, prefix="building-", ignore_cleanup_errors=True) as folder:
+        # Not where another user could exchange the folder
+        place = directory if _is_private(directory) else None
+        with tempfile.TemporaryDirectory(dir=place, prefix="building-", ignore_cleanup_errors=True) as folder:
             for file, text in sources.items():
                 Path(folder, file).write_text(text, encoding="utf-8")
             result = Path(folder, library.name)
-            _run([*command, *_SHARED, str(Path(folder, main)), "-o", str(result)])
-            checksum = Path(folder, _checksum_file(library).name)
-            checksum.write_text(hashlib.sha256(result.read_bytes()).hexdigest(), encoding="utf-8")
-            # On Windows, a library in use cannot be replaced, but then another process has built the same one
-            with contextlib.suppress(PermissionError):
-                os.replace(result, library)
-                os.replace(checksum, _checksum_file(library))
+            _run([*command, *_SHARED, str(Path(folder, main)), "-o", str(result)], folder)
+            content = result.read_bytes()
+        # On Windows, a library in use cannot be replaced, but then another process has built the same one. Elsewhere, a
+        # file of another user may be in the way
+        with contextlib.suppress(PermissionError):
+            _put(content, library)
+            _put(hashlib.sha256(content).hexdigest().encode(), _checksum_file(library))
     except OSError as error:
         raise BuildError(
             f"cannot write to the cache {directory} ({error.strerror or error}), or its files belong to another user; "
             "set QUAD_SWARM_CACHE to a writable directory"
         ) from error
+    if not _is_whole(library):
+        raise BuildError(
+            f"cannot replace {library}, which is damaged or belongs to another user; set QUAD_SWARM_CACHE to a "
+            "directory of your own"
+        )
     return library
 
 
 @functools.lru_cache(maxsize=64)
 def load(path: str, *functions: str) -> ctypes.CDLL:
-    """Load a compiled library.
+    """Load a library that `build` compiled.
 
     :param path: path of the library
     :param functions: functions that it must contain
-    :raises BuildError: if the library cannot be loaded
+    :raises BuildError: if the library cannot be loaded, is damaged, or another user could have written it
     """
     try:
-        library = ctypes.CDLL(path)
+        with open(path, "rb") as file:
+            _check(file.fileno(), Path(path))
+            library = ctypes.CDLL(_opened(file.fileno()) or path)
         for name in functions:
             getattr(library, name).restype = None
-    except (OSError, AttributeError) as error:
-        raise BuildError(
-            f"cannot load {path} ({error}); delete the file to compile it again, or set QUAD_SWARM_CACHE to a "
-            "directory from which libraries may be loaded"
-        ) from error
+    except (OSError, ValueError, AttributeError) as error:
+        told = re.sub(r"^/proc/self/fd/+\d+: ", "", str(error))
+        if "undefined symbol" in told:
+            remedy = "its compiler did not link C++'s library: set CXX to a compiler of C++, such as g++ instead of gcc"
+        else:
+            remedy = (
+                "delete the file to compile it again, or set QUAD_SWARM_CACHE to a directory from which libraries may "
+                "be loaded"
+            )
+        raise BuildError(f"cannot load {path} ({told}); {remedy}") from error
     return library
+
+
+_loads = itertools.count(1)
+
+
+def _opened(descriptor: int) -> str:
+    """Return a path of an open file, so that what is loaded is what was checked, whoever exchanges the file meanwhile;
+    empty if the system has none.
+
+    The number of slashes differs each time: the loader takes equal paths for one library.
+    """
+    folder = "/proc/self/fd"
+    if not os.path.isdir(folder):
+        return ""
+    return f"{folder}{'/' * next(_loads)}{descriptor}"
 
 
 def _native_flag() -> str:
@@ -147,15 +189,53 @@ def _checksum_file(library: Path) -> Path:
 
 
 def _is_whole(library: Path) -> bool:
-    """Return whether the library exists, has the right checksum, and belongs to this user or to the superuser, since
-    its code will be run."""
+    """Return whether the library exists and passes `_check`."""
     try:
-        if hasattr(os, "getuid") and library.stat().st_uid not in (os.getuid(), 0):
-            return False
-        expected = _checksum_file(library).read_text(encoding="utf-8")
-        return hashlib.sha256(library.read_bytes()).hexdigest() == expected.strip()
-    except (OSError, UnicodeDecodeError):
+        with library.open("rb") as file:
+            _check(file.fileno(), library)
+    except (OSError, ValueError):
         return False
+    return True
+
+
+def _check(descriptor: int, library: Path) -> None:
+    """Check an open library, since its code will be run: its checksum is right, and only this user or the superuser can
+    have written the two files.
+
+    :raises ValueError: if not
+    :raises OSError: if a file cannot be read
+    """
+    with _checksum_file(library).open("rb") as checksum:
+        for file in (descriptor, checksum.fileno()):
+            status = os.fstat(file)
+            if hasattr(os, "getuid") and (status.st_uid not in (os.getuid(), 0) or status.st_mode & 0o022):
+                raise ValueError("another user owns it or may write into it")
+        expected = checksum.read().strip()
+    with open(descriptor, "rb", closefd=False) as file:
+        if hashlib.sha256(file.read()).hexdigest().encode() != expected:
+            raise ValueError("its checksum is wrong")
+
+
+def _is_private(directory: Path) -> bool:
+    """Return whether no other user but the superuser can change the entries of a directory."""
+    if not hasattr(os, "getuid"):
+        return True
+    status = directory.stat()
+    return status.st_uid == os.getuid() and not status.st_mode & 0o022
+
+
+def _put(content: bytes, path: Path) -> None:
+    """Write a file atomically, which only this user may change."""
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=".")
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(content)
+        os.chmod(temporary, 0o755)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
 
 
 def _remove_leftovers(directory: Path) -> None:
@@ -196,9 +276,15 @@ def _target(command: tuple[str, ...]) -> str:
     return _run([*command, "-dM", "-E", "-x", "c++", os.devnull])
 
 
-def _run(command: list[str]) -> str:
+def _run(command: list[str], temporary: str | None = None) -> str:
+    """Run the compiler.
+
+    :param command: the command
+    :param temporary: its folder of temporary files, by default the system's
+    """
+    environment = {**os.environ, "TMPDIR": temporary} if temporary else None
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False, env=environment)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise BuildError(f"the C++ compiler {command[0]!r} does not run ({error}); set CXX to another one") from error
     if done.returncode != 0:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import warnings
+from collections.abc import Callable
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.native import BuildError
 from quad_swarm.planner.base import Planner, Plans, PlanStatus, Solution, Solver
 from quad_swarm.planner.fatrop import FatropSolver
@@ -13,7 +14,8 @@ from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Pro
 from quad_swarm.planner.rti import RtiSolver
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
-SOLVERS: dict[str, type[FatropSolver] | type[RtiSolver]] = {"rti": RtiSolver, "fatrop": FatropSolver}
+# Name -> what creates the solver of a problem: its class, or a function
+SOLVERS: dict[str, Callable[[OptimalControlProblem], Solver]] = {"rti": RtiSolver, "fatrop": FatropSolver}
 
 
 def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: int, solver: str = "auto") -> Planner:
@@ -23,8 +25,8 @@ def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: in
     :param quadrotor: physical parameters
     :param n_robots: number of robots in a swarm
     :param solver: one of `SOLVERS`, or "auto" for "rti" if it can be compiled, otherwise "fatrop" with a warning
-    :raises ValueError: if the solver is unknown
-    :raises RuntimeError: if the solver is "rti" and cannot be compiled
+    :raises ValueError: if the solver is unknown, or what `SOLVERS` holds under its name creates no `Solver`
+    :raises BuildError: if the solver is "rti" and cannot be compiled
     """
     if solver != "auto" and solver not in SOLVERS:
         raise unknown_name("solver", solver, ["auto", *SOLVERS])
@@ -33,18 +35,24 @@ def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: in
     return Planner(_make_solver(problem, solver), QuadrotorModel(quadrotor, config.dt), config)
 
 
-def _make_solver(problem: OptimalControlProblem, solver: str) -> Solver:
-    if solver == "fatrop":
-        return FatropSolver(problem)
-    rti = RtiSolver(problem)
+def _make_solver(problem: OptimalControlProblem, name: str) -> Solver:
+    chosen = "rti" if name == "auto" else name
+    solver = SOLVERS[chosen](problem)
+    has_solve = callable(getattr(solver, "solve", None)) and not isinstance(solver, type)
+    if not has_solve or not isinstance(getattr(solver, "name", None), str):
+        raise ValueError(
+            f"SOLVERS[{chosen!r}] created {shown(solver)}, which is no solver: it needs a `name` and a method "
+            "`solve(problems, x_guess, u_guess)`, see quad_swarm.planner.Solver."
+        )
     try:
-        rti.compile()
+        if isinstance(solver, RtiSolver):
+            solver.compile()
     except BuildError as error:
-        if solver == "rti":
-            raise BuildError(f"solver='rti' cannot run: {error}; solver='fatrop' needs no compiler.") from error
+        if name != "auto":
+            raise BuildError(f"solver={name!r} cannot run: {error}; solver='fatrop' needs no compiler.") from error
         _warn_once(f"quad_swarm plans with fatrop, which is hundreds of times slower than rti: {error}.")
-        return FatropSolver(problem)
-    return rti
+        return SOLVERS["fatrop"](problem)
+    return solver
 
 
 @functools.cache

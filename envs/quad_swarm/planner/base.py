@@ -31,7 +31,8 @@ class Solution(NamedTuple):
 
 
 class Solver(Protocol):
-    """Solver of batches of problems. It reports failures as data; if it raises, all its problems count as failed."""
+    """Solver of batches of problems. It reports failures as data; if it raises, or returns no `Solution` of the
+    problems' shapes, all its problems count as failed."""
 
     name: str
 
@@ -58,6 +59,7 @@ class PlanStatus(IntEnum):
     BRAKING = 3
 
 
+_TYPES = (np.dtype(float), np.dtype(float), np.dtype(bool), np.dtype(np.int64))  # of a solution's arrays
 _SOLVED, _BRAKING = int(PlanStatus.SOLVED), int(PlanStatus.BRAKING)  # NumPy is slow with enumerations
 
 
@@ -142,7 +144,7 @@ class Planner:
     def _solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """Call the solver. Plans that are not finite count as failed, as do all plans if the solver raises."""
         try:
-            solution = self.solver.solve(problems, x_guess, u_guess)
+            solution = _checked(self.solver.solve(problems, x_guess, u_guess), x_guess, u_guess)
         except Exception as error:
             message = f"the solver {self.solver.name!r} raised {error!r}: its problems count as failed"
             warnings.warn(message, RuntimeWarning, stacklevel=3)
@@ -183,6 +185,33 @@ class Planner:
             u[:, k, 1] = np.clip(-gain * state[:, 3], -limit, limit)
             state = self.model.step(state, u[:, k])
         return u
+
+
+def _checked(solution: Solution, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
+    """Check the form of a solution. Its arrays become those that the planner reads and writes.
+
+    :raises ValueError: if an array has another shape, or `success` is not boolean
+    """
+    count = len(x_guess)
+    x, u, success, iterations = solution
+    if (
+        type(x) is type(u) is type(success) is type(iterations) is np.ndarray
+        and (x.shape, u.shape, success.shape, iterations.shape) == (x_guess.shape, u_guess.shape, (count,), (count,))
+        and (x.dtype, u.dtype, success.dtype, iterations.dtype) == _TYPES
+        and x.flags.writeable
+        and u.flags.writeable
+        and iterations.flags.writeable
+    ):
+        return solution
+    success = np.array(success)
+    if success.dtype != bool:  # ~1 is not False
+        raise ValueError(f"success has the type {success.dtype}; a solution has booleans")
+    checked = Solution(np.array(x, float), np.array(u, float), success, np.array(iterations, np.int64))
+    shapes = (x_guess.shape, u_guess.shape, (count,), (count,))
+    for name, array, shape in zip(Solution._fields, checked, shapes, strict=True):
+        if array.shape != shape:
+            raise ValueError(f"{name} has the shape {array.shape}; a solution of these problems has {shape}")
+    return checked
 
 
 def shift(trajectory: np.ndarray) -> np.ndarray:

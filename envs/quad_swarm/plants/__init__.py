@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from quad_swarm.plants.base import ModelPlant, Plant, make_plant, parse_plant
+from quad_swarm.plants.base import SIMULATORS, ModelPlant, Plant, PlantError, Simulator, make_plant, parse_plant
 
-__all__ = ["ModelPlant", "Plant", "make_plant", "parse_plant"]
+__all__ = ["SIMULATORS", "ModelPlant", "Plant", "PlantError", "Simulator", "make_plant", "parse_plant"]

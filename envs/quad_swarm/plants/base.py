@@ -2,24 +2,83 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
 MODEL = "model"
-# Simulators and their vehicles, the first of which is the default
-SIMULATORS: dict[str, tuple[str, ...]] = {
-    "crazyflow": ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
-    "rotorpy": ("crazyflie", "crazyfliebrushless", "hummingbird"),
+
+
+class PlantError(ChildProcessError):
+    """Raised if a simulator fails: its process died, or it raised an error or returned something else than states."""
+
+
+class PlantDied(PlantError):
+    """Raised if a simulator's process died."""
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator, which runs in a process of its own.
+
+    :param adapter: ``module:Class`` of its `Plant`, or the class itself. The process imports the module and calls
+        ``Class(vehicle, drag, dt, n_swarms, n_robots)``: a name of ``vehicles``, the drag coefficients along x and y
+        (1/s), the length of a sub-step (s), and the numbers E and n
+    :param vehicles: names of its vehicles, the first of which is the default
+    :raises ValueError: if the adapter is nothing that another process can import, or there is no vehicle
+    """
+
+    adapter: str | type
+    vehicles: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if isinstance(self.adapter, type):
+            object.__setattr__(self, "adapter", f"{self.adapter.__module__}:{self.adapter.__qualname__}")
+        module, colon, name = self.adapter.partition(":") if isinstance(self.adapter, str) else ("", "", "")
+        if not (module and colon and name) or module == "__main__" or "<locals>" in name:
+            raise ValueError(
+                f"adapter={shown(self.adapter)}: the simulator's process imports it, so it must be a class of a module "
+                "or its name, module:Class."
+            )
+        if isinstance(self.vehicles, str) or not self.vehicles or not all(isinstance(v, str) for v in self.vehicles):
+            raise ValueError(f"vehicles={shown(self.vehicles)}: they must be one or more names, as in ('iris',).")
+        object.__setattr__(self, "vehicles", tuple(self.vehicles))
+
+    @property
+    def module(self) -> str:
+        """Name of the adapter's module."""
+        return str(self.adapter).partition(":")[0]
+
+
+SIMULATORS: dict[str, Simulator] = {
+    "crazyflow": Simulator(
+        "quad_swarm.plants.crazyflow:CrazyflowPlant",
+        ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
+    ),
+    "rotorpy": Simulator("quad_swarm.plants.rotorpy:RotorpyPlant", ("crazyflie", "crazyfliebrushless", "hummingbird")),
 }
 
 
 def simulated_vehicles() -> list[str]:
     """Return all vehicles of `SIMULATORS` as values of ``plant``."""
-    return [f"{simulator}:{vehicle}" for simulator, vehicles in SIMULATORS.items() for vehicle in vehicles]
+    return [f"{name}:{vehicle}" for name in SIMULATORS for vehicle in simulator_of(name).vehicles]
+
+
+def simulator_of(name: str) -> Simulator:
+    """Return the entry of `SIMULATORS` for a name.
+
+    :raises ValueError: if it is no `Simulator`
+    """
+    if isinstance(known := SIMULATORS[name], Simulator):
+        return known
+    raise ValueError(
+        f"SIMULATORS[{name!r}]={shown(known)}: it must be a quad_swarm.plants.Simulator, which names the adapter and "
+        "its vehicles, as in Simulator('my_module:MyPlant', ('iris',))."
+    )
 
 
 class Plant(Protocol):
@@ -40,7 +99,8 @@ class Plant(Protocol):
         :param state: current states, (E, n, 9), which are those of the last call, possibly with added noise
         :param u: constant inputs, (E, n, 4)
         :param air: velocity of the air at each robot, (E, n, 2) (m/s)
-        :param factors: factors of each vehicle's parameters, see `QuadrotorModel.step`; for our own model only
+        :param factors: factors of each vehicle's parameters, see `QuadrotorModel.step`; for our own model only, the
+            plants of simulators are called without
         """
         ...
 
@@ -79,9 +139,10 @@ def parse_plant(name: str) -> tuple[str, str]:
         return MODEL, ""
     if simulator not in SIMULATORS:
         raise unknown_name("plant", simulator, [MODEL, *SIMULATORS])
-    if vehicle and vehicle not in SIMULATORS[simulator]:
-        raise unknown_name(f"vehicle of {simulator}", vehicle, SIMULATORS[simulator])
-    return simulator, vehicle or SIMULATORS[simulator][0]
+    known = simulator_of(simulator)
+    if vehicle and vehicle not in known.vehicles:
+        raise unknown_name(f"vehicle of {simulator}", vehicle, known.vehicles)
+    return simulator, vehicle or known.vehicles[0]
 
 
 def make_plant(name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int) -> Plant:
@@ -94,6 +155,7 @@ def make_plant(name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_r
     :param n_robots: number of robots in a swarm
     :raises ValueError: if the plant is unknown, or the simulator does not support sub-steps of this length
     :raises ImportError: if the simulator is not installed
+    :raises PlantError: if the simulator's process dies, or its adapter raises another error
     """
     simulator, vehicle = parse_plant(name)
     if simulator == MODEL:

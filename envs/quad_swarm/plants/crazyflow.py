@@ -98,7 +98,7 @@ class CrazyflowPlant:
         """See `Plant`. A shallow copy suffices, because JAX's arrays are immutable."""
         return copy(self)
 
-    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray) -> np.ndarray:
+    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray, factors: np.ndarray | None = None) -> np.ndarray:
         """See `Plant`."""
         if not len(self._kept):
             return state.copy()

@@ -7,6 +7,7 @@ writes a vehicle file, which worlds accept as ``quadrotor``.
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 import tempfile
 from pathlib import Path
@@ -107,10 +108,13 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
     parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
+    parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="modules to import first, with simulators")
     parser.add_argument(
         "--out", type=Path, metavar="FILE", help="vehicle file to write, YAML; - is the standard output"
     )
     args = parser.parse_args(argv)
+    for name in args.gym_packages or ():  # `sb3-maddpg` has imported them before
+        importlib.import_module(name)
     piped = args.out == Path("-")
     if args.out and not piped:
         if args.out.is_dir():

@@ -11,7 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from quad_swarm.errors import shown
+from quad_swarm.plants.base import PlantDied, PlantError, simulator_of
 from quad_swarm.quadrotor import QuadrotorParams
+
+# What `-c` puts first on the path is the current folder, whose files are not to be run; `sys` is built in
+_LAUNCH = (
+    "import sys; sys.path[:] = [path for path in sys.path if path]; import runpy; "
+    "runpy.run_module('quad_swarm.plants.server', run_name='__main__', alter_sys=True)"
+)
 
 
 class _Server:
@@ -20,8 +28,10 @@ class _Server:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._connection, there = Pipe()
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        command = [sys.executable, "-m", "quad_swarm.plants.server", str(there.fileno())]
+        # An interactive session imports from the current folder: so does the simulator, but after everything else
+        path = [*filter(None, sys.path), *([os.getcwd()] if "" in sys.path else [])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path), "PYTHONSAFEPATH": "1"}
+        command = [sys.executable, "-c", _LAUNCH, str(there.fileno())]
         self.process = subprocess.Popen(command, pass_fds=[there.fileno()], env=environment, stdin=subprocess.DEVNULL)
         there.close()
 
@@ -30,7 +40,7 @@ class _Server:
 
         :raises ValueError: if the process raised it
         :raises ImportError: if the process raised it
-        :raises RuntimeError: if the process died
+        :raises PlantError: if the process died (`PlantDied`) or raised another error
         """
         with self._lock:
             try:
@@ -38,7 +48,7 @@ class _Server:
                 answer = self._connection.recv()
             except (EOFError, OSError) as error:
                 code = self.process.wait()
-                raise RuntimeError(f"The simulator's process exited with {code}; see its messages above.") from error
+                raise PlantDied(f"The simulator's process exited with {code}; see its messages above.") from error
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -68,12 +78,15 @@ class RemotePlant:
     :param n_robots: number of robots in a swarm
     :raises ValueError: if the simulator rejects an argument
     :raises ImportError: if the simulator is not installed
+    :raises PlantError: if its process dies, or its adapter raises another error
     """
 
     def __init__(self, simulator: str, vehicle: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int):
         self._server = _server(simulator)
         drag = (params.drag_x, params.drag_y)
-        self._number = self._server.call("make", None, simulator, vehicle, drag, dt, n_swarms, n_robots)
+        self._name = f"{simulator}:{vehicle}"
+        adapter = simulator_of(simulator).adapter
+        self._number = self._server.call("make", None, adapter, self._name, vehicle, drag, dt, n_swarms, n_robots)
 
     def place(self, swarm: int, state: np.ndarray) -> None:
         """See `Plant`."""
@@ -86,16 +99,25 @@ class RemotePlant:
     def fork(self) -> RemotePlant:
         """See `Plant`."""
         fork = object.__new__(RemotePlant)
-        fork._server, fork._number = self._server, self._server.call("fork", self._number)
+        fork._server, fork._name, fork._number = self._server, self._name, self._server.call("fork", self._number)
         return fork
 
     def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray, factors: np.ndarray | None) -> np.ndarray:
-        """See `Plant`."""
-        return self._server.call("step", self._number, state, u, np.array(air))
+        """See `Plant`.
+
+        :raises PlantError: if the process died, or the states are not finite
+        """
+        after = self._server.call("step", self._number, state, u, np.array(air), None)
+        if after.shape != state.shape or not np.isfinite(after).all():
+            raise PlantError(
+                f"plant={self._name!r} returned {shown(after)}; a step returns the finite states of all robots, shape "
+                f"{state.shape}."
+            )
+        return after
 
     def __del__(self) -> None:
         if hasattr(self, "_number") and self._server.process.poll() is None:
             try:
                 self._server.call("drop", self._number)
-            except (RuntimeError, AttributeError, TypeError):  # at interpreter shutdown
+            except (OSError, AttributeError, TypeError):  # at interpreter shutdown
                 return

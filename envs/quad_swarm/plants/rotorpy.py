@@ -65,7 +65,7 @@ class RotorpyPlant:
         fork._body_rates, fork._rotor_speeds = self._body_rates.copy(), self._rotor_speeds.copy()
         return fork
 
-    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray) -> np.ndarray:
+    def step(self, state: np.ndarray, u: np.ndarray, air: np.ndarray, factors: np.ndarray | None = None) -> np.ndarray:
         """See `Plant`."""
         flat = state.reshape(-1, 9)
         count = len(flat)

@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import itertools
 import sys
+import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
-from quad_swarm.errors import needs_extra
-from quad_swarm.plants.base import SIMULATORS
+import numpy as np
+
+from quad_swarm.plants.base import Plant, PlantError
 
 
-def make(simulator: str, vehicle: str, *arguments: Any) -> Any:
-    """Create a plant in this process."""
-    if simulator not in SIMULATORS:
-        raise ValueError(f"No adapter for the simulator {simulator!r}.")
-    with needs_extra(f"plant='{simulator}:{vehicle}'", "plants"):
-        adapter = getattr(importlib.import_module(f"quad_swarm.plants.{simulator}"), f"{simulator.capitalize()}Plant")
-    return adapter(vehicle, *arguments)
+def make(adapter: str, plant: str, *arguments: Any) -> Plant:
+    """Create a plant in this process.
+
+    :param adapter: see `Simulator`
+    :param plant: name of the plant, for error messages
+    :param arguments: arguments of the adapter
+    :raises ImportError: if the adapter or its simulator is not installed
+    :raises ValueError: if the adapter is no `Plant`
+    """
+    module, _, name = adapter.partition(":")
+    try:
+        created = functools.reduce(getattr, name.split("."), importlib.import_module(module))
+    except (ImportError, AttributeError) as error:
+        needed = f"the simulator: its adapter is {adapter}"
+        if module.startswith("quad_swarm."):
+            needed = "the extra 'plants': in the clone, pip install -e '.[plants]'"
+        raise ImportError(f"plant={plant!r} needs {needed} ({error}).") from None
+    made = created(*arguments)  # type: ignore[operator]
+    if missing := [name for name in ("place", "keep", "fork", "step") if not callable(getattr(made, name, None))]:
+        raise ValueError(f"plant={plant!r}: its adapter {adapter} is no Plant, since it has no {missing[0]}().")
+    return made
 
 
 def serve(connection: Connection) -> None:
@@ -42,8 +59,15 @@ def serve(connection: Connection) -> None:
                 del plants[number]
             else:
                 answer = getattr(plants[number], method)(*arguments)
-        except (ValueError, ImportError) as error:
-            answer = type(error)(str(error))
+                answer = np.asarray(answer, dtype=float) if method == "step" else None
+        except ImportError as error:
+            answer = ImportError(str(error))
+        except Exception as error:  # whatever a foreign adapter raises
+            if method in ("make", "fork") and isinstance(error, ValueError):  # an argument that it refuses
+                answer = ValueError(str(error))
+            else:
+                traceback.print_exc()
+                answer = PlantError(f"The simulator raised {type(error).__name__}: {error}")
         connection.send(answer)
 
 

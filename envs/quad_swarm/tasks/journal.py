@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from quad_swarm.native.build import cache_directory
+from quad_swarm.native.build import BuildError, cache_directory
 
 # Distributions whose versions results depend on: the first two at least in their last bits, the simulators if they fly
 _VERSIONS = (
@@ -29,9 +29,14 @@ _DAYS = 30  # after which pieces are deleted
 _SOURCES = (".py", ".cpp", ".hpp")
 
 
-def default_folder() -> Path:
-    """Return the default folder of pieces, in the same cache as the compiled libraries."""
-    return cache_directory() / "pieces"
+def default_folder() -> Path | None:
+    """Return the default folder of pieces, in the same cache as the compiled libraries; None, with a warning, if there
+    is none."""
+    try:
+        return cache_directory() / "pieces"
+    except BuildError as error:
+        warnings.warn(f"Finished pieces are not kept: {error}.", RuntimeWarning, stacklevel=2)
+        return None
 
 
 class Journal:

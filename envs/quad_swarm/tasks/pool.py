@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import importlib
 import multiprocessing
+import multiprocessing.util
 import os
 import pickle
 import signal
+import sys
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import partial
@@ -137,7 +139,8 @@ class Pool(Executor):
         # One thread per process, so that processes do not compete for cores
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         process = self._context.Process(target=_work, args=(theirs, self._modules), daemon=True)
-        process.start()
+        with _without_current_folder():
+            process.start()
         theirs.close()  # so that the end of the process ends the pipe
         self._workers[mine] = _Worker(process)
         return mine
@@ -187,6 +190,28 @@ class Pool(Executor):
                 piece.future.set_exception(RuntimeError("The pool was stopped."))
         self._workers.clear()
         self._waiting.clear()
+
+
+@contextlib.contextmanager
+def _without_current_folder() -> Iterator[None]:
+    """Start processes of Python that do not import from the current folder, whose files are not to be run: a spawned
+    process has it first on its path until it gets the path of this one."""
+    if sys.version_info >= (3, 11):
+        before = os.environ.get("PYTHONSAFEPATH")
+        os.environ["PYTHONSAFEPATH"] = "1"
+        try:
+            yield
+        finally:
+            os.environ.pop("PYTHONSAFEPATH")
+            if before is not None:
+                os.environ["PYTHONSAFEPATH"] = before
+    else:  # only isolated processes do without it
+        flags = multiprocessing.util._args_from_interpreter_flags  # type: ignore[attr-defined]
+        multiprocessing.util._args_from_interpreter_flags = lambda: [*flags(), "-I"]  # type: ignore[attr-defined]
+        try:
+            yield
+        finally:
+            multiprocessing.util._args_from_interpreter_flags = flags  # type: ignore[attr-defined]
 
 
 def _work(connection: Connection, modules: Sequence[str]) -> None:

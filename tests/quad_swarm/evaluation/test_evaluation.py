@@ -1,5 +1,6 @@
 """The comparison of policies: its independence of processes, its figures, workers that die."""
 
+import functools
 import importlib
 import json
 import os
@@ -11,6 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import foreign
 import numpy as np
 import pytest
 
@@ -19,11 +21,13 @@ from quad_swarm.evaluation.command import paper_policies
 from quad_swarm.evaluation.evaluation import evaluate, fly_all, summarise
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.native import BuildError
-from quad_swarm.planner import RtiSolver
-from quad_swarm.task.rules import RULES
+from quad_swarm.planner import SOLVERS, RtiSolver
+from quad_swarm.plants import SIMULATORS, PlantError, Simulator
+from quad_swarm.task.observation import GROUPS
+from quad_swarm.task.rules import RULES, distance
 from quad_swarm.tasks import Journal
 from quad_swarm.world.presets import make_config
-from quad_swarm.world.scenarios import SCENARIOS
+from quad_swarm.world.scenarios import SCENARIOS, random
 
 
 def condition(policy: str, max_steps: int = 25) -> Condition:
@@ -42,7 +46,10 @@ def test_result_does_not_depend_on_the_number_of_processes():
 def test_other_processes_know_what_a_module_of_the_user_added(tmp_path, monkeypatch):
     module = """
 import numpy as np
-from quad_swarm.task.rules import RULES
+from quad_swarm.planner import SOLVERS
+from quad_swarm.plants import SIMULATORS, PlantError, Simulator
+from quad_swarm.task.observation import GROUPS
+from quad_swarm.task.rules import RULES, distance
 from quad_swarm.world.scenarios import SCENARIOS, random
 
 def alone(n_robots, space, rng):
@@ -108,7 +115,7 @@ def test_pieces_of_a_worker_that_died_are_flown_again(tmp_path, monkeypatch):
     monkeypatch.setenv("MARKER", str(tmp_path / "died"))
     monkeypatch.setattr(evaluation, "_CHUNK", 5)
     one = fly_all([condition("none")], 15)
-    monkeypatch.setattr(evaluation, "run_episodes", killed_once)
+    monkeypatch.setattr(evaluation, "_fly_piece", killed_once)
     two = fly_all([condition("none")], 15, jobs=2)
     assert (tmp_path / "died").exists()
     assert untimed(one) == untimed(two)
@@ -274,3 +281,64 @@ def busy(pid: int) -> bool:
     except OSError:
         return False
     return int(fields[11]) > 100
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_users_register_flies_in_every_process(jobs, monkeypatch):
+    """Also what is no function of their own modules, such as a built-in one with other arguments."""
+    monkeypatch.setitem(SCENARIOS, "apart", functools.partial(random))
+    monkeypatch.setitem(RULES, "near", (functools.partial(distance, 1e3), ()))
+    monkeypatch.setitem(SOLVERS, "stay", foreign.Stay)
+    monkeypatch.setitem(SOLVERS, "gentle", foreign.gentle)
+    monkeypatch.setitem(SIMULATORS, "gazebo", Simulator(foreign.Drifting, ("iris", "typhoon")))
+    monkeypatch.setitem(GROUPS, "ones", foreign.ones)
+    config = make_config("paper")
+    plans = [Condition("near", "apart", config, 10, solver=solver) for solver in ("rti", "stay", "gentle")]
+    flown = [*plans, Condition("none", "apart", make_config("paper", plant="gazebo:typhoon"), 10)]
+    rti, stay, gentle, gazebo = (fly_all([one], 2, jobs=jobs)[one] for one in flown)
+    assert [row["requests"] for row in (*rti, *stay, *gentle)] == [12 * 10] * 6
+    assert [row["path_length"] for row in stay] == [0, 0]
+    assert all(0.1 < a["path_length"] / b["path_length"] < 0.6 for a, b in zip(gentle, rti, strict=True))
+    assert [row["path_length"] for row in gazebo] == pytest.approx([2.0, 2.0])  # 1 s at 2 m/s
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_policies_may_be_objects(jobs):
+    config = make_config("paper")
+    conditions = [Condition(policy, "random", config, 10) for policy in ("none", foreign.Asker(), "full")]
+    none, asker, full = evaluate(conditions, 3, jobs=jobs)
+    assert (none["policy"], asker["policy"], full["policy"]) == ("none", "Asker", "full")
+    assert (none["requests"], asker["requests"]) == (0, full["requests"])
+    assert asker["time_lost"] == full["time_lost"]
+
+
+def test_a_policy_that_cannot_be_sent_to_processes_is_named():
+    class Local(foreign.Asker):
+        pass
+
+    conditions = [Condition(Local(), scenario, make_config("paper"), 2) for scenario in ("random", "random_swap")]
+    assert len(evaluate(conditions, 1)) == 2
+    with pytest.raises(ValueError, match=r"The policy Local cannot be pickled .* choose jobs=1"):
+        evaluate(conditions, 1, jobs=2)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_simulator_that_dies_costs_its_piece_only(jobs, tmp_path, monkeypatch):
+    monkeypatch.setitem(SIMULATORS, "mortal", Simulator(foreign.Mortal, ("iris", "typhoon")))
+    monkeypatch.setenv("FOREIGN_DIED", str(tmp_path / "died"))
+    config = make_config("paper", plant="mortal:iris")
+    conditions = [Condition("none", scenario, config, 10) for scenario in ("random", "random_swap")]
+    rows = [row for one in fly_all(conditions, 2, jobs=jobs).values() for row in one]
+    assert (tmp_path / "died").exists()
+    assert [row["path_length"] for row in rows] == pytest.approx([1.0] * 4)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_simulator_that_always_dies_is_told_in_one_line(jobs, tmp_path, monkeypatch):
+    monkeypatch.setitem(SIMULATORS, "doomed", Simulator(foreign.Mortal, ("iris", "typhoon")))
+    monkeypatch.setenv("FOREIGN_DIED", "/dev/null/nothing")  # which cannot be created
+    config = make_config("paper", plant="doomed:iris")
+    conditions = [Condition("none", scenario, config, 10) for scenario in ("random", "random_swap")]
+    with pytest.raises(PlantError, match="The simulator's process exited with") as error:
+        evaluate(conditions, 2, jobs=jobs)
+    assert "\n" not in str(error.value)

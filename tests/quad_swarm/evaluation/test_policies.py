@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import foreign
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -127,3 +128,96 @@ def test_a_model_that_announces_flies_as_in_its_environment(tmp_path):
     pairs = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', replay_page([one], seed=1), re.DOTALL)[1])
     sent = [pair for step in pairs["flights"][0]["requests"] for pair in step]
     assert sum(len(pair) == 3 for pair in sent) == flight.announced[: len(pairs["flights"][0]["requests"])].sum()
+
+
+class Half(foreign.Asker):
+    """Asks the first half of the others, as a model of Stable-Baselines3 answers."""
+
+    name = "half"
+
+    def predict(self, observation, state=None, deterministic=False):
+        assert deterministic
+        return (super().predict(observation).reshape(-1, 2) * [1, 0]).reshape(len(observation), -1), None
+
+
+class Unhashable(foreign.Asker):
+    __hash__ = None
+
+    def __eq__(self, other):
+        return np.array([True, False])
+
+
+@pytest.mark.parametrize(("policy", "share"), [(foreign.Asker(), 1.0), (Half(), 0.5), (Unhashable(), 1.0)])
+def test_objects_with_predict_fly(policy, share):
+    config = make_config("paper")
+    one = Condition(policy, "random", config, 5)
+    assert one == Condition(policy, "random", config, 5)
+    assert one != Condition(type(policy)(), "random", config, 5)
+    assert {one: 1}[one] == 1
+    assert [row["requests"] for row in run_episodes(one, range(3))] == [60 * share] * 3
+    assert fly(Condition("none", "random", config, 5), 0, model=policy).requests.sum() == 60 * share
+
+
+def test_an_object_may_name_its_observation():
+    class Seeing(foreign.Asker):
+        env_spec = {"kwargs": {"observation": "state+memory"}}  # noqa: RUF012
+
+        def predict(self, observation):
+            self.shape = observation.shape
+            return super().predict(observation)
+
+    policy = Seeing()
+    fly(Condition(policy, "random", make_config("paper"), 1), 0)
+    with gym.make("QuadSwarm-v0", observation="state+memory") as env:
+        assert policy.shape == (1, *env.observation_space.shape)
+
+
+def test_a_trained_model_flies_as_an_object_as_it_does_from_its_file(model):
+    config = make_config("paper")
+    rows = [
+        run_episodes(Condition(policy, "symmetric_swap", config, 20), range(2))
+        for policy in (model, load_model(model, ALGO))
+    ]
+    for a, b in zip(*rows, strict=True):
+        assert {**a, "solve_seconds": 0} == {**b, "solve_seconds": 0}
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (
+            lambda o: np.ones(12),
+            r"2 swarms, shape \(2, 4, 24\), with shape \(12,\); it must answer with 12 finite bits",
+        ),
+        (lambda o: np.full((2, 12), np.nan), "12 finite bits for each swarm"),
+        (lambda o: "bits", r"predict failed on the observations of 2 swarms, shape \(2, 4, 24\) \(ValueError"),
+        (lambda o: o.missing, r"predict failed .* \(AttributeError"),
+    ],
+)
+def test_answers_that_are_no_bits_are_refused(answer, message):
+    class Odd:
+        def predict(self, observation):
+            return answer(observation)
+
+    with pytest.raises(ValueError, match=message) as error:
+        run_episodes(Condition(Odd(), "random", make_config("paper"), 1), range(2))
+    assert str(error.value).startswith("Odd: ")
+
+
+@pytest.mark.parametrize("policy", [None, 3, object(), foreign.Asker, ["none"]])
+def test_what_is_no_policy_is_refused(policy):
+    with pytest.raises(ValueError, match=r"it must be a rule, the path of a model's zip, or an object with predict"):
+        Condition(policy, "random", make_config("paper"))
+
+
+def test_a_foreign_class_needs_no_more_than_load_and_predict(tmp_path):
+    path = tmp_path / "model.zip"
+    path.write_text("weights")
+    one = Condition(path, "random", make_config("paper"), 5, algo="foreign:Loaded")
+    assert one.policy == str(path)
+    assert [row["requests"] for row in run_episodes(one, range(2))] == [60, 60]
+    path.write_text("other")
+    with pytest.raises(ValueError, match=r"cannot be loaded by foreign:Loaded \(ValueError: other weights\)"):
+        run_episodes(one, range(2))
+    with pytest.raises(ValueError, match="not an importable module:Class with a `load`"):
+        run_episodes(Condition(path, "random", make_config("paper"), 5, algo="foreign:Asker"), range(2))

@@ -1,5 +1,7 @@
 """The kernels as pieces of software: compilers, cache, processes, sanitizers, and the same bits from every build."""
 
+import ctypes
+import hashlib
 import multiprocessing
 import os
 import pickle
@@ -16,6 +18,7 @@ from planning import QUADROTOR, assert_same
 
 from quad_swarm import planner
 from quad_swarm.native import build as build_module
+from quad_swarm.native import pairs
 from quad_swarm.planner import (
     BuildError,
     FatropSolver,
@@ -27,6 +30,7 @@ from quad_swarm.planner import (
 )
 from quad_swarm.planner.rti.codegen import generate_model
 from quad_swarm.planner.rti.solver import build_kernel
+from quad_swarm.tasks.journal import default_folder
 
 CONFIG = PlannerConfig(horizon=3)
 SOURCES = Path(planner.__file__).parent / "rti"
@@ -193,7 +197,7 @@ def flip_a_bit(library: Path) -> None:
 def stub_compiler(monkeypatch) -> None:
     """Writes something for a library, at once."""
 
-    def run(command: list[str]) -> str:
+    def run(command: list[str], temporary: str | None = None) -> str:
         if "-o" in command:
             Path(command[-1]).write_bytes(b"library" * 99)
         return ""
@@ -349,3 +353,154 @@ def test_functions_of_lanes_are_accurate(tmp_path):
     errors = [float(text) for text in run_harness(tmp_path, FUNCTIONS).split()]
     limits = [3e-12, 2e-9, 5e-7, 1e-12, 3e-7, 1e-15, 3e-7]
     assert all(error <= limit for error, limit in zip(errors, limits, strict=True)), errors
+
+
+def test_no_home_is_told_with_the_remedy(monkeypatch, tmp_path):
+    for name in ("QUAD_SWARM_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as for a user without an entry and without HOME
+    message = r"there is no cache ~/\.cache/quad_swarm .*; set QUAD_SWARM_CACHE to a writable directory"
+    with pytest.raises(BuildError, match=message):
+        build_module.cache_directory()
+    with pytest.warns(RuntimeWarning, match=message):
+        assert isinstance(make_planner(CONFIG, QUADROTOR, 5).solver, FatropSolver)
+    with pytest.warns(RuntimeWarning, match=f"Finished pieces are not kept: {message}"):
+        assert default_folder() is None
+    pairs.compiled.cache_clear()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert make_planner(CONFIG, QUADROTOR, 5, "fatrop").solver.name == "fatrop"
+            assert pairs.compiled() is None
+    finally:
+        pairs.compiled.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("QUAD_SWARM_CACHE", ".", "."),
+        ("QUAD_SWARM_CACHE", "here", "here"),
+        ("QUAD_SWARM_CACHE", "~/there", "home/there"),
+        ("XDG_CACHE_HOME", "~", "home/quad_swarm"),
+        ("XDG_CACHE_HOME", ".", "quad_swarm"),
+    ],
+)
+def test_the_cache_s_path_is_absolute(name, value, expected, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("QUAD_SWARM_CACHE")
+    monkeypatch.setenv(name, value)
+    assert build_module.cache_directory() == tmp_path / expected
+
+
+def test_a_cache_in_the_current_folder_works(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("QUAD_SWARM_CACHE", ".")
+    assert_same(solve(), solve())
+    assert len(list(tmp_path.glob("rti-*.so"))) == 1
+
+
+def test_a_compiler_of_c_is_named_as_the_cause(cache, tmp_path, monkeypatch):
+    library = cache / "rti-x.so"
+    cache.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "x.cpp").write_text("#include <vector>\nint f(std::vector<int>& v) { v.resize(9); return v.at(3); }\n")
+    command = [*build_module.compiler(), "-shared", "-fPIC", "-nodefaultlibs", str(tmp_path / "x.cpp")]
+    subprocess.run([*command, "-o", str(library)], check=True)
+    library.chmod(0o755)
+    build_module._checksum_file(library).write_text(hashlib.sha256(library.read_bytes()).hexdigest())
+    build_module._checksum_file(library).chmod(0o644)
+    with pytest.raises(BuildError, match=r"cannot load .*rti-x.so \(undefined symbol.*such as g\+\+ instead of gcc"):
+        build_module.load(str(library))
+
+
+def test_temporary_files_of_the_compiler_are_in_the_cache(cache, monkeypatch, tmp_path):
+    seen = []
+    run = subprocess.run
+    monkeypatch.setattr(
+        subprocess, "run", lambda command, **kwargs: (seen.append((command, kwargs["env"])), run(command, **kwargs))[1]
+    )
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "missing"))
+    build_kernel(generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 1)), "float32")
+    ((_, environment),) = [one for one in seen if "-o" in one[0]]
+    assert Path(environment["TMPDIR"]).parent == cache
+
+
+posix = pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+
+
+@posix
+@pytest.mark.parametrize("which", ["library", "checksum"])
+@pytest.mark.parametrize("mode", [0o775, 0o757])
+def test_what_others_may_write_is_compiled_again(which, mode, stub_compiler):
+    library = build_kernel("model", "float32")
+    path = library if which == "library" else build_module._checksum_file(library)
+    path.chmod(mode)
+    assert not build_module._is_whole(library)
+    with pytest.raises(BuildError, match="another user owns it or may write into it"):
+        build_module.load(str(library))
+    assert build_kernel("model", "float32") == library
+    assert build_module._is_whole(library)
+
+
+@posix
+def test_a_library_that_cannot_be_replaced_is_not_loaded(stub_compiler, monkeypatch):
+    """As where another user's file is in a folder in which only owners replace theirs."""
+    library = build_kernel("model", "float32")
+    library.chmod(0o777)
+    put = build_module._put
+
+    def refused(content: bytes, path: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(build_module, "_put", refused)
+    with pytest.raises(BuildError, match=r"cannot replace .*belongs to another user; set QUAD_SWARM_CACHE"):
+        build_kernel("model", "float32")
+    monkeypatch.setattr(build_module, "_put", put)
+    assert build_kernel("model", "float32") == library
+
+
+@posix
+def test_in_a_folder_that_others_may_write_nothing_is_compiled(cache, monkeypatch):
+    places = []
+    monkeypatch.setattr(
+        build_module, "_run", lambda command, temporary=None: places.append(temporary) or write(command)
+    )
+
+    def write(command: list[str]) -> str:
+        if "-o" in command:
+            Path(command[-1]).write_bytes(b"library")
+        return ""
+
+    cache.mkdir(parents=True, exist_ok=True)
+    cache.chmod(0o777)
+    library = build_kernel("model", "float32")
+    assert build_module._is_whole(library)
+    assert library.parent == cache
+    assert Path(places[-1]).parent != cache
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="a library is loaded by its path here")
+def test_what_is_loaded_is_what_was_checked(cache, tmp_path, monkeypatch):
+    """Although someone exchanges the file between the two."""
+
+    def compiled(answer: int) -> Path:
+        source, library = tmp_path / f"{answer}.cpp", tmp_path / f"{answer}.so"
+        source.write_text(f'extern "C" int answer() {{ return {answer}; }}')
+        subprocess.run([*build_module.compiler(), "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+        library.chmod(0o755)
+        return library
+
+    mine, foreign = compiled(1), compiled(2)
+    build_module._checksum_file(mine).write_text(hashlib.sha256(mine.read_bytes()).hexdigest())
+    build_module._checksum_file(mine).chmod(0o644)
+    check = build_module._check
+
+    def exchanged(descriptor: int, library: Path) -> None:
+        check(descriptor, library)
+        os.replace(foreign, mine)
+
+    monkeypatch.setattr(build_module, "_check", exchanged)
+    function = build_module.load(str(mine), "answer").answer
+    function.restype = ctypes.c_int
+    assert function() == 1

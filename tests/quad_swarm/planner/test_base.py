@@ -66,13 +66,22 @@ class Faulty:
         if self.fault == "raises":
             raise ZeroDivisionError("in the solver")
         x, u = x_guess.copy(), u_guess.copy()
-        (x if self.fault == "x" else u)[0, 1] = np.nan
         count = len(x)
-        return Solution(x, u, np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64))
+        success, iterations = np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64)
+        if self.fault == "form":
+            return x, u, success
+        if self.fault == "shape of x":
+            return Solution(x[:, :-1], u, success, iterations)
+        if self.fault == "shape of u":
+            return Solution(x, u[..., :3], success, iterations)
+        if self.fault == "numbers for success":
+            return Solution(x, u, success.astype(int), iterations)
+        (x if self.fault == "x" else u)[0, 1] = np.nan
+        return Solution(x, u, success, iterations)
 
 
 @pytest.mark.filterwarnings("ignore:the solver 'faulty' raised")
-@pytest.mark.parametrize("fault", ["x", "u", "raises"])
+@pytest.mark.parametrize("fault", ["x", "u", "raises", "form", "shape of x", "shape of u", "numbers for success"])
 def test_a_solver_that_breaks_its_contract_has_failed(fault):
     config = PlannerConfig()
     problems = crossing(3, config)
@@ -81,7 +90,39 @@ def test_a_solver_that_breaks_its_contract_has_failed(fault):
     assert np.isfinite(plans.x).all()
     assert np.isfinite(plans.u).all()
     failed = plans.status >= PlanStatus.SHIFTED
-    assert failed.tolist() == ([True] * 3 if fault == "raises" else [True, False, False])
+    assert failed.tolist() == ([True, False, False] if fault in ("x", "u") else [True] * 3)
+
+
+def test_a_solution_of_lists_or_of_arrays_that_cannot_be_written_is_as_good():
+    class Plain(FatropSolver):
+        form = staticmethod(np.asarray)
+
+        def solve(self, *arguments):
+            solution = super().solve(*arguments)
+            return Solution(*map(self.form, solution))
+
+    class Lists(Plain):
+        form = staticmethod(np.ndarray.tolist)
+
+    class Frozen(Plain):
+        @staticmethod
+        def form(array):
+            array.setflags(write=False)
+            return array
+
+    config = PlannerConfig(horizon=3)
+    problems = crossing(3, config)
+    problems.others[1] = np.nan  # one fails, and the planner writes into its place
+    model = QuadrotorModel(QUADROTOR, config.dt)
+    plans = [
+        Planner(kind(OptimalControlProblem(config, QUADROTOR, 2)), model, config).plan(
+            problems, hover(problems, config)
+        )
+        for kind in (Plain, Lists, Frozen)
+    ]
+    assert plans[0].status.tolist() == [PlanStatus.SOLVED, PlanStatus.SHIFTED, PlanStatus.SOLVED]
+    assert_same(plans[1], plans[0])
+    assert_same(plans[2], plans[0])
 
 
 def test_a_solver_that_raises_is_told_of():

@@ -180,3 +180,29 @@ def test_ctrl_c_reaches_the_parent_alone():
     _, errors = process.communicate(timeout=30)
     assert errors.count("KeyboardInterrupt") == 1, errors
     assert process.returncode != 0
+
+
+@pytest.mark.parametrize("python", ["this", "3.10"])
+def test_files_of_the_current_folder_do_not_run_in_the_processes(python, tmp_path):
+    for name in ("pickle", "socket", "struct", "random"):
+        (tmp_path / f"{name}.py").write_text("import os; os.mkdir('RAN'); raise ImportError('mine')")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "my_pieces.py").write_text("def piece(): return 'found'")
+    code = f"""
+import sys
+sys.path[:] = [*filter(None, sys.path), "elsewhere"]
+import types
+import quad_swarm.tasks.pool as pool
+import my_pieces
+if {python!r} != "this":
+    pool.sys = types.SimpleNamespace(version_info=(3, 10))
+with pool.Pool(2) as workers:
+    print([workers.submit(my_pieces.piece).result() for _ in range(2)])
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment.pop("PYTHONSAFEPATH", None)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.strip() == "['found', 'found']", done.stderr
+    assert not (tmp_path / "RAN").exists()

@@ -12,14 +12,19 @@ import casadi as ca
 import numpy as np
 
 from quad_swarm.planner.problem import OptimalControlProblem
+from quad_swarm.quadrotor import N_INPUTS, N_STATES
+
+_UNBOUNDED = 1e9  # on the side of a state that has one bound only (m or m/s)
 
 
 def generate_model(problem: OptimalControlProblem) -> str:
     """Generate the header ``model.hpp``, which `kernel.cpp` includes.
 
-    :param problem: the problem
+    :param problem: the problem, whose class may be the user's
     :return: text of the header
+    :raises ValueError: if the method cannot solve the problem
     """
+    _check_form(problem)
     nx, nu, n_others = problem.nx, problem.nu, problem.n_others
     state, low, high = _state_bounds(problem)
     x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
@@ -59,6 +64,63 @@ def generate_model(problem: OptimalControlProblem) -> str:
     return "\n".join(lines) + "\n" + "\n".join(functions)
 
 
+def formulas(problem: OptimalControlProblem) -> tuple[object, ...]:
+    """Return a key of everything that `generate_model` reads from a problem, in a few milliseconds."""
+    x, u, x0 = ca.SX.sym("x", problem.nx), ca.SX.sym("u", problem.nu), ca.SX.sym("x0", problem.nx)
+    goal, others, distance = ca.SX.sym("goal", 3), ca.SX.sym("others", 3, problem.n_others), ca.SX.sym("distance")
+    outputs = [
+        problem.dynamics(x, u),
+        problem.input_cost(u),
+        problem.goal_cost(x, x0, goal),
+        ca.vertcat(*problem.distances(x, others)),
+        problem.repulsion_residual(distance),
+        problem.repulsion_cost(distance),
+        problem.box_violations(x),
+    ]
+    function = ca.Function("formulas", [x, u, x0, goal, others, distance], outputs)
+    return problem.config, problem.n_others, tuple(problem.max_input.full().ravel()), function.serialize()
+
+
+def _check_form(problem: OptimalControlProblem) -> None:
+    """Refuse problems that `kernel.cpp` would solve only in part.
+
+    :raises ValueError: if there are any
+    """
+    x, u, n_others = ca.SX.sym("x", problem.nx), ca.SX.sym("u", problem.nu), problem.n_others
+    if not (1 <= problem.nx <= N_STATES and 1 <= problem.nu <= N_INPUTS):
+        raise _beyond("nx and nu", f"must be at most {N_STATES} and {N_INPUTS}, not {problem.nx} and {problem.nu}")
+    if ca.depends_on(ca.hessian(problem.input_cost(u), u)[0], u):
+        raise _beyond("input_cost", "must be quadratic in the inputs")
+    distance = ca.SX.sym("distance")
+    squared = [problem.repulsion_cost(distance), problem.repulsion_residual(distance) ** 2]
+    if not _agree([distance], *squared, scale=2 * problem.config.separation):
+        raise _beyond("repulsion_cost", "must be the square of repulsion_residual: change that method instead")
+    columns = [ca.SX.sym(f"other{j}", 3) for j in range(n_others)]
+    distances = problem.distances(x, ca.horzcat(*columns)) if n_others else []
+    if len(distances) != n_others:
+        raise _beyond("distances", f"must be one for each of the {n_others} others, not {len(distances)}")
+    for column, one in zip(columns, distances, strict=True):
+        moved = ca.substitute(one, column, columns[0])
+        rest = [other for other in columns if other is not column]
+        if ca.depends_on(one, ca.vertcat(x[3:], *rest)) or not _agree([x, columns[0]], moved, distances[0], scale=2.0):
+            raise _beyond("distances", "must depend on the two positions only, in the same way for each of the others")
+
+
+def _agree(symbols: list[ca.SX], first: ca.SX, second: ca.SX, scale: float) -> bool:
+    """Return whether two expressions have the same values, at points drawn from a normal distribution."""
+    function = ca.Function("both", symbols, [first, second])
+    rng = np.random.default_rng(0)
+    for _ in range(16):
+        one, other = (value.full() for value in function(*(np.abs(scale * rng.normal(size=s.shape)) for s in symbols)))
+        if not np.allclose(one, other, rtol=1e-9, atol=1e-12, equal_nan=True):
+            return False
+    return True
+
+
+def _beyond(what: str, rule: str) -> ValueError:
+    return ValueError(f"The problem's {what} {rule}; solver='fatrop' solves it as it is.")
+
+
 def _costs(problem: OptimalControlProblem) -> list[str]:
     nx, nu = problem.nx, problem.nu
     x, u, x0 = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("x0", nx)
@@ -67,8 +129,11 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
     # Gauss-Newton approximation of the repulsion r(d)^2: gradient 2 r r', curvature 2 r'^2
     residual = problem.repulsion_residual(distance)
     slope = ca.jacobian(residual, distance)
-    single = OptimalControlProblem(problem.config, problem.quadrotor, 1)
-    separation = single.distances(x, other)[0]
+    if problem.n_others:
+        columns = [other, *(ca.SX.sym(f"other{j}", 3) for j in range(1, problem.n_others))]
+        separation = problem.distances(x, ca.horzcat(*columns))[0]
+    else:  # nobody: the kernel does not call the function
+        separation = OptimalControlProblem(problem.config, problem.quadrotor, 1).distances(x, other)[0]
     return [
         _emit("input_gradient", {"u": u}, {"gradient": ca.gradient(problem.input_cost(u), u)}),
         _emit(
@@ -152,17 +217,25 @@ def _state_bounds(problem: OptimalControlProblem) -> tuple[list[int], list[float
     x = ca.SX.sym("x", problem.nx)
     rows = problem.box_violations(x)
     jacobian = ca.jacobian(rows, x)
+    rule = "must be bounds: each row plus or minus one state, plus a constant, and at most two rows for a state"
     if not jacobian.is_constant():
-        raise ValueError("box_violations must be bounds: each row plus or minus one state, plus a constant.")
+        raise _beyond("box_violations", rule)
     slopes = ca.DM(jacobian).full()
     offsets = ca.Function("offsets", [x], [rows])(0).full().ravel()
     low: dict[int, float] = {}
     high: dict[int, float] = {}
     for slope, offset in zip(slopes, offsets, strict=True):
-        (index,) = np.flatnonzero(slope)
-        (high if slope[index] > 0 else low)[int(index)] = float(-offset / slope[index])
-    states = sorted(low)
-    return states, [low[i] for i in states], [high[i] for i in states]
+        bounded = np.flatnonzero(slope)
+        index = int(bounded[0]) if len(bounded) == 1 else -1
+        bounds = high if slope[index] > 0 else low
+        # The kernel weights each violation alike, so a row in other units would weigh otherwise
+        if len(bounded) != 1 or abs(slope[index]) != 1 or index in bounds or not np.isfinite(offset):
+            raise _beyond("box_violations", rule)
+        bounds[index] = float(-offset / slope[index])
+    states = sorted({*low, *high})
+    if not states:
+        raise _beyond("box_violations", "must bound at least one state")
+    return states, [low.get(i, -_UNBOUNDED) for i in states], [high.get(i, _UNBOUNDED) for i in states]
 
 
 def _varying(name: str, matrix: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -337,8 +410,9 @@ class _Walk:
             elif operation in _BINARY:
                 text = _BINARY[operation].format(*names)
             else:
-                raise NotImplementedError(
-                    f"CasADi operation {operation} has no lane form: add it to the tables in {__name__}."
+                raise ValueError(
+                    f"CasADi's operation {operation} has no lane form: add it to the tables in {__name__}, or choose "
+                    "solver='fatrop'."
                 )
             body.append(f"  const V {self._name(value)} = {text};\n")
         return body + [f"  {target} = {self._name(value)};\n" for target, value in self._stores]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,9 @@ import numpy as np
 from quad_swarm.errors import unknown_name
 from quad_swarm.native.build import addresses, build, load
 from quad_swarm.planner.base import Solution
-from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Problems
-from quad_swarm.planner.rti.codegen import generate_model
-from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorParams
+from quad_swarm.planner.problem import OptimalControlProblem, Problems
+from quad_swarm.planner.rti.codegen import formulas, generate_model
+from quad_swarm.quadrotor import N_INPUTS, N_STATES
 
 # Precision of the iteration -> type in C++
 PRECISIONS = {"float32": "float", "float64": "double"}
@@ -36,7 +35,8 @@ class RtiSolver:
     :param max_iterations: number of interior-point iterations after which a quadratic program counts as failed. There
         is no time limit, so that results are reproducible
     :param tolerance: mean complementarity at which a quadratic program counts as solved
-    :raises ValueError: if a number of iterations or the precision is invalid
+    :raises ValueError: if a number of iterations or the precision is invalid, or the method cannot solve the problem,
+        whose class may be the user's
     """
 
     name = "rti"
@@ -64,6 +64,7 @@ class RtiSolver:
         self.max_iterations = max_iterations
         self.tolerance = tolerance
         self._kernel: Any = None
+        _generated(problem)  # raises if the method cannot solve it
 
     def compile(self) -> None:
         """Compile and load the kernel now instead of at the first solve.
@@ -71,8 +72,8 @@ class RtiSolver:
         :raises BuildError: if it cannot be compiled
         """
         if self._kernel is None:
-            model = _generated(self.problem.config, self.problem.quadrotor, self.problem.n_others)
-            self._kernel = getattr(load(str(build_kernel(model, self.precision)), _FUNCTION), _FUNCTION)
+            library = build_kernel(_generated(self.problem), self.precision)
+            self._kernel = getattr(load(str(library), _FUNCTION), _FUNCTION)
             self._kernel.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 3, ctypes.c_double]
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
@@ -118,10 +119,17 @@ def build_kernel(model: str, precision: str) -> Path:
     return build("rti", "kernel.cpp", {**sources, "model.hpp": model}, [f"REAL={PRECISIONS[precision]}"])
 
 
-@functools.lru_cache(maxsize=64)
-def _generated(config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int) -> str:
-    """Cache `generate_model`, which takes most of a second, for the swarms of the same world."""
-    return generate_model(OptimalControlProblem(config, quadrotor, n_others))
+_models: dict[tuple[object, ...], str] = {}
+
+
+def _generated(problem: OptimalControlProblem) -> str:
+    """Return the header of a problem from a cache by its formulas, whoever wrote them."""
+    key = formulas(problem)
+    if key not in _models:
+        while len(_models) >= 64:
+            _models.pop(next(iter(_models)))
+        _models[key] = generate_model(problem)
+    return _models[key]
 
 
 def _array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

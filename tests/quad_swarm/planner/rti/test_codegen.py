@@ -140,16 +140,85 @@ def test_a_stage_of_the_riccati_recursion_is_that_of_dense_matrices(problem):
     np.testing.assert_allclose(forward["dx_next"], a @ dx + b @ forward["du"], atol=1e-10)
 
 
-def test_says_what_the_generator_cannot_do():
-    class Spinning(OptimalControlProblem):
-        def dynamics(self, x, u):
-            return ca.atan(super().dynamics(x, u))
+class Spinning(OptimalControlProblem):
+    def dynamics(self, x, u):
+        return ca.atan(super().dynamics(x, u))
 
-    class Cornered(OptimalControlProblem):
-        def box_violations(self, x):
-            return x[0] * x[1]
 
-    with pytest.raises(NotImplementedError, match="no lane form"):
-        generate_model(Spinning(CONFIG, QUADROTOR, 1))
-    with pytest.raises(ValueError, match="must be bounds"):
-        generate_model(Cornered(CONFIG, QUADROTOR, 1))
+class Cornered(OptimalControlProblem):
+    def box_violations(self, x):
+        return x[0] * x[1]
+
+
+class Diagonal(OptimalControlProblem):
+    def box_violations(self, x):
+        return x[0] + x[1] - 1
+
+
+class Scaled(OptimalControlProblem):
+    def box_violations(self, x):
+        return 2 * super().box_violations(x)
+
+
+class Twice(OptimalControlProblem):
+    def box_violations(self, x):
+        return ca.vertcat(super().box_violations(x), x[0] - 1)
+
+
+class Unbounded(OptimalControlProblem):
+    def box_violations(self, x):
+        return ca.SX.zeros(0, 1)
+
+
+class Quartic(OptimalControlProblem):
+    def input_cost(self, u):
+        return ca.sumsqr(u) ** 2
+
+
+class Steeper(OptimalControlProblem):
+    def repulsion_cost(self, distance):
+        return 2 * super().repulsion_cost(distance)
+
+
+class Foresighted(OptimalControlProblem):
+    def distances(self, x, others):
+        return [ca.norm_2(x[:3] + 0.1 * x[3:6] - others[:, j]) for j in range(self.n_others)]
+
+
+class Respectful(OptimalControlProblem):
+    def distances(self, x, others):
+        return [one - 0.1 * j for j, one in enumerate(super().distances(x, others))]
+
+
+class Few(OptimalControlProblem):
+    def distances(self, x, others):
+        return super().distances(x, others)[:1]
+
+
+class Larger(OptimalControlProblem):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.nx = 12
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (Spinning, "no lane form"),
+        (Cornered, "box_violations must be bounds"),
+        (Diagonal, "box_violations must be bounds"),
+        (Scaled, "box_violations must be bounds"),
+        (Twice, "box_violations must be bounds"),
+        (Unbounded, "box_violations must bound at least one state"),
+        (Quartic, "input_cost must be quadratic"),
+        (Steeper, "repulsion_cost must be the square of repulsion_residual"),
+        (Foresighted, "distances must depend on the two positions only"),
+        (Respectful, "distances must depend on the two positions only, in the same way"),
+        (Few, "distances must be one for each of the 2 others, not 1"),
+        (Larger, "nx and nu must be at most 9 and 4, not 12 and 3"),
+    ],
+)
+def test_what_the_method_cannot_solve_is_refused(kind, message):
+    with pytest.raises(ValueError, match=message) as error:
+        generate_model(kind(CONFIG, QUADROTOR, 2))
+    assert "solver='fatrop'" in str(error.value)
