@@ -33,9 +33,22 @@ def shown(value: Any, most: int = 200) -> str:
     :return: the value's ``repr`` on one line, shortened if it is long
     """
     try:
-        text = " ".join(repr(value).split())
+        text = repr(value)
     except Exception:  # from a foreign class, or an integer with too many digits for Python
         text = f"<{type(value).__name__}>"
+    return _shortened(text, most)
+
+
+def told(error: BaseException) -> str:
+    """
+    :param error: any error
+    :return: its class and message on one line, shortened if it is long
+    """
+    return _shortened(f"{type(error).__name__}: {error}", 200)
+
+
+def _shortened(text: str, most: int) -> str:
+    text = " ".join(text.split())
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 3) :]}"
 
 

@@ -19,7 +19,7 @@ from optuna.trial import TrialState
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_callback_list, get_latest_run_id
+from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_callback_list
 from sqlalchemy.exc import DBAPIError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -28,20 +28,19 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, con
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule, configure_logger, safe_mean
-from stable_baselines3.common.utils import get_latest_run_id as latest_curve
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.callbacks import DashboardCallback
 from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
-from sb3_maddpg.cli.command_files import write_command
+from sb3_maddpg.cli.command_files import latest_run_number, write_command
 from sb3_maddpg.cli.interrupts import noticed_interrupts
 from sb3_maddpg.cli.literals import format_literal, parse_literal
 from sb3_maddpg.cli.options import check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
-from sb3_maddpg.cli.safety import check_names
+from sb3_maddpg.cli.safety import check_names, check_paths
 from sb3_maddpg.cli.search import (
     STUDY,
     as_absolute,
@@ -141,6 +140,7 @@ class TeamExperimentManager(ExperimentManager):
             kwargs = {"env_kwargs": given, "eval_env_kwargs": self._eval_env_kwargs_args}
             for named in (hyperparams, kwargs):
                 check_names(named, self.env_name.gym_id, f"{foreign} with {self.config}")
+                check_paths(named, foreign, f"{foreign} with {self.config}")
         as_written = dict(hyperparams)
         hyperparams = check_recipe(self.algo, hyperparams, f"recipe for {self.algo} in {self.config}")
         self.own_vec_env = self._read_vec_env(hyperparams)
@@ -207,7 +207,7 @@ class TeamExperimentManager(ExperimentManager):
             self.lock.enter_context(locked(self.checkpoints.run / CHECKPOINTS))
             put_aside(self.checkpoints.run)
             return
-        first = get_latest_run_id(self.log_path, self.env_name) + 1
+        first = latest_run_number(self.log_path, self.env_name) + 1
         self.save_path = str(claim_folder(f"{self.log_path}{self.env_name}", first, self.uuid_str))
         self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
@@ -386,10 +386,11 @@ class TeamExperimentManager(ExperimentManager):
                     output.writer.close()
                     output.writer = SummaryWriter(curves, purge_step=self.checkpoint.saved_at + 1)
             return logger
-        if not self.tensorboard_log or self.continue_training:
-            return configure_logger(int(prints), self.tensorboard_log, name, not self.continue_training)
-        first = latest_curve(self.tensorboard_log, name) + 1
-        folder = claim_folder(str(Path(self.tensorboard_log, name)), first)
+        if not self.tensorboard_log:
+            return configure_logger(int(prints))
+        last = latest_run_number(self.tensorboard_log, name)
+        prefix = str(Path(self.tensorboard_log, name))
+        folder = Path(f"{prefix}_{last}") if self.continue_training else claim_folder(prefix, last + 1)
         return configure(str(folder), [*(["stdout"] if prints else []), "tensorboard"])
 
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
