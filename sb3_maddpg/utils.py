@@ -155,12 +155,28 @@ def process_runs(process: int) -> bool:
     return True
 
 
+_REMEDIES = {
+    errno.ENOSPC: "free space",
+    errno.EDQUOT: "free space",
+    errno.EFBIG: "raise the limit of file sizes (`ulimit -f`)",
+    errno.EIO: "check the disk",
+}
+
+
+def remedy_of(error: BaseException) -> str | None:
+    """
+    :param error: any error
+    :return: what helps if a disk or the user's share of it is full, files may not grow, or a disk fails; else None
+    """
+    return _REMEDIES.get(error.errno or 0) if isinstance(error, OSError) else None
+
+
 def is_full_disk(error: BaseException) -> bool:
     """
     :param error: any error
-    :return: whether a disk or the user's share of it is full
+    :return: whether a file cannot be written now, but may be later, see ``remedy_of``
     """
-    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return remedy_of(error) is not None
 
 
 def sync_folder(folder: Path) -> None:

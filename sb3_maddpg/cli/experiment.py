@@ -7,7 +7,7 @@ import shutil
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -46,6 +46,7 @@ from sb3_maddpg.cli.search import (
     as_absolute,
     best_recipe,
     bring_back,
+    check_trials,
     enlist,
     kept_search,
     open_storage,
@@ -53,8 +54,9 @@ from sb3_maddpg.cli.search import (
     tell_best,
 )
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
+from sb3_maddpg.model_files import trusted
 from sb3_maddpg.team import Team
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, is_full_disk, suggest
+from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, remedy_of, shown, suggest, told
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 # Default number of log tables when training an off-policy algorithm. SB3's default of one every four episodes floods
@@ -106,9 +108,16 @@ class TeamExperimentManager(ExperimentManager):
     continues = False  # whether the study has trials of other workers or of an earlier command
 
     def __init__(
-        self, args: Any, *rest: Any, uuid_str: str = "", checkpoints: Checkpoints | None = None, **kwargs: Any
+        self,
+        args: Any,
+        *rest: Any,
+        uuid_str: str = "",
+        checkpoints: Checkpoints | None = None,
+        given_seed: int | None = None,
+        **kwargs: Any,
     ):
         check_options(args)
+        self.given_seed = given_seed  # None if rl_zoo3 chose one
         self.checkpoints = checkpoints
         self.checkpoint: RunCheckpoint | None = None
         self.lock = contextlib.ExitStack()  # of the run's folder of checkpoints, until learn() ends
@@ -192,10 +201,24 @@ class TeamExperimentManager(ExperimentManager):
             raise ValueError(suggest(f"study in {self.storage}", self.study_name, names)) from None
         except DBAPIError as error:
             raise _no_database(self.storage, error) from error
+        check_trials(study, self.storage)
         for trial in study.get_trials(deepcopy=False):
             if trial.number == trial_id:
-                return HYPERPARAMS_CONVERTER[self.algo](trial.params)
+                return self._arguments_of(trial)
         raise ValueError(f"Study {self.study_name} has no trial {trial_id}, only {len(study.trials)}, counted from 0.")
+
+    def _arguments_of(self, trial: optuna.trial.FrozenTrial) -> dict[str, Any]:
+        """:return: the algorithm's arguments in a trial, which someone else may have written"""
+        source = f"trial {trial.number} of {self.storage}"
+        try:
+            found: dict[str, Any] = HYPERPARAMS_CONVERTER[self.algo](trial.params)
+        except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+            raise ValueError(
+                f"{source} has {shown(trial.params)}, which are no parameters of {self.algo} ({told(error)})."
+            ) from error
+        if not trusted(None):
+            check_names(found, self.env_name.gym_id, source)
+        return found
 
     def create_log_folder(self) -> None:
         """Create the run's folder. A search has none: the log of each trial goes to ``--optimization-log-path``."""
@@ -332,12 +355,13 @@ class TeamExperimentManager(ExperimentManager):
             try:
                 self._learn(model)
             except OSError as error:
-                if not is_full_disk(error):
+                remedy = remedy_of(error)
+                if remedy is None:
                     raise
-                told = f"{error.strerror}: free space"
+                said = f"{error.strerror}: {remedy}"
                 if self.checkpoint is not None:
-                    told += f", then continue with `train --resume {self.save_path}`"
-                raise OSError(error.errno, told, error.filename or self.save_path) from error
+                    said += f", then continue with `train --resume {self.save_path}`"
+                raise OSError(error.errno, said, error.filename or self.save_path) from error
 
     def _learn(self, model: BaseAlgorithm) -> None:
         assert model.env is not None
@@ -432,7 +456,8 @@ class TeamExperimentManager(ExperimentManager):
         # Optuna's writing cannot be interrupted: a trial would remain unfinished
         with noticed_interrupts(lambda: not self.learns) as self.pressed:
             try:
-                super().hyperparameters_optimization()
+                with self._told_disk(kept):
+                    super().hyperparameters_optimization()
             except KeyboardInterrupt:
                 self.pressed.set()
             except ValueError:  # without a complete trial, there is no best one
@@ -450,6 +475,18 @@ class TeamExperimentManager(ExperimentManager):
         if interrupted:
             raise KeyboardInterrupt
 
+    @contextlib.contextmanager
+    def _told_disk(self, kept: Path | None) -> Iterator[None]:
+        """Say what is wrong with the disk. Optuna raises an AssertionError from it, "Should not reach."."""
+        try:
+            yield
+        except (AssertionError, OSError) as error:
+            cause = error if isinstance(error, OSError) else error.__context__
+            if not isinstance(cause, OSError) or (remedy := remedy_of(cause)) is None:
+                raise
+            said = f"{cause.strerror}: {remedy}, then {self._to_continue(kept)}"
+            raise OSError(cause.errno, said, cause.filename or self.storage) from cause
+
     def _to_continue(self, kept: Path | None) -> str:
         """:return: how to continue the search"""
         if kept is not None:
@@ -464,13 +501,22 @@ class TeamExperimentManager(ExperimentManager):
 
     def _write_best(self, path: Path) -> None:
         assert self.study is not None
-        params = HYPERPARAMS_CONVERTER[self.algo](self.study.best_params)
+        params = self._arguments_of(self.study.best_trial)
         with atomic_write(path, "yml") as file:
             file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
         tell_best(self.algo, self.env_name.gym_id, path)
 
     def _search_settings(self) -> tuple[Any, ...]:
-        names = ("algo", "seed", "n_timesteps", "n_trials", "max_total_trials", "n_startup_trials", "n_evaluations")
+        # The seed as given: the repeated command would get another one from rl_zoo3, and start again
+        names = (
+            "algo",
+            "given_seed",
+            "n_timesteps",
+            "n_trials",
+            "max_total_trials",
+            "n_startup_trials",
+            "n_evaluations",
+        )
         return tuple(getattr(self, name) for name in (*names, "n_eval_episodes", "n_eval_envs", "sampler", "pruner"))
 
     def _bring_back(self) -> optuna.Study | None:
@@ -484,6 +530,7 @@ class TeamExperimentManager(ExperimentManager):
         study = optuna.create_study(
             storage=storage, study_name=self.study_name, direction="maximize", load_if_exists=True
         )
+        check_trials(study, self.storage)
         count, finished = bring_back(study), _finished(study)
         enlist(study)
         if finished or count:

@@ -4,6 +4,7 @@ import argparse
 import difflib
 import functools
 import os
+import re
 import runpy
 import sys
 from collections.abc import Callable
@@ -136,13 +137,21 @@ def _train(name: str, argv: list[str], checkpoints: Checkpoints | None) -> int:
         path = packaged_config(known.algo, known.env)
         argv += ["--conf-file", path] if path is not None else []
     manager = rl_zoo3.train.ExperimentManager
-    with_checkpoints: Any = functools.partial(cast(Any, manager), checkpoints=checkpoints)
+    with_checkpoints: Any = functools.partial(cast(Any, manager), checkpoints=checkpoints, given_seed=_seed_of(argv))
     rl_zoo3.train.ExperimentManager = with_checkpoints  # type: ignore[misc]
     try:
         _call(rl_zoo3.train.train, name, argv)
     finally:
         rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
     return 0
+
+
+def _seed_of(argv: list[str]) -> int | None:
+    """:return: value of ``--seed``; rl_zoo3 replaces a missing or negative one by a random number"""
+    parser = argparse.ArgumentParser(add_help=False)  # rl_zoo3 accepts abbreviations
+    parser.add_argument("--seed", default="")
+    seed = parser.parse_known_args(argv)[0].seed
+    return int(seed) if re.fullmatch(r"[0-9]{1,18}", seed) else None
 
 
 def _packaged(recipe: Path) -> list[str]:
