@@ -233,7 +233,7 @@ class AgentPolicy(nn.Module):
                     verbose=False,
                 )
         except ImportError as error:
-            raise ValueError(f'ONNX is not installed ({error}): pip install "sb3-maddpg[onnx]".') from error
+            raise ValueError(f'ONNX is not installed ({error}): pip install -e ".[onnx]" in the clone.') from error
         finally:
             logger.setLevel(level)
         assert program is not None

@@ -21,7 +21,7 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
     try:
         import ray
     except ImportError as error:
-        raise ValueError(f'Ray is not installed ({error}): pip install "sb3-maddpg[ray]".') from error
+        raise ValueError(f'Ray is not installed ({error}): pip install -e ".[ray]" in the clone.') from error
     if ray.is_initialized():
         return ray, False
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked

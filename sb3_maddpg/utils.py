@@ -11,11 +11,13 @@ import os
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 # Arguments of gymnasium.make and make_vec that end up among the environment's own
@@ -66,6 +68,36 @@ def suggest(kind: str, name: Any, known: Iterable[str]) -> str:
     if nearest:
         return f"Unknown {kind} '{name[:100]}': did you mean '{nearest[0]}'?"
     return f"Unknown {kind} '{name[:100]}'. Choose one of: {', '.join(known)}."
+
+
+def remove_empty_log_folder(model: BaseAlgorithm) -> None:
+    """
+    Remove the folder that Stable-Baselines3 creates among the temporary files for a logger without files.
+
+    :param model: a model after training
+    """
+    folder = model.logger.get_dir() if hasattr(model, "_logger") else None
+    if folder is not None and os.path.basename(folder).startswith("SB3-"):
+        with suppress(OSError):  # it is not empty
+            os.rmdir(folder)
+
+
+def load_offer(offer: EntryPoint) -> Any:
+    """
+    Load what an installed package offers.
+
+    :param offer: an entry point
+    :return: the object
+    :raises ImportError: if it cannot be loaded; the message names the package
+    """
+    try:
+        return offer.load()
+    except (Exception, SystemExit) as error:  # from foreign code
+        package = offer.dist.name if offer.dist is not None else "a package"
+        raise ImportError(
+            f"{package} is installed, but its entry point {offer.group}: {offer.name} = {offer.value} cannot be loaded "
+            f"({told(error)}): repair or uninstall {package}."
+        ) from error
 
 
 def describe_env(env: VecEnv) -> dict[str, Any] | None:

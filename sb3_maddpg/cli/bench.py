@@ -105,7 +105,7 @@ def main(argv: list[str]) -> int:
         options = ["--algo", known.algo, "--n-timesteps", str(known.n_timesteps), "--log-folder", folder]
         options += ["--env", known.env] if known.env else []
         options += ["--progress"] if sys.stderr.isatty() else []
-        zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given])
+        zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given], "bench")
     print(f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="")
     print(f"{result['steps_per_second']:.0f} steps/s")
     for name in ("environments", "learning", "acting", "rest"):

@@ -33,7 +33,7 @@ from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.starting import interruptible
-from sb3_maddpg.utils import suggest
+from sb3_maddpg.utils import load_offer, suggest
 
 # Errors in the user's input and errors of the system. Their messages name the remedy, so no traceback is shown.
 USER_ERRORS = (
@@ -113,7 +113,7 @@ def _hand_over(group: str, argv: list[str]) -> int:
     known.env = known.env or next(iter(offers.names))
     if known.env not in offers.names:
         raise ValueError(suggest(f"environment with {group}", known.env, offers.names))
-    main: Callable[[list[str]], int] = offers[known.env].load()
+    main: Callable[[list[str]], int] = load_offer(offers[known.env])
     if helps(rest) and group != "identifiers":
         print(f"Models: MODEL.zip, latest:LOGDIR, {', '.join(f'pretrained:{name}' for name in pretrained_models())}\n")
     rest = [_model(word, known.algo, known.env) for word in rest]
@@ -258,6 +258,7 @@ def examples(name: str) -> str:
         return command.examples
     found = []
     for offer in entry_points(group=f"sb3_maddpg.{command.offers}"):
+        load_offer(offer)
         own = getattr(importlib.import_module(offer.module), "EXAMPLES", "")
         found.append(own.rstrip("\n") or command.examples.replace("ENV", offer.name))
     return "\n".join(found) or command.examples

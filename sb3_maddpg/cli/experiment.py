@@ -56,7 +56,17 @@ from sb3_maddpg.cli.search import (
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.model_files import trusted
 from sb3_maddpg.team import Team
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, remedy_of, shown, suggest, told
+from sb3_maddpg.utils import (
+    arguments_of,
+    atomic_write,
+    describe_env,
+    load_offer,
+    remedy_of,
+    remove_empty_log_folder,
+    shown,
+    suggest,
+    told,
+)
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 # Default number of log tables when training an off-policy algorithm. SB3's default of one every four episodes floods
@@ -142,8 +152,8 @@ class TeamExperimentManager(ExperimentManager):
             hyperparams = {**update(hyperparams, of_trial), **(self.custom_hyperparams or {})}
         if self.n_timesteps > 0:
             hyperparams.setdefault("n_timesteps", self.n_timesteps)
-        if hyperparams.get("noise_type") is None:
-            hyperparams.pop("noise_type", None)
+        if "noise_type" in hyperparams and hyperparams["noise_type"] is None:  # which switches the recipe's noise off
+            del hyperparams["noise_type"]
             hyperparams.pop("noise_std", None)
         if foreign:
             kwargs = {"env_kwargs": given, "eval_env_kwargs": self._eval_env_kwargs_args}
@@ -272,7 +282,7 @@ class TeamExperimentManager(ExperimentManager):
             return
         offers = entry_points(group="sb3_maddpg.dashboards")
         name = self.env_name.gym_id
-        offer = offers[name].load() if name in offers.names else None
+        offer = load_offer(offers[name]) if name in offers.names else None
         evaluation = next((one for one in self.callbacks if isinstance(one, EvalCallback)), None)
         if evaluation is None:  # without evaluations, there are no figures
             self.callbacks.append(DashboardCallback(layout=offer and offer.LAYOUT))
@@ -398,6 +408,7 @@ class TeamExperimentManager(ExperimentManager):
         finally:
             assert model.env is not None
             model.env.close()
+            remove_empty_log_folder(model)
 
     def _logger(self, name: str) -> Logger:
         """:return: a logger of tables on the screen, unless there is a progress bar, and of curves for TensorBoard"""

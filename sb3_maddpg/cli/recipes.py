@@ -151,7 +151,7 @@ def _schedule(value: Any) -> Any:
     text = value.removeprefix("lin_") if isinstance(value, str) else value
     try:
         number = math.nan if isinstance(value, bool) else float(text)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError("write a finite number, or lin_NUMBER for one that decreases linearly to zero")
@@ -299,6 +299,8 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     checked = validated_as(model, hyperparams, lambda name: f"{source}: {name}")
     found = {key: checked[key] for key in hyperparams}
     check_policy_kwargs(algo, found)
+    if found.get("noise_std") is not None and "noise_type" not in found:
+        raise ValueError(f"{source}: noise_std={found['noise_std']} needs noise_type: normal or ornstein-uhlenbeck.")
     validated_as(MonitorArguments, found.get("monitor_kwargs") or {}, lambda name: f"{source}: monitor_kwargs: {name}")
     for key in ("env_wrapper", "vec_env_wrapper", "callback"):
         for name, arguments in _classes(found.get(key)):

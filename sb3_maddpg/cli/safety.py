@@ -31,7 +31,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.command_files import latest_run_number, own_words
-from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
+from sb3_maddpg.cli.literals import BoundedLoader, Refused, parse_literal
 from sb3_maddpg.cli.options import common_options, importing_from
 from sb3_maddpg.cli.recipes import DICTS, check_shown, names_of_classes
 from sb3_maddpg.model_files import refuse_pickled, refuse_pickled_file, trusted
@@ -84,7 +84,7 @@ def _tuple(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> tuple[Any, ...]:
 
 
 def _refuse(loader: yaml.SafeLoader, node: yaml.Node) -> None:
-    raise ValueError(
+    raise Refused(
         f"{node.start_mark.name} holds a value that is not plain ({node.tag}). Reading it may run any code: if you "
         "trust its author, pass --trust."
     )

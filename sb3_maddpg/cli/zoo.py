@@ -21,7 +21,7 @@ try:
     import rl_zoo3.train
     import rl_zoo3.utils
 except ImportError as error:
-    raise ImportError(f"{error}. The zoo needs its own packages: pip install 'sb3-maddpg[zoo]'.") from error
+    raise ImportError(f"{error}. The zoo needs its own packages: pip install -e '.[zoo]' in the clone.") from error
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
@@ -88,14 +88,15 @@ def packaged_config(algo: str, env_id: str) -> str | None:
     return None
 
 
-def train(argv: list[str]) -> int:
+def train(argv: list[str], name: str = "") -> int:
     """
     Train like rl_zoo3, but with checkpoints and, by default, with the packaged recipe.
 
     :param argv: arguments of the command
+    :param name: name of the command on the screen, by default train or tune
     :return: exit status
     """
-    name = "tune" if "-optimize" in argv else "train"
+    name = name or ("tune" if "-optimize" in argv else "train")
     resuming = _resuming(name)
     asked, argv = resuming.parse_known_args(argv)
     if helps(argv):
@@ -162,7 +163,7 @@ def _packaged(recipe: Path) -> list[str]:
 
 def _in_processes(name: str, asked: argparse.Namespace, argv: list[str]) -> int:
     """Run trainings of several seeds, or the workers of a search, in processes of their own."""
-    if asked.seeds is None and name == "train":
+    if asked.seeds is None and name != "tune":
         raise ValueError("--jobs, --engine and --address are for --seeds: a single training runs in this process.")
     if asked.resume is not None:
         raise ValueError("--resume continues one run; --seeds resumes the runs of its command automatically.")

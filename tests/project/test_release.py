@@ -142,4 +142,4 @@ def test_the_command_works_without_extras(installed, tmp_path):
     run(command, "replay", *words, "--out", "page.html", cwd=tmp_path)
     assert "<canvas" in (tmp_path / "page.html").read_text(encoding="utf-8")
     for words, extra in ((["train", "--env", "OwnBit-v0"], "zoo"), (["identify", "--plant", "crazyflow"], "plants")):
-        assert f"pip install 'sb3-maddpg[{extra}]'" in run(command, *words, cwd=tmp_path, status=2)
+        assert f"pip install -e '.[{extra}]' in the clone" in run(command, *words, cwd=tmp_path, status=2)

@@ -310,16 +310,17 @@ def _compare(args: argparse.Namespace) -> None:
     solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name
     common = {"preset": args.preset, "preset_version": PRESET_VERSION, "seed": args.seed, "solver": solver}
     rows = [row | common | ({"world": _parse_world(args.world)} if args.world else {}) for row in rows]
-    print(format_table(rows, args.wide))
-    world = f" with {' '.join(args.world)}" if args.world else ""
-    robots = conditions[0].config.n_robots
-    print(f"\nepisodes: {args.episodes} each; robots: {robots}; preset: {args.preset}{world}; set: {args.seed}")
+    # Files first: printing may fail, and the pieces of the evaluation are gone
     if args.json:
         write_rows(args.json, rows)
     if args.csv:
         write_csv(args.csv, rows)
     if args.latex:
         write_text(args.latex, _latex(table_texts(rows, args.wide)))
+    print(format_table(rows, args.wide))
+    world = f" with {' '.join(args.world)}" if args.world else ""
+    robots = conditions[0].config.n_robots
+    print(f"\nepisodes: {args.episodes} each; robots: {robots}; preset: {args.preset}{world}; set: {args.seed}")
     for path in filter(None, (args.json, args.csv, args.latex)):
         print(f"wrote {path}")
     if args.plot:

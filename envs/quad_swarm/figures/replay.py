@@ -21,7 +21,7 @@ import numpy as np
 from quad_swarm.evaluation.command import add_policy_arguments, make_conditions, run
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import is_model, short_name
-from quad_swarm.evaluation.rows import check_writable
+from quad_swarm.evaluation.rows import check_writable, write_text
 from quad_swarm.figures.colours import COLOURS
 from quad_swarm.geometry import length
 from quad_swarm.quadrotor import ATTITUDE, POSITION
@@ -151,7 +151,7 @@ def _write(args: argparse.Namespace) -> None:
     check_writable(args.out, "--out")
     conditions = make_conditions(args, [args.scenario])
     page = replay_page(conditions, args.seed, args.episode, args.preset)
-    args.out.write_text(page, encoding="utf-8")
+    write_text(args.out, page)
     print(f"wrote {args.out}, {len(page) / 1e6:.1f} MB: open it in a browser")
 
 

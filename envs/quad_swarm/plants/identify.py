@@ -7,6 +7,8 @@ writes a vehicle file, which worlds accept as ``quadrotor``.
 from __future__ import annotations
 
 import argparse
+import os
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,7 +66,7 @@ def identify(plant: str) -> Identification:
         from scipy.optimize import least_squares  # imported here, so that the help needs no extra
     except ImportError as missing:
         raise ImportError(
-            f"Identification needs more packages: pip install 'sb3-maddpg[plants]' ({missing})."
+            f"Identification needs more packages: pip install -e '.[plants]' in the clone ({missing})."
         ) from missing
     u = experiment()
     count = u.shape[1]
@@ -110,6 +112,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
     parser.add_argument("--out", type=Path, metavar="FILE", help="vehicle file to write, YAML")
     args = parser.parse_args(argv)
+    if args.out:
+        _write(args.out, None)
     found = identify(args.plant)
     print(f"{'parameter':22}{args.plant:>22}{'bebop2':>10}")
     for name in VEHICLE_PARAMETERS:
@@ -122,6 +126,24 @@ def main(argv: list[str] | None = None) -> int:
         values = {name: round(getattr(found.params, name), 4) for name in VEHICLE_PARAMETERS}
         residuals = {name: round(getattr(found, name), 4) for name in Identification._fields[1:]}
         text = f"# sb3-maddpg identify --plant {args.plant}\n"
-        args.out.write_text(text + yaml.safe_dump({"parameters": values, "residuals": residuals}, sort_keys=False))
+        _write(args.out, text + yaml.safe_dump({"parameters": values, "residuals": residuals}, sort_keys=False))
         print(f"wrote {args.out}")
     return 0
+
+
+def _write(path: Path, text: str | None) -> None:
+    """Write a file atomically, or, without a text, only check that it could be written. Missing folders are created.
+
+    :raises ValueError: if it cannot be written
+    """
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(0, "it is a folder")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            if text is not None:
+                part = Path(folder, path.name)
+                part.write_text(text, encoding="utf-8")
+                os.replace(part, path)
+    except OSError as error:
+        raise ValueError(f"--out {path} cannot be written: {error.strerror}; choose another path.") from error

@@ -19,7 +19,7 @@ def make(simulator: str, vehicle: str, *arguments: Any) -> Any:
         adapter = getattr(importlib.import_module(f"quad_swarm.plants.{simulator}"), f"{simulator.capitalize()}Plant")
     except ImportError as error:
         raise ImportError(
-            f"plant='{simulator}:{vehicle}' needs the simulator: pip install 'sb3-maddpg[plants]' ({error})."
+            f"plant='{simulator}:{vehicle}' needs the simulator: pip install -e '.[plants]' in the clone ({error})."
         ) from None
     return adapter(vehicle, *arguments)
 

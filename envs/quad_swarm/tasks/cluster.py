@@ -42,7 +42,7 @@ class Cluster(Executor):
         try:
             import ray
         except ImportError as error:
-            raise ValueError(f'Ray is not installed ({error}): pip install "sb3-maddpg[ray]".') from error
+            raise ValueError(f'Ray is not installed ({error}): pip install -e ".[ray]" in the clone.') from error
         self._ray, self._modules, self._mixed = ray, tuple(modules), mixed
         self._begun = not ray.is_initialized()
         if self._begun:
