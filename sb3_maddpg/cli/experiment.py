@@ -329,7 +329,7 @@ class TeamExperimentManager(ExperimentManager):
         """Wrap environments that do not provide their state in ``Replayable`` if exact checkpoints are requested."""
         if self.checkpoints is None or self.checkpoints.every is None or isinstance(self.env_wrapper, _Replaying):
             return
-        env = gymnasium.make(self.env_name.gym_id, **self.env_kwargs)
+        env = gymnasium.spec(self.env_name.gym_id).make(**self.env_kwargs)
         if not tells_state(env):
             self.env_wrapper = _Replaying(self.env_wrapper)
         env.close()

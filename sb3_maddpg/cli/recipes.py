@@ -305,6 +305,8 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     for key in ("env_wrapper", "vec_env_wrapper", "callback"):
         for name, arguments in _classes(found.get(key)):
             _check_call(key, name, arguments)
+    if isinstance(policy := found["policy"], str) and "." in policy:  # which rl_zoo3 imports
+        _class_named("policy", policy, "sb3_maddpg.MADDPGPolicy")
     if isinstance(buffer := found.get("replay_buffer_class"), str):
         found["replay_buffer_class"] = _replay_buffer(buffer)
     return found
@@ -403,12 +405,17 @@ def _replay_buffer(name: str) -> type[ReplayBuffer]:
     """:return: the replay buffer class that a recipe names, by a dotted path or as in rl_zoo3's recipes"""
     if name == "HerReplayBuffer":
         return HerReplayBuffer
+    return _class_named("replay_buffer_class", name, "sb3_maddpg.PrioritizedTeamReplayBuffer")
+
+
+def _class_named(key: str, name: str, example: str) -> Any:
+    """:return: what a dotted path in a recipe names"""
     try:
         return get_class_by_name(name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise ValueError(
-            f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Use the dotted path of a class, "
-            f"such as sb3_maddpg.PrioritizedTeamReplayBuffer. {_OF_WHICH}"
+            f"{key}: {name} in the recipe cannot be imported ({error}). Use the dotted path of a class, such as "
+            f"{example}. {_OF_WHICH}"
         ) from error
 
 
@@ -434,7 +441,7 @@ def _check_call(key: str, name: str, arguments: Any, source: str = "the recipe")
     where = f"{key}: {name} in {source}"
     try:
         found = get_class_by_name(name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise ValueError(f"{where} cannot be imported ({error}). {_OF_WHICH}") from error
     if not callable(found):
         raise ValueError(f"{where} is not a class. Use the dotted path of one.")
