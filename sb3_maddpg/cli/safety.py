@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import packages_distributions, requires
+from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,7 +27,7 @@ from stable_baselines3.common import base_class, off_policy_algorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
 
 from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
@@ -95,6 +96,23 @@ for _tag, _read in (("object/apply:collections.OrderedDict", _ordered_dict), ("t
     RunLoader.add_constructor(f"tag:yaml.org,2002:python/{_tag}", cast(Any, _read))
 
 
+class _SubprocVecEnv(SubprocVecEnv):
+    """
+    ``SubprocVecEnv`` whose processes import nothing from the current folder. Python starts the servers that create them
+    with ``python -c``, which does so before all other imports.
+    """
+
+    def __init__(self, env_fns: list[Callable[[], gymnasium.Env]], start_method: str | None = None):
+        here = Path.cwd()
+        os.chdir(Path(os.__file__).parent)  # of Python's own modules
+        try:
+            resource_tracker.ensure_running()
+            forkserver.ensure_running()
+        finally:
+            os.chdir(here)
+        super().__init__(env_fns, start_method)
+
+
 @contextmanager
 def no_code_from_files() -> Iterator[None]:
     """
@@ -115,6 +133,7 @@ def no_code_from_files() -> Iterator[None]:
     for module in zoo:
         changes += [
             (module, "VecNormalize", SafeVecNormalize),
+            (module, "SubprocVecEnv", _SubprocVecEnv),
             (module, "get_latest_run_id", latest_run_number),
             (module, "get_wrapper_class", _named_wrappers(module.get_wrapper_class)),
         ]
