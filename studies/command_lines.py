@@ -37,8 +37,10 @@ from sb3_maddpg.cli.experiment import TeamExperimentManager
 from sb3_maddpg.cli.safety import RunLoader
 
 SECONDS = 60.0
-_EVENTS = ("os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "pty.spawn")
-_EVENTS += ("pickle.find_class", "socket.connect", "ctypes.dlopen", "webbrowser.open")
+_EVENTS = (
+    *("os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "pty.spawn"),
+    *("pickle.find_class", "socket.connect", "ctypes.dlopen", "webbrowser.open"),
+)
 _CHANGES = ("os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.truncate", "os.symlink", "os.link", "os.chmod")
 TRAP = (
     "from pathlib import Path\nPath(__file__).with_name('caught').touch()\ndef parallel_env(): ...\nclass Trap: ...\n"
@@ -81,18 +83,20 @@ OPTIONS = (
     *("--trial-id", "--storage", "--study-name", "--seeds", "--jobs", "--engine", "--vec-env", "--nonsense", "-zz"),
 )
 WORLD = ("n_robots", "quadrotor", "noise", "noise.wind", "planner", "plant", "radius", "x", "", "a.b.c", "max_tilt")
-POLICIES = ("full", "none", "cpa", "cpa:", "cpa:x", "cpa:1:2:3:4", "latest:", "latest:x", "pretrained:", "pretrained:x")
-POLICIES += (
-    "x.zip",
-    "x.zip@2",
-    "latst:logs",
-    "@",
-    "nope",
-    "lurking",
-    "cpa:1e400",
-    "cpa:nan",
-    "random:2",
-    "distance:-1",
+POLICIES = (
+    *("full", "none", "cpa", "cpa:", "cpa:x", "cpa:1:2:3:4", "latest:", "latest:x", "pretrained:", "pretrained:x"),
+    *(
+        "x.zip",
+        "x.zip@2",
+        "latst:logs",
+        "@",
+        "nope",
+        "lurking",
+        "cpa:1e400",
+        "cpa:nan",
+        "random:2",
+        "distance:-1",
+    ),
 )
 
 
