@@ -1,5 +1,10 @@
 """MADDPG for Stable-Baselines3: decentralised actors, centralised critics, all kinds of actions."""
 
+from sb3_maddpg.starting import end_on_interrupt
+
+end_on_interrupt()  # before the imports, which take seconds
+
+# ruff: noqa: E402
 from importlib.metadata import version
 
 from sb3_maddpg.agent_policy import AgentPolicy

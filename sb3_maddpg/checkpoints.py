@@ -18,6 +18,7 @@ import platform
 import random
 import shutil
 import signal
+import stat
 import threading
 import time
 import warnings
@@ -49,7 +50,7 @@ from sb3_maddpg.env_states import (
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.model_files import as_damage, check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
-from sb3_maddpg.utils import arguments_of, is_full_disk, shown, sources_of, sync_folder
+from sb3_maddpg.utils import arguments_of, remedy_of, shown, sources_of, sync_folder
 
 _FORMAT = 2
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
@@ -72,7 +73,8 @@ class RunCheckpoint(BaseCallback):
     the moment at which the checkpoint was taken. An error in the thread is raised at the beginning of a later rollout.
 
     On SIGTERM and SIGHUP, which clusters and closed terminals send to end a process, the callback writes another
-    checkpoint and then ends the process with that signal. A second signal ends the process at once.
+    checkpoint and then ends the process with that signal. A second signal ends the process at once. A signal that the
+    process ignores, as under ``nohup``, stays ignored.
 
     :param folder: folder for the checkpoints of this run only
     :param every: number of steps between checkpoints; None to take one every half minute, or less often if all
@@ -124,7 +126,8 @@ class RunCheckpoint(BaseCallback):
 
         if threading.current_thread() is threading.main_thread():
             for name in ("SIGTERM", "SIGHUP"):
-                if number := getattr(signal, name, None):
+                number = getattr(signal, name, None)
+                if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
                     self._handlers[number] = signal.signal(number, self._on_signal)
 
     def _on_training_end(self) -> None:
@@ -138,11 +141,13 @@ class RunCheckpoint(BaseCallback):
         if self._signal is not None:
             _end_by(number)
         self._signal = number
+        _leave_closed_terminal()
 
     def _on_rollout_start(self) -> None:
         if self._signal is not None:
             self.save()
-            print(f"Ended by {signal.Signals(self._signal).name} at step {self.model.num_timesteps}.", flush=True)
+            with suppress(OSError):  # nobody may be able to read it any more
+                print(f"Ended by {signal.Signals(self._signal).name} at step {self.model.num_timesteps}.", flush=True)
             _end_by(self._signal)
         if self._writer is not None and not self._writer.is_alive():
             self._finish()
@@ -222,10 +227,14 @@ class RunCheckpoint(BaseCallback):
             if self.verbose:
                 print(f"Checkpoint at step {writer.steps}: {writer.target}")
             return writer.target
-        if not is_full_disk(error):
+        remedy = remedy_of(error)
+        if remedy is None:
             raise error
         warnings.warn(
-            f"No space left for a checkpoint at step {writer.steps}: the previous one stays ({error}).", stacklevel=2
+            f"No space left for a checkpoint at step {writer.steps}: the previous one stays ({error})."
+            if remedy == "free space"
+            else f"No checkpoint at step {writer.steps}: the previous one stays. {self.folder}: {error}; {remedy}.",
+            stacklevel=2,
         )
         for path in self.folder.glob(f"*{_UNFINISHED}"):
             shutil.rmtree(path, ignore_errors=True)
@@ -610,6 +619,16 @@ def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
     if not isinstance(value, np.ndarray) or value.shape != np.shape(present):
         raise ValueError(f"A checkpoint is damaged: its {name} is {shown(value)}.")
     return value
+
+
+def _leave_closed_terminal() -> None:
+    """Write nothing more to a terminal that was closed, since that would raise an error before the checkpoint."""
+    for output in (1, 2):
+        with suppress(OSError):
+            if stat.S_ISCHR(os.fstat(output).st_mode) and not os.isatty(output):
+                null = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null, output)
+                os.close(null)
 
 
 def _end_by(number: int) -> None:

@@ -68,7 +68,15 @@ from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, MixedActions, Team, into_box, plain_joint_space
 from sb3_maddpg.typed_json import encode
-from sb3_maddpg.utils import arguments_of, as_numbers, atomic_write, describe_env, shown, suggest
+from sb3_maddpg.utils import (
+    arguments_of,
+    as_numbers,
+    atomic_write,
+    describe_env,
+    remove_empty_log_folder,
+    shown,
+    suggest,
+)
 from sb3_maddpg.validation import (
     LEAST_TEMPERATURE,
     Arguments,
@@ -941,6 +949,8 @@ class MADDPG(OffPolicyAlgorithm):
             # ended. Without last observations, it begins new episodes.
             if broken_off:
                 self._last_obs = None
+            if not self._custom_logger:
+                remove_empty_log_folder(self)
         # Log the episodes since SB3's last log, which are all of them in a short training
         if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_maddpg.maddpg import MADDPG, as_vec_env
 from sb3_maddpg.relational import PairPolicy
-from sb3_maddpg.utils import suggest
+from sb3_maddpg.utils import load_offer, suggest
 
 
 def pretrained_models() -> dict[str, Path]:
@@ -20,7 +20,7 @@ def pretrained_models() -> dict[str, Path]:
 
     :return: name -> folder of the model with its ``model.zip``
     """
-    packages = [Path(str(files(offer.value))) for offer in entry_points(group="sb3_maddpg.models")]
+    packages = [Path(str(files(load_offer(offer)))) for offer in entry_points(group="sb3_maddpg.models")]
     found = {path.parent.name: path.parent for package in packages for path in package.glob("*/model.zip")}
     return dict(sorted(found.items()))
 

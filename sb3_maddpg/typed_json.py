@@ -20,7 +20,7 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_maddpg.team import CategoricalActions, MixedActions, TeamObservation
-from sb3_maddpg.utils import shown, suggest
+from sb3_maddpg.utils import load_offer, shown, suggest
 
 Json = Any
 _TYPE = "$"
@@ -161,7 +161,7 @@ def _is_public_class(value: Any, module: Any) -> bool:
 @cache
 def _load_entry_points() -> None:
     for offer in entry_points(group="sb3_maddpg.allowed_in_files"):
-        offer.load()
+        load_offer(offer)
 
 
 def known_class(cls: type) -> bool:

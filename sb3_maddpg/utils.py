@@ -14,11 +14,13 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 # Arguments of gymnasium.make and make_vec that end up among the environment's own
@@ -37,9 +39,22 @@ def shown(value: Any, most: int = 200) -> str:
     :return: the value's ``repr`` on one line, shortened if it is long
     """
     try:
-        text = " ".join(repr(value).split())
+        text = repr(value)
     except Exception:  # from a foreign class, or an integer with too many digits for Python
         text = f"<{type(value).__name__}>"
+    return _shortened(text, most)
+
+
+def told(error: BaseException) -> str:
+    """
+    :param error: any error
+    :return: its class and message on one line, shortened if it is long
+    """
+    return _shortened(f"{type(error).__name__}: {error}", 200)
+
+
+def _shortened(text: str, most: int) -> str:
+    text = " ".join(text.split())
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-(most // 3) :]}"
 
 
@@ -57,6 +72,36 @@ def suggest(kind: str, name: Any, known: Iterable[str]) -> str:
     if nearest:
         return f"Unknown {kind} '{name[:100]}': did you mean '{nearest[0]}'?"
     return f"Unknown {kind} '{name[:100]}'. Choose one of: {', '.join(known)}."
+
+
+def remove_empty_log_folder(model: BaseAlgorithm) -> None:
+    """
+    Remove the folder that Stable-Baselines3 creates among the temporary files for a logger without files.
+
+    :param model: a model after training
+    """
+    folder = model.logger.get_dir() if hasattr(model, "_logger") else None
+    if folder is not None and os.path.basename(folder).startswith("SB3-"):
+        with suppress(OSError):  # it is not empty
+            os.rmdir(folder)
+
+
+def load_offer(offer: EntryPoint) -> Any:
+    """
+    Load what an installed package offers.
+
+    :param offer: an entry point
+    :return: the object
+    :raises ImportError: if it cannot be loaded; the message names the package
+    """
+    try:
+        return offer.load()
+    except (Exception, SystemExit) as error:  # from foreign code
+        package = offer.dist.name if offer.dist is not None else "a package"
+        raise ImportError(
+            f"{package} is installed, but its entry point {offer.group}: {offer.name} = {offer.value} cannot be loaded "
+            f"({told(error)}): repair or uninstall {package}."
+        ) from error
 
 
 def describe_env(env: VecEnv) -> dict[str, Any] | None:
@@ -146,12 +191,28 @@ def process_runs(process: int) -> bool:
     return True
 
 
+_REMEDIES = {
+    errno.ENOSPC: "free space",
+    errno.EDQUOT: "free space",
+    errno.EFBIG: "raise the limit of file sizes (`ulimit -f`)",
+    errno.EIO: "check the disk",
+}
+
+
+def remedy_of(error: BaseException) -> str | None:
+    """
+    :param error: any error
+    :return: what helps if a disk or the user's share of it is full, files may not grow, or a disk fails; else None
+    """
+    return _REMEDIES.get(error.errno or 0) if isinstance(error, OSError) else None
+
+
 def is_full_disk(error: BaseException) -> bool:
     """
     :param error: any error
-    :return: whether a disk or the user's share of it is full
+    :return: whether a file cannot be written now, but may be later, see ``remedy_of``
     """
-    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return remedy_of(error) is not None
 
 
 def sync_folder(folder: Path) -> None:

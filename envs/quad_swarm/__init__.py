@@ -3,6 +3,8 @@
 Importing the package registers ``QuadSwarm-v0`` in Gymnasium. `parallel_env` creates the PettingZoo environment.
 """
 
+from importlib.metadata import version
+
 import gymnasium
 
 from quad_swarm.interfaces.env import QuadSwarmEnv
@@ -20,6 +22,7 @@ if "QuadSwarm-v0" not in gymnasium.registry:
         vector_entry_point="quad_swarm.interfaces.vector_env:QuadSwarmVectorEnv",
     )
 
+__version__ = version("sb3-maddpg")
 __all__ = [
     "PRESETS",
     "PRESET_VERSION",

@@ -109,7 +109,7 @@ def main(argv: list[str]) -> int:
         options += ["--env", known.env] if known.env else []
         options += ["--progress"] if sys.stderr.isatty() else []
         with contextlib.redirect_stdout(printed):
-            zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given])
+            zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given], "bench")
     print(
         f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="", file=printed
     )

@@ -8,13 +8,14 @@ import hashlib
 import hmac
 import json
 import os
+import re
 import secrets
 import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from sb3_maddpg.utils import atomic_write
+from sb3_maddpg.utils import atomic_write, shown, told
 
 COMMAND_FILE = "command.json"
 _KEY_BYTES = 32
@@ -29,6 +30,29 @@ class Command(NamedTuple):
     """Number of steps between checkpoints, None for checkpoints by time"""
     folder: Path | None
     """Folder in which this user started the run; None if someone else did, or if the folder is gone"""
+
+
+def runs_of(folder: Path, name: str) -> dict[int, Path]:
+    """
+    :param folder: folder of an algorithm's runs
+    :param name: name of the environment
+    :return: number -> folder of each run, the highest number first
+    """
+    form = re.compile(rf"{re.escape(name)}_([0-9]{{1,18}})")
+    paths = [path for path in folder.iterdir() if path.is_dir()] if folder.is_dir() else []
+    found = {int(match[1]): path for path in paths if (match := form.fullmatch(path.name))}
+    return dict(sorted(found.items(), reverse=True))
+
+
+def latest_run_number(folder: str = "", name: str = "") -> int:
+    """
+    Like the functions of rl_zoo3 and Stable-Baselines3, which fail at folders such as ``NAME_²``.
+
+    :param folder: folder of runs, or of TensorBoard's logs
+    :param name: name of the environment, or of the log
+    :return: the highest number, 0 if there is no run
+    """
+    return next(iter(runs_of(Path(folder), str(name))), 0)
 
 
 def resumable(argv: list[str]) -> list[str]:
@@ -75,11 +99,25 @@ def read_command(run: Path) -> Command:
     try:
         command = json.loads((run / COMMAND_FILE).read_text())
         argv, every = [str(word) for word in command["argv"]], command["every"]
+        if every is not None and (type(every) is not int or every < 1):
+            raise ValueError(f"checkpoints every {shown(every)} steps")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{run} is not the folder of a run with checkpoints ({error}).") from error
+        raise ValueError(f"{run} is not the folder of a run with checkpoints ({told(error)}).") from error
     folder, signature = str(command.get("folder")), _signature(argv, str(command.get("folder")))
     own = signature is not None and hmac.compare_digest(signature.encode(), str(command.get("signature")).encode())
     return Command(argv, every, Path(folder) if own and Path(folder).is_dir() else None)
+
+
+def own_words(run: Path) -> list[str]:
+    """
+    :param run: folder of a run
+    :return: the words of the command with which this user started it, none if someone else did
+    """
+    with contextlib.suppress(ValueError):
+        command = read_command(run)
+        if command.folder is not None:
+            return command.argv
+    return []
 
 
 def _signature(argv: list[str], folder: str) -> str | None:

@@ -11,13 +11,14 @@ import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from importlib.metadata import entry_points
+from importlib.metadata import entry_points, version
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
 import gymnasium
 import yaml
 
+from sb3_maddpg.cli.command_files import runs_of
 from sb3_maddpg.cli.options import (
     PROG,
     check_writable,
@@ -29,10 +30,12 @@ from sb3_maddpg.cli.options import (
     nearest_options,
 )
 from sb3_maddpg.cli.overview import ALGORITHMS, overview
+from sb3_maddpg.cli.terminal import discard_output, is_unread, lasting_output
 from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
-from sb3_maddpg.utils import shown, suggest
+from sb3_maddpg.starting import interruptible
+from sb3_maddpg.utils import load_offer, shown, suggest
 
 # Errors in the user's input and errors of the system. Their messages name the remedy, so no traceback is shown.
 USER_ERRORS = (
@@ -112,7 +115,7 @@ def _hand_over(group: str, argv: list[str]) -> int:
     known.env = known.env or next(iter(offers.names))
     if known.env not in offers.names:
         raise ValueError(suggest(f"environment with {group}", known.env, offers.names))
-    main: Callable[[list[str]], int] = offers[known.env].load()
+    main: Callable[[list[str]], int] = load_offer(offers[known.env])
     if helps(rest) and group != "identifiers":
         print(f"Models: MODEL.zip, latest:LOGDIR, {', '.join(f'pretrained:{name}' for name in pretrained_models())}\n")
     rest = [_model(word, known.algo, known.env) for word in rest]
@@ -170,8 +173,7 @@ def latest_model(word: str, algo: str, env_id: str) -> str:
     """
     algo = algo.rpartition(":")[2].lower()  # of MODULE:CLASS
     folder, name = Path(word.removeprefix("latest:"), algo), env_id.replace("/", "-")  # as in rl_zoo3
-    runs = [path for path in folder.glob(f"{name}_*") if path.name[len(name) + 1 :].isdigit()]
-    for run in sorted(runs, key=lambda path: int(path.name[len(name) + 1 :]), reverse=True):
+    for run in runs_of(folder, name).values():
         for model in (run / f"{name}.zip", run / "best_model.zip"):
             if model.is_file():
                 return str(model)
@@ -271,6 +273,7 @@ def examples(name: str) -> str:
         return command.examples
     found = []
     for offer in entry_points(group=f"sb3_maddpg.{command.offers}"):
+        load_offer(offer)
         own = getattr(importlib.import_module(offer.module), "EXAMPLES", "")
         found.append(own.rstrip("\n") or command.examples.replace("ENV", offer.name))
     return "\n".join(found) or command.examples
@@ -355,6 +358,7 @@ def _parser() -> argparse.ArgumentParser:
         description=DESCRIPTION.format(commands=commands),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"{PROG} {version('sb3-maddpg')}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     parser.add_argument("command", choices=COMMANDS, metavar="command", help="one of those above")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help="options of the command")
@@ -381,32 +385,50 @@ def main(argv: list[str] | None = None) -> int:
     :param argv: arguments, by default those of the command line
     :return: exit status, 2 for an error in the user's input, 130 after Ctrl-C
     """
-    with nearest_options():
-        arguments = _parser().parse_args(argv)
+    interruptible()
+    words = sys.argv[1:] if argv is None else argv
+    debug = "--debug" in words
+    try:
+        with lasting_output(), nearest_options():
+            status = _run(words)
+            sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        print("Interrupted.", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except BrokenPipeError as error:
+        if debug or not is_unread():
+            return _told(error, debug)
+        discard_output()
+        return 128 + signal.SIGPIPE
+    except USER_ERRORS as error:
+        return _told(error, debug)
+
+
+def _run(words: list[str]) -> int:
+    arguments = _parser().parse_args(words)
     command, rest = arguments.command, arguments.arguments
-    debug = arguments.debug or "--debug" in rest
     # Commands of packages may have this option, rl_zoo3's do not
     if command not in ("evaluate", "replay"):
         rest = [word for word in rest if word != "--debug"]
     trusts, rest = "--trust" in rest, [word for word in rest if word != "--trust"]
     if helps(rest):
         print(f"{PROG} {command}: {COMMANDS[command].help}\n\nexamples:\n{examples(command)}\n")
-    try:
-        with importing_from(Path.cwd(), rest), _trust() if trusts else nullcontext(), nearest_options():
-            return COMMANDS[command].run(rest)
-    except KeyboardInterrupt:
-        if debug:
-            raise
-        print("Interrupted.", file=sys.stderr)
-        return 128 + signal.SIGINT
-    except USER_ERRORS as error:
-        if debug:
-            raise
-        text = str(error)
-        if isinstance(error, OSError) and error.strerror:
-            text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-        print(f"error: {text or type(error).__name__} (--debug shows the traceback)", file=sys.stderr)
-        return 2
+    with importing_from(Path.cwd(), rest), _trust() if trusts else nullcontext():
+        return COMMANDS[command].run(rest)
+
+
+def _told(error: BaseException, debug: bool) -> int:
+    """Print an error on one line, or raise it for its traceback."""
+    if debug:
+        raise error
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    print(f"error: {' '.join(text.split()) or type(error).__name__} (--debug shows the traceback)", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

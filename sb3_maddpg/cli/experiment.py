@@ -7,7 +7,7 @@ import shutil
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -19,7 +19,7 @@ from optuna.trial import TrialState
 from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_callback_list, get_latest_run_id
+from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_callback_list
 from sqlalchemy.exc import DBAPIError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -28,25 +28,25 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, con
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule, configure_logger, safe_mean
-from stable_baselines3.common.utils import get_latest_run_id as latest_curve
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.callbacks import DashboardCallback
 from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
-from sb3_maddpg.cli.command_files import write_command
+from sb3_maddpg.cli.command_files import latest_run_number, write_command
 from sb3_maddpg.cli.interrupts import noticed_interrupts
 from sb3_maddpg.cli.literals import format_literal, parse_literal
 from sb3_maddpg.cli.options import check_writable
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, shares_parameters
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_options, check_recipe, policy_class, read_recipe
-from sb3_maddpg.cli.safety import check_names
+from sb3_maddpg.cli.safety import check_names, check_paths
 from sb3_maddpg.cli.search import (
     STUDY,
     as_absolute,
     best_recipe,
     bring_back,
+    check_trials,
     enlist,
     kept_search,
     open_storage,
@@ -54,8 +54,19 @@ from sb3_maddpg.cli.search import (
     tell_best,
 )
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
+from sb3_maddpg.model_files import trusted
 from sb3_maddpg.team import Team
-from sb3_maddpg.utils import arguments_of, atomic_write, describe_env, is_full_disk, suggest
+from sb3_maddpg.utils import (
+    arguments_of,
+    atomic_write,
+    describe_env,
+    load_offer,
+    remedy_of,
+    remove_empty_log_folder,
+    shown,
+    suggest,
+    told,
+)
 from sb3_maddpg.vec_env import GymnasiumVecEnv
 
 # Default number of log tables when training an off-policy algorithm. SB3's default of one every four episodes floods
@@ -107,9 +118,16 @@ class TeamExperimentManager(ExperimentManager):
     continues = False  # whether the study has trials of other workers or of an earlier command
 
     def __init__(
-        self, args: Any, *rest: Any, uuid_str: str = "", checkpoints: Checkpoints | None = None, **kwargs: Any
+        self,
+        args: Any,
+        *rest: Any,
+        uuid_str: str = "",
+        checkpoints: Checkpoints | None = None,
+        given_seed: int | None = None,
+        **kwargs: Any,
     ):
         check_options(args)
+        self.given_seed = given_seed  # None if rl_zoo3 chose one
         self.checkpoints = checkpoints
         self.checkpoint: RunCheckpoint | None = None
         self.lock = contextlib.ExitStack()  # of the run's folder of checkpoints, until learn() ends
@@ -134,13 +152,14 @@ class TeamExperimentManager(ExperimentManager):
             hyperparams = {**update(hyperparams, of_trial), **(self.custom_hyperparams or {})}
         if self.n_timesteps > 0:
             hyperparams.setdefault("n_timesteps", self.n_timesteps)
-        if hyperparams.get("noise_type") is None:
-            hyperparams.pop("noise_type", None)
+        if "noise_type" in hyperparams and hyperparams["noise_type"] is None:  # which switches the recipe's noise off
+            del hyperparams["noise_type"]
             hyperparams.pop("noise_std", None)
         if foreign:
             kwargs = {"env_kwargs": given, "eval_env_kwargs": self._eval_env_kwargs_args}
             for named in (hyperparams, kwargs):
                 check_names(named, self.env_name.gym_id, f"{foreign} with {self.config}")
+                check_paths(named, foreign, f"{foreign} with {self.config}")
         as_written = dict(hyperparams)
         hyperparams = check_recipe(self.algo, hyperparams, f"recipe for {self.algo} in {self.config}")
         self.own_vec_env = self._read_vec_env(hyperparams)
@@ -192,10 +211,24 @@ class TeamExperimentManager(ExperimentManager):
             raise ValueError(suggest(f"study in {self.storage}", self.study_name, names)) from None
         except DBAPIError as error:
             raise _no_database(self.storage, error) from error
+        check_trials(study, self.storage)
         for trial in study.get_trials(deepcopy=False):
             if trial.number == trial_id:
-                return HYPERPARAMS_CONVERTER[self.algo](trial.params)
+                return self._arguments_of(trial)
         raise ValueError(f"Study {self.study_name} has no trial {trial_id}, only {len(study.trials)}, counted from 0.")
+
+    def _arguments_of(self, trial: optuna.trial.FrozenTrial) -> dict[str, Any]:
+        """:return: the algorithm's arguments in a trial, which someone else may have written"""
+        source = f"trial {trial.number} of {self.storage}"
+        try:
+            found: dict[str, Any] = HYPERPARAMS_CONVERTER[self.algo](trial.params)
+        except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+            raise ValueError(
+                f"{source} has {shown(trial.params)}, which are no parameters of {self.algo} ({told(error)})."
+            ) from error
+        if not trusted(None):
+            check_names(found, self.env_name.gym_id, source)
+        return found
 
     def create_log_folder(self) -> None:
         """Create the run's folder. A search has none: the log of each trial goes to ``--optimization-log-path``."""
@@ -207,7 +240,7 @@ class TeamExperimentManager(ExperimentManager):
             self.lock.enter_context(locked(self.checkpoints.run / CHECKPOINTS))
             put_aside(self.checkpoints.run)
             return
-        first = get_latest_run_id(self.log_path, self.env_name) + 1
+        first = latest_run_number(self.log_path, self.env_name) + 1
         self.save_path = str(claim_folder(f"{self.log_path}{self.env_name}", first, self.uuid_str))
         self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
@@ -250,7 +283,7 @@ class TeamExperimentManager(ExperimentManager):
         offers = entry_points(group="sb3_maddpg.dashboards")
         name = self.env_name.gym_id
         try:
-            offer = offers[name].load() if name in offers.names else None
+            offer = load_offer(offers[name]) if name in offers.names else None
         except ImportError as error:
             raise ImportError(
                 f"--tensorboard-log draws figures of {name}, which needs the extra 'plot': in the clone, "
@@ -302,7 +335,7 @@ class TeamExperimentManager(ExperimentManager):
         """Wrap environments that do not provide their state in ``Replayable`` if exact checkpoints are requested."""
         if self.checkpoints is None or self.checkpoints.every is None or isinstance(self.env_wrapper, _Replaying):
             return
-        env = gymnasium.make(self.env_name.gym_id, **self.env_kwargs)
+        env = gymnasium.spec(self.env_name.gym_id).make(**self.env_kwargs)
         if not tells_state(env):
             self.env_wrapper = _Replaying(self.env_wrapper)
         env.close()
@@ -338,12 +371,13 @@ class TeamExperimentManager(ExperimentManager):
             try:
                 self._learn(model)
             except OSError as error:
-                if not is_full_disk(error):
+                remedy = remedy_of(error)
+                if remedy is None:
                     raise
-                told = f"{error.strerror}: free space"
+                said = f"{error.strerror}: {remedy}"
                 if self.checkpoint is not None:
-                    told += f", then continue with `train --resume {self.save_path}`"
-                raise OSError(error.errno, told, error.filename or self.save_path) from error
+                    said += f", then continue with `train --resume {self.save_path}`"
+                raise OSError(error.errno, said, error.filename or self.save_path) from error
 
     def _learn(self, model: BaseAlgorithm) -> None:
         assert model.env is not None
@@ -380,6 +414,7 @@ class TeamExperimentManager(ExperimentManager):
         finally:
             assert model.env is not None
             model.env.close()
+            remove_empty_log_folder(model)
 
     def _logger(self, name: str) -> Logger:
         """:return: a logger of tables on the screen, unless there is a progress bar, and of curves for TensorBoard"""
@@ -392,10 +427,11 @@ class TeamExperimentManager(ExperimentManager):
                     output.writer.close()
                     output.writer = SummaryWriter(curves, purge_step=self.checkpoint.saved_at + 1)
             return logger
-        if not self.tensorboard_log or self.continue_training:
-            return configure_logger(int(prints), self.tensorboard_log, name, not self.continue_training)
-        first = latest_curve(self.tensorboard_log, name) + 1
-        folder = claim_folder(str(Path(self.tensorboard_log, name)), first)
+        if not self.tensorboard_log:
+            return configure_logger(int(prints))
+        last = latest_run_number(self.tensorboard_log, name)
+        prefix = str(Path(self.tensorboard_log, name))
+        folder = Path(f"{prefix}_{last}") if self.continue_training else claim_folder(prefix, last + 1)
         return configure(str(folder), [*(["stdout"] if prints else []), "tensorboard"])
 
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
@@ -437,7 +473,8 @@ class TeamExperimentManager(ExperimentManager):
         # Optuna's writing cannot be interrupted: a trial would remain unfinished
         with noticed_interrupts(lambda: not self.learns) as self.pressed:
             try:
-                super().hyperparameters_optimization()
+                with self._told_disk(kept):
+                    super().hyperparameters_optimization()
             except KeyboardInterrupt:
                 self.pressed.set()
             except ValueError:  # without a complete trial, there is no best one
@@ -455,6 +492,18 @@ class TeamExperimentManager(ExperimentManager):
         if interrupted:
             raise KeyboardInterrupt
 
+    @contextlib.contextmanager
+    def _told_disk(self, kept: Path | None) -> Iterator[None]:
+        """Say what is wrong with the disk. Optuna raises an AssertionError from it, "Should not reach."."""
+        try:
+            yield
+        except (AssertionError, OSError) as error:
+            cause = error if isinstance(error, OSError) else error.__context__
+            if not isinstance(cause, OSError) or (remedy := remedy_of(cause)) is None:
+                raise
+            said = f"{cause.strerror}: {remedy}, then {self._to_continue(kept)}"
+            raise OSError(cause.errno, said, cause.filename or self.storage) from cause
+
     def _to_continue(self, kept: Path | None) -> str:
         """:return: how to continue the search"""
         if kept is not None:
@@ -469,13 +518,22 @@ class TeamExperimentManager(ExperimentManager):
 
     def _write_best(self, path: Path) -> None:
         assert self.study is not None
-        params = HYPERPARAMS_CONVERTER[self.algo](self.study.best_params)
+        params = self._arguments_of(self.study.best_trial)
         with atomic_write(path, "yml") as file:
             file.write(yaml.safe_dump({self.env_name.gym_id: as_yaml(update(self.recipe, params))}).encode())
         tell_best(self.algo, self.env_name.gym_id, path)
 
     def _search_settings(self) -> tuple[Any, ...]:
-        names = ("algo", "seed", "n_timesteps", "n_trials", "max_total_trials", "n_startup_trials", "n_evaluations")
+        # The seed as given: the repeated command would get another one from rl_zoo3, and start again
+        names = (
+            "algo",
+            "given_seed",
+            "n_timesteps",
+            "n_trials",
+            "max_total_trials",
+            "n_startup_trials",
+            "n_evaluations",
+        )
         return tuple(getattr(self, name) for name in (*names, "n_eval_episodes", "n_eval_envs", "sampler", "pruner"))
 
     def _bring_back(self) -> optuna.Study | None:
@@ -489,6 +547,7 @@ class TeamExperimentManager(ExperimentManager):
         study = optuna.create_study(
             storage=storage, study_name=self.study_name, direction="maximize", load_if_exists=True
         )
+        check_trials(study, self.storage)
         count, finished = bring_back(study), _finished(study)
         enlist(study)
         if finished or count:

@@ -10,7 +10,7 @@ import torch
 import yaml
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
-from sb3_maddpg.utils import shown
+from sb3_maddpg.utils import shown, told
 
 WORDS = {"true": True, "false": False, "null": None, "none": None}
 NOT_FINITE = ("nan", "inf", "infinity")
@@ -35,10 +35,11 @@ def parse_literal(text: str) -> Any:
     :raises ValueError: if the text is anything else, or contains a number that is not finite
     """
     try:
-        tree = ast.parse(text.strip(), mode="eval")
+        return _finite(_value(ast.parse(text.strip(), mode="eval").body))
     except SyntaxError as error:
         raise ValueError(f"{shown(text)} is not valid Python: {error.msg}") from error
-    return _finite(_value(tree.body))
+    except (RecursionError, MemoryError):  # Python's parser raises either
+        raise ValueError(f"{shown(text)} is nested too deeply") from None
 
 
 def parse_value(text: str) -> Any:
@@ -60,9 +61,9 @@ def parse_value(text: str) -> Any:
         if text[0] not in "[{":
             raise error
     try:
-        return _finite(yaml.safe_load(text))
+        return _finite(yaml.load(text, BoundedLoader))
     except (yaml.YAMLError, RecursionError):
-        raise ValueError(f"{text} is neither a list nor a dict, in Python or in YAML") from None
+        raise ValueError(f"{shown(text)} is neither a list nor a dict, in Python or in YAML") from None
 
 
 def _is_word(text: str) -> bool:
@@ -73,6 +74,8 @@ def _is_word(text: str) -> bool:
         tree = ast.parse(text, mode="eval")
     except SyntaxError:
         return True
+    except (RecursionError, MemoryError):
+        return False
     # Arithmetic has only constants, as has an overflowing number
     return any(isinstance(node, ast.Name) for node in ast.walk(tree))
 
@@ -92,7 +95,9 @@ def _value(node: ast.expr) -> Any:
         case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(one.arg for one in keywords):
             return {one.arg: _value(one.value) for one in keywords}
         case ast.Call(func=ast.Name(id="list" | "tuple" as name), args=[argument], keywords=[]):
-            return SEQUENCES[name](_value(argument))
+            if isinstance(elements := _value(argument), (list, tuple)):
+                return SEQUENCES[name](elements)
+            raise ValueError(f"{name}({shown(elements)}) needs a list or a tuple: write {name}([...])")
         case ast.Name(id="RMSpropTFLike"):
             return RMSpropTFLike
         case ast.Attribute(value=module, attr=name) if ast.unparse(module) in CLASSES:
@@ -108,15 +113,17 @@ def _value(node: ast.expr) -> Any:
 
 def _key(node: ast.expr | None) -> Any:
     key = _value(node)  # type: ignore[arg-type]
-    if isinstance(key, (list, dict)):
-        raise ValueError(f"{key} cannot be the key of a dict")
+    try:
+        hash(key)
+    except TypeError:
+        raise ValueError(f"{shown(key)} cannot be the key of a dict") from None
     return key
 
 
 def _finite(value: Any) -> Any:
     not_finite = isinstance(value, float) and not math.isfinite(value)
     if not_finite or (isinstance(value, str) and value.lower().lstrip("+-.") in NOT_FINITE):
-        raise ValueError(f"{value} is not a finite number")
+        raise ValueError(f"{str(value)[:50]} is not a finite number")
     if isinstance(value, dict):
         contents = [*value, *value.values()]
     else:
@@ -162,13 +169,29 @@ class StoreValues(argparse.Action):
         setattr(namespace, self.dest, pairs)
 
 
+class Refused(ValueError):
+    """Text that is valid YAML, but is not accepted; the message says why."""
+
+
 class BoundedLoader(yaml.SafeLoader):
-    """YAML loader that refuses files whose aliases stand for more values than fit into memory."""
+    """YAML loader that refuses text whose aliases stand for more values than fit into memory, and all wrong values."""
+
+    def get_single_data(self) -> Any:
+        try:
+            return super().get_single_data()
+        except (AttributeError, TypeError, LookupError, ArithmeticError) as error:  # such as `!!timestamp 1`
+            raise yaml.constructor.ConstructorError(
+                problem=f"a value is not what its tag says ({told(error)})"
+            ) from error
+        except ValueError as error:  # such as 2001-99-99
+            if isinstance(error, (UnicodeError, Refused)):
+                raise
+            raise yaml.constructor.ConstructorError(problem=f"a value is not what it seems ({told(error)})") from error
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
         if node is not None and _count(node, {}) > _MOST_VALUES:
-            raise ValueError(f"{self.name} holds more than {_MOST_VALUES} values: shorten it, and use fewer aliases.")
+            raise Refused(f"{self.name} holds more than {_MOST_VALUES} values: shorten it, and use fewer aliases.")
         return node
 
 

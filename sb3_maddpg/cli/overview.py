@@ -14,6 +14,7 @@ from sb3_maddpg.iddpg import IDDPG
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.pretrained_models import pretrained_models
+from sb3_maddpg.utils import load_offer
 
 ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 
@@ -22,7 +23,7 @@ def load_environments() -> None:
     """Import the modules that register environments: the toy tasks, and those that packages name by an entry point."""
     importlib.import_module("sb3_maddpg.team_tasks")
     for entry_point in entry_points(group="sb3_maddpg.environments"):
-        entry_point.load()
+        load_offer(entry_point)
 
 
 def environments() -> list[str]:

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Protocol
 
+from sb3_maddpg.cli.terminal import tell
 from sb3_maddpg.ray_cluster import connect
 from sb3_maddpg.utils import suggest
 
@@ -44,7 +45,8 @@ class Job(Protocol):
 
 def run_all(jobs: Sequence[Job], parallel: int, engine: str = "local", address: str | None = None) -> int:
     """
-    Run commands to their end. SIGINT, SIGTERM and SIGHUP end all of them.
+    Run commands to their end. SIGINT, SIGTERM and SIGHUP end all of them, unless this process ignores the signal, as
+    under ``nohup``.
 
     :param jobs: the commands
     :param parallel: number of processes at a time
@@ -63,8 +65,10 @@ def run_all(jobs: Sequence[Job], parallel: int, engine: str = "local", address: 
     runs = _ClusterProcesses(address, parallel) if engine == "ray" else _Processes()
     handlers = {}
     for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name) and threading.current_thread() is threading.main_thread():
-            number = getattr(signal, name)
+        number = getattr(signal, name, None)
+        if number is None or threading.current_thread() is not threading.main_thread():
+            continue
+        if signal.getsignal(number) is not signal.SIG_IGN:
             handlers[number] = signal.signal(number, _as_exit)
     failed = 0
     try:
@@ -78,7 +82,7 @@ def run_all(jobs: Sequence[Job], parallel: int, engine: str = "local", address: 
                 runs.stop()
                 if not isinstance(error, KeyboardInterrupt):
                     raise
-                print("Interrupted; repeat the command to continue.", flush=True)
+                tell("Interrupted; repeat the command to continue.")
                 failed = 128 + signal.SIGINT
     finally:
         runs.close()
@@ -99,13 +103,13 @@ class _Processes:
         """Run a command and return its exit status."""
         words, what = job.command()
         if not words:
-            print(f"{job.name}: {what}", flush=True)
+            tell(f"{job.name}: {what}")
             return 0
         with self._lock, job.output.open("ab") as file:
             if self._stopped:
                 return 1
             process = subprocess.Popen(
-                [sys.executable, "-m", "sb3_maddpg", *words],
+                [*_launcher(), *words],
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
@@ -113,7 +117,7 @@ class _Processes:
                 preexec_fn=_end_with_parent if sys.platform == "linux" else None,
             )
             self._running.append(process)
-        print(f"{job.name}: {what}; {job.output}", flush=True)
+        tell(f"{job.name}: {what}; {job.output}")
         return _told(job, process.wait())
 
     def stop(self) -> None:
@@ -154,14 +158,14 @@ class _ClusterProcesses(_Processes):
                 return 1
             reference = self._start.remote(os.getcwd(), job)
             self._references.append(reference)
-        print(f"{job.name}: waits for a process of the cluster; {job.output}", flush=True)
+        tell(f"{job.name}: waits for a process of the cluster; {job.output}")
         try:
             status = self._ray.get(reference)
         except self._ray.exceptions.TaskCancelledError:
             return 1
         except self._ray.exceptions.RayError as error:
             reason = str(error).strip().splitlines()[-1]
-            print(f"{job.name}: lost {_RETRIES + 1} times ({reason})", flush=True)
+            tell(f"{job.name}: lost {_RETRIES + 1} times ({reason})")
             return 1
         return _told(job, status)
 
@@ -177,6 +181,17 @@ class _ClusterProcesses(_Processes):
             self._ray.shutdown()
 
 
+def _launcher() -> list[str]:
+    """
+    :return: the words that start ``sb3-maddpg`` in another process. ``-m`` alone would import modules from the current
+        folder before all others.
+    """
+    if sys.version_info >= (3, 11):
+        return [sys.executable, "-P", "-m", "sb3_maddpg"]
+    start = "import sys; del sys.path[0]; import runpy; runpy.run_module('sb3_maddpg', run_name='__main__')"
+    return [sys.executable, "-c", start]
+
+
 def _run_there(directory: str, job: Job) -> int:
     """Run a command in a process of a cluster."""
     os.chdir(directory)
@@ -185,7 +200,7 @@ def _run_there(directory: str, job: Job) -> int:
 
 def _told(job: Job, status: int) -> int:
     """Print how a command ended and return its exit status."""
-    print(f"{job.name}: {'finished' if status == 0 else f'ended with {status}, see {job.output}'}", flush=True)
+    tell(f"{job.name}: {'finished' if status == 0 else f'ended with {status}, see {job.output}'}")
     return abs(status)
 
 

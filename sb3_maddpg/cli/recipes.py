@@ -28,7 +28,7 @@ from sqlalchemy.exc import ArgumentError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
@@ -36,7 +36,7 @@ from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
 from sb3_maddpg.cli.options import did_you_mean, files_beside
 from sb3_maddpg.cli.overview import packaged_recipes
 from sb3_maddpg.utils import arguments_of, shown, suggest
-from sb3_maddpg.validation import Arguments, validated_as
+from sb3_maddpg.validation import Arguments, NormalizationArguments, validated_as
 
 # Arguments of the algorithm that come from the command line
 COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
@@ -47,6 +47,8 @@ SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 # Maximum number of parallel environments
 MOST_COPIES = 10_000
 SIMPLE = (int, float, bool, str, type(None))
+# Keys of a recipe that hold a dict, or text with one
+DICTS = ("env_kwargs", "eval_env_kwargs", "monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_kwargs")
 
 
 def at_least(low: int, otherwise: int | None = None) -> AfterValidator:
@@ -149,7 +151,7 @@ def _schedule(value: Any) -> Any:
     text = value.removeprefix("lin_") if isinstance(value, str) else value
     try:
         number = math.nan if isinstance(value, bool) else float(text)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError("write a finite number, or lin_NUMBER for one that decreases linearly to zero")
@@ -158,6 +160,14 @@ def _schedule(value: Any) -> Any:
 
 def _literal(value: Any) -> Any:
     return parse_literal(value) if isinstance(value, str) else value
+
+
+def _normalization(given: dict[str, Any]) -> dict[str, Any]:
+    """Check the arguments of ``VecNormalize``."""
+    parameters = inspect.signature(VecNormalize).parameters
+    arguments = {name: parameters[name].default for name in NormalizationArguments.model_fields}
+    checked = validated_as(NormalizationArguments, {**arguments, **given}, str)
+    return {name: checked[name] for name in given}
 
 
 def _noise_type(name: str) -> str:
@@ -171,6 +181,8 @@ Count = Annotated[PositiveInt, BeforeValidator(_number)]
 NotNegative = Annotated[float, Field(ge=0)]
 Copies = Annotated[Count, at_most(MOST_COPIES)]
 KeywordArguments = Annotated[dict[str, Any], BeforeValidator(_literal)]
+Normalization = bool | Annotated[dict[str, Any], BeforeValidator(_literal), AfterValidator(_normalization)]
+Named = str | dict[str, Any] | list[str | dict[str, Any]] | None
 
 
 class ZooKeys(Arguments):
@@ -181,17 +193,17 @@ class ZooKeys(Arguments):
     n_timesteps: Count
     policy: str | type[BasePolicy]
     n_envs: Copies = 1
-    callback: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
+    callback: Named = None
     env_kwargs: KeywordArguments | None = None
-    env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
+    env_wrapper: Named = None
     eval_env_kwargs: KeywordArguments | None = None
     frame_stack: Copies | None = None
     monitor_kwargs: KeywordArguments | None = None
     noise_type: Annotated[str, AfterValidator(_noise_type)] | None = None
     noise_std: Annotated[NotNegative | None, BeforeValidator(_number), Field(validate_default=True)] = None
-    normalize: bool | KeywordArguments = False
+    normalize: Normalization = False
     vec_env: str | None = None
-    vec_env_wrapper: str | dict[str, Any] | list[str | dict[str, Any]] | None = None
+    vec_env_wrapper: Named = None
 
     @field_validator("noise_std")
     @classmethod
@@ -201,10 +213,21 @@ class ZooKeys(Arguments):
         return noise_std
 
 
+class ShownKeys(Arguments):
+    """Keys of the settings of a run that rl_zoo3 reads in order to show it."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    env_kwargs: KeywordArguments | None = None
+    env_wrapper: Named | type = None
+    frame_stack: Copies | None = None
+    normalize: Normalization | None = False
+    vec_env_wrapper: Named | type = None
+
+
 class MonitorArguments(Arguments):
     """Arguments of Stable-Baselines3's ``Monitor`` that a recipe may set."""
 
-    filename: str | None = None
     allow_early_resets: bool = True
     reset_keywords: tuple[str, ...] = ()
     info_keywords: tuple[str, ...] = ()
@@ -276,12 +299,37 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     checked = validated_as(model, hyperparams, lambda name: f"{source}: {name}")
     found = {key: checked[key] for key in hyperparams}
     check_policy_kwargs(algo, found)
+    if found.get("noise_std") is not None and "noise_type" not in found:
+        raise ValueError(f"{source}: noise_std={found['noise_std']} needs noise_type: normal or ornstein-uhlenbeck.")
     validated_as(MonitorArguments, found.get("monitor_kwargs") or {}, lambda name: f"{source}: monitor_kwargs: {name}")
     for key in ("env_wrapper", "vec_env_wrapper", "callback"):
         for name, arguments in _classes(found.get(key)):
             _check_call(key, name, arguments)
+    if isinstance(policy := found["policy"], str) and "." in policy:  # which rl_zoo3 imports
+        _class_named("policy", policy, "sb3_maddpg.MADDPGPolicy")
     if isinstance(buffer := found.get("replay_buffer_class"), str):
         found["replay_buffer_class"] = _replay_buffer(buffer)
+    return found
+
+
+def check_shown(settings: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """
+    Check the settings of a run that rl_zoo3 reads in order to show it.
+
+    :param settings: settings of the run
+    :param source: the file, for error messages
+    :return: those that are set, as rl_zoo3 expects them
+    :raises ValueError: if a value is invalid
+    """
+    checked = validated_as(ShownKeys, settings, lambda name: f"{source}: {name}")
+    found = {key: value for key, value in checked.items() if key in settings and value is not None}
+    for key in ("env_wrapper", "vec_env_wrapper"):
+        for name, arguments in _classes(found.get(key)):
+            _check_call(key, name, arguments, source)
+    if found.get("normalize"):
+        found["normalize_kwargs"] = found["normalize"]
+    if isinstance(buffer := settings.get("replay_buffer_class"), str):
+        found["replay_buffer_class"] = buffer
     return found
 
 
@@ -357,12 +405,17 @@ def _replay_buffer(name: str) -> type[ReplayBuffer]:
     """:return: the replay buffer class that a recipe names, by a dotted path or as in rl_zoo3's recipes"""
     if name == "HerReplayBuffer":
         return HerReplayBuffer
+    return _class_named("replay_buffer_class", name, "sb3_maddpg.PrioritizedTeamReplayBuffer")
+
+
+def _class_named(key: str, name: str, example: str) -> Any:
+    """:return: what a dotted path in a recipe names"""
     try:
         return get_class_by_name(name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise ValueError(
-            f"replay_buffer_class: {name} in the recipe cannot be imported ({error}). Use the dotted path of a class, "
-            f"such as sb3_maddpg.PrioritizedTeamReplayBuffer. {_OF_WHICH}"
+            f"{key}: {name} in the recipe cannot be imported ({error}). Use the dotted path of a class, such as "
+            f"{example}. {_OF_WHICH}"
         ) from error
 
 
@@ -380,15 +433,15 @@ def _classes(value: Any) -> list[tuple[str, Any]]:
         return [found for one in value for found in _classes(one)]
     if isinstance(value, dict):
         return [(str(name), arguments) for name, arguments in value.items()]
-    return [(value, {})] if isinstance(value, str) else [(str(name), {}) for name in value or ()]
+    return [(value, {})] if isinstance(value, str) else []
 
 
-def _check_call(key: str, name: str, arguments: Any) -> None:
+def _check_call(key: str, name: str, arguments: Any, source: str = "the recipe") -> None:
     """Check that a class of a recipe exists and can be called with its arguments."""
-    where = f"{key}: {name} in the recipe"
+    where = f"{key}: {name} in {source}"
     try:
         found = get_class_by_name(name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise ValueError(f"{where} cannot be imported ({error}). {_OF_WHICH}") from error
     if not callable(found):
         raise ValueError(f"{where} is not a class. Use the dotted path of one.")

@@ -14,12 +14,13 @@ from typing import Any
 import optuna
 from huggingface_sb3 import EnvironmentName
 from optuna.storages import BaseStorage, JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
+from optuna.storages.journal._file import get_lock_file
 from optuna.trial import TrialState
 
 from sb3_maddpg.cli.options import PROG
 from sb3_maddpg.cli.processes import run_all
-from sb3_maddpg.utils import process_runs, shown
+from sb3_maddpg.utils import process_runs, told
 
 STUDY = "search"
 _IDENTITY = "SB3_MADDPG_WORKER"  # environment variable with the identity that a worker keeps when it is restarted
@@ -53,10 +54,65 @@ def open_storage(storage: str) -> BaseStorage | str:
             # A line without end may be one that another worker is writing
             if first and (first.endswith(b"\n") or not first.startswith(b"{")):
                 json.loads(first)["op_code"]
+            _end_last_line(as_absolute(storage))
         return JournalStorage(JournalFileBackend(as_absolute(storage)))
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        told = shown(f"{type(error).__name__}: {error}")
-        raise ValueError(f"--storage {storage} is not a journal of Optuna ({told}): name another file.") from error
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RecursionError) as error:
+        raise ValueError(
+            f"--storage {storage} is not a journal of Optuna ({told(error)}): name another file."
+        ) from error
+
+
+def _end_last_line(path: str) -> None:
+    """Remove the unfinished last line that a power loss left in a journal. Optuna would append to it."""
+    if _without_end(path) == 0:
+        return
+    with get_lock_file(JournalFileSymlinkLock(path)):  # without it, another worker may be writing the line
+        unfinished = _without_end(path)
+        with Path(path).open("rb+") as file:
+            file.seek(-unfinished, os.SEEK_END)
+            try:
+                json.loads(file.read())["op_code"]
+            except (ValueError, KeyError, TypeError, IndexError, RecursionError):
+                file.seek(-unfinished, os.SEEK_END)
+                file.truncate()
+            else:
+                file.write(b"\n")  # an editor may have removed it
+
+
+def _without_end(path: str) -> int:
+    """:return: number of bytes after the last complete line of a file"""
+    with Path(path).open("rb") as file:
+        end = file.seek(0, os.SEEK_END)
+        tail = b""
+        while len(tail) < end and b"\n" not in tail:
+            size = min(2 * len(tail) + 4096, end)
+            file.seek(-size, os.SEEK_END)
+            tail = file.read(size)
+    return len(tail) - tail.rfind(b"\n") - 1
+
+
+def check_trials(study: optuna.Study, storage: str) -> None:
+    """
+    Check the trials of a study, since a storage may have been edited.
+
+    :param study: a study
+    :param storage: value of ``--storage``
+    :raises ValueError: if a value of a trial cannot be one
+    """
+    try:
+        for trial in study.get_trials(deepcopy=False):
+            optuna.trial.create_trial(
+                state=trial.state,
+                values=trial.values,
+                params=trial.params,
+                distributions=trial.distributions,
+                intermediate_values=trial.intermediate_values,
+            )
+            numbers = [*(trial.values or ()), *trial.intermediate_values, *trial.intermediate_values.values()]
+            if any(isinstance(one, bool) or not isinstance(one, (int, float)) for one in numbers):
+                raise TypeError(f"trial {trial.number} has values that are no numbers")
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+        raise ValueError(f"--storage {storage} is damaged ({told(error)}): name another one.") from error
 
 
 def as_absolute(storage: str) -> str:

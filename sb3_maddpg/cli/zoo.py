@@ -4,9 +4,11 @@ import argparse
 import difflib
 import functools
 import os
+import re
 import runpy
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,12 +25,12 @@ except ImportError as error:
     raise ImportError(f"{error}. This needs the extra 'zoo': in the clone, pip install -e '.[zoo]'.") from error
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, get_latest_run_id, get_saved_hyperparams
+from rl_zoo3.utils import ALGOS
 
 from sb3_maddpg import parallel
 from sb3_maddpg.checkpoints import newest
 from sb3_maddpg.cli import pettingzoo_ids
-from sb3_maddpg.cli.command_files import COMMAND_FILE, read_command, recipe_of, resumable
+from sb3_maddpg.cli.command_files import COMMAND_FILE, latest_run_number, read_command, recipe_of, resumable
 from sb3_maddpg.cli.experiment import CHECKPOINTS, Checkpoints, TeamExperimentManager
 from sb3_maddpg.cli.interrupts import noticed_interrupts
 from sb3_maddpg.cli.literals import StoreValues
@@ -44,8 +46,8 @@ from sb3_maddpg.cli.options import (
 from sb3_maddpg.cli.overview import ALGORITHMS, load_environments, overview, packaged_recipes
 from sb3_maddpg.cli.parameter_sharing import SharedPolicy, shares_parameters
 from sb3_maddpg.cli.processes import ENGINES
-from sb3_maddpg.cli.recipes import LengthOption, check_options
-from sb3_maddpg.cli.safety import check_run, check_words, no_code_from_files
+from sb3_maddpg.cli.recipes import LengthOption, check_env_kwargs, check_options
+from sb3_maddpg.cli.safety import check_links, check_words, no_code_from_files, run_settings, shown_with
 from sb3_maddpg.cli.search import search
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
@@ -87,14 +89,15 @@ def packaged_config(algo: str, env_id: str) -> str | None:
     return None
 
 
-def train(argv: list[str]) -> int:
+def train(argv: list[str], name: str = "") -> int:
     """
     Train like rl_zoo3, but with checkpoints and, by default, with the packaged recipe.
 
     :param argv: arguments of the command
+    :param name: name of the command on the screen, by default train or tune
     :return: exit status
     """
-    name = "tune" if "-optimize" in argv else "train"
+    name = name or ("tune" if "-optimize" in argv else "train")
     resuming = _resuming(name)
     asked, argv = resuming.parse_known_args(argv)
     if helps(argv):
@@ -136,13 +139,21 @@ def _train(name: str, argv: list[str], checkpoints: Checkpoints | None) -> int:
         path = packaged_config(known.algo, known.env)
         argv += ["--conf-file", path] if path is not None else []
     manager = rl_zoo3.train.ExperimentManager
-    with_checkpoints: Any = functools.partial(cast(Any, manager), checkpoints=checkpoints)
+    with_checkpoints: Any = functools.partial(cast(Any, manager), checkpoints=checkpoints, given_seed=_seed_of(argv))
     rl_zoo3.train.ExperimentManager = with_checkpoints  # type: ignore[misc]
     try:
         _call(rl_zoo3.train.train, name, argv)
     finally:
         rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
     return 0
+
+
+def _seed_of(argv: list[str]) -> int | None:
+    """:return: value of ``--seed``; rl_zoo3 replaces a missing or negative one by a random number"""
+    parser = argparse.ArgumentParser(add_help=False)  # rl_zoo3 accepts abbreviations
+    parser.add_argument("--seed", default="")
+    seed = parser.parse_known_args(argv)[0].seed
+    return int(seed) if re.fullmatch(r"[0-9]{1,18}", seed) else None
 
 
 def _packaged(recipe: Path) -> list[str]:
@@ -153,7 +164,7 @@ def _packaged(recipe: Path) -> list[str]:
 
 def _in_processes(name: str, asked: argparse.Namespace, argv: list[str]) -> int:
     """Run trainings of several seeds, or the workers of a search, in processes of their own."""
-    if asked.seeds is None and name == "train":
+    if asked.seeds is None and name != "tune":
         raise ValueError("--jobs, --engine and --address are for --seeds: a single training runs in this process.")
     if asked.resume is not None:
         raise ValueError("--resume continues one run; --seeds resumes the runs of its command automatically.")
@@ -200,7 +211,8 @@ def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, l
         raise ValueError(f"{run} has no complete checkpoint.")
     folder = Path.cwd() if command.folder is None and trusted(None) else command.folder
     if folder is None:
-        check_words(command.argv, str(run / COMMAND_FILE))
+        check_links(run)
+        check_words(command.argv, run, str(run / COMMAND_FILE))
     words = [*command.argv, "-i", str(path / "model.zip")]
     if command.folder is not None and (recipe := recipe_of(words)) is not None:
         words += _packaged(recipe)  # a file of this name in the current folder is not the one that was meant
@@ -217,20 +229,18 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     parser.add_argument("--env-kwargs", nargs="+", action=StoreValues, default={})
     known, rest = parser.parse_known_args(argv)
     rest += ["--n-timesteps", str(known.n_timesteps)]
-    algorithm = None
+    exp_id, algorithm, shows = known.exp_id, None, cast("AbstractContextManager[None]", nullcontext())
     if not helps(rest):
         check_options(known, LengthOption)
         _check(known)
-        name = EnvironmentName(known.env)
-        exp_id = known.exp_id or get_latest_run_id(str(Path(known.folder, known.algo)), name)
-        run = Path(known.folder, known.algo, f"{name}_{exp_id}" if exp_id > 0 else "")
-        check_run(run / name, known.env)
-        with no_code_from_files():
-            hyperparams, _ = get_saved_hyperparams(str(run / name))
-        env_kwargs = {**hyperparams.get("env_kwargs", {}), **known.env_kwargs}
-        rest += ["--env", known.env]
-        # rl_zoo3 reads these values as Python; its own merging drops some of them
-        rest += ["--env-kwargs", *(f"{key}:{value!r}" for key, value in env_kwargs.items())] if env_kwargs else []
+        name, folder = EnvironmentName(known.env), Path(known.folder, known.algo)
+        exp_id = known.exp_id or latest_run_number(str(folder), name)
+        settings, env_kwargs = run_settings(
+            folder / f"{name}_{exp_id}" if exp_id > 0 else folder, known.env, known.env_kwargs
+        )
+        check_env_kwargs(known.env, env_kwargs)
+        shows = shown_with(settings, env_kwargs)
+        rest += ["--env", known.env, *(["--env-kwargs", "merged"] if env_kwargs else [])]
         if command == "enjoy" and "--no-render" not in rest:
             reason = "there is no display" if _is_headless() else f"{known.env} has no window to show"
             if _is_headless() or not _has_window(known.env, env_kwargs):
@@ -239,9 +249,9 @@ def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
         if shares_parameters(ALGOS[known.algo], known.env):
             algorithm = ALGOS[known.algo]
             ALGOS[known.algo] = SharedPolicy.loader(algorithm.load)
-    words = ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(known.exp_id), *rest]
+    words = ["--algo", known.algo, "--folder", known.folder, "--exp-id", str(exp_id), *rest]
     try:
-        with noticed_interrupts() as pressed:
+        with noticed_interrupts() as pressed, shows:
             _call(function, command, words)
     finally:
         if algorithm is not None:

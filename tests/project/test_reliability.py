@@ -1,5 +1,6 @@
-"""Short forms of the studies of kills, of damaged files, of solvers that fail and of random worlds."""
+"""Short forms of the studies of kills, of damaged files, of wrong commands, of solvers that fail, of random worlds."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
-from studies import random_worlds, solver_faults
+from studies import command_lines, random_worlds, solver_faults
 from studies.kills import POINTS
 from studies.swarm.protocol import condition
 
@@ -60,6 +61,24 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, seed):
     assert sum(row["count"] for row in rows) == 250
     assert {row["outcome"] for row in rows} == {"refused", "loaded"}
     assert len({row["file"] for row in rows}) == 8
+
+
+def test_wrong_commands_are_refused_in_one_line_or_harmless(tmp_path):
+    kinds = [one.__name__ for one in command_lines.KINDS]
+    done = study("command_lines", "--count", "250", "--seed", "3", "--json", str(tmp_path / "commands.json"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = read_rows(tmp_path / "commands.json")
+    assert sum(row["count"] for row in rows) == 250
+    assert {row["outcome"] for row in rows} == {"accepted", "usage", "one line"}
+    assert {row["kind"] for row in rows} == set(kinds)
+
+
+def test_the_study_of_wrong_commands_hears_what_a_command_does(tmp_path):
+    recorder = command_lines.Recorder(tmp_path / "here")
+    with recorder.listening() as caught:
+        (tmp_path / "elsewhere").write_text("")
+        os.system("true")
+    assert [one.split()[0] for one in caught] == ["open", "os.system"]
 
 
 @pytest.mark.parametrize("kind", solver_faults.KINDS)

@@ -4,6 +4,7 @@ import errno
 import importlib
 import importlib.metadata
 import json
+import os
 import re
 import shutil
 import signal
@@ -413,15 +414,24 @@ def test_a_damaged_checkpoint_is_passed_over(damage, tmp_path):
     assert before < last
 
 
-def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (errno.ENOSPC, "No space left for a checkpoint at step .*: the previous one stays"),
+        (errno.EDQUOT, "No space left for a checkpoint at step .*: the previous one stays"),
+        (errno.EIO, "No checkpoint at step .*: the previous one stays.*check the disk"),
+        (errno.EFBIG, "No checkpoint at step .*: the previous one stays.*raise the limit of file sizes"),
+    ],
+)
+def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch, number, told):
     expected = digest(make("replayed").learn(STEPS))
 
     def full(point: str) -> None:
         if point == "written model.zip" and len(list(tmp_path.glob("checkpoint-*"))) > 2:
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(checkpoints, "fault", full)
-    with pytest.warns(UserWarning, match="No space left for a checkpoint at step .*: the previous one stays"):
+    with pytest.warns(UserWarning, match=told):
         model = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
     assert digest(model) == expected, "the training goes on"
     assert not list(tmp_path.glob("*.unfinished"))

@@ -324,7 +324,7 @@ def _compare(args: argparse.Namespace) -> None:
         for row, condition in zip(rows, conditions, strict=True)
     ]
     footer = _footer(args, rows)
-    print(format_table(rows, args.wide), "", *footer, sep="\n", file=printed)
+    # Files first: printing may fail, and the pieces of the evaluation are gone
     if args.json:
         write_rows(args.json, rows)
     if args.csv:
@@ -332,6 +332,7 @@ def _compare(args: argparse.Namespace) -> None:
     if args.latex:
         comment = "".join(f"% {line}\n" for line in footer)
         write_text(args.latex, comment + _latex(table_texts(rows, args.wide)))
+    print(format_table(rows, args.wide), "", *footer, sep="\n", file=printed)
     for path in filter(None, (args.json, args.csv, args.latex)):
         if path != STDOUT:
             print(f"wrote {path}", file=printed)

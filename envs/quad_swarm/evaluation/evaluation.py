@@ -213,7 +213,7 @@ def _fly(
 
     if executor is None and (jobs == 1 or len(left) < 2):
         for k in left:
-            yield checked(k, *_flown(*work[k]))
+            yield checked(k, *_flown(_fly_piece, *work[k]))
         return
     for condition in dict.fromkeys(work[k][0] for k in left):
         if _pickled(condition) is None:
@@ -223,14 +223,14 @@ def _fly(
             )
     additions = _additions()
     with make_pool(jobs) if executor is None else nullcontext(executor) as pool:
-        futures = {pool.submit(_informed, additions, _flown, *work[k]): k for k in left}
+        futures = {pool.submit(_informed, additions, _flown, _fly_piece, *work[k]): k for k in left}
         for future in as_completed(futures):
             yield checked(futures[future], *future.result())
 
 
-def _flown(condition: Condition, episodes: range) -> tuple[dict[str, str], Rows]:
+def _flown(fly: Callable[..., Rows], condition: Condition, episodes: range) -> tuple[dict[str, str], Rows]:
     """Fly a piece of work, possibly on another machine, and return what made it, see `_origin`, and its rows."""
-    return _origin(condition), _fly_piece(condition, episodes)
+    return _origin(condition), fly(condition, episodes)
 
 
 def _depends_on(condition: Condition) -> tuple[set[str], list[Path]]:

@@ -94,7 +94,7 @@ def _load(policy: str, algo: str, stamp: tuple[int, ...]) -> Any:
     module_name, _, class_name = algo.partition(":")
     try:
         loader = functools.reduce(getattr, class_name.split("."), importlib.import_module(module_name))
-        load = loader.load  # type: ignore[attr-defined]
+        load = loader.load
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"--algo {algo!r} is not an importable module:Class with a `load` ({error}).") from error
     try:

@@ -211,8 +211,8 @@ def _check(descriptor: int, library: Path) -> None:
             if hasattr(os, "getuid") and (status.st_uid not in (os.getuid(), 0) or status.st_mode & 0o022):
                 raise ValueError("another user owns it or may write into it")
         expected = checksum.read().strip()
-    with open(descriptor, "rb", closefd=False) as file:
-        if hashlib.sha256(file.read()).hexdigest().encode() != expected:
+    with open(descriptor, "rb", closefd=False) as content:
+        if hashlib.sha256(content.read()).hexdigest().encode() != expected:
             raise ValueError("its checksum is wrong")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -117,10 +118,7 @@ def main(argv: list[str] | None = None) -> int:
         importlib.import_module(name)
     piped = args.out == Path("-")
     if args.out and not piped:
-        if args.out.is_dir():
-            raise ValueError(f"--out {args.out} is a folder: pass the path of a file.")
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=args.out.parent).close()  # fails here, not after the flights
+        _write(args.out, None)
     found = identify(args.plant)
     lines = [f"{'parameter':22}{args.plant:>22}{'bebop2':>10}"]
     for name in VEHICLE_PARAMETERS:
@@ -138,6 +136,24 @@ def main(argv: list[str] | None = None) -> int:
         if piped:
             sys.stdout.write(text)
         else:
-            args.out.write_text(text)
+            _write(args.out, text)
             print(f"wrote {args.out}")
     return 0
+
+
+def _write(path: Path, text: str | None) -> None:
+    """Write a file atomically, or, without a text, only check that it could be written. Missing folders are created.
+
+    :raises ValueError: if it cannot be written
+    """
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(0, "it is a folder")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            if text is not None:
+                part = Path(folder, path.name)
+                part.write_text(text, encoding="utf-8")
+                os.replace(part, path)
+    except OSError as error:
+        raise ValueError(f"--out {path} cannot be written: {error.strerror}; choose another path.") from error

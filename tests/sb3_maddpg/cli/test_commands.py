@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+import quad_swarm
+import sb3_maddpg
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.scenarios import SCENARIOS
-from sb3_maddpg import MADDPG
+from sb3_maddpg import MADDPG, typed_json
 from sb3_maddpg.cli import commands
 from sb3_maddpg.cli.commands import COMMANDS, examples, main
 from sb3_maddpg.cli.overview import ALGORITHMS, packaged_recipes
@@ -29,6 +31,7 @@ def test_every_command_helps_with_an_example(name, capsys):
     shown = capsys.readouterr().out
     assert "usage:" in shown
     assert examples(name).splitlines()[0].strip() in shown
+    assert f"usage: sb3-maddpg {name}" in shown
     assert not any(word in COMMANDS[name].examples for word in ("Swarm", "swarm"))
 
 
@@ -152,3 +155,41 @@ def test_ctrl_c_ends_any_command_with_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "Interrupted.\n"
     with pytest.raises(KeyboardInterrupt):
         main(["bench", "--debug"])
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out == f"sb3-maddpg {sb3_maddpg.__version__}\n"
+    assert quad_swarm.__version__ == sb3_maddpg.__version__
+
+
+@pytest.mark.parametrize(
+    ("group", "argv"),
+    [
+        ("environments", ["train", "--env", "OwnBit-v0"]),
+        ("environments", ["--help"]),
+        ("models", ["pretrained"]),
+        ("evaluators", ["evaluate", "--env", "Broken-v0"]),
+        ("replays", ["--help"]),
+        ("allowed_in_files", ["evaluate", "--policy", "pretrained:quad-swarm-flight"]),
+    ],
+)
+@pytest.mark.parametrize("code", ["import no_such_module", "raise RuntimeError('a\\nb')", "raise SystemExit(3)"])
+def test_a_package_that_cannot_be_loaded_is_named(group, argv, code, tmp_path, monkeypatch, capsys):
+    (tmp_path / "broken_package.py").write_text(code)
+    info = tmp_path / "their_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Name: their-package\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[sb3_maddpg.{group}]\nBroken-v0 = broken_package:thing\n")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    typed_json._load_entry_points.cache_clear()
+    try:
+        assert main(argv) == 2
+    finally:
+        typed_json._load_entry_points.cache_clear()
+    (told,) = capsys.readouterr().err.strip().splitlines()
+    assert f"their-package is installed, but its entry point sb3_maddpg.{group}: Broken-v0" in told

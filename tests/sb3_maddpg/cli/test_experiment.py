@@ -4,6 +4,7 @@ import errno
 import os
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,10 +12,12 @@ import gymnasium
 import numpy as np
 import pytest
 import yaml
+from stable_baselines3.common.logger import configure
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.commands import main
 from sb3_maddpg.cli.experiment import claim_folder
+from sb3_maddpg.team_tasks import OwnBit
 
 RECIPE = {
     "n_timesteps": 400,
@@ -28,6 +31,7 @@ RECIPE = {
 }
 WITHOUT_RL_ZOO3 = """
 import sys
+import tempfile
 sys.modules["rl_zoo3"] = None
 from sb3_maddpg import MADDPG
 model = MADDPG.load(sys.argv[1])
@@ -141,3 +145,16 @@ def test_a_team_of_another_size_goes_on_with_the_trained_networks(capsys):
     assert (resized.policy.team.n_agents, resized.num_timesteps, resized.gamma) == (5, 60, 0.5)
     assert resized.policy.net_arch == [8]
     assert (resized.policy.parameters_to_vector() == trained.policy.parameters_to_vector()).all()
+
+
+def test_trainings_leave_no_empty_folders_among_the_temporary_files(tmp_path, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    assert train("--verbose", "0") == 0
+    model = MADDPG("MlpPolicy", OwnBit(), learning_starts=20, batch_size=8, verbose=1)
+    model.learn(40).learn(20, reset_num_timesteps=False)
+    assert not list((tmp_path / "temporary").glob("SB3-*"))
+    own = configure(str(tmp_path / "SB3-own"), ["csv"])
+    model.set_logger(own)
+    model.learn(40)
+    assert (tmp_path / "SB3-own/progress.csv").exists()

@@ -4,9 +4,10 @@ import argparse
 
 import pytest
 import torch
+import yaml
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
-from sb3_maddpg.cli.literals import StoreValues, format_literal, parse_literal, parse_value
+from sb3_maddpg.cli.literals import BoundedLoader, StoreValues, format_literal, parse_literal, parse_value
 
 
 @pytest.mark.parametrize(
@@ -93,3 +94,37 @@ def test_an_option_is_key_and_value():
     for word in ("preset", "preset:", ":1", "n:nan"):
         with pytest.raises(ValueError, match=r"--env-kwargs .*Write key:value"):
             parser.parse_args(["--env-kwargs", word])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("-" * 3000 + "1", "nested too deeply|not evaluated|not valid Python"),
+        ("[" * 3000 + "]" * 3000, "neither a list nor a dict"),
+        ("not " * 3000 + "a", "nested too deeply|not evaluated|not valid Python"),
+        ("tuple(1)", r"tuple\(1\) needs a list or a tuple"),
+        ("list(5)", r"list\(5\) needs a list or a tuple"),
+        ("list('ab')", r"list\('ab'\) needs a list or a tuple"),
+        ("dict(a={(1, [2]): 3})", r"\(1, \[2\]\) cannot be the key of a dict"),
+        ("[!!timestamp 1]", "neither a list nor a dict"),
+        ("[!!int '']", "neither a list nor a dict"),
+        ("[!!bool 1, a b]", "neither a list nor a dict"),
+        ("[2001-99-99, a b]", "neither a list nor a dict"),
+    ],
+)
+def test_what_cannot_be_read_is_told_in_one_line(text, told):
+    with pytest.raises(ValueError, match=told) as refused:
+        parse_value(text)
+    assert len(str(refused.value)) < 500
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_sequences_may_be_written_as_calls():
+    assert parse_value("tuple([1, 2])") == (1, 2)
+    assert parse_value("list((1, 'a'))") == [1, "a"]
+
+
+@pytest.mark.parametrize("text", ["!!timestamp 1", "!!int ''", "!!bool 1", "2001-99-99", "!!float x", "!!set [1]"])
+def test_yaml_values_that_are_not_what_their_tags_say_are_errors_of_yaml(text):
+    with pytest.raises(yaml.YAMLError, match=r"a value is not what|expected a mapping"):
+        yaml.load(f"key: {text}", BoundedLoader)

@@ -1,11 +1,14 @@
 """Commands in processes of their own; what happens if they are killed is tested where they are used."""
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
-from sb3_maddpg.cli.processes import run_all
+from sb3_maddpg.cli.processes import _launcher, run_all
 
 
 @dataclass(frozen=True)
@@ -55,3 +58,49 @@ def test_commands_get_their_environment(tmp_path):
 def test_refuses_what_cannot_run(arguments, message):
     with pytest.raises(ValueError, match=message):
         run_all([], **arguments)
+
+
+# Modules that Python, multiprocessing or a command imports
+SHADOWED = ("pickle", "socket", "selectors", "signal", "yaml", "gymnasium", "runpy", "multiprocessing")
+TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.caught').touch()\nraise RuntimeError('caught')\n"
+
+
+def lay_traps(folder: Path) -> None:
+    for name in SHADOWED:
+        (folder / f"{name}.py").write_text(TRAP)
+
+
+@pytest.mark.parametrize("version", [(3, 10), (3, 11)])
+def test_a_child_imports_nothing_from_the_current_folder_but_from_pythonpath(version, tmp_path, monkeypatch):
+    if version > sys.version_info[:2]:
+        pytest.skip("this Python has no -P")
+    monkeypatch.setattr(sys, "version_info", (*version, 0, "final", 0))
+    lay_traps(tmp_path)
+    (tmp_path / "path").mkdir()
+    (tmp_path / "path/on_the_path.py").write_text("print('imported from PYTHONPATH')\n")
+    words = ["evaluate", "--gym-packages", "on_the_path", "--policy", "nope"]
+    env = {**os.environ, "PYTHONPATH": str(tmp_path / "path")}
+    done = subprocess.run([*_launcher(), *words], cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert "imported from PYTHONPATH" in done.stdout
+    assert not list(tmp_path.glob("*.caught")), done.stderr
+
+
+@pytest.mark.parametrize("words", [["--vec-env", "subproc", "-params", "n_envs:2"], ["--seeds", "0", "--jobs", "1"]])
+def test_processes_of_a_training_import_only_what_the_user_named(words, tmp_path):
+    pytest.importorskip("rl_zoo3")
+    pytest.importorskip("mpe2")
+    lay_traps(tmp_path)
+    (tmp_path / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
+    (tmp_path / "r.yml").write_text(
+        "default: {n_timesteps: 60, policy: MlpPolicy, learning_starts: 20, batch_size: 8}\n"
+    )
+    script = Path(sys.executable).with_name("sb3-maddpg")
+    if not script.exists():
+        pytest.skip("the command is not installed beside Python")
+    command = [str(script), "train", "--env", "my_team", "--conf-file", "r.yml", "--eval-freq", "-1", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
+    logs = "".join(path.read_text() for path in tmp_path.glob("logs/*.log"))
+    assert done.returncode == 0, done.stdout + done.stderr + logs
+    assert list(tmp_path.glob("logs/maddpg/my_team_1/my_team.zip"))
+    assert not list(tmp_path.glob("*.caught")), done.stderr

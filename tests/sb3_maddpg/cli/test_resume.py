@@ -242,7 +242,18 @@ def killed(tmp_path_factory) -> Path:
         (["--conf-file", "lurking"], "with lurking may run any code"),
         (["--conf", "lurking.py"], "with lurking.py may run any code"),
         (["--conf-file", "evil.yml"], "callback names 'lurking.Callback'"),
-        (["-optimize", "--sampler", "auto"], "may run any code"),
+        (["-optimize"], "may run any code"),
+        (["-optimize", "--sampler", "auto"], "has the option '--sampler'"),
+        (
+            [
+                "-params",
+                "callback:[{stable_baselines3.common.callbacks.CheckpointCallback: "
+                "{save_freq: 9, save_path: ../victim}}]",
+            ],
+            "save_path is '../victim', which may be a path outside",
+        ),
+        (["-params", "monitor_kwargs:{info_keywords: [a/b]}"], "info_keywords is 'a/b'"),
+        (["--track"], "has the option '--track'"),
     ],
 )
 def test_the_command_of_someone_elses_run_runs_no_code(killed, monkeypatch, capsys, words, told):

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sb3_maddpg.cli.command_files import read_command
 from sb3_maddpg.cli.commands import main
-from sb3_maddpg.cli.safety import RunLoader, check_names
+from sb3_maddpg.cli.safety import RunLoader, check_names, check_paths, check_words
 
 pytest.importorskip("rl_zoo3")
 SHORT = ["--env", "OwnBit-v0", "-n", "60", "-params", "learning_starts:20", "buffer_size:500", "--eval-freq", "-1"]
@@ -249,3 +250,169 @@ def test_a_package_in_the_present_folder_does_not_count_as_installed(tmp_path, m
     with pytest.raises(ValueError, match=r"names 'posing\.Wrapper'"):
         check_names({"env_wrapper": "posing.Wrapper"}, "OwnBit-v0", "file")
     assert not Path("caught").exists()
+
+
+@pytest.mark.parametrize("command", ["enjoy", "record"])
+@pytest.mark.parametrize("name", ["config.yml", "args.yml"])
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"--folder=other/x": 1},
+        {"--gym-packages=lurking\n": 1},
+        {"--reward-log=caught": 1},
+        {"-o": "caught"},
+        {"--": 1},
+        {"episode_length": "10 --folder=other"},
+    ],
+)
+def test_keys_of_a_run_are_no_options(run, capsys, monkeypatch, command, name, kwargs):
+    monkeypatch.delitem(sys.modules, "lurking", raising=False)
+    Path("lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
+    for folder in ("other", "other/x:1"):  # the folder that rl_zoo3 would be told to open
+        run_there = Path(folder, "maddpg/OwnBit-v0_1/OwnBit-v0")
+        run_there.mkdir(parents=True)
+        (run_there / "config.yml").write_text(yaml.safe_dump({"env_wrapper": {"os.mkdir": {"path": "caught"}}}))
+    change(run / name, env_kwargs=kwargs)
+    before = sorted(Path().rglob("*"))
+    argv = [command, "--env", "OwnBit-v0", "-n", "20", *(["--no-render"] if command == "enjoy" else [])]
+    assert main(argv) == 2
+    assert sorted(Path().rglob("*")) == before
+    printed = capsys.readouterr()
+    assert "Loading other" not in printed.out
+    assert "argument of OwnBit-v0" in printed.err or "episode_length='10 --folder=other'" in printed.err
+    assert len(printed.err.splitlines()) == 1
+
+
+def test_the_arguments_of_a_run_arrive_as_they_are_and_the_command_line_replaces_them(run, monkeypatch):
+    found = {}
+    monkeypatch.setattr("rl_zoo3.enjoy.create_test_env", lambda *args, **kwargs: found.update(kwargs) or 1 / 0)
+    change(run / "config.yml", env_kwargs={"episode_length": [1, "two\nthree", {"c": None}], "render_mode": "human"})
+    with pytest.raises(ZeroDivisionError):
+        main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render", "--env-kwargs", "render_mode:ansi"])
+    assert found["env_kwargs"] == {"episode_length": [1, "two\nthree", {"c": None}], "render_mode": "ansi"}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "name"),
+    [
+        ("env_wrapper", {"stable_baselines3.common.monitor.Monitor": {"filename": "{}/victim"}}, "filename"),
+        ("env_wrapper", {"stable_baselines3.common.monitor.Monitor": {"filename": "victim"}}, "filename"),
+        ("env_wrapper", [{"gymnasium.wrappers.RecordVideo": {"video_folder": "~/victim"}}], "video_folder"),
+        ("env_wrapper", [{"gymnasium.wrappers.RecordVideo": {"video_folder": b"../victim"}}], "video_folder"),
+        (
+            "vec_env_wrapper",
+            {"stable_baselines3.common.vec_env.VecMonitor": {"filename": "logs/../victim"}},
+            "filename",
+        ),
+        ("env_kwargs", {"notes": {"to": ["{}/victim"]}}, "to"),
+        ("env_kwargs", "dict(save_path='victim')", "save_path"),
+    ],
+)
+def test_a_run_names_no_path_outside_its_folder(run, capsys, key, value, name):
+    if key == "env_wrapper":
+        value = (
+            json.loads(json.dumps(value).replace("{}", str(Path.cwd()))) if b"" not in str(value).encode() else value
+        )
+    change(run / "config.yml", **{key: value})
+    before = sorted(Path().rglob("*"))
+    assert main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]) == 2
+    told = capsys.readouterr().err
+    assert f"config.yml: {name} is " in told
+    assert "may be a path outside" in told
+    assert "--trust" in told
+    assert sorted(Path().rglob("*")) == before
+
+
+def test_a_run_may_name_paths_in_its_folder_and_trusted_runs_any(run):
+    wrapper = "stable_baselines3.common.monitor.Monitor"
+    change(run / "config.yml", env_wrapper={wrapper: {"filename": str(run / "again")}})
+    argv = ["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]
+    assert main(argv) == 0
+    assert (run / "again.monitor.csv").exists()
+    change(run / "config.yml", env_wrapper={wrapper: {"filename": "elsewhere"}})
+    assert main([*argv, "--trust"]) == 0
+    assert Path("elsewhere.monitor.csv").exists()
+
+
+def test_paths_in_the_users_own_command_are_accepted(run, tmp_path):
+    (command,) = Path("logs").rglob("command.json")
+    values = {"quadrotor": "vehicles/mine.yml"}
+    with pytest.raises(ValueError, match=r"quadrotor is 'vehicles/mine\.yml', which may be a path outside"):
+        check_paths(values, run.parent, "config.yml", read_command(command.parent).argv)
+    check_paths(values, run.parent, "config.yml", ["--env-kwargs", "quadrotor:vehicles/mine.yml"])
+
+
+def test_links_in_a_run_do_not_lead_out_of_it(run, tmp_path, capsys):
+    (tmp_path / "victim").mkdir()
+    (run.parent / "videos").symlink_to(tmp_path / "victim")
+    (run.parent / "inside.zip").symlink_to(run.parent / "OwnBit-v0.zip")
+    assert main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]) == 2
+    assert "videos' is a link out of the run's folder" in capsys.readouterr().err
+    (run.parent / "videos").unlink()
+    assert main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--track"], "has the option '--track'"),
+        (["--trac"], "has the option '--trac'"),
+        (["--wandb-entity=them"], "has the option '--wandb-entity'"),
+        (["--storage", "victim.log"], "has the option '--storage'"),
+        (["--optimization-log-path", "victim"], "has the option '--optimization-log-path'"),
+        (["-tb", "/victim"], "--tensorboard-log is '/victim'"),
+        (["--tensorboard-log=victim"], "--tensorboard-log is 'victim'"),
+        (["--tensorb", "victim"], "has the option '--tensorb'"),
+    ],
+)
+def test_the_command_of_someone_else_writes_into_its_run_only(tmp_path, words, told):
+    with pytest.raises(ValueError, match=told):
+        check_words(["--env", "OwnBit-v0", *words], tmp_path, "command.json")
+    check_words(
+        ["--env", "OwnBit-v0", "-n", "-1", "--tensorboard-log", str(tmp_path / "curves")], tmp_path, "command.json"
+    )
+
+
+@pytest.mark.parametrize(
+    ("change_to", "told"),
+    [
+        ({"frame_stack": None}, None),
+        ({"frame_stack": {}}, "frame_stack={}"),
+        ({"frame_stack": -1}, "frame_stack=-1"),
+        ({"env_wrapper": [[1]]}, "env_wrapper=[[1]]"),
+        ({"env_wrapper": {"gymnasium.wrappers.TimeLimit": {}}}, "needs max_episode_steps"),
+        ({"env_wrapper": {"gymnasium.wrappers.TimeLimit": {"steps": 3}}}, "unexpected keyword argument 'steps'"),
+        ({"env_wrapper": {"gymnasium.wrappers.TimeLimit": 3}}, "has int 3 instead of arguments"),
+        ({"env_wrapper": {"gymnasium.wrappers.ReshapeObservation": {"shape": "x"}}}, "cannot wrap the environment"),
+        ({"env_wrapper": "gymnasium.wrappers.NoSuch"}, "gymnasium.wrappers.NoSuch"),
+        ({"vec_env_wrapper": 1}, "vec_env_wrapper=1"),
+        ({"vec_env_wrapper": {"stable_baselines3.common.vec_env.VecFrameStack": {}}}, "needs n_stack"),
+        ({"normalize": {"a": 1}}, "argument 'a'"),
+        ({"normalize": "dict(clip_obs='x')"}, "clip_obs='x'"),
+        ({"env_kwargs": "dict("}, "dict("),
+        ({"replay_buffer_class": None}, None),
+        ({"normalize": None}, None),
+    ],
+)
+def test_settings_of_a_run_are_checked(run, capsys, change_to, told):
+    change(run / "config.yml", **change_to)
+    status = main(["enjoy", "--env", "OwnBit-v0", "-n", "20", "--no-render"])
+    error = capsys.readouterr().err
+    assert status == (0 if told is None else 2), error
+    if told is not None:
+        assert told in error
+        assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["OwnBit-v0_²", "OwnBit-v0_٣", "OwnBit-v0_2x"])
+def test_folders_that_look_like_runs_are_passed_over(run, name):
+    Path("logs/maddpg", name).mkdir()
+    argv = ["--env", "OwnBit-v0", "-n", "20"]
+    assert main(["enjoy", *argv, "--no-render"]) == 0
+    assert main(["train", *SHORT, "--tensorboard-log", "tb"]) == 0
+    Path("tb/OwnBit-v0/MADDPG_1²").mkdir()
+    assert main(["train", *SHORT, "--tensorboard-log", "tb"]) == 0
+    assert sorted(path.name for path in Path("tb/OwnBit-v0").iterdir()) == ["MADDPG_1", "MADDPG_1²", "MADDPG_2"]
+    assert sorted(path.name for path in Path("logs/maddpg").iterdir() if path.name != name) == [
+        f"OwnBit-v0_{number}" for number in (1, 2, 3)
+    ]

@@ -1,5 +1,6 @@
 """Searches whose processes are killed: nothing that is finished is tried again, nothing that was begun is lost."""
 
+import errno
 import os
 import signal
 import socket
@@ -12,6 +13,7 @@ import optuna
 import pandas as pd
 import pytest
 import yaml
+from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 from processes import children, descendants
 
@@ -22,7 +24,7 @@ from sb3_maddpg.cli.search import bring_back, enlist, kept_search, open_storage,
 pytest.importorskip("rl_zoo3")
 RECIPE = {"n_timesteps": 400, "policy": "MlpPolicy", "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
 COMMAND = [sys.executable, "-m", "sb3_maddpg", "train", "-optimize", "--env", "OwnBit-v0", "--conf-file", "recipe.yml"]
-COMMAND += ["--n-evaluations", "2", "--n-eval-envs", "1", "--seed", "1", "--n-startup-trials", "2"]
+COMMAND += ["--n-evaluations", "2", "--n-eval-envs", "1", "--n-startup-trials", "2"]  # without a seed, as documented
 
 
 def start(*words: str) -> subprocess.Popen:
@@ -242,3 +244,97 @@ def test_the_command_for_the_best_recipe_can_be_pasted(capsys):
 def test_the_same_settings_name_the_same_search(tmp_path):
     assert kept_search(tmp_path, "Env-v0", ({"a": 1}, 2)) == kept_search(tmp_path, "Env-v0", ({"a": 1}, 2))
     assert kept_search(tmp_path, "Env-v0", ({"a": 1}, 2)) != kept_search(tmp_path, "Env-v0", ({"a": 1}, 3))
+
+
+def journal(path: Path) -> optuna.Study:
+    study = optuna.create_study(storage=open_storage(str(path)), study_name="s", direction="maximize")
+    for value in (1.0, 2.0):
+        trial = study.ask()
+        trial.suggest_float("tau", 0.001, 0.05)
+        trial.report(value, 1)
+        study.tell(trial, value)
+    return study
+
+
+@pytest.mark.parametrize("missing", [1, 2, 20, 60])
+def test_the_unfinished_last_line_of_a_journal_is_dropped(tmp_path, missing):
+    path = tmp_path / "t.log"
+    journal(path)
+    whole = path.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    path.write_bytes(whole[:-missing])
+    again = optuna.load_study(storage=open_storage(str(path)), study_name="s")
+    assert [trial.value for trial in again.trials] == [1.0, 2.0 if missing == 1 else None]
+    assert path.read_bytes() == (whole if missing == 1 else b"".join(lines[:-1]))
+    again.set_user_attr("a", 1)  # appends a line
+    assert optuna.load_study(storage=open_storage(str(path)), study_name="s").user_attrs == {"a": 1}
+    assert not list(tmp_path.glob("t.log.*"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"values":[2.0]', '"values":["two"]'),
+        ('"values":[2.0]', '"values":2.0'),
+        ('"values":[2.0]', '"values":[true]'),
+        ('"intermediate_value":2.0', '"intermediate_value":"x"'),
+        ('"step":1', '"step":"one"'),
+        ('"param_value_internal":', '"param_value_internal":"x","was":'),
+        ('"param_value_internal":', '"param_value_internal":9,"was":'),
+    ],
+)
+def test_edited_types_in_a_journal_are_told_in_one_line(tmp_path, monkeypatch, capsys, old, new):
+    monkeypatch.chdir(tmp_path)
+    journal(Path("t.log"))
+    text = Path("t.log").read_text()
+    assert old in text
+    Path("t.log").write_text(text.replace(old, new))
+    for words in (["-optimize", "--n-trials", "1"], ["--trial-id", "1"]):
+        assert main(["train", "--env", "OwnBit-v0", *words, "--storage", "t.log", "--study-name", "s"]) == 2
+        (told,) = capsys.readouterr().err.strip().splitlines()
+        assert told.startswith("error: --storage ")
+        assert "t.log is damaged" in told or "t.log is not a journal" in told
+        assert "name another" in told
+
+
+@pytest.mark.parametrize(
+    ("params", "told"),
+    [
+        ({"callback": "os.system"}, "callback names 'os.system', which may run any code"),
+        ({"env_wrapper": "lurking.Wrapper"}, "env_wrapper names 'lurking.Wrapper'"),
+        ({"net_arch": "huge"}, "which are no parameters of maddpg"),
+        ({"share_actor": "x"}, "which are no parameters of maddpg"),
+    ],
+)
+def test_the_trial_of_someone_else_names_no_code(tmp_path, monkeypatch, capsys, params, told):
+    monkeypatch.chdir(tmp_path)
+    study = optuna.create_study(storage=open_storage("t.log"), study_name="s", direction="maximize")
+    choices = {key: optuna.distributions.CategoricalDistribution([value]) for key, value in params.items()}
+    study.add_trial(optuna.trial.create_trial(value=1.0, params=params, distributions=choices))
+    argv = ["train", "--env", "OwnBit-v0", "--trial-id", "0", "--storage", "t.log", "--study-name", "s"]
+    assert main(argv) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_full_disk_during_a_search_is_told_and_the_search_goes_on_later(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("recipe.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "n_timesteps": 60}}))
+    words = ["train", *COMMAND[4:], "--n-trials", "2", "--verbose", "0"]
+    append, trials = JournalFileBackend.append_logs, []
+
+    def full(backend, logs):
+        trials.extend(log for log in logs if "values" in log)
+        if len(trials) == 2:
+            with open(backend._file_path, "ab") as file:
+                file.write(b'{"op_code":6,"wor')  # as far as there was space
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(backend, logs)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(JournalFileBackend, "append_logs", full)
+        assert main(words) == 2
+    error = capsys.readouterr().err
+    assert "No space left on device: free space, then repeat the command to continue" in error
+    assert "Should not reach" not in error
+    assert main(words) == 0
+    assert "The search continues after 1 finished trials" in capsys.readouterr().out

@@ -93,7 +93,7 @@ def _check_form(problem: OptimalControlProblem) -> None:
         raise _beyond("input_cost", "must be quadratic in the inputs")
     distance = ca.SX.sym("distance")
     squared = [problem.repulsion_cost(distance), problem.repulsion_residual(distance) ** 2]
-    if not _agree([distance], *squared, scale=2 * problem.config.separation):
+    if not _agree([distance], squared[0], squared[1], scale=2 * problem.config.separation):
         raise _beyond("repulsion_cost", "must be the square of repulsion_residual: change that method instead")
     columns = [ca.SX.sym(f"other{j}", 3) for j in range(n_others)]
     distances = problem.distances(x, ca.horzcat(*columns)) if n_others else []

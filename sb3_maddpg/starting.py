@@ -1,0 +1,36 @@
+"""Ctrl-C while the command ``sb3-maddpg`` is still importing its modules, before it can handle it."""
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from itertools import pairwise
+from typing import Any
+
+
+def _is_command() -> bool:
+    is_module = ("-m", "sb3_maddpg") in pairwise(sys.orig_argv)
+    return is_module or os.path.basename(sys.argv[0] if sys.argv else "").split(".")[0] == "sb3-maddpg"
+
+
+def _end(number: int, frame: Any) -> None:
+    os.write(2, b"Interrupted.\n")
+    os._exit(128 + number)  # an import could catch an exception
+
+
+def end_on_interrupt() -> None:
+    """End the command on Ctrl-C with one line, until ``interruptible``. Other programs keep Python's behaviour."""
+    if (
+        _is_command()
+        and multiprocessing.parent_process() is None
+        and threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ):
+        signal.signal(signal.SIGINT, _end)
+
+
+def interruptible() -> None:
+    """Let Ctrl-C raise ``KeyboardInterrupt`` again."""
+    if signal.getsignal(signal.SIGINT) is _end:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,0 +1,50 @@
+"""Ctrl-C while the command imports its modules."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+# Stands for an import that takes long: it sends Ctrl-C to itself
+SLOW = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nimport time\ntime.sleep(60)\n"
+
+
+@pytest.mark.parametrize("words", [["-m", "sb3_maddpg", "pretrained"], ["sb3-maddpg", "pretrained"]])
+def test_ctrl_c_during_the_imports_is_one_line(words, tmp_path):
+    (tmp_path / "torch.py").write_text(SLOW)
+    (tmp_path / "sb3-maddpg").write_text("from sb3_maddpg.cli.commands import main\nmain()\n")
+    if words[0] != "-m":
+        words = [str(tmp_path / words[0]), *words[1:]]
+    done = subprocess.run(
+        [sys.executable, *words], cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True
+    )
+    assert done.returncode == 128 + signal.SIGINT
+    assert done.stderr == "Interrupted.\n"
+
+
+def test_other_programs_keep_their_keyboard_interrupt(tmp_path):
+    (tmp_path / "torch.py").write_text(SLOW)
+    program = "try:\n    import sb3_maddpg\nexcept KeyboardInterrupt:\n    print('as usual')\n"
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True
+    )
+    assert done.stdout == "as usual\n", done.stderr
+
+
+def test_background_jobs_keep_ignoring_it(tmp_path):
+    (tmp_path / "torch.py").write_text(SLOW.replace("time.sleep(60)", "print('goes on', flush=True)\nos._exit(0)"))
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_maddpg", "pretrained"],
+        cwd=tmp_path,
+        env=environment(tmp_path),
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )
+    assert done.stdout == "goes on\n", done.stderr
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "HOME": str(folder)}
