@@ -94,7 +94,8 @@ class TeamReplayBuffer(ReplayBuffer):
 
     - ``agent_rewards``, (n_agents,): the agents' rewards, by default the team's reward for every agent;
     - ``agent_terminated``, (n_agents,): whether each agent terminated, by default none terminates before the team;
-    - ``agent_truncated``, (n_agents,): whether each agent was truncated although others go on, by default none was;
+    - ``agent_truncated``, (n_agents,): whether each agent was truncated although others go on, by default those that
+      act no more in the next step without having terminated;
     - ``agent_active``, (n_agents,): whether each agent acted, by default all did;
     - ``pair_rewards``, (n_agents, n_pairs), required if ``n_pairs`` is set: the part of an agent's reward that belongs
       to each of its neighbours.
@@ -358,7 +359,8 @@ class TeamReplayBuffer(ReplayBuffer):
         self._read_infos("agent_terminated", new.agent_terminated, infos, 0.0)
         some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
         if self._read_infos("agent_truncated", self._truncated, infos, 0.0) and self._truncated.any():
-            early = (self._truncated > 0) & (new.agent_active > 0) & (new.dones[:, None] == 0)
+            goes_on = (new.agent_active > 0) & (new.agent_terminated == 0) & (self._truncated == 0)
+            early = (self._truncated > 0) & (new.agent_active > 0) & goes_on.any(axis=1, keepdims=True)
             new.agent_active[early] = _TRUNCATED
             self.all_active &= not early.any()
         if self.n_pairs:
@@ -373,6 +375,8 @@ class TeamReplayBuffer(ReplayBuffer):
             # This observation takes the place of the last next observation. Where another episode begins although the
             # last one did not end, the last transition is treated as its end, like a time limit.
             self.dones[pos - 1][(self.observations[pos] != obs).any(axis=(1, 2))] = 1
+        if some_say and not new.agent_active.all():
+            self._mark_departures(obs, new.agent_active)
         self.observations[pos] = obs
         if self.optimize_memory_usage:
             self.observations[(pos + 1) % self.buffer_size] = next_obs
@@ -389,6 +393,22 @@ class TeamReplayBuffer(ReplayBuffer):
         if self.pos == self.buffer_size:
             self.full = True
             self.pos = 0
+
+    def _mark_departures(self, obs: np.ndarray, active: np.ndarray) -> None:
+        """
+        Agents that act no more, although they have not terminated, were truncated in the step before.
+
+        :param obs: the present observations, (n_envs, n_agents, columns)
+        :param active: column ``agent_active`` of the present step, (n_envs, n_agents)
+        """
+        if not self.n_added:
+            return
+        before = self._columns(self.numbers[self.pos - 1])
+        left = (active == 0) & (before.agent_active == 1) & (before.agent_terminated == 0) & (before.dones[:, None] == 0)
+        if left.any():
+            seen = self.observations[self.pos] if self.optimize_memory_usage else self.next_observations[self.pos - 1]
+            same_episode = (seen == obs).all(axis=(1, 2))
+            before.agent_active[left & same_episode[:, None]] = _TRUNCATED
 
     def _check(self, what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
         """

@@ -150,9 +150,11 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         if (acts & gone).any():
             name = team.names[np.flatnonzero(acts & gone)[0]]
             raise ValueError(
-                f"Agent {name} is active {where}, although it has terminated: set its agent_active to False."
+                f"Agent {name} is active {where}, although it has terminated or was truncated: set its agent_active to "
+                "False."
             )
-        gone |= np.asarray(info.get("agent_terminated", np.zeros(team.n_agents)), bool)
+        for name in ("agent_terminated", "agent_truncated"):
+            gone |= np.asarray(info.get(name, np.zeros(team.n_agents)), bool)
         if terminated or truncated:
             if env.has_wrapper_attr("n_curriculum_levels") and "is_success" not in info:
                 raise ValueError('CurriculumCallback needs info["is_success"] in the last step of an episode.')

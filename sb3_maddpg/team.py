@@ -33,7 +33,8 @@ class TeamInfo(TypedDict, total=False):
     terminates before the team."""
     agent_truncated: np.ndarray
     """Whether each agent was truncated in this step, (n_agents,) bool, although others go on. It bootstraps from its
-    last observation, while the others go on without it. By default, no agent is truncated before the team."""
+    last observation, while the others go on without it. By default, agents are truncated before the team that act no
+    more in the next step without having terminated."""
     agent_active: np.ndarray
     """Whether each agent acted in this step, (n_agents,) bool. By default, all agents acted."""
     pair_rewards: np.ndarray

@@ -145,6 +145,49 @@ def test_masks_appear_once_an_agent_did_not_act(n_steps):
     assert transition(memory, 0).active is None
 
 
+@pytest.mark.parametrize("kwargs", [{}, {"optimize_memory_usage": True, "handle_timeout_termination": False}])
+@pytest.mark.parametrize("said", [True, False])
+def test_who_was_truncated_before_the_others(kwargs, said):
+    memory = buffer(**kwargs)
+    cut = {"agent_truncated": [0, 1, 0]} if said else {}
+    episodes(memory, {}, cut, OUT, {**OUT, "done": True}, OUT)
+    batch = [transition(memory, row) for row in range(4)]
+    assert batch[0].next_truncated is None
+    assert batch[1].next_truncated.tolist() == [[0, 1, 0]]
+    assert batch[1].active.tolist() == batch[1].next_active.tolist() == [[1, 1, 1]]
+    assert [sample.next_truncated for sample in batch[2:]] == [None, None]
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        ({"agent_terminated": [0, 1, 0]}, OUT),
+        ({"done": True, "TimeLimit.truncated": True}, OUT),
+        ({"agent_truncated": [1, 1, 1], "done": True, "TimeLimit.truncated": True}, OUT),
+        ({"agent_truncated": [1, 1, 0], "agent_terminated": [0, 0, 1], "done": True}, OUT),
+        (OUT, {**OUT, "agent_truncated": [0, 1, 0]}),
+    ],
+)
+def test_nobody_was_truncated_before_the_others(steps):
+    memory = buffer()
+    episodes(memory, *steps)
+    assert transition(memory, 0).next_truncated is None
+
+
+def test_an_episode_that_is_broken_off_truncates_nobody():
+    for kwargs in ({}, {"optimize_memory_usage": True, "handle_timeout_termination": False}):
+        memory = buffer(**kwargs)
+        episodes(memory, {})
+        episodes(memory, OUT, start=5)
+        assert transition(memory, 0).next_truncated is None
+
+
+def test_a_time_limit_of_the_team_in_the_step_of_an_agents_own():
+    memory = buffer()
+    episodes(memory, {"agent_truncated": [1, 0, 0], "done": True, "TimeLimit.truncated": True})
+    assert transition(memory, 0).next_truncated.tolist() == [[1, 0, 0]]
+
+
 @pytest.mark.parametrize(
     ("steps", "rewards", "discounts", "dones", "end"),
     [
