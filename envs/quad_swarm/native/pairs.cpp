@@ -107,7 +107,8 @@ EXPORT void quad_swarm_believe(Integer n_pairs, Integer n_stages, Integer n_chos
 }
 
 // `ages` null: all answers are as old as `age`. `remembered` null: without memory. `believed` null: not needed.
-EXPORT void quad_swarm_receive(Integer n_pairs, Integer n_stages, Integer age, double dt, const Flag* arriving,
+EXPORT void quad_swarm_receive(Integer n_pairs, Integer n_stages, Integer age, double dt, double misfit,
+                               const Flag* arriving,
                                const double* received, const Integer* ages, const double* pos, const double* vel,
                                const Flag* remembers, const Integer* known_age, const double* known, double* remembered,
                                Integer* next_age, double* believed, Integer* source) {
@@ -116,7 +117,7 @@ EXPORT void quad_swarm_receive(Integer n_pairs, Integer n_stages, Integer age, d
   for (Integer k = 0; k < row; k++) times[k] = dt * static_cast<double>(k / 3 + 1);
   Integer answer = 0;
   for (Integer pair = 0; pair < n_pairs; pair++) {
-    bool arrives = arriving[pair];
+    bool arrives = arriving[pair], believes = remembers[pair];
     const double* plan = known + (row + 3) * pair;
     next_age[pair] = known_age[pair];
     if (arrives) {
@@ -125,12 +126,13 @@ EXPORT void quad_swarm_receive(Integer n_pairs, Integer n_stages, Integer age, d
       if (arrives) {
         plan = received + (row + 3) * answer;
         next_age[pair] = made;
+        believes = made < n_stages && distance(plan, pos + 3 * pair) <= misfit;
         if (remembered) std::memcpy(remembered + (row + 3) * pair, plan, (row + 3) * sizeof(double));
       }
       answer++;
     }
     if (!believed) continue;
-    source[pair] = arrives ? 2 : remembers[pair] ? 1 : 0;
+    source[pair] = !believes ? 0 : arrives ? 2 : 1;
     if (source[pair])
       std::memcpy(believed + row * pair, plan + 3, row * sizeof(double));
     else

@@ -19,10 +19,12 @@ from quad_swarm.native.build import BuildError, addresses, build, load
 
 _SOURCE = "pairs.cpp"
 _INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+_OF_BELIEVE = (np.float64, np.float64, np.float64, np.bool_)  # types of the arrays of a function
+_OF_RECEIVE = (np.bool_, np.float64, np.int64, np.float64, np.float64, np.bool_, np.int64, np.float64)
 _FUNCTIONS = {
     "quad_swarm_remember": [_INTEGER, _INTEGER, _REAL, *[_ARRAY] * 7],
     "quad_swarm_believe": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 6],
-    "quad_swarm_receive": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 12],
+    "quad_swarm_receive": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 12],
     "quad_swarm_approach": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 9],
     "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
     "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
@@ -62,7 +64,8 @@ def remember(
         later, age = advance(remembered), age + 1
         error = length(later[..., 0, :] - pos)
         return later, age, error, (age < n_stages) & (error <= memory)
-    remembered, age, pos = map(np.ascontiguousarray, (remembered, age, pos))
+    remembered, pos = np.ascontiguousarray(remembered, np.float64), np.ascontiguousarray(pos, np.float64)
+    age = np.ascontiguousarray(age, np.int64)
     later, next_age = np.empty_like(remembered), np.empty_like(age)
     error, remembers = np.empty(age.shape), np.empty(age.shape, dtype=bool)
     library.quad_swarm_remember(
@@ -93,7 +96,8 @@ def believe(
     if (library := compiled()) is None:
         steady = pos[..., None, :] + (dt * (chosen + 1))[:, None] * vel[..., None, :]
         return np.where(remembers[..., None, None], remembered.take(chosen + 1, axis=-2), steady)
-    arrays = [np.ascontiguousarray(array) for array in (pos, vel, remembered, remembers)]
+    kinds = zip((pos, vel, remembered, remembers), _OF_BELIEVE, strict=True)
+    arrays = [np.ascontiguousarray(array, kind) for array, kind in kinds]
     believed = np.empty((*pos.shape[:-1], len(chosen), 3))
     library.quad_swarm_believe(
         remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *addresses(chosen, *arrays, believed)
@@ -119,8 +123,10 @@ def receive(
     dt: float,
     memory: bool,
     predicts: bool = True,
+    misfit: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Take received plans instead of older ones.
+    """Take received plans instead of older ones. They are believed unless they were made N or more steps ago or
+    contradict the observation.
 
     :param known: what is known; received plans are written into ``known.remembered``, which is contiguous, if there is
         a memory
@@ -131,18 +137,25 @@ def receive(
     :param dt: length of a stage (s)
     :param memory: whether received plans are remembered
     :param predicts: whether to return more than the ages
+    :param misfit: largest distance between the observed position and that of a received plan which is believed (m)
     :return: ages of the newest plans, believed positions at the next N steps, (pairs, N, 3) (m), and where they come
         from, (pairs): 2 for a plan that arrives now, 1 for a remembered one, 0 for a constant velocity
+    :raises ValueError: if ``known.remembered`` cannot be written into
     """
     ages = age if isinstance(age, np.ndarray) else None
+    if memory:
+        _check_in_place("known.remembered", known.remembered)
     if (library := compiled()) is not None:
         arrays = [arriving, received if len(received) else None, None if ages is None or not len(ages) else ages]
-        arrays = [None if one is None else np.ascontiguousarray(one) for one in (*arrays, *known)]
+        arrays = [
+            None if one is None else np.ascontiguousarray(one, kind)
+            for one, kind in zip((*arrays, *known), _OF_RECEIVE, strict=True)
+        ]
         next_age = np.empty(arriving.shape, dtype=np.int64)
         believed = np.empty((*arriving.shape, received.shape[-2] - 1, 3)) if predicts else None
         source = np.empty(arriving.shape, dtype=np.int64) if predicts else None
         library.quad_swarm_receive(
-            *(arriving.size, received.shape[-2] - 1, 0 if ages is not None else age, dt),
+            *(arriving.size, received.shape[-2] - 1, 0 if ages is not None else age, dt, misfit),
             *addresses(*arrays, known.remembered if memory else None, next_age, believed, source),
         )
         return next_age, believed, source
@@ -156,9 +169,21 @@ def receive(
     next_age[arriving] = age
     if not predicts:
         return next_age, None, None
-    believed = believe(known.pos, known.vel, known.remembered, known.remembers, dt)
-    believed[arriving] = received[:, 1:]
-    return next_age, believed, np.where(arriving, 2, np.where(known.remembers, 1, 0))
+    remembers = known.remembers & ~arriving
+    believed = believe(known.pos, known.vel, known.remembered, remembers, dt)
+    fits = (age < received.shape[-2] - 1) & (length(received[:, 0] - known.pos[arriving]) <= misfit)
+    arriving = arriving.copy()
+    arriving[arriving] = fits
+    believed[arriving] = received[fits, 1:]
+    return next_age, believed, np.where(arriving, 2, np.where(remembers, 1, 0))
+
+
+def _check_in_place(name: str, array: np.ndarray) -> None:
+    """Check an array that is changed in place, of which the compiled code must not get a copy."""
+    if array.dtype != np.float64 or not array.flags.c_contiguous or not array.flags.writeable:
+        raise ValueError(
+            f"{name} is changed in place: it must be contiguous, writable and of the type float64, not {array.dtype}."
+        )
 
 
 @functools.cache
@@ -188,7 +213,8 @@ def approach(
         expected = believe(pos, vel, remembered, remembers, dt) - own[:, :, None, None]
         distances = length(plan[:, :, None] - expected)
         return distances.min(axis=-1), distances.argmin(axis=-1), distances[..., -1]
-    arrays = [np.ascontiguousarray(array) for array in (own, plan, pos, vel, remembered, remembers)]
+    arrays = [np.ascontiguousarray(array, np.float64) for array in (own, plan, pos, vel, remembered)]
+    arrays.append(np.ascontiguousarray(remembers, np.bool_))
     least, last = np.empty(remembers.shape), np.empty(remembers.shape)
     nearest = np.empty(remembers.shape, dtype=np.int64)
     n_others = remembers.shape[-1]
@@ -203,7 +229,9 @@ def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
 
     :param trajectories: believed trajectories of each robot's others, contiguous, (E, n, n - 1, N, 3) (m)
     :param later: time shift as a fraction of a step, (E, n) in [0, 1)
+    :raises ValueError: if the trajectories cannot be written into
     """
+    _check_in_place("trajectories", trajectories)
     if (library := compiled()) is None:
         pieces = np.diff(trajectories, axis=-2)
         pieces *= later[..., None, None, None]
@@ -211,7 +239,7 @@ def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
         trajectories[..., -1, :] += pieces[..., -1, :]
         return
     n_rows, n_stages = trajectories.shape[2:4]
-    later = np.ascontiguousarray(later)
+    later = np.ascontiguousarray(later, np.float64)
     library.quad_swarm_resample(later.size, n_rows, n_stages, *addresses(later, trajectories))
 
 
@@ -232,7 +260,7 @@ def keep_right(
     if (library := compiled()) is not None:
         others = np.array(others, dtype=float, order="C")
         clearance = np.zeros(others.shape[:-1])
-        x, known = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(known)
+        x, known = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(known, np.bool_)
         library.quad_swarm_keep_right(*others.shape[:3], width, dt, fade, slow, *addresses(x, known, others, clearance))
         return others, clearance
     velocity = (others[:, :, 1] - others[:, :, 0]) / dt
@@ -262,8 +290,9 @@ def neighbours(
         (E, n, m)
     """
     if (library := compiled()) is not None:
-        others, present = np.array(others, order="C"), np.array(present, order="C")
-        pos, vel, reverse = np.ascontiguousarray(pos), np.ascontiguousarray(vel), np.empty_like(others)
+        others, present = np.array(others, np.int64, order="C"), np.array(present, np.bool_, order="C")
+        pos, vel = np.ascontiguousarray(pos, np.float64), np.ascontiguousarray(vel, np.float64)
+        reverse = np.empty_like(others)
         library.quad_swarm_neighbours(*others.shape, limit, look_ahead, *addresses(pos, vel, others, present, reverse))
         return others, present, reverse
     n_swarms, n, m = others.shape

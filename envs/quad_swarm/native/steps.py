@@ -65,8 +65,8 @@ def measure(
     shape = (n_swarms, n, n - 1) if others is None else others.shape
     empty = np.empty if others is not None else _swarms_last
     if (library := pairs.compiled()) is not None:
-        positions, goals = np.ascontiguousarray(positions), np.ascontiguousarray(goals)
-        others = None if others is None else np.ascontiguousarray(others)
+        positions, goals = np.ascontiguousarray(positions, np.float64), np.ascontiguousarray(goals, np.float64)
+        others = None if others is None else np.ascontiguousarray(others, np.int64)
         measured = Measured(
             *(np.empty(n_swarms), np.empty(n_swarms)),
             *(empty(shape), empty(shape), empty(shape, bool), empty(shape, bool)),

@@ -1,13 +1,15 @@
 """Beliefs of each robot about the others' motion (Sec. III-C and IV-A).
 
-A robot believes, in order of preference: the plan it requested (made one step ago), the plan it received earlier, as
-long as it fits what the robot observes, and a constant velocity.
+A robot believes, in order of preference: the plan it requested (made one step ago), unless it is older than the horizon
+or grossly contradicts what the robot observes; the plan it received earlier, as long as it fits what the robot
+observes; and a constant velocity.
 
 Arrays have a leading axis of E swarms. Axes of length n - 1 list the others of a robot in ascending order.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -144,17 +146,27 @@ class Beliefs:
     :param memory: an earlier plan is believed as long as it predicts the observed position to within this distance (m)
         and is younger than N steps; 0 disables the memory
     :param n_others: number of others that a robot has beliefs about, by default all n - 1
+    :param misfit: a plan that arrives is believed if it is younger than N steps and predicts the observed position to
+        within this distance (m)
     :raises ValueError: if ``memory`` is negative or NaN
     """
 
     def __init__(
-        self, n_swarms: int, n_robots: int, horizon: int, dt: float, memory: float, n_others: int | None = None
+        self,
+        n_swarms: int,
+        n_robots: int,
+        horizon: int,
+        dt: float,
+        memory: float,
+        n_others: int | None = None,
+        misfit: float = math.inf,
     ):
         if not memory >= 0:
             raise ValueError(f"memory={memory}: it must be a distance in metres, or 0 to disable the memory.")
         self.horizon = horizon
         self.dt = dt
         self.memory = memory
+        self.misfit = max(misfit, memory)
         shape = (n_swarms, n_robots, n_robots - 1 if n_others is None else n_others)
         # Remembered positions now and at the next N steps, and steps since they were planned, N or more without a plan
         self._remembered = np.zeros((*shape, horizon + 1, 3))
@@ -254,7 +266,7 @@ class Beliefs:
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
         now = self.predict(pos, vel)
         known = pairs.Known(now.pos, now.vel, now.remembers, now.age, now.remembered)
-        arguments = (arriving, received, age, self.dt, bool(self.memory), predicts)
+        arguments = (arriving, received, age, self.dt, bool(self.memory), predicts, self.misfit)
         self._age, believed, source = pairs.receive(known, *arguments)
         self._remembered = now.remembered  # no one else uses it any more
         self._known = None

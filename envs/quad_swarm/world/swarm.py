@@ -24,6 +24,9 @@ from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig, points
 from quad_swarm.world.realisation import Realisation
 
+# Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
+# keeps less than half of it from the robot. In "flight-hard", plans are up to 0.15 m off, less than a fifth
+_MISFIT = 0.5
 # Distance (in separations) at which an empty slot shows a robot, far beyond all plans
 _NOBODY = 30.0
 
@@ -95,7 +98,7 @@ class Swarm:
         self.goal = np.zeros((n_swarms, n, 3))
         self.neighbours = Neighbours(n_swarms, n, config.neighbourhood)
         self.chance = Realisation(config, n_swarms)
-        beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others)
+        beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others, _MISFIT * config.planner.separation)
         self.beliefs = Beliefs(*beliefs)
         differ = config.radio.is_random or config.sensing.others
         self.presumed_beliefs = Beliefs(*beliefs) if differ else self.beliefs

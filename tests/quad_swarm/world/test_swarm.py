@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from quad_swarm.native import pairs
 from quad_swarm.native.pairs import advance
 from quad_swarm.planner import PlanStatus
 from quad_swarm.task.view import View
-from quad_swarm.world.beliefs import BeliefSource
+from quad_swarm.world.beliefs import Beliefs, BeliefSource
 from quad_swarm.world.presets import PRESETS, make_config
-from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
 
@@ -191,3 +192,30 @@ def test_planned_separation_is_the_distance_between_plans():
     plans = swarm.plans[0, :, 2:5, :3]
     between = np.linalg.norm(plans[0] - plans[2], axis=-1)
     assert swarm.planned_separation(3, swarm.neighbours.numbers())[0, 0, 1] == pytest.approx(between)
+
+
+@pytest.mark.parametrize(("delay", "believed"), [(1, True), (8, True), (9, False), (20, False)])
+def test_answers_older_than_the_horizon_are_not_believed(delay, believed):
+    """They say nothing about the next steps: whoever asks everybody must not be worse off than whoever asks nobody."""
+    config = make_config("paper", radio={"delay": delay}, memory=0)
+    swarm = Swarm(config, 8)
+    for k in range(8):
+        starts, goals = SCENARIOS["symmetric_swap"](4, config.space, np.random.default_rng(k))
+        swarm.reset(k, starts, goals)
+    sources = set()
+    for _ in range(25):
+        report = swarm.step(np.ones((8, 4, 3), bool))
+        sources |= set(np.unique(report.belief_source).tolist())
+    assert (2 in sources) == believed
+
+
+def test_answers_that_contradict_what_is_seen_are_not_believed():
+    beliefs = Beliefs(1, 2, 4, 0.1, memory=0.0, misfit=0.3)
+    pos, vel = np.zeros((1, 2, 1, 3)), np.full((1, 2, 1, 3), 1.0)
+    plans = np.zeros((2, 5, 3))
+    plans[1] = 0.31 / np.sqrt(3)  # where robot 1 asks for the plan of robot 0, it is 0.31 m off
+    known = pairs.Known(pos[0, :, 0], vel[0, :, 0], np.zeros(2, bool), np.full(2, 9), np.zeros((2, 5, 3)))
+    _, believed, source = pairs.receive(known, np.ones(2, bool), plans, 1, 0.1, False, True, beliefs.misfit)
+    assert source.tolist() == [2, 0]
+    assert not believed[0].any()
+    assert believed[1, 0] == pytest.approx([0.1] * 3), "a constant velocity"
