@@ -14,6 +14,8 @@ from quad_swarm.quadrotor import N_INPUTS, N_STATES
 _LARGEST_EXPONENT = 300.0  # of the repulsion, whose square is still far from overflow
 
 _LARGEST_NUMBER = 1e5  # m, m/s or rad: problems with larger numbers fail without a solve
+_IN_LINE = 1e-3  # distance of another robot from the line to the goal from which its sides differ (m)
+_ASIDE = 0.1  # how far a guess then ends beside the line (m)
 
 
 class FatropSolver:
@@ -59,7 +61,7 @@ class FatropSolver:
         for b in range(count):
             about_others = (problems.others[b].ravel(), clearance[b].ravel())
             parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others])
-            variables[program.x_index] = x_guess[b, 1:, :nx]
+            variables[program.x_index] = x_guess[b, 1:, :nx] + _aside(problems, b, horizon)[:, :nx]
             variables[program.u_index] = u_guess[b, :, :nu]
             if not (_is_sane(parameters) and _is_sane(variables)):
                 continue
@@ -77,6 +79,24 @@ class FatropSolver:
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"_program": None, "_solver": None}  # rebuilt on demand in another process
+
+
+def _aside(problems: Problems, row: int, horizon: int) -> np.ndarray:
+    """Return offsets of a guess to one side of the line to the goal, (N, 9): exactly in line with another robot, neither
+    side is nearer, and the solver would stop in front of it or fail.
+
+    :param problems: the batch
+    :param row: the problem
+    :param horizon: number of stages N
+    """
+    along = problems.goal[row, :2] - problems.x[row, :2]
+    others = problems.others[row, :, 0, :2] - problems.x[row, :2]
+    offsets = np.zeros((horizon, N_STATES))
+    distance = np.hypot(*along)
+    side = np.array([-along[1], along[0]]) / distance if distance > 1e-9 else np.array([0.0, 1.0])
+    if (np.abs(others @ side) < _IN_LINE).any():
+        offsets[:, :2] = side * _ASIDE * np.linspace(1 / horizon, 1, horizon)[:, None]
+    return offsets
 
 
 def _is_sane(numbers: np.ndarray) -> bool:

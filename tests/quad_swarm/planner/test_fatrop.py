@@ -10,8 +10,9 @@ import pytest
 from planning import QUADROTOR, crossing, hover
 
 from quad_swarm.planner import FatropSolver, OptimalControlProblem, PlannerConfig, PlanStatus, Problems, make_planner
+from quad_swarm.planner.base import Plans
 from quad_swarm.planner.fatrop import transcribe
-from quad_swarm.quadrotor import QuadrotorModel
+from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
 CONFIG = PlannerConfig()
 PROBLEM = OptimalControlProblem(CONFIG, QUADROTOR, 1)
@@ -154,3 +155,20 @@ def test_a_batch_solves_each_problem_as_if_alone():
     for b in range(5):
         alone = problems.part(slice(b, b + 1))
         assert np.array_equal(planner.plan(alone, hover(alone, config)).x[0], together.x[b])
+
+
+@pytest.mark.parametrize("gap", [0.7, 1.0, 1.5])
+def test_a_robot_exactly_in_line_is_flown_around(gap):
+    """Neither side is nearer: the solver stopped in front of it for ever."""
+    planner = make_planner(PlannerConfig(), QuadrotorParams(), 2, "fatrop")
+    x, goal = np.zeros((1, 9)), np.array([[2.0, 0.0, 1.5]])
+    x[0, :3] = -2.0, 0.0, 1.5
+    other = np.tile(np.array([-2 + gap, 0.0, 1.5]), (1, 1, planner.config.horizon, 1))
+    plans, closest = Plans.hover(x, planner.config.horizon), np.inf
+    for _ in range(60):
+        plans = planner.plan(Problems(x, goal, other), plans)
+        assert plans.status[0] == 0
+        x = planner.model.rollout(x, plans.u[:, :1])[:, 1]
+        closest = min(closest, float(np.linalg.norm(x[0, :3] - other[0, 0, 0])))
+    assert np.linalg.norm(x[0, :3] - goal[0]) < 0.1
+    assert closest > 0.59
