@@ -82,8 +82,8 @@ class FatropSolver:
 
 
 def _aside(problems: Problems, row: int, horizon: int) -> np.ndarray:
-    """Return offsets of a guess to one side of the line to the goal, (N, 9): exactly in line with another robot, neither
-    side is nearer, and the solver would stop in front of it or fail.
+    """Return offsets of a guess to one side of the line to the goal, (N, 9): exactly in line with another robot,
+    neither side is nearer, and the solver would stop in front of it.
 
     :param problems: the batch
     :param row: the problem
