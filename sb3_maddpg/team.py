@@ -317,8 +317,7 @@ class Team:
         if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and agent in numbers:
             return numbers.index(agent)
         positions = "" if named_by_integers else f", or 0 to {self.n_agents - 1}"
-        names = ", ".join(self.names if named_by_integers else map(repr, self.names))
-        raise ValueError(f"There is no agent {shown(agent)}: the agents are {names}{positions}.")
+        raise ValueError(f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}{positions}.")
 
     def homogeneous(self, agent: int, other: int) -> bool:
         """

@@ -182,7 +182,8 @@ class PolicyArguments(ThresholdArgument):
     agent_names: list[str] | tuple[str, ...] | None = Field(description="a list of names, one per agent, or None")
     normalize_images: bool = Field(description="True or False")
     image_columns: Sequence[Sequence[Annotated[Sequence[NaturalOrZero], Len(2, 2)]]] | None = Field(
-        description="for each agent and for the state, a list of first and end of the columns of an image, or None"
+        default=None,
+        description="for each agent and for the state, a list of first and end of the columns of an image, or None",
     )
 
     @field_validator("activation_fn")

@@ -193,7 +193,7 @@ def test_groups_by_name_and_number():
 @pytest.mark.parametrize(
     ("share", "message"),
     [
-        ([["mixed_0", "mixed_9"]], "There is no agent 'mixed_9'.*'mixed_0', 'mixed_1'"),
+        ([["mixed_0", "mixed_9"]], "There is no agent 'mixed_9'.*mixed_0, mixed_1"),
         ([[0, 6]], "There is no agent 6.*0 to 5"),
         ([["mixed_0", 1], [0]], "share_actor.* names an agent twice"),
         ([[2, 2]], "names an agent twice"),

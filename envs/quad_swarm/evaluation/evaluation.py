@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import pickle
 import sys
 import uuid
@@ -177,7 +178,8 @@ def _run_all(
     work: Sequence[tuple[Condition, range]], jobs: int, journal: Journal, executor: Executor | None
 ) -> list[Rows]:
     """Return the statistics of each piece of work, in order. Pieces in the journal are not flown again."""
-    keys = [_key(*piece) for piece in work]
+    of_condition = {condition: _condition_key(condition) for condition in dict.fromkeys(one for one, _ in work)}
+    keys = [_key(condition, episodes, of_condition[condition]) for condition, episodes in work]
     found = {k: journal.fetch(key) for k, key in enumerate(keys)}
     done: dict[int, Rows] = {k: rows for k, rows in found.items() if _fits(rows, work[k][1])}
     left = [k for k in range(len(work)) if k not in done]
@@ -277,10 +279,18 @@ def _fly_piece(condition: Condition, episodes: range) -> Rows:
     return run_episodes(condition, episodes)
 
 
-def _key(condition: Condition, episodes: range) -> str:
-    """Return the key of a piece of work, which includes the content of a model's file, or of a policy that is an
-    object."""
-    what: list[Any] = [replace(condition, policy=name_of(condition.policy)), episodes, _solver(condition), _additions()]
+def _key(condition: Condition, episodes: range, of_condition: str | None = None) -> str:
+    """Return the key of a piece of work.
+
+    :param of_condition: the condition's key, which takes milliseconds to compute
+    """
+    digest = hashlib.sha256(f"{of_condition or _condition_key(condition)} {episodes!r}".encode())
+    return digest.hexdigest()[:32]
+
+
+def _condition_key(condition: Condition) -> str:
+    """Return the key of a condition, which includes the content of a model's file, or of a policy that is an object."""
+    what: list[Any] = [replace(condition, policy=name_of(condition.policy)), _solver(condition), _additions()]
     if not isinstance(condition.policy, str):
         what.append(_pickled(condition.policy) or uuid.uuid4())  # what cannot be kept is flown again
     return Journal.key(repr(what), *_depends_on(condition))

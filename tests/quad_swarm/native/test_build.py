@@ -404,7 +404,7 @@ def test_a_cache_in_the_current_folder_works(monkeypatch, tmp_path):
 def test_a_compiler_of_c_is_named_as_the_cause(cache, tmp_path, monkeypatch):
     library = cache / "rti-x.so"
     cache.mkdir(parents=True, exist_ok=True)
-    (tmp_path / "x.cpp").write_text("#include <vector>\nint f(std::vector<int>& v) { v.resize(9); return v.at(3); }\n")
+    (tmp_path / "x.cpp").write_text("int of_no_library();\nint f() { return of_no_library(); }\n")
     command = [*build_module.compiler(), "-shared", "-fPIC", "-nodefaultlibs", str(tmp_path / "x.cpp")]
     subprocess.run([*command, "-o", str(library)], check=True)
     library.chmod(0o755)

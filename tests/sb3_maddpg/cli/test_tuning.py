@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
+import numpy as np
 import optuna
 import pytest
 import yaml
@@ -67,8 +68,9 @@ class Worse(OwnBit):
     """Pays the less, the later the trial."""
 
     def step(self, action):
-        observation, _, *rest = super().step(action)
-        return observation, float(-Counts.trials), *rest
+        observation, _, *ends, info = super().step(action)
+        reward = float(-Counts.trials)
+        return observation, reward, *ends, {**info, "agent_rewards": np.full(self.n_agents, reward)}
 
 
 @pytest.fixture
