@@ -121,7 +121,7 @@ class AgentPolicy(nn.Module):
         """
         :param obs: observations, (batch, obs_dim)
         :return: actions in the environment's units, in the data type of the agent's action space and within its bounds:
-            (batch, *shape of the space), but (batch, 1) for ``Discrete``
+            batch first and then the space's shape, but (batch, 1) for ``Discrete``
         """
         if self.limit is not None:
             obs = ((obs - self.mean) / self.std).clamp(-self.limit, self.limit).float()
@@ -147,7 +147,7 @@ class AgentPolicy(nn.Module):
 
         :param observation: an array, such as an image, or a flat observation, (obs_dim,), or a batch of flat ones,
             (batch, obs_dim), flattened as by Gymnasium's ``flatten``
-        :return: an action of the agent's action space, or a batch of them, (batch, *shape of the space), but (batch, 1)
+        :return: an action of the agent's action space, or a batch of them, batch first and then the space's shape, but (batch, 1)
             for ``Discrete``
         :raises ValueError: if the observation has another length or holds NaN or infinity
         """

@@ -97,7 +97,7 @@ def believe(
         steady = pos[..., None, :] + (dt * (chosen + 1))[:, None] * vel[..., None, :]
         return np.where(remembers[..., None, None], remembered.take(chosen + 1, axis=-2), steady)
     kinds = zip((pos, vel, remembered, remembers), _OF_BELIEVE, strict=True)
-    arrays = [np.ascontiguousarray(array, kind) for array, kind in kinds]
+    arrays: list[np.ndarray] = [np.ascontiguousarray(array, kind) for array, kind in kinds]
     believed = np.empty((*pos.shape[:-1], len(chosen), 3))
     library.quad_swarm_believe(
         remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *addresses(chosen, *arrays, believed)
