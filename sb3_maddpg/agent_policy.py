@@ -147,8 +147,8 @@ class AgentPolicy(nn.Module):
 
         :param observation: an array, such as an image, or a flat observation, (obs_dim,), or a batch of flat ones,
             (batch, obs_dim), flattened as by Gymnasium's ``flatten``
-        :return: an action of the agent's action space, or a batch of them, batch first and then the space's shape, but (batch, 1)
-            for ``Discrete``
+        :return: an action of the agent's action space, or a batch of them: batch first and then the space's shape, but
+            (batch, 1) for ``Discrete``
         :raises ValueError: if the observation has another length or holds NaN or infinity
         """
         flatten = (
