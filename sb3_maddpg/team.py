@@ -310,7 +310,8 @@ class Team:
         :return: the agent's index
         :raises ValueError: if there is no such agent
         """
-        if not isinstance(agent, bool) and str(agent) in self.names:  # also an environment's own ids, such as (0, 1)
+        # Also an environment's own ids, such as (0, 1); plain integers may be positions
+        if (type(agent) not in (bool, int) and not isinstance(agent, np.integer)) and str(agent) in self.names:
             return self.names.index(str(agent))
         named_by_integers = all(_INTEGER.fullmatch(name) for name in self.names)
         numbers = list(map(int, self.names)) if named_by_integers else range(self.n_agents)

@@ -26,7 +26,8 @@ GOOD = {
 
 def test_values_become_what_is_expected():
     given = {**GOOD, "threshold": "0.25", "n_critics": np.int64(2), "net_arch": (8, 8)}
-    assert validated(PolicyArguments, **given) == {**GOOD, "threshold": 0.25, "n_critics": 2, "net_arch": [8, 8]}
+    expected = {**GOOD, "threshold": 0.25, "n_critics": 2, "net_arch": [8, 8], "image_columns": None}
+    assert validated(PolicyArguments, **given) == expected
     assert validated(PairPolicyArguments, pair_credit="false", shared_threshold=True)["pair_credit"] is False
 
 
