@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import TYPE_CHECKING
 
@@ -155,6 +155,8 @@ class AgentPolicy(nn.Module):
             f"Flatten an observation as TeamEnv does: gymnasium.spaces.flatten(env.observation_space({self.name!r}), "
             "observation)."
         )
+        if isinstance(observation, Mapping) and self.name in observation:
+            raise ValueError(f"These are observations of several agents: pass observations[{self.name!r}] alone.")
         try:
             obs = th.as_tensor(as_numbers(observation))
         except ValueError:

@@ -404,9 +404,8 @@ class TeamReplayBuffer(ReplayBuffer):
         if not self.n_added:
             return
         before = self._columns(self.numbers[self.pos - 1])
-        left = (
-            (active == 0) & (before.agent_active == 1) & (before.agent_terminated == 0) & (before.dones[:, None] == 0)
-        )
+        left = (active == 0) & (before.agent_active == 1) & (before.agent_terminated == 0)
+        left &= before.dones[:, None] == 0
         if left.any():
             seen = self.observations[self.pos] if self.optimize_memory_usage else self.next_observations[self.pos - 1]
             same_episode = (seen == obs).all(axis=(1, 2))

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.callbacks import check_success
-from sb3_maddpg.parallel import TeamEnv, explained_reset
+from sb3_maddpg.parallel import TeamEnv, explained_reset, what_to_pass
 from sb3_maddpg.relational import NeighbourViews, check_layout
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
@@ -38,7 +38,7 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     if not isinstance(env, gymnasium.Env):
-        raise ValueError(f"{shown(env)} is neither a Gymnasium environment nor a PettingZoo ParallelEnv.")
+        raise ValueError(f"{shown(env)} is not an environment: {what_to_pass(env, 'check_team_env')}.")
     check_wrappers(env)
     names = env.get_wrapper_attr("agent_names") if env.has_wrapper_attr("agent_names") else None
     team = Team.from_spaces(env.observation_space, env.action_space, names)

@@ -9,7 +9,7 @@ import os
 import pathlib
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from operator import attrgetter
 from typing import Any, ClassVar, Literal, TypeVar, cast, get_args
@@ -63,7 +63,7 @@ from sb3_maddpg.model_files import (
 )
 from sb3_maddpg.networks import polyak_update, single_precision
 from sb3_maddpg.normalization import ObservationStatistics, for_team
-from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.parallel import TeamEnv, find_module, what_to_pass
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, MixedActions, Team, into_box, plain_joint_space
@@ -250,32 +250,33 @@ class MADDPG(OffPolicyAlgorithm):
                 raise ValueError(
                     f"replay_buffer_kwargs[{name!r}] is an argument of the algorithm: pass {name} to it instead."
                 )
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),  # a copy, since _read_env adds to it
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            policy_kwargs=dict(policy_kwargs or {}),
-            stats_window_size=given["stats_window_size"],
-            tensorboard_log=None if tensorboard_log is None else str(given["tensorboard_log"]),
-            verbose=given["verbose"],
-            device=device,
-            seed=given["seed"],
-            sde_support=False,
-            supported_action_spaces=ACTION_SPACES,
-            support_multi_env=True,
-        )
+        with _explained_id(env):
+            super().__init__(
+                policy,
+                env,
+                learning_rate,
+                buffer_size,
+                learning_starts,
+                batch_size,
+                tau,
+                gamma,
+                train_freq,
+                gradient_steps,
+                action_noise=action_noise,
+                replay_buffer_class=replay_buffer_class,
+                replay_buffer_kwargs=dict(replay_buffer_kwargs or {}),  # a copy, since _read_env adds to it
+                optimize_memory_usage=optimize_memory_usage,
+                n_steps=n_steps,
+                policy_kwargs=dict(policy_kwargs or {}),
+                stats_window_size=given["stats_window_size"],
+                tensorboard_log=None if tensorboard_log is None else str(given["tensorboard_log"]),
+                verbose=given["verbose"],
+                device=device,
+                seed=given["seed"],
+                sde_support=False,
+                supported_action_spaces=ACTION_SPACES,
+                support_multi_env=True,
+            )
         self.use_action_cost = use_action_cost
         self.threshold_price = threshold_price
         self.exploration_noise = exploration_noise
@@ -1306,6 +1307,27 @@ class MADDPG(OffPolicyAlgorithm):
         return ["policy", "actor.optimizer", "critic.optimizer"], []
 
 
+@contextmanager
+def _explained_id(env: Any) -> Iterator[None]:
+    """
+    Explain the error of Gymnasium about an id that it does not know.
+
+    :param env: an environment, or the id of one
+    :raises ValueError: instead of Gymnasium's error
+    """
+    try:
+        yield
+    except gymnasium.error.UnregisteredEnv as error:
+        name, what = str(env).removesuffix("/parallel_env").replace("/", "."), "the environment"
+        with suppress(ValueError):
+            if all(map(str.isidentifier, name.split("."))) and hasattr(find_module(name), "parallel_env"):
+                what = f"{name}.parallel_env()"
+        raise ValueError(
+            f"env={env!r} is no id that Gymnasium knows ({error}): pass {what} itself, or import the package that "
+            "registers the id first."
+        ) from error
+
+
 def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
     """
     Wrap an environment the way the algorithms train on it.
@@ -1317,10 +1339,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     :raises ValueError: if the spaces do not describe a team, or see ``check_vec_env``
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
-        raise ValueError(
-            f"env={shown(env)} is not an environment: pass a PettingZoo or Gymnasium environment, or a VecEnv of "
-            "Stable-Baselines3."
-        )
+        raise ValueError(f"env={shown(env)} is not an environment: {what_to_pass(env, 'the algorithm')}.")
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)

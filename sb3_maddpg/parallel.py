@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,12 +18,14 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
 from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
 MASK = "action_mask"
+_ADDRESS = re.compile(" at 0x[0-9a-fA-F]+")
 _LARGEST_REWARD = float(np.finfo(np.float32).max)
 _BLACK_DEATH = (
     "The wrapper {} keeps dead agents in the episode, which then hardly ever ends (in SuperSuit 3.11 only if all "
@@ -298,7 +301,9 @@ class TeamEnv(gymnasium.Env):
                 continue
             if one.get("is_success") is not None:
                 self._successes[agent] = self._flag(agent, "is_success", one["is_success"])
-            own = one.get("metrics") or {}
+            own = one.get("metrics")
+            if own is None:
+                continue
             if not isinstance(own, Mapping):
                 raise ValueError(
                     f"infos[{agent!r}]['metrics'] of {self.parallel_env} is {shown(own)} {self._when}: it must be a "
@@ -403,9 +408,12 @@ class TeamEnv(gymnasium.Env):
         """:return: the actions of the live agents, each in its own space"""
         values = np.asarray(action)
         if values.shape != self.action_space.shape:
+            what = f"is {shown(action)}, not an array of shape"
+            if isinstance(action, np.ndarray) and action.dtype != object:
+                what = f"has shape {values.shape}, not"
             raise ValueError(
-                f"The joint action has shape {values.shape}, not {self.action_space.shape}: it must be flat, agent "
-                f"after agent ({', '.join(self.agent_names)})."
+                f"The joint action {what} {self.action_space.shape}: it must be flat, agent after agent "
+                f"({', '.join(self.agent_names)})."
             )
         if values.dtype.kind not in "biuf" or not self._inside(values).all():
             self._refuse_action(values)
@@ -628,6 +636,11 @@ class TurnBased(ParallelEnv):
                 )
             seen = _space_of(env, "observation_space", agent)
             masked = isinstance(seen, spaces.Dict) and MASK in seen.spaces
+            if not masked and _mask_columns(seen):
+                raise ValueError(
+                    f"Agent {agent!r} of {env} observes {seen}: the action mask of a turn-based environment must be an "
+                    f"entry {MASK!r} of the outermost Dict."
+                )
             self._observation_spaces[agent] = seen if masked else _masked_space(seen, space)
         if getattr(env, "state_space", None) is not None:
             self.state_space = env.state_space
@@ -766,9 +779,38 @@ def _flat(space: spaces.Space, value: Any) -> np.ndarray:
     return np.asarray(flatten(space, value))
 
 
+def what_to_pass(env: Any, taker: str) -> str:
+    """
+    :param env: something else than the environment that was expected
+    :param taker: the class or function that it was passed to
+    :return: what to pass instead, for error messages
+    """
+    if isinstance(env, gymnasium.Env):
+        return f"pass a Gymnasium environment of a team itself, without {taker}"
+    if isinstance(env, VecEnv):
+        return (
+            f"pass one of its environments to {taker}; vectorise after that, as in DummyVecEnv([lambda: TeamEnv(env)])"
+        )
+    if isinstance(env, gymnasium.vector.VectorEnv):
+        return "the algorithms take sb3_maddpg.vec_env.GymnasiumVecEnv(env)"
+    if isinstance(env, str):
+        return "pass the environment itself: what gymnasium.make or a module's parallel_env() returns"
+    if isinstance(env, ModuleType):
+        return f"pass what its function returns, {env.__name__.rpartition('.')[2]}.parallel_env()"
+    if isinstance(env, (list, tuple)):
+        return f"pass one environment to {taker}, or DummyVecEnv([make_one, make_another]) of functions to an algorithm"
+    if callable(env) and not hasattr(env, "step"):
+        return "pass the environment that it creates, by calling it"
+    if isinstance(env, type):
+        return f"pass an instance, {env.__name__}(...)"
+    return (
+        "pass an environment of PettingZoo (derived from ParallelEnv or AECEnv), or a Gymnasium environment of a team"
+    )
+
+
 def _possible_agents(env: Any) -> tuple[Any, ...]:
     if not isinstance(env, ParallelEnv):
-        raise ValueError(f"{shown(env)} is not a PettingZoo ParallelEnv.")
+        raise ValueError(f"{shown(env)} is not an environment of PettingZoo: {what_to_pass(env, 'TeamEnv')}.")
     agents = getattr(env, "possible_agents", None) or ()
     agents = tuple(agents) if isinstance(agents, Iterable) else ()
     if not agents:
@@ -780,10 +822,13 @@ def _possible_agents(env: Any) -> tuple[Any, ...]:
 
 def _names_of(agents: Sequence[Any]) -> tuple[str, ...]:
     """:return: the agents' names, their numbers if Python would name them by their addresses"""
-    plain = [type(agent).__str__ is object.__str__ and type(agent).__repr__ is object.__repr__ for agent in agents]
-    return tuple(
-        f"agent_{i}" if without else str(agent) for i, (agent, without) in enumerate(zip(agents, plain, strict=True))
+    names = tuple(
+        str(agent) if isinstance(agent, str) or not _ADDRESS.search(str(agent)) else f"agent_{index}"
+        for index, agent in enumerate(agents)
     )
+    if len(set(names)) < len(names):
+        raise ValueError(f"possible_agents, {shown(list(agents))}, have the same name twice: {', '.join(names)}.")
+    return names
 
 
 def _metadata_of(env: ParallelEnv | AECEnv) -> Mapping[str, Any]:
@@ -909,7 +954,10 @@ def _mask_columns(space: spaces.Space) -> list[int]:
     """:return: the columns of a flat observation that hold the action mask, PettingZoo's dict entry of that name"""
     found = list(_masks_in(space))
     if len(found) > 1:
-        raise ValueError(f"The observation space {space} holds {len(found)} parts called {MASK!r}: rename all but one.")
+        raise ValueError(
+            f"The observation space {space} holds {len(found)} parts called {MASK!r}: rename all but one, or leave out "
+            "info_mask if one of them comes from it."
+        )
     return found[0] if found else []
 
 

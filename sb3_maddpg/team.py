@@ -18,6 +18,10 @@ from sb3_maddpg.utils import shown
 AgentActionSpace = spaces.MultiBinary | spaces.Box | spaces.Discrete | spaces.MultiDiscrete
 ACTION_SPACES = (spaces.MultiBinary, spaces.Box, spaces.Discrete, spaces.MultiDiscrete)
 _INTEGER = re.compile("0|-?[1-9][0-9]*")
+_OF_TEAMS = (
+    "If this is a single-agent environment, use an algorithm of Stable-Baselines3, such as PPO. For a team, pass a "
+    "PettingZoo environment itself, not vectorised by other libraries"
+)
 
 
 class TeamInfo(TypedDict, total=False):
@@ -344,16 +348,11 @@ class Team:
         :return: the team
         :raises ValueError: if the spaces do not describe a team, or the names do not fit
         """
-        if isinstance(observation_space, spaces.Dict):
-            raise ValueError(
-                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. Flatten each "
-                "agent's dictionary, as the adapter for PettingZoo environments does (sb3_maddpg.parallel)."
-            )
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 2:
+            parts = ", each flattened if it is a Dict or Tuple" if hasattr(observation_space, "spaces") else ""
             raise ValueError(
-                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. Pass a PettingZoo "
-                "environment itself, without vectorising it, or stack the agents' observations along a first axis. For "
-                "a single agent, use an algorithm of Stable-Baselines3, such as TD3 or DQN."
+                f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. {_OF_TEAMS}, or "
+                f"stack the agents' observations along a first axis{parts}."
             )
         if not all(observation_space.shape):
             raise ValueError(
@@ -431,8 +430,8 @@ def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActi
     if not isinstance(action_space, ACTION_SPACES) or action_space.shape is None or len(action_space.shape) != 1:
         raise ValueError(
             f"A team action is a flat MultiBinary, Box or MultiDiscrete of length n_agents * action_dim, not "
-            f"{action_space}. Flatten the space in the environment and reshape actions to (n_agents, action_dim) in "
-            "step()."
+            f"{action_space}, with {n_agents} agents, one per row of the observation. {_OF_TEAMS}, or flatten the "
+            "space in the environment and reshape actions to (n_agents, action_dim) in step()."
         )
     (length,) = action_space.shape
     if isinstance(action_space, spaces.MultiDiscrete) and action_space.start.any():
@@ -443,8 +442,9 @@ def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActi
         )
     if length % n_agents:
         raise ValueError(
-            f"A joint action of {length} numbers cannot be divided evenly among {n_agents} agents. "
-            "Give every agent the same number of actions, or describe the team with sb3_maddpg.team.MixedActions."
+            f"A joint action of {length} numbers cannot be divided evenly among {n_agents} agents, one per row of the "
+            "observation. Give every agent the same number of actions, or describe the team with "
+            f"sb3_maddpg.team.MixedActions. {_OF_TEAMS}."
         )
     k = length // n_agents
     if isinstance(action_space, spaces.MultiBinary):

@@ -11,6 +11,7 @@ import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from difflib import get_close_matches
 from importlib.metadata import entry_points, version
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
@@ -114,8 +115,16 @@ def _hand_over(group: str, argv: list[str]) -> int:
         raise ValueError(f"--env is missing: {choice}.")
     known.env = known.env or next(iter(offers.names))
     if known.env not in offers.names:
-        raise ValueError(suggest(f"environment with {group}", known.env, offers.names))
+        if get_close_matches(known.env, offers.names, n=1):
+            raise ValueError(suggest("environment", known.env, offers.names))
+        raise ValueError(
+            f"This command is for {', '.join(sorted(offers.names))}, not for {shown(known.env)}: no installed package "
+            f"provides {group} for it. `sb3-maddpg enjoy` and `record` run models in any environment, and "
+            "evaluate_policy of Stable-Baselines3 measures their returns."
+        )
     main: Callable[[list[str]], int] = load_offer(offers[known.env])
+    if helps(rest):
+        print(f"Environments (--env, by default the first): {', '.join(sorted(offers.names))}\n")
     if helps(rest) and group != "identifiers":
         print(f"Models: MODEL.zip, latest:LOGDIR, {', '.join(f'pretrained:{name}' for name in pretrained_models())}\n")
     rest = [_model(word, known.algo, known.env) for word in rest]

@@ -168,6 +168,7 @@ def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
 class EveryAgent(BaseParallelWrapper):
     """
     Wrapper that keeps agents that ended before the others, with zero observations and rewards, until the episode ends.
+    In the last step, each agent's info holds the ``is_success`` that it said last.
     SuperSuit's ``black_death_v3`` should do this, but in version 3.11 it only ends an episode if all agents are both
     terminated and truncated in the same step.
 
@@ -177,6 +178,7 @@ class EveryAgent(BaseParallelWrapper):
     def __init__(self, env: ParallelEnv):
         super().__init__(env)
         self.agents = self.possible_agents
+        self._successes: dict[Any, Any] = {}
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """
@@ -185,6 +187,7 @@ class EveryAgent(BaseParallelWrapper):
         :return: observations and infos of all agents
         """
         observations, infos = self.env.reset(seed=seed, options=options)
+        self._successes = {}
         return self._fill(observations), {agent: infos.get(agent, {}) for agent in self.agents}
 
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
@@ -195,6 +198,12 @@ class EveryAgent(BaseParallelWrapper):
         given = {agent: actions[agent] for agent in self.env.agents}
         observations, rewards, terminations, truncations, infos = self.env.step(given)
         over = not self.env.agents
+        said = {agent: (infos.get(agent) or {}).get("is_success") for agent in given}
+        self._successes |= {agent: success for agent, success in said.items() if success is not None}
+        infos = {agent: dict(infos.get(agent) or {}) for agent in self.agents}
+        if over:  # SB3 reads it in the last step only, to which not every agent came
+            for agent, success in self._successes.items():
+                infos[agent]["is_success"] = success
         # Some environments keep reporting agents that have left
         truncated = {agent: over and agent in given and bool(truncations[agent]) for agent in self.agents}
         terminated = {agent: over and (not truncated[agent] or bool(terminations[agent])) for agent in self.agents}
@@ -203,7 +212,7 @@ class EveryAgent(BaseParallelWrapper):
             {agent: rewards[agent] if agent in given else 0.0 for agent in self.agents},
             terminated,
             truncated,
-            {agent: infos.get(agent, {}) for agent in self.agents},
+            infos,
         )
 
     def _fill(self, observations: dict) -> dict:

@@ -369,7 +369,7 @@ def test_missing_keys_are_filled_in_environment_by_environment():
         ({"gamma": 1.5}, {}, r"gamma=1\.5"),
         ({"n_pairs": -1}, {}, "n_pairs=-1"),
         ({"n_steps": 2, "optimize_memory_usage": True, "handle_timeout_termination": False}, {}, "Set n_steps=1"),
-        ({"space": spaces.Dict()}, {}, "Flatten each agent's dictionary"),
+        ({"space": spaces.Dict()}, {}, "each flattened if it is a Dict"),
     ],
 )
 def test_what_cannot_be_used_is_refused(kwargs, info, message):

@@ -95,7 +95,7 @@ class Wrong(team_tasks.OwnBit):
             "different observations",
         ),
         (gymnasium.make("CartPole-v1"), r"shape \(n_agents, obs_dim\)"),
-        ("CartPole-v1", "neither a Gymnasium environment"),
+        ("CartPole-v1", "not an environment: pass the environment itself"),
     ],
 )
 def test_what_is_wrong_is_said(env, message):

@@ -20,7 +20,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_maddpg import MADDPG
+from sb3_maddpg import MADDPG, check_team_env
+from sb3_maddpg.maddpg import as_vec_env
 from sb3_maddpg.parallel import TeamEnv
 from toys import Toy
 
@@ -305,7 +306,7 @@ def test_metrics_of_agents_are_averaged_and_logged(tmp_path):
     assert {float(row["rollout/ep_len_a"]) for row in rows} == {2.0}
 
 
-@pytest.mark.parametrize("metrics", [{"x": "fast"}, {"x": np.nan}, {"x": [1, 2]}, 3.0, {"x": {}}])
+@pytest.mark.parametrize("metrics", [{"x": "fast"}, {"x": np.nan}, {"x": [1, 2]}, 3.0, {"x": {}}, np.ones(2), 0])
 def test_metrics_that_are_no_numbers_are_refused(metrics):
     env = TeamEnv(Broken(lambda env, *parts: parts[4].update(a={"metrics": metrics}), {"a": (2, TERMINATED)}))
     with pytest.raises(ValueError, match=r"infos\['a'\]\['metrics'\].* of .* in step 1 of the episode.*must be a"):
@@ -337,7 +338,7 @@ def test_a_terminated_agent_need_not_see_its_end():
     ("env", "message"),
     [
         (simple_spread_v3.env(), "aec_to_parallel"),
-        (gymnasium.make("CartPole-v1"), "not a PettingZoo ParallelEnv"),
+        (gymnasium.make("CartPole-v1"), "pass a Gymnasium environment of a team itself"),
         (Broken(possible_agents=[]), "possible_agents"),
         (Broken(possible_agents=["a", "b", "a"]), "a name twice"),
         (Broken(action_space=lambda agent: spaces.Text(3)), "'a' has the action space Text"),
@@ -664,15 +665,9 @@ class Colour(enum.IntEnum):
     BLUE = 2
 
 
-@pytest.mark.parametrize(
-    "names", [((0, 0), (0, 1)), (1, 2), (np.int64(3), np.int64(7)), tuple(Colour), (Thing(), Thing()), ("a b", "c,d")]
-)
+@pytest.mark.parametrize("names", [((0, 0), (0, 1)), (1, 2), (np.int64(3), np.int64(7)), tuple(Colour), ("a b", "c,d")])
 def test_agents_are_found_by_the_environment_s_own_ids(names, tmp_path):
-    if isinstance(names[0], Thing):  # as no file could name them
-        assert MADDPG("MlpPolicy", Named(*names)).policy.team.names == ("agent_0", "agent_1")
-        return
     model = MADDPG("MlpPolicy", Named(*names), policy_kwargs={"share_actor": [[names[0]], [names[1]]]})
-    assert len(set(model.policy.team.names)) == 2
     for agent in names:
         assert model.agent_policy(agent).name == str(agent)
     with pytest.raises(ValueError, match=f"There is no agent 'x': the agents are .*{re.escape(str(names[1]))}"):
@@ -680,8 +675,14 @@ def test_agents_are_found_by_the_environment_s_own_ids(names, tmp_path):
 
 
 def test_agents_without_names_fit_files_of_others_of_their_kind(tmp_path):
-    MADDPG("MlpPolicy", Named(Thing(), Thing())).save(tmp_path / "model")
-    MADDPG.load(tmp_path / "model", env=Named(Thing(), Thing()))
+    assert TeamEnv(Named((0, 2), "Thing at 0x1")).agent_names == ("(0, 2)", "Thing at 0x1")
+    model = MADDPG("MlpPolicy", Named(Thing(), (Thing(), 2)))
+    assert model.policy.team.names == ("agent_0", "agent_1")
+    model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model", env=Named(Thing(), (Thing(), 2)))
+    assert loaded.agent_policy(1).name == "agent_1"
+    with pytest.raises(ValueError, match="have the same name twice: agent_0, agent_0"):
+        TeamEnv(Named(Thing(), "agent_0"))
 
 
 MASKED = spaces.Dict({"action_mask": spaces.Box(0, 1, (3,), np.int8), "seen": spaces.Box(-1, 1, (2,))})
@@ -737,7 +738,7 @@ class NoOptions(Toy):
 
 
 def test_a_reset_without_options_is_explained_in_training():
-    message = r"reset\(\) of .* takes no `options`: declare it as `def reset\(self, seed=None, options=None\)`"
+    message = r"reset\(\) of toy takes no `options`: declare it as `def reset\(self, seed=None, options=None\)`"
     with pytest.raises(ValueError, match=message):
         MADDPG("MlpPolicy", NoOptions("binary")).learn(20)
 
@@ -762,8 +763,101 @@ def test_what_is_no_observation_of_a_team_is_explained():
     ],
 )
 def test_what_is_no_team_is_explained(env):
-    with pytest.raises(ValueError, match=r"Pass a PettingZoo environment itself.*For a single agent, use"):
+    message = r"single-agent environment, use an algorithm of Stable-Baselines3.*pass a PettingZoo environment itself"
+    with pytest.raises(ValueError, match=message):
         MADDPG("MlpPolicy", env())
+
+
+class Alone(gymnasium.Env):
+    """A single agent's environment, in name only."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("observation_space", "action_space"),
+    [
+        (spaces.Discrete(4), spaces.Discrete(2)),
+        (spaces.Tuple((SHORT, SHORT)), spaces.Discrete(2)),
+        (spaces.Dict({"observation": SHORT, "desired_goal": SHORT}), SHORT),
+        (spaces.Box(0, 255, (36, 36, 3), np.uint8), SHORT),
+        (spaces.Box(0, 255, (36, 36), np.uint8), spaces.Discrete(4)),  # a grey image looks like 36 agents
+        (spaces.Box(0, 255, (36, 36), np.uint8), SHORT),
+    ],
+)
+@pytest.mark.parametrize("take", [lambda env: MADDPG("MlpPolicy", env), check_team_env])
+def test_environments_of_a_single_agent_are_explained(take, observation_space, action_space):
+    with pytest.raises(ValueError, match="If this is a single-agent environment, use an algorithm of Stable-Baselines"):
+        take(Alone(observation_space, action_space))
+
+
+def vectorised():
+    return DummyVecEnv([lambda: TeamEnv(Toy("binary"))])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "remedy"),
+    [
+        (simple_spread_v3, r"simple_spread_v3\.parallel_env\(\)"),
+        (simple_spread_v3.parallel_env, "that it creates, by calling it"),
+        (Toy, "that it creates, by calling it|pass an instance, Toy"),
+        ("mpe2/simple_spread_v3", r"what gymnasium.make or a module's parallel_env\(\) returns"),
+        ([1, 2], "pass one environment"),
+        (3, "pass an environment of PettingZoo"),
+    ],
+)
+def test_what_is_no_environment_is_explained(wrong, remedy):
+    for take in (TeamEnv, check_team_env, as_vec_env):
+        with pytest.raises(ValueError, match=remedy):
+            take(wrong)
+
+
+def test_a_vectorised_environment_is_no_single_one():
+    for take in (TeamEnv, check_team_env):
+        with pytest.raises(ValueError, match=r"one of its environments.*DummyVecEnv\(\[lambda: TeamEnv\(env\)\]\)"):
+            take(vectorised())
+    with pytest.raises(ValueError, match="without TeamEnv"):
+        TeamEnv(TeamEnv(Toy("binary")))
+    envs = gymnasium.vector.SyncVectorEnv([lambda: TeamEnv(Toy("binary"))])
+    with pytest.raises(ValueError, match="GymnasiumVecEnv"):
+        MADDPG("MlpPolicy", envs)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "remedy"),
+    [
+        ("mpe2/simple_spread_v3", r"pass mpe2\.simple_spread_v3\.parallel_env\(\) itself"),
+        ("mpe2.simple_spread_v3", r"pass mpe2\.simple_spread_v3\.parallel_env\(\) itself"),
+        ("my_envs/x", "pass the environment itself, or import the package"),
+        ("CartPole-v7", "pass the environment itself, or import the package"),
+    ],
+)
+def test_ids_that_gymnasium_does_not_know_are_explained(env_id, remedy):
+    with pytest.raises(ValueError, match=f"env='{env_id}' is no id that Gymnasium knows .*: {remedy}"):
+        MADDPG("MlpPolicy", env_id)
+
+
+def test_actions_by_agent_are_no_joint_action():
+    env = TeamEnv(Toy("binary"))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"The joint action is \{'binary_0': 1\}, not an array of shape \(6,\)"):
+        env.step({"binary_0": 1})
+
+
+def test_a_game_with_turns_has_its_masks_on_top():
+    class Deep(Turns):
+        def observation_space(self, agent):
+            return spaces.Dict({"inner": MASKED})
+
+    with pytest.raises(ValueError, match="must be an entry 'action_mask' of the outermost Dict"):
+        TeamEnv(Deep())
 
 
 def test_wrappers_that_take_agents_away_are_named():

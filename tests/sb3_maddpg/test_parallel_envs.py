@@ -214,7 +214,7 @@ def test_processes_make_the_same_steps():
         (["supersuit.pad_observations_v9"], "pad_observations_v9 cannot be imported"),
         (["pad_observations_v0"], "pad_observations_v0 cannot be imported"),
         ([["supersuit.dtype_v0", "float32"]], "neither a dotted path nor a dict"),
-        ("supersuit.pettingzoo_env_to_vec_env_v1", "not a PettingZoo ParallelEnv"),
+        ("supersuit.pettingzoo_env_to_vec_env_v1", "not an environment of PettingZoo"),
     ],
 )
 def test_wrappers_that_do_not_fit_are_refused(wrappers, message):

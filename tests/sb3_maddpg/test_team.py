@@ -169,7 +169,7 @@ def test_agents_are_found_by_name_and_number():
 @pytest.mark.parametrize(
     ("observation", "action", "message"),
     [
-        (spaces.Dict({"a": SHORT}), spaces.MultiBinary(4), "Flatten each agent's dictionary"),
+        (spaces.Dict({"a": SHORT}), spaces.MultiBinary(4), "each flattened if it is a Dict"),
         (SHORT, spaces.MultiBinary(4), r"\(n_agents, obs_dim\)"),
         (spaces.Box(-1, 1, (2, 3)), spaces.Discrete(4), "A team action is a flat"),
         (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary((2, 2)), "A team action is a flat"),
