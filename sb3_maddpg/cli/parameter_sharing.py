@@ -148,21 +148,33 @@ class AgentsVecEnv(VecEnv):
 def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
     """:return: the agents, after checking that their spaces are equal"""
     agents = env.possible_agents
-    for kind, space_of, wrapper in (
-        ("observation", env.observation_space, "pad_observations_v0"),
-        ("action", env.action_space, "pad_action_space_v0"),
-    ):
+    kinds = (
+        ("observation", env.observation_space, "pad_observations_v0", (spaces.Box,)),
+        ("action", env.action_space, "pad_action_space_v0", (spaces.Box, spaces.Discrete)),
+    )
+    # Only if both can be padded is there anything to gain
+    pads = all(_can_be_padded([space_of(agent) for agent in agents], types) for _, space_of, _, types in kinds)
+    for kind, space_of, wrapper, _ in kinds:
         first = space_of(agents[0])
         for agent in agents:
             if space_of(agent) != first:
                 remedy = "train with --algo maddpg, matd3 or iddpg"
-                if type(space_of(agent)) is type(first) and isinstance(first, (spaces.Box, spaces.Discrete)):
+                if pads:
                     remedy = f"add supersuit.{wrapper} to `wrappers` of env_kwargs, or {remedy}"
+                else:
+                    remedy = f"no wrapper makes these spaces alike, so {remedy}"
                 raise ValueError(
                     f"{env_id} has heterogeneous agents: the {kind} space of {agents[0]} is {first}, that of {agent} "
                     f"is {space_of(agent)}. A shared policy needs equal spaces: {remedy}."
                 )
     return agents
+
+
+def _can_be_padded(agents_spaces: Sequence[spaces.Space], types: tuple[type[spaces.Space], ...]) -> bool:
+    """:return: whether SuperSuit can make the spaces of these types alike, or they are"""
+    first = agents_spaces[0]
+    same = all(type(one) is type(first) and len(one.shape or ()) == len(first.shape or ()) for one in agents_spaces)
+    return all(one == first for one in agents_spaces) or (same and isinstance(first, types))
 
 
 class EveryAgent(BaseParallelWrapper):

@@ -93,12 +93,45 @@ def test_floats_become_binary_actions():
     [
         ({}, "heterogeneous agents: the observation space of adversary_0 is .*add supersuit.pad_observations_v0"),
         ({"wrappers": PADDED, "state": True}, "state:True is for critics"),
+        ({"wrappers": PADDED, "info_mask": True}, "info_mask:True is for MADDPG, MATD3 and IDDPG"),
     ],
 )
 def test_teams_that_cannot_share_a_policy_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         AgentsVecEnv(TAG, 1, kwargs)
-    assert AgentsVecEnv(TAG, 1, {"wrappers": PADDED}).num_envs == 4
+    assert AgentsVecEnv(TAG, 1, {"wrappers": PADDED, "info_mask": False}).num_envs == 4
+
+
+MIXED = """
+from gymnasium import spaces
+from mpe2 import simple_tag_v3
+from pettingzoo.utils import BaseParallelWrapper
+
+class Mixed(BaseParallelWrapper):
+    def action_space(self, agent):
+        return {SPACE}
+
+def parallel_env(**kwargs):
+    return Mixed(simple_tag_v3.parallel_env(**kwargs))
+"""
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        "spaces.Box(-1, 1, (2,)) if agent == 'agent_0' else super().action_space(agent)",
+        "spaces.MultiBinary(2 if agent == 'agent_0' else 3)",
+        "spaces.MultiDiscrete([2] * (2 if agent == 'agent_0' else 3))",
+    ],
+)
+def test_no_padding_is_recommended_where_none_helps(space, tmp_path, monkeypatch):
+    name = f"mixed_{abs(hash(space))}"
+    (tmp_path / f"{name}.py").write_text(MIXED.replace("{SPACE}", space))
+    monkeypatch.syspath_prepend(tmp_path)
+    register(name)
+    with pytest.raises(ValueError, match="no wrapper makes these spaces alike, so train with --algo maddpg") as error:
+        AgentsVecEnv(name, 1, {})
+    assert "supersuit" not in str(error.value)
 
 
 def test_agents_that_leave_see_zeros_until_the_episode_ends(tmp_path, monkeypatch):
@@ -115,6 +148,32 @@ def test_agents_that_leave_see_zeros_until_the_episode_ends(tmp_path, monkeypatc
         assert observations[1].any()
     # The one terminated long ago, the others are cut off
     assert [bool(info.get("TimeLimit.truncated")) for info in infos] == [False, True, True]
+
+
+def test_agents_that_ended_earlier_count_as_successes_or_not(tmp_path, monkeypatch):
+    says = """
+    def step(self, actions):
+        found = self.left(actions)
+        found[4].pop("agent_0", None) if self.steps else found[4].update(agent_0={"is_success": False})
+        found[4]["agent_1"] = {"is_success": True}
+        found[4]["agent_2"] = {}
+        self.steps += 1
+        return found
+
+def parallel_env"""
+    text = LEAVING.replace("def step", "def left").replace("self.gone = 0", "self.gone = self.steps = 0")
+    (tmp_path / "saying.py").write_text(text.replace("\ndef parallel_env", says))
+    monkeypatch.syspath_prepend(tmp_path)
+    register("saying")
+    env = AgentsVecEnv("saying", 1, {"max_cycles": 4})
+    env.reset()
+    for _ in range(2):
+        for _ in range(4):
+            *_, infos = env.step(np.zeros(3))
+        assert [info.get("is_success") for info in infos] == [False, True, None]
+    model = PPO("MlpPolicy", env, n_steps=40, batch_size=40).learn(120)
+    assert sorted(set(model.ep_success_buffer)) == [False, True]
+    assert np.mean(model.ep_success_buffer) == 0.5
 
 
 @pytest.mark.parametrize(

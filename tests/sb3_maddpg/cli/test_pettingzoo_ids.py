@@ -44,7 +44,8 @@ def test_a_module_that_fails_is_no_unknown_id(tmp_path, monkeypatch):
 
 def test_arguments_are_those_of_the_module():
     assert pettingzoo_ids.arguments("mpe2.simple_tag_v3") >= {"num_good", "continuous_actions", "state", "wrappers"}
-    assert "entry" not in pettingzoo_ids.arguments("mpe2.simple_tag_v3")
+    assert "info_mask" in pettingzoo_ids.arguments("mpe2.simple_tag_v3")
+    assert not {"entry", "kwargs"} & pettingzoo_ids.arguments("mpe2.simple_tag_v3")
     assert pettingzoo_ids.arguments("quad_swarm") is None  # takes whatever QuadSwarmEnv does
     assert "mpe2/simple_tag_v3" in pettingzoo_ids.siblings("mpe2/simple_tig_v3")
 
