@@ -995,6 +995,10 @@ class MADDPG(OffPolicyAlgorithm):
         check_success(infos)
         super()._update_info_buffer(infos, dones)
         record_metrics(self.logger, infos)
+        if dones is not None and dones.any():  # a wrapper may have ended an episode, unknown to its TeamEnv
+            assert self.env is not None
+            begun = [self.env.unwrapped.reset_infos[k] for k in np.flatnonzero(dones)]
+            record_metrics(self.logger, [{"metrics": info["last_metrics"]} for info in begun if "last_metrics" in info])
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         env = self._wrap_env(env, self.verbose)

@@ -84,7 +84,10 @@ class TeamEnv(gymnasium.Env):
     - ``metrics``: the means of the numbers in the agents' ``infos[agent]["metrics"]``, and at the end of an episode
       ``rollout/ep_rew_NAME`` of each agent that took part (``rollout/ep_rew_agent_mean`` of an agent called "mean",
       since ``rollout/ep_rew_mean`` is the team's) and, where agents end before others, ``rollout/ep_len_NAME``
-    - ``is_success``: at the end of an episode, whether all agents succeeded whose infos say so, each as it said last
+    - ``is_success``: whether all agents succeeded whose infos have said so in this episode, each as it said last
+
+    If a wrapper such as ``TimeLimit`` ended the last episode, its returns and lengths are in the next info of ``reset``
+    as ``last_metrics``, from which MADDPG logs them.
 
     Rewards of agents that have already ended are ignored with a warning, as are action masks in infos without
     ``info_mask``.
@@ -143,6 +146,7 @@ class TeamEnv(gymnasium.Env):
         self._metric_names = _names_of_returns(self.agent_names)
         self._lay_out(action_spaces)
         self._live: list[int] = []
+        self._steps = 0
         self._taking_part: list[int] = []
         self._returns = [0.0] * len(agents)
         # Of agents that have ended in this episode, and whether they succeeded as far as they said
@@ -176,11 +180,6 @@ class TeamEnv(gymnasium.Env):
         return getattr(self if hasattr(self, name) else self.parallel_env, name)
 
     @property
-    def is_over(self) -> bool:
-        """Whether all agents have ended, or no episode has begun."""
-        return not self._live
-
-    @property
     def team_spaces(self) -> tuple[TeamObservation, Any]:
         """The spaces of observation and joint action, also behind wrappers and in other processes."""
         return self.observation_space, self.action_space
@@ -211,6 +210,8 @@ class TeamEnv(gymnasium.Env):
         """
         seed = as_seed(seed)
         super().reset(seed=seed)
+        # A wrapper such as TimeLimit may have ended the episode, unknown to the environment
+        last = self._metrics_of_episode() if self._live and self._steps else {}
         self._live, self._steps = [], 0
         with explained_reset(self.parallel_env):
             returned = self.parallel_env.reset(seed=seed, options=options)
@@ -227,6 +228,8 @@ class TeamEnv(gymnasium.Env):
         self._returns = [0.0] * len(self._agents)
         self._lengths, self._successes = {}, {}
         info = _agent_infos(infos)
+        if last:
+            info["last_metrics"] = last
         if len(self._live) < len(self._agents):
             info["agent_active"] = np.isin(np.arange(len(self._agents)), self._live)
         return self._observe(self._with_masks(observations, infos), self._live), info
@@ -287,8 +290,10 @@ class TeamEnv(gymnasium.Env):
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
         self._read_agents_infos(infos, info)
         self._lengths |= dict.fromkeys(set(acted).difference(live), self._steps)
+        if self._successes:
+            info["is_success"] = all(self._successes.values())
         if over:
-            self.end_info(info)
+            info["metrics"] = {**info.get("metrics", {}), **self._metrics_of_episode()}
         reward = info["team_reward"] = sum(rewards) / n_agents
         info["episode_step"] = self._steps
         return self._observe(self._with_masks(observations, infos), seen), reward, over and not cut, cut, info
@@ -322,22 +327,16 @@ class TeamEnv(gymnasium.Env):
         if metrics:
             info["metrics"] = {name: sum(values) / len(values) for name, values in metrics.items()}
 
-    def end_info(self, info: dict[str, Any]) -> None:
-        """
-        Complete the info of an episode's last step, also if a wrapper such as ``TimeLimit`` ends the episode.
-
-        :param info: the info, which gets ``metrics`` and, if agents report it, ``is_success``
-        """
-        returns = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
-        info["metrics"] = {**info.get("metrics", {}), **returns}
+    def _metrics_of_episode(self) -> dict[str, float]:
+        """:return: returns of the agents that took part and, where agents end before others, how long they lived"""
+        metrics = {self._metric_names[row]: self._returns[row] for row in self._taking_part}
         lengths = {row: self._lengths.get(row, self._steps) for row in self._taking_part}
         # Lengths tell something only where agents end before others, and then in every episode
         self._unequal = self._unequal or len(set(lengths.values())) > 1
         if self._unequal:
             names = {row: self._metric_names[row].replace("ep_rew_", "ep_len_", 1) for row in lengths}
-            info["metrics"] |= {names[row]: float(length) for row, length in lengths.items()}
-        if self._successes:
-            info["is_success"] = all(self._successes.values())
+            metrics |= {names[row]: float(length) for row, length in lengths.items()}
+        return metrics
 
     def render(self) -> Any:
         """Render the environment."""

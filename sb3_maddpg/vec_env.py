@@ -190,10 +190,6 @@ class BorderEnv(Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._check(observation, "after step()")
-        team_env = self.env.unwrapped
-        if truncated and isinstance(team_env, TeamEnv) and not team_env.is_over:
-            info = dict(info)
-            team_env.end_info(info)
         if terminated or truncated:
             observation, info = np.array(observation), deepcopy(info)
         else:  # environments that are stepped one after the other may share arrays, too

@@ -272,7 +272,7 @@ class Misshapen(gymnasium.Env):
         (spaces.Box(-1, 1, (6,)), spaces.MultiBinary(6), r"shape \(n_agents, obs_dim\).*stack"),
         (spaces.Discrete(4), spaces.MultiBinary(6), r"not Discrete\(4\)"),
         (spaces.Box(-1, 1, (4, 3)), spaces.MultiBinary(6), "6 numbers.*4 agents"),
-        (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary((2, 3)), r"MultiBinary\(\(2, 3\)\).*Flatten"),
+        (spaces.Box(-1, 1, (2, 3)), spaces.MultiBinary((2, 3)), r"MultiBinary\(\(2, 3\)\).*flatten"),
         (spaces.Box(-1, 1, (2, 3)), spaces.Discrete(4), r"A team action is a flat.*not Discrete\(4\)"),
     ],
 )

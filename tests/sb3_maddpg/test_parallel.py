@@ -14,11 +14,10 @@ from gymnasium import spaces
 from mpe2 import simple_spread_v3
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from sb3_maddpg import MADDPG, check_team_env
 from sb3_maddpg.maddpg import as_vec_env
@@ -286,7 +285,6 @@ def test_agents_that_ended_before_the_others_count_as_successes_or_not(said, suc
     env = TeamEnv(Broken(spoil, {"a": (2, TERMINATED), "b": (4, TRUNCATED)}))
     for _ in range(2):
         infos = [step[4] for step in play(env)]
-        assert not any("is_success" in info for info in infos[:-1])
         assert infos[-1].get("is_success") is success
 
 
@@ -313,18 +311,33 @@ def test_metrics_that_are_no_numbers_are_refused(metrics):
         play(env)
 
 
-def test_returns_are_logged_where_a_wrapper_ends_the_episodes():
-    env = gymnasium.wrappers.TimeLimit(TeamEnv(Script({"a": (5, TRUNCATED), "b": (8, TRUNCATED)})), 3)
-    keys = []
+class Limited(gymnasium.Wrapper):
+    """Ends episodes after three steps, unknown to the environment."""
 
-    class Keys(BaseCallback):
-        def _on_step(self):
-            keys.extend(info["metrics"] for info in self.locals["infos"] if "metrics" in info)
-            return True
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated or info["episode_step"] == 3, truncated, info
 
-    MADDPG("MlpPolicy", env, learning_starts=1000).learn(6, callback=Keys())
-    assert len(keys) >= 2
-    assert all(metrics == {"rollout/ep_rew_a": 6.0, "rollout/ep_rew_b": 12.0} for metrics in keys)
+
+def script_with_successes():
+    def spoil(env, *parts):
+        parts[4].update({"b": {"is_success": True}} if env.time == 2 else {})
+
+    return TeamEnv(Broken(spoil, {"a": (2, TERMINATED), "b": (8, TRUNCATED)}))
+
+
+@pytest.mark.parametrize("vectorised", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("limit", [lambda env: gymnasium.wrappers.TimeLimit(env, 3), Limited])
+def test_returns_are_logged_where_a_wrapper_ends_the_episodes(vectorised, limit, tmp_path):
+    envs = VecMonitor(vectorised([lambda: limit(script_with_successes())] * 2))
+    model = MADDPG("MlpPolicy", envs, learning_starts=1000)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(24, log_interval=1)
+    with (tmp_path / "progress.csv").open() as file:
+        last = [row for row in csv.DictReader(file) if row["rollout/ep_rew_a"]][-1]
+    expected = {"ep_rew_a": 3.0, "ep_rew_b": 12.0, "ep_len_a": 2.0, "ep_len_b": 3.0, "success_rate": 1.0}
+    assert {name: float(last[f"rollout/{name}"]) for name in expected} == expected
+    envs.close()
 
 
 def test_a_terminated_agent_need_not_see_its_end():
