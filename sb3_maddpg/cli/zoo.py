@@ -222,7 +222,8 @@ def _resumed(asked: argparse.Namespace, argv: list[str]) -> tuple[Checkpoints, l
 
 def _show(command: str, function: Callable[[], Any], argv: list[str]) -> int:
     """Show a trained model in an environment with the arguments of its training."""
-    parser = common_options()
+    # With abbreviations, which rl_zoo3 accepts: it must open the run that was checked here
+    parser = argparse.ArgumentParser(add_help=False, parents=[common_options()])
     parser.add_argument("-f", "--folder", default="logs")
     parser.add_argument("--exp-id", type=int, default=0)
     parser.add_argument("--n-timesteps", "-n", type=int, default=1000)

@@ -5,6 +5,7 @@ import contextlib
 import json
 import os
 import pickle
+import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -416,3 +417,19 @@ def test_folders_that_look_like_runs_are_passed_over(run, name):
     assert sorted(path.name for path in Path("logs/maddpg").iterdir() if path.name != name) == [
         f"OwnBit-v0_{number}" for number in (1, 2, 3)
     ]
+
+
+@pytest.mark.parametrize("option", ["--folder", "--fold", "-f"])
+def test_abbreviated_options_choose_the_run_that_is_checked(spread, capsys, option):
+    """rl_zoo3 accepts abbreviations, and would read the unchecked arguments of another run."""
+    shutil.copytree("logs", "other")
+    (args,) = Path("other").rglob("args.yml")
+    change(args, env_kwargs={"wrappers": [{"os.mkdir": {"path": "caught"}}]})
+    assert main(["enjoy", "--env", SPREAD, option, "other", "-n", "20", "--no-render"]) == 2
+    assert "names 'os.mkdir'" in capsys.readouterr().err
+    assert not Path("caught").exists()
+
+
+def test_abbreviated_arguments_of_the_environment_arrive(run, capsys):
+    assert main(["enjoy", "--env", "OwnBit-v0", "--env-k", "nonsense:5", "-n", "20", "--no-render"]) == 2
+    assert "Unknown argument of OwnBit-v0 'nonsense'" in capsys.readouterr().err
