@@ -466,7 +466,8 @@ class TeamExperimentManager(ExperimentManager):
             _make_tables(self.storage)
         self.storage = as_absolute(self.storage)
         self.continues = kept is None or kept.is_file()
-        study = self._bring_back()
+        with self._told_disk(kept):
+            study = self._bring_back()
         if kept is not None:
             self.study = study  # may be complete except for its report
         verbosity = optuna.logging.get_verbosity()

@@ -15,7 +15,6 @@ import optuna
 from huggingface_sb3 import EnvironmentName
 from optuna.storages import BaseStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
-from optuna.storages.journal._file import get_lock_file
 from optuna.trial import TrialState
 
 from sb3_maddpg.cli.options import PROG
@@ -23,6 +22,7 @@ from sb3_maddpg.cli.processes import run_all
 from sb3_maddpg.utils import process_runs, told
 
 STUDY = "search"
+_BEGINS = b'{"op_code":'  # a journal
 _IDENTITY = "SB3_MADDPG_WORKER"  # environment variable with the identity that a worker keeps when it is restarted
 _PROCESS = "process"  # attribute of a trial that identifies the process running it
 _WORKER = "worker "  # prefix of the attributes of a study that identify the processes that work on it
@@ -52,43 +52,59 @@ def open_storage(storage: str) -> BaseStorage | str:
             with Path(storage).open("rb") as file:
                 first = file.readline()
             # A line without end may be one that another worker is writing
-            if first and (first.endswith(b"\n") or not first.startswith(b"{")):
+            if first.endswith(b"\n"):
                 json.loads(first)["op_code"]
+            elif not first.startswith(_BEGINS) and not _BEGINS.startswith(first):
+                raise ValueError("its first line is no entry")
             _end_last_line(as_absolute(storage))
         return JournalStorage(JournalFileBackend(as_absolute(storage)))
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RecursionError) as error:
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+        AssertionError,
+    ) as error:
         raise ValueError(
             f"--storage {storage} is not a journal of Optuna ({told(error)}): name another file."
         ) from error
 
 
 def _end_last_line(path: str) -> None:
-    """Remove the unfinished last line that a power loss left in a journal. Optuna would append to it."""
-    if _without_end(path) == 0:
+    """Remove the damaged last line that a power loss left in a journal. Optuna would append to it, and stop there."""
+    if _damaged(Path(path).read_bytes()) == 0:
         return
-    with get_lock_file(JournalFileSymlinkLock(path)):  # without it, another worker may be writing the line
-        unfinished = _without_end(path)
+    lock = JournalFileSymlinkLock(path)  # without it, another worker may be writing the line
+    lock.acquire()
+    try:
         with Path(path).open("rb+") as file:
-            file.seek(-unfinished, os.SEEK_END)
-            try:
-                json.loads(file.read())["op_code"]
-            except (ValueError, KeyError, TypeError, IndexError, RecursionError):
-                file.seek(-unfinished, os.SEEK_END)
-                file.truncate()
-            else:
-                file.write(b"\n")  # an editor may have removed it
+            content = file.read()
+            if damaged := _damaged(content):
+                file.truncate(len(content) - damaged)
+                file.seek(0, os.SEEK_END)
+                file.write(content[-damaged:] + b"\n" if _is_entry(content[-damaged:]) else b"")
+                os.fsync(file.fileno())
+    finally:
+        lock.release()
 
 
-def _without_end(path: str) -> int:
-    """:return: number of bytes after the last complete line of a file"""
-    with Path(path).open("rb") as file:
-        end = file.seek(0, os.SEEK_END)
-        tail = b""
-        while len(tail) < end and b"\n" not in tail:
-            size = min(2 * len(tail) + 4096, end)
-            file.seek(-size, os.SEEK_END)
-            tail = file.read(size)
-    return len(tail) - tail.rfind(b"\n") - 1
+def _damaged(content: bytes) -> int:
+    """
+    :return: length of the last line of a journal, if it has no end or is no entry, such as one that was cut off and to
+        which Optuna then appended another. Earlier lines are the reader's matter.
+    """
+    last = content[content.rfind(b"\n", 0, -1) + 1 :]
+    return 0 if not last or (last.endswith(b"\n") and _is_entry(last)) else len(last)
+
+
+def _is_entry(line: bytes) -> bool:
+    try:
+        json.loads(line)["op_code"]
+    except (ValueError, KeyError, TypeError, IndexError, RecursionError):
+        return False
+    return True
 
 
 def check_trials(study: optuna.Study, storage: str) -> None:

@@ -225,7 +225,7 @@ def test_a_lock_that_a_killed_process_left_is_released(tmp_path, monkeypatch):
     backend._lock.release()
 
 
-@pytest.mark.parametrize("text", ["not json\n", "hello", "[]\n", '{"op_code":0,"worker_id":"x"}\n'])
+@pytest.mark.parametrize("text", ["not json\n", "hello", '{"mine": 1}', "[]\n", '{"op_code":0,"worker_id":"x"}\n'])
 @pytest.mark.parametrize("words", [[], ["--study-name", "s"]])
 def test_a_file_that_is_no_journal_is_named_and_left_alone(text, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -269,6 +269,43 @@ def test_the_unfinished_last_line_of_a_journal_is_dropped(tmp_path, missing):
     again.set_user_attr("a", 1)  # appends a line
     assert optuna.load_study(storage=open_storage(str(path)), study_name="s").user_attrs == {"a": 1}
     assert not list(tmp_path.glob("t.log.*"))
+
+
+@pytest.mark.parametrize("rest", [b"\0" * 30, b"\n", b'{"op_code":5,"worker_id":"x"}\n'])
+def test_a_damaged_last_line_of_a_journal_is_dropped(tmp_path, rest):
+    """Zeros of a file system after a power loss, or an entry that Optuna appended to an unfinished one."""
+    path = tmp_path / "t.log"
+    journal(path)
+    whole = path.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    path.write_bytes(whole[:-20] + rest)
+    again = optuna.load_study(storage=open_storage(str(path)), study_name="s")
+    assert [trial.value for trial in again.trials] == [1.0, None]
+    assert path.read_bytes() == b"".join(lines[:-1])
+    again.set_user_attr("a", 1)
+    assert optuna.load_study(storage=open_storage(str(path)), study_name="s").user_attrs == {"a": 1}
+
+
+def test_a_journal_that_is_damaged_elsewhere_stays_as_it_is(tmp_path):
+    path = tmp_path / "t.log"
+    journal(path)
+    first, *lines = path.read_bytes().splitlines(keepends=True)
+    for damaged in ([first, b"{\n", *lines], [first, *lines, b'{"op_code":77,"worker_id":"x"}\n']):
+        path.write_bytes(b"".join(damaged))
+        with pytest.raises(ValueError, match=r"t\.log is not a journal of Optuna"):
+            optuna.load_study(storage=open_storage(str(path)), study_name="s")
+        assert path.read_bytes() == b"".join(damaged)
+
+
+def test_a_disk_that_is_full_from_the_start_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(JournalFileBackend, "append_logs", full)
+    assert main(["tune", "--env", "OwnBit-v0", "-n", "100", "--n-trials", "1"]) == 2
+    assert "No space left on device: free space, then repeat the command to continue." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
