@@ -141,7 +141,7 @@ class RunCheckpoint(BaseCallback):
         if self._signal is not None:
             _end_by(number)
         self._signal = number
-        _leave_closed_terminal()
+        _leave_closed_terminal(number)
 
     def _on_rollout_start(self) -> None:
         if self._signal is not None:
@@ -621,11 +621,16 @@ def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
     return value
 
 
-def _leave_closed_terminal() -> None:
-    """Write nothing more to a terminal that was closed, since that would raise an error before the checkpoint."""
+def _leave_closed_terminal(number: int) -> None:
+    """
+    Write nothing more to a terminal that was closed, nor to a pipe whose reader, such as ``tee``, ended with it, since
+    that would raise an error before the checkpoint.
+    """
     for output in (1, 2):
         with suppress(OSError):
-            if stat.S_ISCHR(os.fstat(output).st_mode) and not os.isatty(output):
+            mode = os.fstat(output).st_mode
+            piped = stat.S_ISFIFO(mode) and number == getattr(signal, "SIGHUP", None)
+            if piped or (stat.S_ISCHR(mode) and not os.isatty(output)):
                 null = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(null, output)
                 os.close(null)

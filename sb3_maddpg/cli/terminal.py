@@ -4,12 +4,15 @@ import errno
 import io
 import os
 import select
+import stat
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+_SECONDS = 0.3  # within which a signal arrives
 _telling = threading.Lock()
 
 
@@ -25,17 +28,34 @@ class _Terminal(io.FileIO):
             return memoryview(data).nbytes
 
 
+class _Pipe(io.FileIO):
+    """
+    A pipe, perhaps to a ``tee`` that ends because its terminal was closed. The signal of that may arrive a little later
+    and replace this output.
+    """
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            time.sleep(_SECONDS)
+            return super().write(data)
+
+
 @contextmanager
 def lasting_output() -> Iterator[None]:
     """Let a command go on when its terminal is closed: a training would be lost for the sake of a table."""
     before = sys.stdout, sys.stderr
     for name in ("stdout", "stderr"):
         stream: Any = getattr(sys, name)
-        if stream is not None and stream is getattr(sys, f"__{name}__") and stream.isatty():
+        if stream is None or stream is not getattr(sys, f"__{name}__"):
+            continue
+        is_pipe = stat.S_ISFIFO(os.fstat(stream.fileno()).st_mode)
+        if is_pipe or stream.isatty():
             stream.flush()
-            raw = io.BufferedWriter(_Terminal(stream.fileno(), "w", closefd=False))
-            lasting = io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=True)
-            setattr(sys, name, lasting)
+            raw = io.BufferedWriter((_Pipe if is_pipe else _Terminal)(stream.fileno(), "w", closefd=False))
+            buffering = stream.line_buffering if is_pipe else True
+            setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=buffering))
     try:
         yield
     finally:

@@ -65,6 +65,27 @@ def test_a_training_whose_terminal_is_closed_writes_its_checkpoint_and_ends_by_t
     assert len(checkpoints()) == 1
 
 
+def test_a_training_whose_tee_ends_with_the_terminal_writes_its_checkpoint_too():
+    """Its tables meet the broken pipe before the signal arrives."""
+    process = subprocess.Popen(
+        [*TRAIN, "--checkpoint-every", "1000000", "--log-interval", "1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    try:
+        while not trains():
+            process.stdout.read1(65536)
+            assert process.poll() is None
+        process.stdout.close()
+        time.sleep(0.05)
+        process.send_signal(signal.SIGHUP)
+        process.wait(timeout=300)
+    finally:
+        process.kill()
+    assert process.returncode == -signal.SIGHUP
+    assert len(checkpoints()) == 1
+
+
 def read_all(terminal: int) -> None:
     try:
         while os.read(terminal, 65536):
