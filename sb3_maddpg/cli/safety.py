@@ -281,7 +281,7 @@ def check_paths(values: Any, run: Path, source: str, own: Sequence[str] = (), na
     :param values: the settings, in dicts and lists of any depth
     :param run: folder of the run
     :param source: the file, for error messages
-    :param own: words of the user; what one of them holds is accepted
+    :param own: words of the user; a path that one of them holds as a whole is accepted
     :param name: name of the argument that holds the values
     :raises ValueError: if a text may be such a path
     """
@@ -294,11 +294,16 @@ def check_paths(values: Any, run: Path, source: str, own: Sequence[str] = (), na
     elif isinstance(values, (str, bytes)):
         text = os.fsdecode(values)
         may_be_path = _OF_PATHS.search(name) or re.search(r"[/\\\0]|^~|^\.\.?$|^[A-Za-z]:", text)
-        if may_be_path and not _is_inside(text, run) and not any(text in word for word in own):
+        if may_be_path and not _is_inside(text, run) and not any(_holds(word, text) for word in own):
             raise ValueError(
                 f"{source}: {name} is {shown(text)}, which may be a path outside {run}: remove it, or pass --trust if "
                 "you trust the file's author."
             )
+
+
+def _holds(word: str, path: str) -> bool:
+    """:return: whether a word of a command holds a path, and not only as a part of another one"""
+    return bool(path) and re.search(rf"(?<![\w./\\~-]){re.escape(path)}(?![\w./\\~-])", word) is not None
 
 
 def _literal(value: Any) -> Any:

@@ -430,6 +430,16 @@ def test_abbreviated_options_choose_the_run_that_is_checked(spread, capsys, opti
     assert not Path("caught").exists()
 
 
+def test_paths_of_the_users_own_command_are_accepted_as_a_whole_only(tmp_path):
+    """A file that comes back from someone else may not use the folders that a path of the command leads through."""
+    own = ["-conf", "/home/me/recipes/r.yml", "-params", "env_wrapper:{a.B: {video_folder: /home/me/videos}}", "save:x"]
+    for path in ("/home/me/recipes/r.yml", "/home/me/videos", "x"):
+        check_paths({"video_folder": path}, tmp_path, "file", own)
+    for path in ("/home/me", "/home/me/recipes/r", "/", "me/videos", "home", "/home/me/videos/", "~"):
+        with pytest.raises(ValueError, match="may be a path outside"):
+            check_paths({"video_folder": path}, tmp_path, "file", own)
+
+
 def test_abbreviated_arguments_of_the_environment_arrive(run, capsys):
     assert main(["enjoy", "--env", "OwnBit-v0", "--env-k", "nonsense:5", "-n", "20", "--no-render"]) == 2
     assert "Unknown argument of OwnBit-v0 'nonsense'" in capsys.readouterr().err
