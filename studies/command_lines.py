@@ -126,7 +126,8 @@ class Recorder:
         if not self.active:
             return
         # Videos, and the compiled planner
-        expected = any(word in str(arguments[:2]) for word in ("ffmpeg", "ffplay", "/quad_swarm/"))
+        programs = ("ffmpeg", "ffplay", "/quad_swarm/", "/proc/self/fd/")  # the last is a checked library
+        expected = any(word in str(arguments[:2]) for word in programs)
         if event in _EVENTS and not expected:
             self.caught.append(f"{event} {arguments[:1]}")
         writes = (

@@ -165,7 +165,7 @@ class StoreValues(argparse.Action):
                     raise ValueError(f"'{word}' has no value")
                 pairs[key] = parse_value(value)
         except ValueError as error:
-            raise ValueError(f"{option_string} {' '.join(values)}: {error}. Write key:value.") from error
+            raise ValueError(f"{option_string} {shown(' '.join(values))}: {error}. Write key:value.") from error
         setattr(namespace, self.dest, pairs)
 
 

@@ -27,6 +27,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -445,6 +446,8 @@ def _check_call(key: str, name: str, arguments: Any, source: str = "the recipe")
         raise ValueError(f"{where} cannot be imported ({error}). {_OF_WHICH}") from error
     if not callable(found):
         raise ValueError(f"{where} is not a class. Use the dotted path of one.")
+    if key == "callback" and not (isinstance(found, type) and issubclass(found, BaseCallback)):
+        raise ValueError(f"{where} is no subclass of Stable-Baselines3's BaseCallback. Use the dotted path of one.")
     if not isinstance(arguments, dict):
         raise ValueError(f"{where} has {_kind(arguments)} instead of arguments: write `{name}: {{ARGUMENT: VALUE}}`.")
     try:

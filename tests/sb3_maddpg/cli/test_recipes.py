@@ -170,6 +170,14 @@ def test_a_wrapper_or_callback_that_is_no_class_is_refused(key, name):
             check_recipe("maddpg", {**recipe, key: value}, "recipe")
 
 
+@pytest.mark.parametrize("name", ["os.system", "collections.OrderedDict", "gymnasium.wrappers.TimeLimit"])
+def test_what_is_no_callback_is_not_called(capsys, name):
+    """Calling it would run anything, and Stable-Baselines3 would then fail at its result."""
+    argv = ["train", "--env", "OwnBit-v0", "--eval-freq", "-1", "-params", f"callback:[{{{name}: {{command: exit}}}}]"]
+    assert main(argv) == 2
+    assert f"callback: {name} in the recipe is no subclass" in capsys.readouterr().err
+
+
 LIMIT, STACK = "gymnasium.wrappers.TimeLimit", "stable_baselines3.common.vec_env.VecFrameStack"
 CHECKPOINT = "stable_baselines3.common.callbacks.CheckpointCallback"
 
