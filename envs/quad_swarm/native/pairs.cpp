@@ -204,22 +204,29 @@ EXPORT void quad_swarm_keep_right(Integer n_robots, Integer n_others, Integer n_
   }
 }
 
+// `errors` null: robots observe each other without errors.
 EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_places, double limit, double look_ahead,
-                                  const double* pos, const double* vel, Integer* others, Flag* present,
-                                  Integer* reverse) {
+                                  const double* pos, const double* vel, const double* errors, Integer* others,
+                                  Flag* present, Integer* reverse) {
   std::vector<std::pair<double, Integer>> near;
   std::vector<Flag> comes(n_robots);
+  std::vector<const double*> error(n_robots, nullptr);  // of each other that is in a slot
   for (Integer swarm = 0; swarm < n_swarms; swarm++) {
     const double *swarm_pos = pos + 3 * n_robots * swarm, *swarm_vel = vel + 3 * n_robots * swarm;
     const Integer first = n_places * n_robots * swarm;
     for (Integer robot = 0; robot < n_robots; robot++) {
       near.clear();
+      for (Integer k = first + n_places * robot; errors && k < first + n_places * (robot + 1); k++)
+        if (present[k]) error[others[k]] = errors + 6 * k;
       for (Integer other = 0; other < n_robots; other++) {
         double apart[3], along[3];
         for (int i = 0; i < 3; i++) {
           apart[i] = swarm_pos[3 * robot + i] - swarm_pos[3 * other + i];
           along[i] = swarm_vel[3 * robot + i] - swarm_vel[3 * other + i];
+          if (error[other]) apart[i] -= error[other][i];
+          if (error[other]) along[i] -= error[other][i + 3];
         }
+        error[other] = nullptr;
         if (other == robot || dot(apart, apart) > limit * limit) continue;
         const double time =
             std::min(std::max(-dot(apart, along) / std::max(dot(along, along), 1e-12), 0.0), look_ahead);

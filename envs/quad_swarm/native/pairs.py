@@ -28,7 +28,7 @@ _FUNCTIONS = {
     "quad_swarm_approach": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 9],
     "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
     "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
-    "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 5],
+    "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 6],
     "quad_swarm_measure": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 11],
     "quad_swarm_count": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 13],
 }
@@ -274,7 +274,13 @@ def keep_right(
 
 
 def neighbours(
-    pos: np.ndarray, vel: np.ndarray, others: np.ndarray, present: np.ndarray, limit: float, look_ahead: float
+    pos: np.ndarray,
+    vel: np.ndarray,
+    others: np.ndarray,
+    present: np.ndarray,
+    limit: float,
+    look_ahead: float,
+    errors: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Update the neighbours of each robot. A robot that remains a neighbour keeps its slot, see
     `quad_swarm.world.neighbours`.
@@ -286,6 +292,8 @@ def neighbours(
     :param limit: maximum distance of a neighbour (m), infinity for any distance
     :param look_ahead: time over which the smallest distance at constant velocities decides which robots are nearest
         (s); 0 for the current distance
+    :param errors: errors of the position and the velocity that each robot observes of the others in its slots,
+        (E, n, m, 6) (m and m/s); None for none
     :return: the new ``others`` and ``present``, and the slot of the robot at each of its neighbours, -1 without one,
         (E, n, m)
     """
@@ -293,11 +301,19 @@ def neighbours(
         others, present = np.array(others, np.int64, order="C"), np.array(present, np.bool_, order="C")
         pos, vel = np.ascontiguousarray(pos, np.float64), np.ascontiguousarray(vel, np.float64)
         reverse = np.empty_like(others)
-        library.quad_swarm_neighbours(*others.shape, limit, look_ahead, *addresses(pos, vel, others, present, reverse))
+        errors = None if errors is None else np.ascontiguousarray(errors, np.float64)
+        library.quad_swarm_neighbours(
+            *others.shape, limit, look_ahead, *addresses(pos, vel, errors, others, present, reverse)
+        )
         return others, present, reverse
     n_swarms, n, m = others.shape
     numbers = np.arange(n)
     apart, along = (each[:, :, None] - each[:, None] for each in (pos, vel))
+    if errors is not None:
+        where = np.nonzero(present)
+        seen = (*where[:2], others[where])
+        apart[seen] -= errors[where][:, :3]
+        along[seen] -= errors[where][:, 3:]
     within = _dot(apart, apart) <= limit * limit
     within[:, numbers, numbers] = False
     time = np.minimum(np.maximum(-_dot(apart, along) / np.maximum(_dot(along, along), 1e-12), 0.0), look_ahead)

@@ -24,7 +24,8 @@ from quad_swarm.world.beliefs import other_indices, reverse_indices
 class Neighbourhood:
     """Limits of the others that a robot perceives, predicts and may request plans from, by default none.
 
-    :param max_others: maximum number of others, of which the nearest are chosen; None for all
+    :param max_others: maximum number of others, of which the nearest are chosen, as the robot observes them; None for
+        all
     :param range: maximum distance of others, for both sensors and radio (m); None for any distance
     :param look_ahead: time over which the smallest distance at constant velocities decides which others are nearest
         (s); 0 for the current distance. In a crowd, the others that are currently nearest are not the most relevant
@@ -88,30 +89,33 @@ class Neighbours:
         """Whether there may be others that a robot does not perceive."""
         return self.present is not None
 
-    def update(self, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
-        """Update the slots of limited neighbourhoods.
+    def update(self, pos: np.ndarray, vel: np.ndarray, errors: np.ndarray | None = None) -> np.ndarray:
+        """Update the slots of limited neighbourhoods by what robots observe.
 
-        :param pos: positions, (E, n, 3) (m)
-        :param vel: velocities, (E, n, 3) (m/s)
+        :param pos: positions as the robots estimate their own, (E, n, 3) (m)
+        :param vel: velocities as the robots estimate their own, (E, n, 3) (m/s)
+        :param errors: additional errors of each robot about the others in its slots, (E, n, m, 6); None for none
         :return: whether another robot, or none, is in the slot now, (E, n, m) bool
         """
         assert self.present is not None
         before = self.others
         self.others, self.present, self.reverse = pairs.neighbours(
-            pos, vel, self.others, self.present, self._range, self._look_ahead
+            pos, vel, self.others, self.present, self._range, self._look_ahead, errors
         )
         return self.others != before
 
-    def reset(self, swarm: int, pos: np.ndarray) -> None:
-        """Fill the slots of one swarm, whose robots are at rest.
+    def reset(self, swarm: int, pos: np.ndarray, vel: np.ndarray | None = None) -> None:
+        """Fill the slots of one swarm.
 
         :param swarm: index of the swarm
-        :param pos: positions, (n, 3) (m)
+        :param pos: positions as the robots estimate their own, (n, 3) (m)
+        :param vel: velocities as the robots estimate their own, (n, 3) (m/s); None at rest
         """
         if self.present is None:
             return
+        vel = np.zeros_like(pos) if vel is None else vel
         empty = self._empty(1, self.others.shape[-1])
-        fresh = pairs.neighbours(pos[None], np.zeros((1, *pos.shape)), *empty, self._range, self._look_ahead)
+        fresh = pairs.neighbours(pos[None], vel[None], *empty, self._range, self._look_ahead)
         for mine, new in zip((self.others, self.present, self.reverse), fresh, strict=True):
             mine[swarm] = new[0]
 

@@ -141,6 +141,11 @@ class Realisation:
             return pos, vel
         return pos + self._observer[..., :3], vel + self._observer[..., 3:]
 
+    @property
+    def observer_errors(self) -> np.ndarray | None:
+        """The observers' errors about positions and velocities of others, (E, n, n - 1, 6); None without any."""
+        return self._observer if self.config.sensing.others else None
+
     def arrivals(self, requests: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Draw which answers of this step arrive.
 

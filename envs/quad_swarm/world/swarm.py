@@ -198,7 +198,6 @@ class Swarm:
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
-        self.neighbours.reset(swarm, starts)
         for beliefs in {self.beliefs, self.presumed_beliefs}:
             beliefs.forget(np.array([swarm]))
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
@@ -210,6 +209,9 @@ class Swarm:
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
             self.chance.reset(swarm, noise_seed)
+        if self.neighbours.limited:
+            estimate = self.estimate()[swarm]
+            self.neighbours.reset(swarm, estimate[:, POSITION], estimate[:, VELOCITY])
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
@@ -303,7 +305,8 @@ class Swarm:
 
         :return: whether another robot, or none, is in the slot now, (E, n, m) bool
         """
-        changed = self.neighbours.update(self.pos, self.vel)
+        estimate = self.estimate()
+        changed = self.neighbours.update(estimate[..., POSITION], estimate[..., VELOCITY], self.chance.observer_errors)
         if changed.any():
             for beliefs in {self.beliefs, self.presumed_beliefs}:
                 beliefs.forget_others(changed)

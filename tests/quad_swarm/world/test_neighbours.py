@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from quad_swarm.native import pairs
 from quad_swarm.task.request_task import make_task
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
@@ -305,3 +306,43 @@ def test_spread_names_robots_by_their_numbers():
     assert spread(places, numbers)[0].tolist() == [[False, True], [True, False], [True, False]]
     plain = np.random.default_rng(0).random((2, 4, 3)) < 0.5
     assert spread(plain, other_indices(4)) is plain
+
+
+def nearest_as_observed(swarm: Swarm, m: int) -> list[set[int]]:
+    """The others that each robot of the first swarm takes for the nearest, from what it is given about everybody."""
+    estimate, numbers = swarm.estimate()[0], swarm.neighbours.numbers_in(0)
+    observed = swarm.observe()[0][0]
+    chosen = []
+    for robot, own in enumerate(estimate[:, :3]):
+        seen = estimate[:, :3].copy()  # what the others broadcast
+        for slot, other in enumerate(numbers[robot]):
+            seen[other] = observed[robot, slot]
+        distances = np.linalg.norm(seen - own, axis=-1)
+        distances[robot] = np.inf
+        chosen.append(set(np.argsort(distances)[:m].tolist()))
+    return chosen
+
+
+@pytest.mark.parametrize("sensing", [{"pos": 1.0}, {"others_pos": 1.0}, {"pos": 0.5, "others_pos": 0.5}])
+@pytest.mark.parametrize("way", ["compiled", "numpy"])
+def test_neighbours_are_chosen_by_what_robots_observe(sensing, way, monkeypatch):
+    if way == "numpy":
+        monkeypatch.setattr(pairs, "compiled", lambda: None)
+    config = make_config("paper", n_robots=8, world={"neighbourhood": {"max_others": 3}, "sensing": sensing})
+    swarm = Swarm(config, 1)
+    starts = np.random.default_rng(1).uniform([-4, -4, 0.7], [4, 4, 2.1], (8, 3))
+    swarm.reset(0, starts, starts, noise_seed=3)
+    if "pos" in sensing:
+        estimate = swarm.estimate()[0, :, :3]
+        distances = np.linalg.norm(estimate[:, None] - estimate, axis=-1) + np.diag(np.full(8, np.inf))
+        expected = [set(row[:3].tolist()) for row in np.argsort(distances)]
+        assert [set(row) for row in swarm.neighbours.numbers_in(0).tolist()] == expected
+    by_truth = 0
+    for _ in range(20):
+        swarm.chance.advance()  # errors change, robots stay
+        expected = nearest_as_observed(swarm, 3)
+        swarm._look_around()
+        assert [set(row) for row in swarm.neighbours.numbers_in(0).tolist()] == expected
+        distances = np.linalg.norm(swarm.pos[0][:, None] - swarm.pos[0], axis=-1) + np.diag(np.full(8, np.inf))
+        by_truth += [set(row[:3].tolist()) for row in np.argsort(distances)] == expected
+    assert by_truth < 20
