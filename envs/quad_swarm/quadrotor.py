@@ -1,11 +1,12 @@
 """The attitude-commanded quadrotor: one CasADi expression that both the planner and the simulator integrate.
 
 State ``x`` (9): position ``p`` (m, world frame, z up), velocity ``v`` (m/s), roll ``phi``, pitch ``theta``, yaw ``psi``
-(rad). Input ``u`` (4): commanded roll and pitch (rad), commanded climb rate (m/s), commanded yaw rate (rad/s).
+(rad). A positive pitch accelerates along the heading, a positive roll to its right. Input ``u`` (4): commanded roll and
+pitch (rad), commanded climb rate (m/s), commanded yaw rate (rad/s).
 
 The model and its parameters come from the simulator that the paper's laboratory published (Parrot Bebop 2;
 tud-amr/mrca-mav, dynamics/bebop_dynamics.m). Drag is linear in the velocity, attitude and climb rate follow their
-commands with first-order lags, and yaw does not affect the translation.
+commands with first-order lags.
 """
 
 from __future__ import annotations
@@ -81,22 +82,29 @@ def scaled(params: QuadrotorParams, factors: ca.SX) -> Any:
     return SimpleNamespace(gravity=params.gravity, **values)
 
 
-def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -> ca.SX:
+def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, heading: bool = True) -> ca.SX:
     """Compute the time derivative of the state.
 
     :param x: state, (9,)
     :param u: input, (4,)
     :param wind: horizontal velocity of the air, (2,), world frame (m/s); drag acts on the velocity relative to the air
     :param params: physical parameters
+    :param heading: whether roll and pitch are about the axes of the heading, otherwise about the world's, as where
+        the yaw is 0
     :return: dx/dt, (9,)
     """
-    vx, vy, vz, phi, theta = x[3], x[4], x[5], x[6], x[7]
+    vx, vy, vz = x[3], x[4], x[5]
+    right, forward = ca.tan(x[6]), ca.tan(x[7])
+    if heading:
+        cos, sin = ca.cos(x[8]), ca.sin(x[8])
+        right, forward = cos * right - sin * forward, cos * forward + sin * right
+    phi, theta = x[6], x[7]
     return ca.vertcat(
         vx,
         vy,
         vz,
-        params.gravity * ca.tan(theta) - params.drag_x * (vx - wind[0]),
-        -params.gravity * ca.tan(phi) - params.drag_y * (vy - wind[1]),
+        params.gravity * forward - params.drag_x * (vx - wind[0]),
+        -params.gravity * right - params.drag_y * (vy - wind[1]),
         (params.climb_gain * u[2] - vz) / params.climb_time_constant,
         (params.roll_gain * u[0] - phi) / params.roll_time_constant,
         (params.pitch_gain * u[1] - theta) / params.pitch_time_constant,
@@ -104,21 +112,24 @@ def state_derivative(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams) -
     )
 
 
-def rk4_step(x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float | ca.SX) -> ca.SX:
+def rk4_step(
+    x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float | ca.SX, heading: bool = True
+) -> ca.SX:
     """Take one classical Runge-Kutta step of length ``dt`` (s) with constant input (eq. 1), see `state_derivative`."""
-    k1 = state_derivative(x, u, wind, params)
-    k2 = state_derivative(x + dt / 2 * k1, u, wind, params)
-    k3 = state_derivative(x + dt / 2 * k2, u, wind, params)
-    k4 = state_derivative(x + dt * k3, u, wind, params)
+    k1 = state_derivative(x, u, wind, params, heading)
+    k2 = state_derivative(x + dt / 2 * k1, u, wind, params, heading)
+    k3 = state_derivative(x + dt / 2 * k2, u, wind, params, heading)
+    k4 = state_derivative(x + dt * k3, u, wind, params, heading)
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def step_function(params: QuadrotorParams, dt: float | None, varied: bool = False) -> ca.Function:
+def step_function(params: QuadrotorParams, dt: float | None, varied: bool = False, heading: bool = True) -> ca.Function:
     """Create the discrete dynamics as a CasADi function ``(x, u, wind) -> x_next``, (9,), (4,), (2,) -> (9,).
 
     :param params: physical parameters
     :param dt: length of the step (s); None makes it an additional argument
     :param varied: whether the factors of `VEHICLE_PARAMETERS`, (8,), are an additional argument
+    :param heading: see `state_derivative`
     """
     x, u, wind = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS), ca.SX.sym("wind", 2)
     inputs = {"x": x, "u": u, "wind": wind}
@@ -127,15 +138,15 @@ def step_function(params: QuadrotorParams, dt: float | None, varied: bool = Fals
         params = scaled(params, inputs["factors"])
     if dt is None:
         inputs["dt"] = ca.SX.sym("dt")
-    x_next = ca.cse(rk4_step(x, u, wind, params, inputs.get("dt", dt)))
+    x_next = ca.cse(rk4_step(x, u, wind, params, inputs.get("dt", dt), heading))
     return ca.Function("quadrotor_step", list(inputs.values()), [x_next], list(inputs), ["x_next"])
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled_step(params: QuadrotorParams, dt: float | None, varied: bool) -> RowFunction | None:
+def _compiled_step(params: QuadrotorParams, dt: float | None, varied: bool, heading: bool) -> RowFunction | None:
     """Compile `step_function` for many rows. Returns None if that fails, of which the planner warns."""
     try:
-        return RowFunction(step_function(params, dt, varied))
+        return RowFunction(step_function(params, dt, varied, heading))
     except BuildError:
         return None
 
@@ -175,13 +186,16 @@ class QuadrotorModel:
         count = x.size // N_STATES
         if count == 0:
             return x.copy()
-        if count >= _WORTH_COMPILING and (compiled := _compiled_step(self.params, dt, varied)) is not None:
+        u = arguments[1]
+        assert u is not None
+        heading = bool(np.count_nonzero(x[..., 8]) or np.count_nonzero(u[..., 3]))
+        if count >= _WORTH_COMPILING and (compiled := _compiled_step(self.params, dt, varied, heading)) is not None:
             return compiled(count, arguments).reshape(x.shape)
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches need few functions
         calls: dict[Any, _BufferedCall] = self._local.__dict__
-        key = (dt, varied, capacity)
+        key = (dt, varied, heading, capacity)
         if key not in calls:
-            calls[key] = _BufferedCall(step_function(self.params, dt, varied), capacity)
+            calls[key] = _BufferedCall(step_function(self.params, dt, varied, heading), capacity)
         return calls[key](count, arguments).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -6,13 +6,13 @@ import functools
 import math
 import warnings
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
-from quad_swarm.quadrotor import N_INPUTS, QuadrotorModel
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorModel
 
 
 class Solution(NamedTuple):
@@ -98,6 +98,9 @@ class Planner:
 
     The level is chosen independently for each robot, so a failure never affects another robot's plan.
 
+    :ivar checks: whether `plan` refuses invalid arrays; otherwise, problems whose numbers are not finite fail and
+        brake, as in the steps of swarms, which never raise
+
     :param solver: the solver
     :param model: discrete dynamics, for the levels without a solver
     :param config: horizon and limits
@@ -107,14 +110,65 @@ class Planner:
         self.solver = solver
         self.model = model
         self.config = config
+        self.checks = True
 
     def plan(self, problems: Problems, previous: Plans) -> Plans:
         """Solve a batch of B problems; solver failures never raise.
 
+        Robots may have any heading. Limits of roll and pitch hold along the heading.
+
         :param problems: the batch
         :param previous: plans of the same robots in the previous step
         :return: the new plans
+        :raises ValueError: if an array has another shape or type than `Problems` and `Plans` say, or holds numbers that
+            are not finite; not without `checks`
         """
+        if self.checks:
+            problems, previous = self._checked(problems, previous)
+        if not np.count_nonzero(problems.x[:, 8]):
+            return self._plan(problems, previous)
+        # Within, roll and pitch are those about the world's axes, to which the problem has no yaw
+        yaw = problems.x[:, 8]
+        with np.errstate(invalid="ignore"):  # an infinite yaw fails like other states that are not finite
+            wrapped = np.remainder(yaw + np.pi, 2 * np.pi) - np.pi
+        start, before = turned(problems.x, -yaw), turned(previous.x, -previous.x[..., 8])
+        start[:, 8], before[..., 8] = wrapped, before[..., 8] + (wrapped - yaw)[:, None]
+        u_before = turned(previous.u, -previous.x[:, :-1, 8], 0)
+        plans = self._plan(problems._replace(x=start), previous._replace(x=before, u=u_before))
+        planned = (
+            plans.x[:, :-1, 8] if self.config.max_yaw_rate else np.repeat(wrapped[:, None], plans.u.shape[1], axis=1)
+        )
+        u, limit = turned(plans.u, planned, 0), self.config.max_tilt
+        u[..., :2] = np.clip(u[..., :2], -limit, limit)
+        return plans._replace(x=self.model.rollout(problems.x, u), u=u)
+
+    def _checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
+        """Check the arrays of a call and convert them to their types."""
+        stages, kept = self.config.horizon, self.config.max_neighbours
+        count, *_ = (*_shape(problems.x), 0)
+        n_others = shape[1] if len(shape := _shape(problems.others)) == 4 else 0
+        taken = n_others if kept is None else min(n_others, kept)
+        if taken != (expected := getattr(getattr(self.solver, "problem", None), "n_others", taken)):
+            n_others = expected  # what the message asks for
+        x = _array("x", problems.x, (count, N_STATES))
+        goal = _array("goal", problems.goal, (count, 3))
+        others = _array("others", problems.others, (count, n_others, stages, 3))
+        clearance, announced = problems.clearance, problems.announced
+        if clearance is not None:
+            clearance = _array("clearance", clearance, (count, n_others, stages))
+        if announced is not None:
+            announced = _array("announced", announced, (count, n_others), np.dtype(bool))
+        return Problems(x, goal, others, clearance, announced), Plans(
+            # The last plan is a guess, so that numbers which are not finite only cost a retry
+            _array("previous.x", previous.x, (count, stages + 1, N_STATES), finite=False),
+            _array("previous.u", previous.u, (count, stages, N_INPUTS), finite=False),
+            _array("previous.age", previous.age, (count,), np.dtype(np.int64)),
+            _array("previous.status", previous.status, (count,), np.dtype(np.int64)),
+            _array("previous.iterations", previous.iterations, (count,), np.dtype(np.int64)),
+        )
+
+    def _plan(self, problems: Problems, previous: Plans) -> Plans:
+        """Do the same with roll and pitch about the world's axes, whatever the yaw."""
         x_guess, u_guess = shift(previous.x), shift(previous.u)
         problems = self._nearest_others(problems, x_guess)
         if self.config.right_of_way:
@@ -138,8 +192,19 @@ class Planner:
             status[failed[lasts]] = PlanStatus.SHIFTED
             u[failed[lasts]] = u_guess[failed[lasts]]
             u[failed[~lasts]] = self.braking_inputs(problems.x[failed[~lasts]])
-            x[failed] = self.model.rollout(problems.x[failed], u[failed])
+            x[failed] = self._rollout(problems.x[failed], u[failed])
         return Plans(x, u, age, status, iterations)
+
+    def _rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Roll out states with roll and pitch about the world's axes, see `QuadrotorModel.rollout`."""
+        if not (np.count_nonzero(x[:, 8]) or np.count_nonzero(u[..., 3])):
+            return self.model.rollout(x, u)
+        held, still = x.copy(), u.copy()
+        held[:, 8] = still[..., 3] = 0.0
+        states = self.model.rollout(held, still)
+        states[..., 8] = x[:, 8:]
+        states[:, 1:, 8] += self.config.dt * u[..., 3].cumsum(axis=1)
+        return states
 
     def _solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """Call the solver. Plans that are not finite count as failed, as do all plans if the solver raises."""
@@ -173,7 +238,8 @@ class Planner:
     def braking_inputs(self, x: np.ndarray) -> np.ndarray:
         """Compute inputs that bring robots to hover from their states without a solver, (B, 9) -> (B, N, 4).
 
-        The commanded tilt opposes the velocity and saturates at its limit. The commanded climb rate is zero.
+        The commanded tilt, about the world's axes, opposes the velocity and saturates at its limit. The commanded climb
+        rate is zero.
         """
         # Tilt a = v / (g * 0.5 s) stops the linearised robot in about half a second without overshoot
         gain = 1.0 / (self.model.params.gravity * 0.5)
@@ -183,7 +249,7 @@ class Planner:
         for k in range(self.config.horizon):
             u[:, k, 0] = np.clip(gain * state[:, 4], -limit, limit)
             u[:, k, 1] = np.clip(-gain * state[:, 3], -limit, limit)
-            state = self.model.step(state, u[:, k])
+            state = self._rollout(state, u[:, k : k + 1])[:, 1]
         return u
 
 
@@ -212,6 +278,51 @@ def _checked(solution: Solution, x_guess: np.ndarray, u_guess: np.ndarray) -> So
         if array.shape != shape:
             raise ValueError(f"{name} has the shape {array.shape}; a solution of these problems has {shape}")
     return checked
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    """Return the shape of an array or of nested lists, () if they have none."""
+    try:
+        return np.shape(value)
+    except (ValueError, TypeError):
+        return ()
+
+
+def _array(
+    name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype = _TYPES[0], finite: bool = True
+) -> np.ndarray:
+    """Check an array of a call and convert it to its type.
+
+    :raises ValueError: if it has another shape or kind, or holds numbers that are not finite
+    """
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError):  # nested lists of different lengths, or a foreign class
+        array = np.array(None)
+    kinds = {"f": "fiu", "i": "iu", "b": "b"}[dtype.kind]
+    if array.shape != shape or array.dtype.kind not in kinds:
+        raise ValueError(
+            f"{name} has shape {array.shape} and type {array.dtype}; this planner takes {shape} and {dtype}."
+        )
+    if finite and not np.isfinite(array).all():
+        where = [int(index) for index in np.argwhere(~np.isfinite(array))[0]]
+        raise ValueError(f"{name}{where} is {array[tuple(where)]}: the numbers of a problem must be finite.")
+    return array.astype(dtype, copy=False)
+
+
+def turned(values: np.ndarray, angle: np.ndarray, first: int = 6) -> np.ndarray:
+    """Return states or inputs whose roll and pitch are about axes that are turned by an angle.
+
+    :param values: states (..., 9) or inputs (..., 4)
+    :param angle: angle by which the axes turn about the vertical, counter-clockwise, (...) (rad)
+    :param first: index of the roll: 6 for states, 0 for inputs
+    """
+    values = values.copy()
+    with np.errstate(invalid="ignore"):
+        cos, sin = np.cos(angle), np.sin(angle)
+    roll, pitch = values[..., first].copy(), values[..., first + 1].copy()
+    values[..., first], values[..., first + 1] = cos * roll + sin * pitch, cos * pitch - sin * roll
+    return values
 
 
 def shift(trajectory: np.ndarray) -> np.ndarray:

@@ -155,10 +155,11 @@ class OptimalControlProblem:
         self.max_input = ca.DM(limits[: self.nu])
 
     def dynamics(self, x: ca.SX, u: ca.SX) -> ca.SX:
-        """Return the next state, (nx,), in still air (eq. 1)."""
+        """Return the next state, (nx,), in still air (eq. 1). Roll and pitch are about the world's axes; `Planner.plan`
+        converts them from and to those of the heading."""
         x_full = ca.vertcat(x, ca.SX.zeros(N_STATES - self.nx))
         u_full = ca.vertcat(u, ca.SX.zeros(N_INPUTS - self.nu))
-        return ca.cse(rk4_step(x_full, u_full, ca.SX.zeros(2), self.quadrotor, self.config.dt))[: self.nx]
+        return ca.cse(rk4_step(x_full, u_full, ca.SX.zeros(2), self.quadrotor, self.config.dt, False))[: self.nx]
 
     def input_cost(self, u: ca.SX) -> ca.SX:
         """Return the cost of the inputs of one stage, each divided by its limit."""

@@ -92,6 +92,7 @@ class Swarm:
     def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
         self.config = config
         self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_others + 1, solver)
+        self.planner.checks = False
         n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
         self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
         self.state = np.zeros((n_swarms, n, 9))

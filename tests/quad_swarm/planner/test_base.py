@@ -1,7 +1,9 @@
 """Every level of the fallback chain, and which of the others a plan considers."""
 
 import dataclasses
+import math
 
+import foreign
 import numpy as np
 import pytest
 from planning import QUADROTOR, assert_same, crossing, hover, scattered
@@ -24,6 +26,7 @@ def test_a_bad_lane_brakes_and_leaves_its_neighbours_alone():
     config = PlannerConfig()
     problems = crossing(3, config)
     planner = make_planner(config, QUADROTOR, 3, "fatrop")
+    planner.checks = False
     good = planner.plan(problems, hover(problems, config))
     broken = problems._replace(others=problems.others.copy())
     broken.others[1, 0, 3] = np.nan
@@ -113,13 +116,12 @@ def test_a_solution_of_lists_or_of_arrays_that_cannot_be_written_is_as_good():
     config = PlannerConfig(horizon=3)
     problems = crossing(3, config)
     problems.others[1] = np.nan  # one fails, and the planner writes into its place
-    model = QuadrotorModel(QUADROTOR, config.dt)
-    plans = [
-        Planner(kind(OptimalControlProblem(config, QUADROTOR, 2)), model, config).plan(
-            problems, hover(problems, config)
-        )
-        for kind in (Plain, Lists, Frozen)
-    ]
+    plans = []
+    for kind in (Plain, Lists, Frozen):
+        problem = OptimalControlProblem(config, QUADROTOR, 2)
+        planner = Planner(kind(problem), QuadrotorModel(QUADROTOR, config.dt), config)
+        planner.checks = False
+        plans.append(planner.plan(problems, hover(problems, config)))
     assert plans[0].status.tolist() == [PlanStatus.SOLVED, PlanStatus.SHIFTED, PlanStatus.SOLVED]
     assert_same(plans[1], plans[0])
     assert_same(plans[2], plans[0])
@@ -168,3 +170,126 @@ def test_a_limit_above_the_number_of_others_changes_nothing():
     last = Plans.hover(problems.x, 10)
     plans = [make_planner(PlannerConfig(max_neighbours=k), QUADROTOR, 3, "rti").plan(problems, last) for k in (None, 9)]
     assert_same(*plans)
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("x", np.zeros(9), r"x has shape \(9,\) and type float64; this planner takes \(9, 9\)"),
+        ("x", np.zeros((1, 12)), r"x has shape \(1, 12\) .* takes \(1, 9\)"),
+        ("x", np.zeros((1, 9), complex), r"x has .* type complex128; .* and float64"),
+        ("x", "state", r"x has shape \(\)"),
+        ("x", [[0.0] * 9, [0.0] * 8], r"x has shape \(\) and type object"),
+        ("goal", np.zeros((1, 2)), r"goal has shape \(1, 2\) .* takes \(1, 3\)"),
+        ("others", np.zeros((1, 10, 2, 3)), r"others has shape \(1, 10, 2, 3\) .* takes \(1, 2, 10, 3\)"),
+        ("others", np.zeros((1, 2, 11, 3)), r"others has shape \(1, 2, 11, 3\) .* takes \(1, 2, 10, 3\)"),
+        ("others", np.zeros((1, 1, 10, 3)), r"others has shape \(1, 1, 10, 3\) .* takes \(1, 2, 10, 3\)"),
+        ("others", np.zeros((2, 2, 10, 3)), r"others has shape \(2, 2, 10, 3\) .* takes \(1, 2, 10, 3\)"),
+        ("others", np.full((1, 2, 10, 3), np.nan), r"others\[0, 0, 0, 0\] is nan: the numbers of a problem must be"),
+        ("others", np.full((1, 2, 10, 3), np.inf), r"others\[0, 0, 0, 0\] is inf"),
+        ("goal", np.array([[0, np.nan, 0]]), r"goal\[0, 1\] is nan"),
+        ("clearance", np.zeros((1, 2)), r"clearance has shape \(1, 2\) .* takes \(1, 2, 10\)"),
+        ("announced", np.ones((1, 2)), r"announced has .* type float64; this planner takes \(1, 2\) and bool"),
+        ("previous.x", np.zeros((1, 10, 9)), r"previous.x has shape \(1, 10, 9\) .* takes \(1, 11, 9\)"),
+        ("previous.u", np.zeros((1, 10, 3)), r"previous.u has shape \(1, 10, 3\) .* takes \(1, 10, 4\)"),
+        ("previous.age", np.zeros(1), r"previous.age has .* float64; this planner takes \(1,\) and int64"),
+    ],
+)
+def test_a_call_with_other_arrays_is_refused_in_one_sentence(solver, field, value, message):
+    config = PlannerConfig()
+    planner = make_planner(config, QUADROTOR, 3, solver)
+    problems = crossing(1, config)
+    last = hover(problems, config)
+    if field.startswith("previous."):
+        last = last._replace(**{field.removeprefix("previous."): value})
+    else:
+        problems = problems._replace(**{field: value})
+    with pytest.raises(ValueError, match=message) as error:
+        planner.plan(problems, last)
+    assert str(error.value).count(". ") == 0
+
+
+def test_lists_and_single_precision_are_as_good_as_arrays():
+    config = PlannerConfig()
+    problems = crossing(2, config)
+    planner, last = make_planner(config, QUADROTOR, 3, "fatrop"), hover(problems, config)
+    single = problems._replace(others=problems.others.astype(np.float32).astype(float))
+    expected = planner.plan(single, last)
+    lists = single._replace(x=problems.x.tolist(), goal=problems.goal.tolist(), others=single.others.astype(np.float32))
+    assert_same(planner.plan(lists, last), expected)
+
+
+HEADINGS = [math.radians(degrees) for degrees in (30, 45, 90, -120, 180, 354, 720)]
+
+
+def fly_by_thrust(planner: Planner, config: PlannerConfig, yaw: float, goal: np.ndarray, seconds: float) -> np.ndarray:
+    """Fly with an attitude that a rotation matrix turns into an acceleration, as that of a vehicle does."""
+    q, dt = QUADROTOR, config.dt / 10
+    state = np.zeros((1, 9))
+    state[0, 2], state[0, 8] = 1.5, yaw
+    plans, path = Plans.hover(state, config.horizon), [state.copy()]
+    others = np.full((1, 1, config.horizon, 3), 50.0)
+    for _ in range(round(seconds / config.dt)):
+        plans = planner.plan(Problems(state, goal, others), plans)
+        assert plans.status[0] == PlanStatus.SOLVED
+        assert np.abs(plans.u[0, :, :2]).max() <= config.max_tilt + 1e-12
+        u = plans.u[0, 0]
+        for _ in range(10):
+            roll, pitch, psi = state[0, 6:9]
+            ahead, left = np.tan(pitch), -np.tan(roll) / np.cos(pitch)  # of the rotors' force, over that along z
+            force = np.array([ahead * np.cos(psi) - left * np.sin(psi), ahead * np.sin(psi) + left * np.cos(psi)])
+            acceleration = q.gravity * force - np.array([q.drag_x, q.drag_y]) * state[0, 3:5]
+            climb = (q.climb_gain * u[2] - state[0, 5]) / q.climb_time_constant
+            attitude = (
+                (q.roll_gain * u[0] - roll) / q.roll_time_constant,
+                (q.pitch_gain * u[1] - pitch) / q.pitch_time_constant,
+            )
+            state[0] += dt * np.array([*state[0, 3:6], *acceleration, climb, *attitude, u[3]])
+        path.append(state.copy())
+    return np.concatenate(path)
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+@pytest.mark.parametrize("yaw", HEADINGS)
+def test_any_heading_flies_to_the_goal(solver, yaw):
+    config = PlannerConfig()
+    planner = make_planner(config, QUADROTOR, 2, solver)
+    goal = np.array([[1.5, 1.0, 1.8]])
+    path = fly_by_thrust(planner, config, yaw, goal, 5.0)
+    assert np.linalg.norm(path[-1, :3] - goal[0]) < 0.1
+    assert path[-1, 8] == yaw
+    # Along the straight way
+    off = np.cross(path[:, :3] - path[0, :3], (goal[0] - path[0, :3]) / np.linalg.norm(goal[0] - path[0, :3]))
+    assert np.linalg.norm(off, axis=-1).max() < 0.25
+
+
+@pytest.mark.parametrize("yaw", [0.5, 3.0, 6.18, -6.18, 4 * math.pi - 0.5])
+def test_a_planned_yaw_turns_the_short_way(yaw):
+    config = PlannerConfig(max_yaw_rate=1.5)
+    path = fly_by_thrust(make_planner(config, QUADROTOR, 2, "rti"), config, yaw, np.array([[1.5, 1.0, 1.8]]), 6.0)
+    nearest = 2 * math.pi * round(yaw / (2 * math.pi))
+    assert path[-1, 8] == pytest.approx(nearest, abs=0.05)
+    assert np.abs(path[:, 8] - yaw).max() <= abs(nearest - yaw) + 0.05
+    assert np.linalg.norm(path[-1, :3] - [1.5, 1.0, 1.8]) < 0.1
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
+def test_every_level_of_the_chain_knows_the_heading(yaw):
+    config = PlannerConfig(horizon=30)
+    x = np.zeros((2, 9))
+    x[:, 2], x[:, 3:5], x[:, 8] = 1.5, [1.5, -1.0], yaw
+
+    class Failing(foreign.Stay):
+        def solve(self, problems, x_guess, u_guess):
+            solution = super().solve(problems, x_guess, u_guess)
+            return solution._replace(success=~solution.success)
+
+    model = QuadrotorModel(QUADROTOR, config.dt)
+    planner = Planner(Failing(OptimalControlProblem(config, QUADROTOR, 1)), model, config)
+    old = Plans.hover(x, config.horizon)._replace(age=np.array([config.horizon, 0]))
+    plans = planner.plan(Problems(x, x[:, :3], np.full((2, 1, 30, 3), 9.0)), old)
+    assert plans.status.tolist() == [PlanStatus.BRAKING, PlanStatus.SHIFTED]
+    assert (plans.x[..., 8] == yaw).all()
+    assert np.linalg.norm(plans.x[0, -1, 3:6]) < 0.2
+    np.testing.assert_allclose(plans.x, model.rollout(x, plans.u), atol=1e-12)
