@@ -14,6 +14,9 @@ from quad_swarm.quadrotor import N_INPUTS, N_STATES
 _LARGEST_EXPONENT = 300.0  # of the repulsion, whose square is still far from overflow
 
 _LARGEST_NUMBER = 1e5  # m, m/s or rad: problems with larger numbers fail without a solve
+# Of points that are good enough although fatrop did not reach its tolerance
+_FEASIBLE = 1e-6  # violation of constraints (m, m/s or rad)
+_STATIONARY = 1e-3  # gradient of the Lagrangian over 1 + the cost
 _IN_LINE = 1e-3  # distance of another robot from the line to the goal from which its sides differ (m)
 _ASIDE = 0.1  # how far a guess then ends beside the line (m)
 
@@ -23,8 +26,8 @@ class FatropSolver:
 
     :param problem: the problem
     :param tolerance: fatrop's convergence tolerance
-    :param max_iterations: number of iterations after which a problem counts as failed. There is no time limit, so that
-        results are reproducible
+    :param max_iterations: number of iterations after which a problem counts as failed, unless the point reached is
+        feasible and stationary relative to its cost. There is no time limit, so that results are reproducible
     """
 
     name = "fatrop"
@@ -35,6 +38,7 @@ class FatropSolver:
         self.max_iterations = max_iterations
         self._program: Program | None = None
         self._solver: ca.Function | None = None
+        self._stationarity: ca.Function | None = None
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """See `Solver.solve`."""
@@ -70,15 +74,41 @@ class FatropSolver:
             except RuntimeError:  # fatrop failed numerically; the fallback chain takes over
                 continue
             stats = solver.stats()
-            success[b], iterations[b] = stats["success"], stats["iter_count"]
+            success[b] = stats["success"] or self._is_good(solution, parameters)
+            iterations[b] = stats["iter_count"]
             optimum = solution["x"].full().ravel()
             success[b] &= np.isfinite(optimum).all()
             x[b, 1:, :nx] = optimum[program.x_index]
             u[b, :, :nu] = optimum[program.u_index]
         return Solution(x, u, success, iterations)
 
+    def _is_good(self, solution: dict[str, ca.DM], parameters: np.ndarray) -> bool:
+        """Return whether a point at which fatrop stopped obeys the constraints and is stationary relative to its cost.
+        Where robots overlap, violations cost thousands, and the last digits of the tolerance would take hundreds of
+        iterations."""
+        assert self._program is not None
+        if self._stationarity is None:
+            self._stationarity = _stationarity(self._program)
+        residual = self._stationarity(solution["x"], parameters, solution["lam_g"], solution["lam_x"])
+        g, bounds = solution["g"].full().ravel(), self._program.bounds
+        violation = np.maximum(bounds["lbg"] - g, g - bounds["ubg"]).max(initial=0.0)
+        stationary = float(ca.norm_inf(residual)) <= _STATIONARY * (1 + abs(float(solution["f"])))
+        return bool(violation <= _FEASIBLE and stationary)
+
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"_program": None, "_solver": None}  # rebuilt on demand in another process
+        return self.__dict__ | {
+            "_program": None,
+            "_solver": None,
+            "_stationarity": None,
+        }  # rebuilt on demand in another process
+
+
+def _stationarity(program: Program) -> ca.Function:
+    """Return the gradient of the Lagrangian as a function of variables, parameters and multipliers."""
+    x, g = program.nlp["x"], program.nlp["g"]
+    of_g, of_x = ca.SX.sym("lam_g", g.numel()), ca.SX.sym("lam_x", x.numel())
+    gradient = ca.gradient(program.nlp["f"] + ca.dot(of_g, g), x) + of_x
+    return ca.Function("stationarity", [x, program.nlp["p"], of_g, of_x], [gradient])
 
 
 def _aside(problems: Problems, row: int, horizon: int) -> np.ndarray:

@@ -7,10 +7,17 @@ import sys
 import casadi as ca
 import numpy as np
 import pytest
-from planning import QUADROTOR, crossing, hover
+from planning import QUADROTOR, crossing, hover, unit
 
-from quad_swarm.planner import FatropSolver, OptimalControlProblem, PlannerConfig, PlanStatus, Problems, make_planner
-from quad_swarm.planner.base import Plans
+from quad_swarm.planner import (
+    FatropSolver,
+    OptimalControlProblem,
+    PlannerConfig,
+    Plans,
+    PlanStatus,
+    Problems,
+    make_planner,
+)
 from quad_swarm.planner.fatrop import transcribe
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 
@@ -172,3 +179,29 @@ def test_a_robot_exactly_in_line_is_flown_around(gap):
         closest = min(closest, float(np.linalg.norm(x[0, :3] - other[0, 0, 0])))
     assert np.linalg.norm(x[0, :3] - goal[0]) < 0.1
     assert closest > 0.59
+
+
+@pytest.mark.parametrize("towards", [(3.0, 0.0, 0.0), (2.0, 2.0, 0.0)])
+@pytest.mark.parametrize("distance", [0.0, 0.1, 0.3, 0.5, 0.6, 1.0, 1.5])
+def test_a_robot_leaves_another_that_it_overlaps_or_that_is_in_line(distance, towards):
+    config, model = PlannerConfig(), QuadrotorModel(QUADROTOR, 0.1)
+    planner = make_planner(config, QUADROTOR, 2, "fatrop")
+    state = np.zeros((1, 9))
+    state[0, 2] = 1.5
+    goal = state[:, :3] + towards
+    others = np.tile(state[0, :3] + distance * unit(np.array(towards)), (1, 1, 10, 1))
+    plans = Plans.hover(state, config.horizon)
+    for _ in range(80):
+        plans = planner.plan(Problems(state, goal, others), plans)
+        assert plans.status[0] == PlanStatus.SOLVED
+        state = model.step(state, plans.u[:, 0])
+    assert np.linalg.norm(state[0, :3] - goal) < 0.1
+
+
+def test_points_that_are_not_stationary_have_failed():
+    config = PlannerConfig()
+    problems = crossing(4, config)
+    problem = OptimalControlProblem(config, QUADROTOR, 2)
+    guess = np.repeat(problems.x[:, None], 11, axis=1), np.zeros((4, 10, 4))
+    assert FatropSolver(problem).solve(problems, *guess).success.all()
+    assert not FatropSolver(problem, max_iterations=3).solve(problems, *guess).success.any()
