@@ -130,3 +130,18 @@ def test_a_vehicle_with_other_parameters_flies_as_the_model_of_those():
         alone = QuadrotorModel(QuadrotorParams(**params), 0.02).step(x[k], u[k], wind[k])
         np.testing.assert_allclose(flown[k], alone, atol=1e-12)
     np.testing.assert_allclose(model.step(x, u, wind, np.ones_like(factors)), model.step(x, u, wind), atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [4, 40])  # by the interpreter, and compiled
+def test_a_heading_in_the_batch_leaves_the_other_rows_as_they_are(count):
+    rng = np.random.default_rng(0)
+    model = QuadrotorModel(PARAMS, 0.05)
+    states, inputs = random_states(count, rng)
+    states[:, 8] = inputs[:, 3] = 0.0
+    level = model.step(states, inputs)
+    turned, turning = states.copy(), inputs.copy()
+    turned[1, 8], turning[2, 3] = 1.0, 0.5
+    mixed = model.step(turned, turning)
+    rest = np.setdiff1d(np.arange(count), [1, 2])
+    assert np.array_equal(mixed[rest], level[rest])
+    assert not np.array_equal(mixed[1, 3:5], level[1, 3:5])

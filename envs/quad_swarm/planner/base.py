@@ -127,20 +127,24 @@ class Planner:
             problems, previous = self._checked(problems, previous)
         if not np.count_nonzero(problems.x[:, 8]):
             return self._plan(problems, previous)
-        # Within, roll and pitch are those about the world's axes, to which the problem has no yaw
-        yaw = problems.x[:, 8]
+        # Within, roll and pitch are those about the world's axes, to which the problem has no yaw. Only robots with a
+        # yaw are turned, so that a plan does not depend on the batch it is in
+        rows = np.flatnonzero(problems.x[:, 8])
+        yaw, old = problems.x[rows, 8], previous.x[rows, :, 8]
         with np.errstate(invalid="ignore"):  # an infinite yaw fails like other states that are not finite
             wrapped = np.remainder(yaw + np.pi, 2 * np.pi) - np.pi
-        start, before = turned(problems.x, -yaw), turned(previous.x, -previous.x[..., 8])
-        start[:, 8], before[..., 8] = wrapped, before[..., 8] + (wrapped - yaw)[:, None]
-        u_before = turned(previous.u, -previous.x[:, :-1, 8], 0)
+        start, before, u_before = problems.x.copy(), previous.x.copy(), previous.u.copy()
+        start[rows], before[rows] = turned(start[rows], -yaw), turned(before[rows], -old)
+        start[rows, 8], before[rows, :, 8] = wrapped, old + (wrapped - yaw)[:, None]
+        u_before[rows] = turned(u_before[rows], -old[:, :-1], 0)
         plans = self._plan(problems._replace(x=start), previous._replace(x=before, u=u_before))
         planned = (
-            plans.x[:, :-1, 8] if self.config.max_yaw_rate else np.repeat(wrapped[:, None], plans.u.shape[1], axis=1)
+            plans.x[rows, :-1, 8] if self.config.max_yaw_rate else np.repeat(wrapped[:, None], old.shape[1] - 1, 1)
         )
-        u, limit = turned(plans.u, planned, 0), self.config.max_tilt
+        u, limit = turned(plans.u[rows], planned, 0), self.config.max_tilt
         u[..., :2] = np.clip(u[..., :2], -limit, limit)
-        return plans._replace(x=self.model.rollout(problems.x, u), u=u)
+        plans.u[rows], plans.x[rows] = u, self.model.rollout(problems.x[rows], u)
+        return plans
 
     def _checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
         """Check the arrays of a call and convert them to their types."""

@@ -293,3 +293,19 @@ def test_every_level_of_the_chain_knows_the_heading(yaw):
     assert (plans.x[..., 8] == yaw).all()
     assert np.linalg.norm(plans.x[0, -1, 3:6]) < 0.2
     np.testing.assert_allclose(plans.x, model.rollout(x, plans.u), atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+@pytest.mark.parametrize("max_yaw_rate", [0.0, 1.5])
+def test_a_plan_does_not_depend_on_the_headings_of_the_batch(solver, max_yaw_rate):
+    config = PlannerConfig(max_yaw_rate=max_yaw_rate)
+    problems = crossing(4, config)
+    planner = make_planner(config, QUADROTOR, 3, solver)
+    last = planner.plan(problems, hover(problems, config))
+    level = planner.plan(problems, last)
+    problems.x[[1, 3], 8] = [0.7, -2.0]
+    mixed = planner.plan(problems, last)
+    assert_same([field[[0, 2]] for field in mixed], [field[[0, 2]] for field in level])
+    for k in (1, 3):
+        alone = planner.plan(problems.part([k]), Plans(*(field[[k]] for field in last)))
+        assert_same([field[[k]] for field in mixed], alone)
