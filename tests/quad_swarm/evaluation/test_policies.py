@@ -103,7 +103,8 @@ def test_a_model_flies_more_robots_than_it_was_trained_with_and_asks_its_neighbo
     perceived = flight.other_requests
     assert perceived.sum(axis=2).mean() > 3
     assert perceived.sum(axis=2).max() == 5
-    assert flight.separation[:-1][perceived].max() <= 4.0
+    # In range as observed: the two robots' own errors and the observer's have a standard deviation of 5 mm each
+    assert flight.separation[:-1][perceived].max() <= 4.0 + 6 * 0.005 * 3**0.5
     assert (flight.requests <= perceived).all()
     [row] = run_episodes(one, [first_episode(1)])
     assert 0 < row["requests"] < row["possible_requests"] == perceived.sum()
