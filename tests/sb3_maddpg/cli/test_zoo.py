@@ -236,6 +236,26 @@ def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
     assert json.loads(capsys.readouterr().out) == ["none", "--algo", "sb3_maddpg.matd3:MATD3"]
 
 
+@pytest.mark.parametrize(
+    ("algo", "loader"),
+    [
+        ("sb3_maddpg:MADDPG", "sb3_maddpg:MADDPG"),  # the default of the command behind it
+        ("stable_baselines3:PPO", "stable_baselines3:PPO"),
+        ("my_loader:Outer.Inner", "my_loader:Outer.Inner"),
+    ],
+)
+def test_the_class_that_loads_models_may_be_any(algo, loader, arena, tmp_path, capsys):
+    (tmp_path / "my_loader.py").write_text("class Outer:\n    class Inner:\n        pass\n")
+    assert main(["evaluate", "--env", "Arena-v0", "--algo", algo, "none"]) == 3
+    assert json.loads(capsys.readouterr().out) == ["none", "--algo", loader]
+
+
+@pytest.mark.parametrize("algo", ["sb3_maddpg:Nope", "no_such_module:Nope", "sb3_maddpg:", ":MADDPG"])
+def test_a_class_that_does_not_exist_is_named(algo, arena, capsys):
+    assert main(["evaluate", "--env", "Arena-v0", "--algo", algo, "none"]) == 2
+    assert f"--algo '{algo}' is not an importable MODULE:CLASS" in capsys.readouterr().err
+
+
 def test_examples_of_a_command_are_those_of_what_is_installed(arena, monkeypatch, capsys):
     for shown in ("  sb3-maddpg evaluate --env Arena-v0 --policy latest:logs\n", "  sb3-maddpg evaluate spicy\n"):
         assert main(["evaluate", "--env", "Arena-v0", "--help"]) == 3
