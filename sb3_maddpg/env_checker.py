@@ -17,7 +17,7 @@ from sb3_maddpg.parallel import TeamEnv, explained_reset, what_to_pass
 from sb3_maddpg.relational import NeighbourViews, check_layout
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
-from sb3_maddpg.vec_env import ArrivalCheck, check_wrappers
+from sb3_maddpg.vec_env import ArrivalCheck, check_wrappers, watched
 
 _SCALARS = {"is_success", "metrics", "team_reward", "episode_step"}
 _FLAGS = ("agent_terminated", "agent_truncated", "agent_active", "pair_terminated")
@@ -40,6 +40,7 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
     if not isinstance(env, gymnasium.Env):
         raise ValueError(f"{shown(env)} is not an environment: {what_to_pass(env, 'check_team_env')}.")
     check_wrappers(env)
+    env = watched(env)
     names = env.get_wrapper_attr("agent_names") if env.has_wrapper_attr("agent_names") else None
     team = Team.from_spaces(env.observation_space, env.action_space, names)
     space, legal = env.observation_space, _LegalActions(env, team)

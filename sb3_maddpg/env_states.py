@@ -24,7 +24,7 @@ from sb3_maddpg.normalization import TeamVecNormalize
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import shown
-from sb3_maddpg.vec_env import BorderEnv, GymnasiumVecEnv
+from sb3_maddpg.vec_env import GymnasiumVecEnv, Transparent
 
 _BEFORE = ".before"
 
@@ -126,7 +126,7 @@ def _told(env: Any) -> Any:
 
 
 def _env_state(env: gymnasium.Env) -> dict[str, Any]:
-    if isinstance(env, BorderEnv):  # has no state
+    if isinstance(env, Transparent):  # has no state
         return _env_state(env.env)
     own = {"class": type(env).__name__}
     if isinstance(env, Replayable):  # replaying does not restore all attributes of inner wrappers
@@ -141,7 +141,7 @@ def _env_state(env: gymnasium.Env) -> dict[str, Any]:
 
 
 def _load_env_state(env: gymnasium.Env, state: dict[str, Any]) -> None:
-    if isinstance(env, BorderEnv):
+    if isinstance(env, Transparent):
         return _load_env_state(env.env, state)
     _take(env, state)
     if "inner" in state:
@@ -156,7 +156,9 @@ def _load_env_state(env: gymnasium.Env, state: dict[str, Any]) -> None:
 
 def _layers(env: gymnasium.Env) -> list[gymnasium.Env]:
     """:return: the wrappers around an environment, outermost first"""
-    return [env, *_layers(env.env)] if isinstance(env, gymnasium.Wrapper) else []
+    if not isinstance(env, gymnasium.Wrapper):
+        return []
+    return [*([] if isinstance(env, Transparent) else [env]), *_layers(env.env)]
 
 
 def _layer(env: gymnasium.Env) -> dict[str, Any]:

@@ -85,7 +85,7 @@ from sb3_maddpg.validation import (
     TrainingArguments,
     validated,
 )
-from sb3_maddpg.vec_env import ArrivalCheck, check_vec_env
+from sb3_maddpg.vec_env import ArrivalCheck, check_outside, check_vec_env, steps_its_envs
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
@@ -289,6 +289,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.curriculum_level = 0
         self.env_spec: dict[str, Any] | None = None
         self._stopped = False
+        self._seeds_of_reset: Any = None  # SB3's environments replace them in every reset()
         self.normalized_observations = False  # whether VecNormalize normalises the observations of the networks
         self.observation_statistics: dict[str, Any] | None = None  # of a loaded file, see ObservationStatistics
         self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
@@ -933,7 +934,9 @@ class MADDPG(OffPolicyAlgorithm):
             missing = "the optimizers' state" if self.lean == "critic" else "critics and the optimizers' state"
             warnings.warn(f"This model was saved without {missing}, which are initialised afresh.", stacklevel=2)
             self.lean = None
-        self._arrivals = ArrivalCheck(self.n_envs)
+        self._arrivals = ArrivalCheck(self.n_envs, copied=steps_its_envs(self.env.unwrapped))
+        if self._was_reset():  # by somebody else, for example to evaluate the model
+            self._last_obs = None
         broken_off = True
         try:
             super().learn(
@@ -952,10 +955,24 @@ class MADDPG(OffPolicyAlgorithm):
                 self._last_obs = None
             if not self._custom_logger:
                 remove_empty_log_folder(self)
+            self._seeds_of_reset = self._seeds_of_env()
         # Log the episodes since SB3's last log, which are all of them in a short training
         if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
         return self
+
+    def _seeds_of_env(self) -> Any:
+        return getattr(self.env.unwrapped, "_seeds", None) if self.env is not None else None
+
+    def _was_reset(self) -> bool:
+        """:return: whether somebody else has called ``reset()`` of the environment, which forgets seeds for it"""
+        seeds = self._seeds_of_env()
+        return self._seeds_of_reset is not None and seeds is not self._seeds_of_reset and not any(seeds or ())
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        prepared = super()._setup_learn(*args, **kwargs)
+        self._seeds_of_reset = self._seeds_of_env()
+        return prepared
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         rollout = super().collect_rollouts(*args, **kwargs)
@@ -971,7 +988,12 @@ class MADDPG(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        normalizer = self._vec_normalize_env
+        if self._was_reset():
+            raise ValueError(
+                "A callback has reset the training environment in the middle of an episode, whose next transition "
+                "would be false: give EvalCallback or evaluate_policy an environment of its own."
+            )
+        normalizer, arrived = self._vec_normalize_env, reward
         if normalizer is None:
             self._last_original_obs, original_obs = self._last_obs, new_obs
         else:  # the replay buffer holds what is not normalised
@@ -979,6 +1001,8 @@ class MADDPG(OffPolicyAlgorithm):
         assert isinstance(original_obs, np.ndarray)
         reads_parts = self.use_action_cost or getattr(replay_buffer, "n_pairs", 0) > 0
         self._arrivals.check(reward, original_obs, dones, infos, reads_parts)
+        if normalizer is not None and self.env is not normalizer:
+            check_outside(normalizer, new_obs, arrived)
         next_obs = original_obs.copy()
         for k in np.flatnonzero(dones):
             info = infos[k]
@@ -1001,6 +1025,7 @@ class MADDPG(OffPolicyAlgorithm):
             record_metrics(self.logger, [{"metrics": info["last_metrics"]} for info in begun if "last_metrics" in info])
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        self._seeds_of_reset = None
         env = self._wrap_env(env, self.verbose)
         self._check_normalization(env)
         before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
@@ -1305,7 +1330,15 @@ class MADDPG(OffPolicyAlgorithm):
         if self.observation_statistics is None:
             last.append("observation_statistics")
         networks = ["actor", "critic", "actor_target", "critic_target"]
-        return [*super()._excluded_save_params(), *last, *networks, "_cost_of_encoded", "_arrivals", "_stopped"]
+        return [
+            *super()._excluded_save_params(),
+            *last,
+            *networks,
+            "_cost_of_encoded",
+            "_arrivals",
+            "_stopped",
+            "_seeds_of_reset",
+        ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

@@ -200,6 +200,8 @@ class TeamEnv(gymnasium.Env):
             clips = isinstance(space, spaces.Box) and space.dtype != np.float32
             self._actions.append(_Action(begin, end, space, clips, _start_of(space), space.dtype.type))
         self._clip = any(isinstance(space, spaces.Box) for space in action_spaces)
+        whole = np.concatenate([np.full(len(heads_of(one)), not isinstance(one, spaces.Box)) for one in action_spaces])
+        self._whole = whole if whole.any() else None  # bits and categories
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """
@@ -439,7 +441,10 @@ class TeamEnv(gymnasium.Env):
 
     def _inside(self, values: np.ndarray) -> np.ndarray:
         """:return: which numbers are finite and, unless they will be clipped, in their space, (length,)"""
-        return (values >= self._least) & (values <= self._most)
+        inside = (values >= self._least) & (values <= self._most)
+        if self._whole is not None and values.dtype.kind == "f":
+            inside &= ~self._whole | (values == np.rint(values))
+        return inside
 
     def _refuse_action(self, values: np.ndarray) -> None:
         for agent, (begin, end, space, *_) in zip(self.agent_names, self._actions, strict=True):

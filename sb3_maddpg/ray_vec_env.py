@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from sb3_maddpg.env_states import NoStateError, Replayable, load_vec_env_state, tells_state, vec_env_state
 from sb3_maddpg.ray_cluster import connect
-from sb3_maddpg.vec_env import BorderEnv
+from sb3_maddpg.vec_env import at_border
 
 Call = tuple[str, tuple[Any, ...]]
 
@@ -195,8 +195,9 @@ class _Shard:
 
     def __init__(self, make: Callable[[], VecEnv], snapshot: dict[str, Any] | None, done: Sequence[Call]):
         self.env = make()
-        if isinstance(self.env, DummyVecEnv):
-            self.env.envs = [BorderEnv(one if tells_state(one) else Replayable(one)) for one in self.env.envs]
+        inner = self.env.unwrapped
+        if isinstance(inner, DummyVecEnv):
+            inner.envs = [at_border(one if tells_state(one) else Replayable(one)) for one in inner.envs]
         if snapshot is not None:
             load_vec_env_state(self.env, deepcopy(snapshot))  # Ray's arrays are read-only
         for call in done:

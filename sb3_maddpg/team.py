@@ -52,8 +52,8 @@ class TeamInfo(TypedDict, total=False):
     metrics: dict[str, float]
     """Numbers whose means are logged under their keys."""
     team_reward: float
-    """The reward that ``step`` returns, from which the algorithm sees that a wrapper changed it. Required if there are
-    ``agent_rewards`` and the team's reward is neither their mean nor their sum."""
+    """The reward that ``step`` returns, from which the algorithm sees that a wrapper changed it. Required in other
+    processes if there are ``agent_rewards`` and the team's reward is neither their mean nor their sum."""
     episode_step: int
     """Number of the step in its episode, from 1, from which the algorithm sees that a wrapper skipped steps."""
 

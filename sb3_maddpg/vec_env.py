@@ -1,6 +1,7 @@
 """Vectorised environments: an adapter from Gymnasium's, and checks of environments that are stepped together."""
 
-import sys
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
@@ -9,13 +10,13 @@ from typing import Any
 import numpy as np
 from gymnasium import Env, RewardWrapper, Wrapper, spaces
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import NormalizeReward
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_maddpg.parallel import TeamEnv, explained_reset, layers_of
-from sb3_maddpg.team import MixedActions, TeamObservation
+from sb3_maddpg.team import InfoKey, MixedActions, TeamObservation
 from sb3_maddpg.utils import as_seed, integers_problem, not_finite_at, shown
 
 _REWARD_WRAPPERS = (RewardWrapper, NormalizeReward)
@@ -61,7 +62,7 @@ class GymnasiumVecEnv(VecEnv):
         self.reset_infos = unbatch(infos, self.num_envs)
         self._reset_seeds()
         self._begun = True
-        return _own(observations)
+        return np.array(observations)  # the environments may write into theirs again
 
     def step_async(self, actions: np.ndarray) -> None:
         """
@@ -98,7 +99,7 @@ class GymnasiumVecEnv(VecEnv):
             rows[k] = {**rows[k].get("final_info", {}), "terminal_observation": rows[k]["final_obs"]}
         for row, timeout in zip(rows, (truncations & ~terminations).tolist(), strict=True):
             row["TimeLimit.truncated"] = timeout
-        return _own(observations), rewards.astype(np.float32), dones, rows
+        return np.array(observations), rewards.astype(np.float32), dones, rows
 
     def close(self) -> None:
         self.envs.close()
@@ -160,18 +161,79 @@ def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
     return rows
 
 
-# References to an array that only its caller knows: the caller's, the argument of `_own`, and that of getrefcount
-_REFERENCES = 3
+class Transparent(Wrapper):
+    """
+    Wrapper that hands all attributes on, so that neither other wrappers nor ``set_attr`` of vectorised environments
+    find another environment than without it.
+
+    :param env: an environment
+    """
+
+    _own = frozenset({"env", "_action_space", "_observation_space", "_metadata", "_cached_spec", "_step"})
+
+    def __getattr__(self, name: str) -> Any:
+        if "env" not in self.__dict__ or name.startswith("__"):  # a copy that is being made
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in self._own:
+            super().__setattr__(name, value)
+        else:
+            setattr(self.env, name, value)
 
 
-def _own(observations: np.ndarray) -> np.ndarray:
-    """:return: the observations in an array that the environments cannot overwrite: a copy if they still know it"""
-    if observations.base is None and sys.getrefcount(observations) <= _REFERENCES:
-        return observations
-    return observations.copy()
+class WatchedEnv(Transparent):
+    """
+    Innermost wrapper of a team environment, which adds to its infos what the environment itself gave, ``inner_reward``
+    and ``inner_step``. ``ArrivalCheck`` compares with them what arrives through all other wrappers.
+
+    :param env: a team environment
+    """
+
+    def reset(self, **kwargs: Any) -> Any:
+        self._step = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        returned = self.env.step(action)
+        try:
+            observation, reward, terminated, truncated, info = returned
+            info = {**info, "inner_reward": reward}
+        except (TypeError, ValueError):  # for others to complain about
+            return returned
+        self._step = getattr(self, "_step", 0) + 1
+        if not _OF_AGENTS.isdisjoint(info):  # otherwise nothing is lost if a wrapper skips steps
+            info["inner_step"] = self._step
+        return observation, reward, terminated, truncated, info
 
 
-class BorderEnv(Wrapper):
+_OF_AGENTS = frozenset(InfoKey.__args__)  # type: ignore[attr-defined]
+
+
+def watched(env: Env) -> Env:
+    """
+    :param env: a team environment, with its wrappers
+    :return: the same with ``WatchedEnv`` around the innermost environment, except ``TeamEnv``, which says itself what
+        it gave
+    """
+    inner = env.unwrapped
+    if isinstance(inner, TeamEnv):
+        return env
+    if env is inner:
+        return WatchedEnv(env)
+    layer = next((one for one in layers_of(env) if one.__dict__.get("env") is inner), None)
+    if layer is not None and not isinstance(layer, WatchedEnv):
+        layer.env = WatchedEnv(inner)
+    return env
+
+
+def at_border(env: Env) -> Env:
+    """:return: the environment in a ``BorderEnv``, and watched"""
+    return env if isinstance(env, BorderEnv) else BorderEnv(watched(env))
+
+
+class BorderEnv(Transparent):
     """
     Outermost wrapper of an environment that SB3's vectorised environments step. It hands on what they would spoil:
     observations of integers are checked before they are cast, and what came with the end of an episode is copied before
@@ -206,8 +268,8 @@ class BorderEnv(Wrapper):
 
 def check_vec_env(vec_env: VecEnv) -> None:
     """
-    Check what wrappers do to a team, in whichever process they do it, and let ``BorderEnv`` watch the environments of a
-    ``DummyVecEnv``.
+    Check what wrappers do to a team, in whichever process they do it, and put ``BorderEnv`` around the environments
+    that are stepped in this process.
 
     :param vec_env: a vectorised team environment
     :raises ValueError: if wrappers change the spaces or only the team's reward, see ``check_single_envs``
@@ -215,12 +277,16 @@ def check_vec_env(vec_env: VecEnv) -> None:
     inner = vec_env.unwrapped
     if not isinstance(inner, VecEnv):
         return  # SuperSuit's wrapper has environments of another kind, whose spaces are refused
-    # Subclasses may step other things than their envs
-    envs = inner.envs if type(inner) is DummyVecEnv else _single_envs(inner)
+    here: Any = inner if steps_its_envs(inner) else None
+    if isinstance(inner, GymnasiumVecEnv) and isinstance(inner.envs.unwrapped, SyncVectorEnv):
+        here = inner.envs.unwrapped
+    envs = _single_envs(inner) if here is None else here.envs
     if envs:
         check_single_envs(envs)
-    if type(inner) is DummyVecEnv:
-        inner.envs = [env if isinstance(env, BorderEnv) else BorderEnv(env) for env in inner.envs]
+    if here is not None:
+        here.envs = [at_border(env) for env in envs]
+    elif isinstance(inner, GymnasiumVecEnv):
+        _warn_of_casts(inner.envs.unwrapped)
     _check_spaces(f"Wrappers of {shown(inner)} change", _spaces_of(vec_env), _spaces_of(inner))
     if isinstance(inner, GymnasiumVecEnv):
         base = inner.envs.unwrapped
@@ -233,6 +299,25 @@ def check_vec_env(vec_env: VecEnv) -> None:
                 with suppress(NotImplementedError):
                     if any(inner.env_is_wrapped(wrapper)):
                         raise _only_team_reward(wrapper.__name__)
+
+
+def steps_its_envs(vec_env: VecEnv) -> bool:
+    """:return: whether this is a ``DummyVecEnv``, or a subclass that does not step other things than its ``envs``"""
+    return isinstance(vec_env, DummyVecEnv) and all(
+        getattr(type(vec_env), name) is getattr(DummyVecEnv, name) for name in ("reset", "step_wait")
+    )
+
+
+def _warn_of_casts(vector: VectorEnv) -> None:
+    space = vector.single_observation_space
+    if isinstance(vector, AsyncVectorEnv) and space.dtype is not None and space.dtype.kind in "iu":
+        if all(vector.call("has_wrapper_attr", "team_spaces")):  # TeamEnv checks what it returns
+            return
+        warnings.warn(
+            f"AsyncVectorEnv casts observations to {space.dtype} in its processes, where NaN and numbers out of range "
+            "become other numbers unnoticed: run check_team_env(env), or use SubprocVecEnv, where they are refused.",
+            stacklevel=2,
+        )
 
 
 def _single_envs(vec_env: VecEnv) -> Sequence[Env]:
@@ -330,19 +415,42 @@ def check_wrappers(env: Env) -> None:
             raise _only_team_reward(type(layer).__name__)
 
 
+def check_outside(normalizer: VecNormalize, obs: Any, rewards: np.ndarray) -> None:
+    """
+    Check that wrappers outside of ``VecNormalize`` change nothing: the replay buffer stores what ``VecNormalize`` got.
+
+    :param normalizer: the wrapper, after a step
+    :param obs: the observations as they arrived, (n_envs, n_agents, columns)
+    :param rewards: the team's rewards as they arrived, (n_envs,)
+    :raises ValueError: if either is not what ``VecNormalize`` returned
+    """
+    original = np.asarray(normalizer.get_original_obs())
+    absent = (original == 0) & (obs == 0)  # see TeamVecNormalize
+    same_obs = obs.shape == original.shape and np.all(
+        absent | np.isclose(obs, np.asarray(normalizer.normalize_obs(original)))
+    )
+    if not same_obs or not np.allclose(rewards, normalizer.normalize_reward(normalizer.get_original_reward())):
+        raise ValueError(
+            f"A wrapper outside of VecNormalize changes {'rewards' if same_obs else 'observations'}, but the algorithm "
+            "learns from those that VecNormalize gets: put VecNormalize outermost."
+        )
+
+
 class ArrivalCheck:
     """
     Compares the transitions that arrive at the algorithm with what the environments say they gave. Wrappers in any
-    process may have changed or added up the team's reward, skipped steps, or kept arrays that were overwritten.
+    process may have changed or added up the team's reward, changed how episodes end, skipped steps, or kept arrays that
+    were overwritten.
 
     :param n_envs: number of environments
+    :param copied: whether the last observations are copies, see ``BorderEnv``
     """
 
-    def __init__(self, n_envs: int):
+    def __init__(self, n_envs: int, copied: bool = False):
         # Number of each environment's last step in its episode, 0 if it is not known
         self._steps = [0] * n_envs
         # First observations of episodes that equal the last ones of the episodes before, None if one differed
-        self._firsts: list[list[np.ndarray] | None] = [[] for _ in range(n_envs)]
+        self._firsts: list[list[np.ndarray] | None] = [None if copied else [] for _ in range(n_envs)]
 
     def check(
         self,
@@ -359,32 +467,55 @@ class ArrivalCheck:
         :param infos: infos of the environments
         :param reads_parts: whether the algorithm reads parts of the team's reward even if agents have none of their
             own, as with ``pair_credit`` and ``use_action_cost``
-        :raises ValueError: if ``info["team_reward"]``, or without it both mean and sum of ``info["agent_rewards"]``,
-            differ from the reward that arrived, ``info["episode_step"]`` skips steps, or the last observations of
-            episodes are the first ones of the next episodes
+        :raises ValueError: if the reward that arrived differs from what the environment gave, see ``WatchedEnv``, or in
+            other processes ``info["team_reward"]``, or without it both mean and sum of ``info["agent_rewards"]``; if
+            steps are skipped, an end was dropped or made a truncation, or the last observations of episodes are the
+            first ones of the next episodes
         """
         for k, info in enumerate(infos):
             if reads_parts or "agent_rewards" in info:
                 self._check_reward(k, float(rewards[k]), info)
-            step = info.get("episode_step", 0)
+            step = info.get("inner_step", info.get("episode_step", 0))
             if step and self._steps[k] and step != self._steps[k] + 1:
                 raise ValueError(
                     f"Environment {k} went from step {self._steps[k]} to step {step} of its episode, so that what "
-                    "happened to its agents in between is lost: a wrapper skips steps or resets the environment "
-                    f"itself. {_REMEDY}"
+                    "happened to its agents in between is lost: a wrapper or a callback skips steps or resets the "
+                    f"environment itself. {_REMEDY}"
                 )
             self._steps[k] = 0 if dones[k] else step
+            if dones[k]:
+                self._check_cut(k, info)
+            elif "terminal_observation" in info:
+                raise ValueError(
+                    f"Environment {k} was reset, but a wrapper reports no end of its episode, so that the first "
+                    f"observation of the next episode would pass for the next one of this one. {_REMEDY}"
+                )
             if dones[k] and self._firsts[k] is not None:
                 last = info.get("original_terminal_observation", info.get("terminal_observation"))
                 self._check_end(k, observations[k], last)
 
     @staticmethod
+    def _check_cut(env: int, info: Mapping[str, Any]) -> None:
+        if info.get("TimeLimit.truncated") and np.all(info.get("agent_terminated", False)):
+            raise ValueError(
+                f"The episode of environment {env} was truncated, but all agents terminated in its last step: a "
+                "wrapper changes only the team's end, while the algorithm learns from the agents' ends in `info`. "
+                f"{_REMEDY}"
+            )
+
+    @staticmethod
     def _check_reward(env: int, arrived: float, info: Mapping[str, Any]) -> None:
         # Rewards arrive in single precision
-        own: Any = info.get("team_reward")
-        if own is not None and abs(arrived - own) <= 1e-5 * max(abs(own), 1e-3):
+        own: Any = info.get("inner_reward", info.get("team_reward"))
+        try:
+            own = None if own is None else float(own)
+            if own is not None and abs(arrived - own) <= 1e-5 * max(abs(own), 1e-3):
+                return
+            agents = np.asarray(info.get("agent_rewards", ()), float)
+        except (TypeError, ValueError):  # the replay buffer says what is wrong
             return
-        agents = np.asarray(info.get("agent_rewards", ()), float)
+        if not math.isfinite(arrived):
+            return
         given = [] if agents.size == 0 else [agents.mean(), agents.sum()]
         if own is not None:
             given = [own]
@@ -410,5 +541,6 @@ class ArrivalCheck:
         if len(firsts) >= _SAME_ENDS and any((one != first).any() for one in firsts):
             raise ValueError(
                 f"The last observations of {len(firsts)} episodes of environment {env} are the first ones of the next "
-                "episodes: the environment writes into an array that it has returned. Return a copy, `obs.copy()`."
+                "episodes: the environment writes into an array that it has returned. Return a copy, `obs.copy()`; if "
+                "episodes do go on where the last one ended, use DummyVecEnv."
             )

@@ -13,6 +13,7 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
@@ -659,11 +660,11 @@ def test_an_episode_that_was_broken_off_leaves_no_transition(callback, fail_at, 
 
 def test_a_training_that_was_not_broken_off_goes_on_in_its_episode():
     env = Clock()
-    model = MADDPG("MlpPolicy", env, **{**SMALL, "learning_starts": 1000}).learn(14)
-    model.learn(14, reset_num_timesteps=False)
-    before, after = model.replay_buffer.next_observations[13, 0, 0], model.replay_buffer.observations[14, 0, 0]
+    model = MADDPG("MlpPolicy", env, **{**SMALL, "learning_starts": 1000}).learn(15)
+    model.learn(15, reset_num_timesteps=False)
+    before, after = model.replay_buffer.next_observations[14, 0, 0], model.replay_buffer.observations[15, 0, 0]
     assert before.tolist() == after.tolist()
-    assert before[1] == 4
+    assert before[1] == 5
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -775,3 +776,37 @@ def test_an_agent_that_is_truncated_counts_in_its_own_target_only():
             keeps[agent] = 1
             alone = model.critic_target(obs[[row]], actions[[row]] * keeps[None, :, None])[0, 0, agent]
             assert found[row, agent].item() == pytest.approx(alone.item(), abs=1e-6)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_an_evaluation_in_the_training_environment_leaves_no_transition(n_steps):
+    model = MADDPG("MlpPolicy", Clock(), **{**SMALL, "learning_starts": 1000}, n_steps=n_steps).learn(15)
+    evaluate_policy(model, model.get_env(), 1, warn=False)
+    model.learn(15, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    now, then = buffer.observations[:30, 0, 0], buffer.next_observations[:30, 0, 0]
+    assert (now + np.float32([0, 1]) == then).all()
+    assert then[14, 1] == 5
+    assert now[15, 1] == 0
+    if n_steps > 1:
+        assert buffer.cuts[14, 0] == 1
+
+
+def test_a_callback_that_resets_the_training_environment_is_refused():
+    class Evaluate(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 14:
+                evaluate_policy(self.model, self.training_env, 1, warn=False)
+            return True
+
+    with pytest.raises(ValueError, match="callback has reset the training environment"):
+        MADDPG("MlpPolicy", Clock()).learn(60, callback=Evaluate())
+
+
+def test_seeds_for_the_next_reset_do_not_end_an_episode():
+    model = MADDPG("MlpPolicy", Clock(), **{**SMALL, "learning_starts": 1000}).learn(15)
+    model.get_env().seed(5)
+    model.learn(15, reset_num_timesteps=False)
+    before, after = model.replay_buffer.next_observations[14, 0, 0], model.replay_buffer.observations[15, 0, 0]
+    assert before.tolist() == after.tolist()
+    assert before[1] == 5

@@ -570,6 +570,8 @@ def test_a_seed_of_numpy_is_a_seed():
         (spaces.MultiBinary(2), [0, 2]),
         (spaces.MultiDiscrete([2, 3]), [2, 0]),
         (spaces.MultiBinary(1), ["x"]),
+        (spaces.MultiBinary(2), [0, 0.5]),  # as wrappers that smooth or rescale actions make them
+        (spaces.Discrete(3), [1.5]),
     ],
 )
 def test_actions_outside_of_their_space_are_refused(space, wrong):

@@ -118,6 +118,36 @@ def test_environments_may_write_into_their_actions():
     assert actions.all()
 
 
+class WritesAgain(OwnBit):
+    """Observes the step in an array that it writes into again."""
+
+    seen = np.zeros((3, 3), np.float32)
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        self.seen[:] = 0
+        return self.seen, {}
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        self.seen[:] = self._steps / 100
+        return self.seen, *rest
+
+
+def test_last_observations_are_copied_behind_wrappers_of_a_shard():
+    env = RayVecEnv([lambda: VecMonitor(DummyVecEnv([WritesAgain]))])
+    last = []
+    try:
+        env.reset()
+        for _ in range(40):
+            _, _, dones, infos = env.step(np.ones((1, 9), np.int8))
+            last += [info["terminal_observation"][0, 0] for info, done in zip(infos, dones, strict=True) if done]
+    finally:
+        env.close()
+    assert len(last) >= 2
+    assert min(last) > 0
+
+
 def test_what_is_learned_is_the_same_to_the_last_bit():
     digests = []
     for env in (RayVecEnv([swarms, swarms], snapshot_every=7), Together(swarms)):

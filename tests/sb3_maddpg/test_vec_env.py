@@ -304,21 +304,100 @@ def test_a_team_s_own_way_of_adding_up_rewards_is_named():
             reward = float(info["agent_rewards"].min())
             return obs, reward, *ends, {**info, "team_reward": reward} if self.named else info
 
-    with pytest.raises(ValueError, match=r"return it in info\['team_reward'\], too"):
-        MADDPG("MlpPolicy", Worst(), **SMALL).learn(40)
-    env = Worst()
-    env.named = True
-    MADDPG("MlpPolicy", env, **SMALL).learn(40)
+    MADDPG("MlpPolicy", Worst(), **SMALL).learn(40)  # in this process, it is seen what the environment gives
+    with pytest.raises(ValueError, match="team's reward of environment 0 arrived as"):
+        MADDPG("MlpPolicy", Shaped(Worst()), **SMALL).learn(40)
+    envs = SubprocVecEnv([Worst], start_method="fork")
+    try:
+        with pytest.raises(ValueError, match=r"return it in info\['team_reward'\], too"):
+            MADDPG("MlpPolicy", envs, **SMALL).learn(40)
+        envs.set_attr("named", True)
+        MADDPG("MlpPolicy", envs, **SMALL).learn(40)
+    finally:
+        envs.close()
+
+
+class Skip(gymnasium.Wrapper):
+    """Adds up rewards of two steps, of whose infos the last one remains."""
+
+    def step(self, action):
+        _, before, terminated, truncated, _ = returned = self.env.step(action)
+        if terminated or truncated:
+            return returned
+        obs, reward, *rest = self.env.step(action)
+        return obs, before + reward, *rest
+
+
+class Equal(OwnBit):
+    """Agents whose rewards never vary, or that only say when they end."""
+
+    def __init__(self, rewards):
+        super().__init__()
+        self.rewards = rewards
+
+    def step(self, action):
+        obs, _, *ends, _ = super().step(action)
+        flags = {"agent_terminated": np.array([self._steps == 3, False, False])}
+        return obs, 1.0, *ends, {"agent_rewards": np.ones(3)} if self.rewards else flags
 
 
 def test_steps_that_a_wrapper_skips_are_noticed_without_rewards():
-    class Skip(gymnasium.Wrapper):
+    class Silent(gymnasium.Wrapper):
         def step(self, action):
             self.env.step(action)
             return self.env.step(action)
 
     with pytest.raises(ValueError, match="Environment 0 went from step 2 to step 4 of its episode"):
-        MADDPG("MlpPolicy", Skip(toy()), **SMALL).learn(40)
+        MADDPG("MlpPolicy", Silent(toy()), **SMALL).learn(40)
+
+
+@pytest.mark.parametrize("vector", [DummyVecEnv, "sync"])
+@pytest.mark.parametrize(("rewards", "message"), [(True, "arrived as 2"), (False, "went from step 2 to step 4")])
+def test_steps_of_any_environment_that_a_wrapper_skips_are_noticed(rewards, message, vector):
+    def make():
+        return Skip(Equal(rewards))
+
+    envs = DummyVecEnv([make]) if vector is DummyVecEnv else GymnasiumVecEnv(SyncVectorEnv([make], **SAME_STEP))
+    with pytest.raises(ValueError, match=message):
+        MADDPG("MlpPolicy", envs, **SMALL).learn(40)
+
+
+def test_rewards_that_are_added_up_arrive_if_agents_have_none():
+    class Team(OwnBit):
+        def step(self, action):
+            obs, _, *ends, _ = super().step(action)
+            return obs, float(self._steps), *ends, {}
+
+    buffer = MADDPG("MlpPolicy", Skip(Team()), **SMALL).learn(40).replay_buffer
+    assert buffer.agent_rewards[:4, 0].tolist() == [[3] * 3, [7] * 3, [11] * 3, [15] * 3]
+
+
+def test_the_environment_s_own_words_for_other_things_are_no_hindrance():
+    class Words(OwnBit):
+        def step(self, action):
+            obs, reward, *ends, info = super().step(action)
+            return obs, reward, *ends, {**info, "team_reward": 1e9, "episode_step": 4 * self._steps}
+
+    model = MADDPG("MlpPolicy", Words(), **SMALL).learn(40)
+    assert np.allclose(model.replay_buffer.agent_rewards[:40].mean(axis=2), model.replay_buffer.rewards[:40], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda info: {"agent_rewards": ["x", "y", "z"]}, "agent_rewards.*does not hold numbers"),
+        (lambda info: {"agent_rewards": np.array([1, 2, np.nan])}, "(?i)agent_1|agent_2|nan"),
+    ],
+)
+def test_what_is_no_reward_is_named_as_such(change, message):
+    class Odd(OwnBit):
+        def step(self, action):
+            obs, reward, *ends, info = super().step(action)
+            return obs, np.nan if "nan" in message else reward, *ends, change(info)
+
+    with pytest.raises(ValueError, match=message) as raised:
+        MADDPG("MlpPolicy", Odd(), **SMALL).learn(40)
+    assert "wrapper" not in str(raised.value)
 
 
 class Rescaled(gymnasium.ActionWrapper):
@@ -494,3 +573,120 @@ def test_integer_observations_do_not_wrap_around(value):
     with pytest.raises(ValueError, match=rf"observation of agent 0 is {value} in column 0, no integer of uint8"):
         MADDPG("MlpPolicy", Counting(np.uint8, value), **SMALL).learn(10)
     MADDPG("MlpPolicy", Counting(np.uint8, 7.0), **SMALL).learn(10)
+
+
+class Changed(VecEnvWrapper):
+    """Hands on what a function makes of a step."""
+
+    def __init__(self, envs, change):
+        super().__init__(envs)
+        self.change = change
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.change(*self.venv.step_wait())
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda obs, rewards, *rest: (obs, 7 * rewards - 3, *rest), "rewards"),
+        (lambda obs, *rest: (obs / 2 - 3, *rest), "observations"),
+    ],
+)
+@pytest.mark.parametrize("norm_reward", [False, True])
+def test_nothing_changes_outside_of_vec_normalize(change, what, norm_reward):
+    def normalized():
+        return VecNormalize(DummyVecEnv([toy, toy]), norm_reward=norm_reward)
+
+    with pytest.raises(ValueError, match=f"outside of VecNormalize changes {what}.*put VecNormalize outermost"):
+        MADDPG("MlpPolicy", Changed(normalized(), change), **SMALL).learn(40)
+    MADDPG("MlpPolicy", VecMonitor(VecCheckNan(normalized())), **SMALL).learn(60)
+
+
+@pytest.mark.parametrize("make", [toy, OwnBit])
+@pytest.mark.parametrize("of", [DummyVecEnv, SubprocVecEnv])
+def test_an_end_that_a_wrapper_drops_is_noticed(of, make):
+    envs = of([make], **({"start_method": "fork"} if of is SubprocVecEnv else {}))
+    changed = Changed(envs, lambda obs, rewards, dones, infos: (obs, rewards, np.zeros_like(dones), infos))
+    try:
+        with pytest.raises(ValueError, match="Environment 0 was reset, but a wrapper reports no end"):
+            MADDPG("MlpPolicy", changed, **SMALL).learn(60)
+    finally:
+        envs.close()
+
+
+class Endings(gymnasium.Wrapper):
+    """Ends by termination of all agents; says that it was truncated, or the other way round."""
+
+    def __init__(self, env, to_truncated):
+        super().__init__(env)
+        self.to_truncated = to_truncated
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        over = terminated or truncated
+        if self.to_truncated:
+            return obs, reward, False, over, {**info, "agent_terminated": np.full(3, over)}
+        return obs, reward, over, False, info
+
+
+def test_ends_are_those_that_arrive_or_are_refused():
+    with pytest.raises(ValueError, match="was truncated, but all agents terminated in its last step"):
+        MADDPG("MlpPolicy", Endings(OwnBit(), True), **SMALL).learn(60)
+    buffer = MADDPG("MlpPolicy", Endings(OwnBit(), False), **SMALL).learn(60).replay_buffer
+    assert buffer.dones[:60].sum() > 2
+    assert buffer.timeouts[:60].sum() == 0
+
+
+def test_attributes_reach_the_environment_behind_the_border():
+    envs = DummyVecEnv([OwnBit])
+    MADDPG("MlpPolicy", envs, **SMALL)
+    envs.set_attr("level", 3)
+    assert envs.envs[0].unwrapped.level == 3
+    assert envs.envs[0].level == 3
+    assert envs.get_attr("level") == [3]
+    assert deepcopy(envs.envs[0]).level == 3
+
+
+class OwnDummy(DummyVecEnv):
+    """A subclass that steps its environments as DummyVecEnv does."""
+
+
+@pytest.mark.parametrize("value", [np.nan, 300])
+@pytest.mark.parametrize("of", [OwnDummy, "sync"])
+def test_integer_observations_are_checked_in_all_that_is_stepped_here(of, value):
+    def make():
+        return Counting(np.uint8, value)
+
+    envs = of([make]) if of is OwnDummy else GymnasiumVecEnv(SyncVectorEnv([make], **SAME_STEP))
+    with pytest.raises(ValueError, match=f"observation of agent 0 is {value}.* in column 0, no integer of uint8"):
+        MADDPG("MlpPolicy", envs, **SMALL).learn(10)
+
+
+def test_casts_in_other_processes_are_warned_of():
+    envs = GymnasiumVecEnv(AsyncVectorEnv([lambda: Counting(np.uint8)], **SAME_STEP))
+    try:
+        with pytest.warns(UserWarning, match="AsyncVectorEnv casts observations to uint8"):
+            MADDPG("MlpPolicy", envs, **SMALL)
+    finally:
+        envs.close()
+
+
+class GoesOn(Counting):
+    """Each episode begins where the last one ended."""
+
+    def look(self):
+        return np.full((2, 2), getattr(self, "steps", 0) % 200, np.float32)
+
+    def step(self, action):
+        self.steps = getattr(self, "steps", 0) + 1
+        return super().step(action)
+
+
+def test_episodes_may_begin_where_the_last_one_ended():
+    buffer = MADDPG("MlpPolicy", GoesOn(), **SMALL).learn(60).replay_buffer
+    assert buffer.observations[:60, 0, 0, 0].tolist() == list(range(60))
+    assert buffer.next_observations[:60, 0, 0, 0].tolist() == list(range(1, 61))
