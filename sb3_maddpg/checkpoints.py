@@ -37,6 +37,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.env_states import (
     NoStateError,
+    checked_bits,
     layers,
     load_vec_env_state,
     plain_entries,
@@ -111,10 +112,12 @@ class RunCheckpoint(BaseCallback):
         if self._pending is not None:
             try:
                 _restore(cast(MADDPG, self.model), callbacks, self._pending)
-            except (KeyError, TypeError, AttributeError, IndexError) as error:
+            except (ValueError, OSError):
+                raise
+            except Exception as error:  # from environments, wrappers and callbacks of any kind
                 raise ValueError(
                     f"A checkpoint in {self.folder} is damaged, or belongs to another environment or other callbacks "
-                    f"({type(error).__name__}: {error})."
+                    f"({type(error).__name__}: {shown(str(error))})."
                 ) from error
             self._pending = None
         else:
@@ -630,12 +633,35 @@ def _random_state() -> dict[str, Any]:
 
 
 def _set_random_state(state: dict[str, Any]) -> None:
+    """
+    :param state: see ``_random_state``
+    :raises ValueError: if a part does not fit its generator; none is changed then
+    """
+    own = _random_state()
     version, numbers, gauss = state["python"]
+    plain = version == own["python"][0] and isinstance(numbers, list) and len(numbers) == len(own["python"][1])
+    if not (plain and all(type(one) is int and 0 <= one < 2**32 for one in numbers) and numbers[-1] < len(numbers)):
+        raise ValueError("A checkpoint is damaged: its state of Python's random number generator does not fit.")
+    if gauss is not None and not (isinstance(gauss, float) and math.isfinite(gauss)):
+        raise ValueError(f"A checkpoint is damaged: Python's random number generator has gauss={shown(gauss)}.")
+    bits = checked_bits(state["numpy"], own["numpy"])
+    present = [own["torch"], *(own["cuda"] if state["cuda"] else [])]
+    given = [state["torch"], *(state["cuda"] if own["cuda"] else [])]
+    for one, other in zip(given, present, strict=True):
+        if not isinstance(one, np.ndarray) or (one.shape, one.dtype) != (other.shape, other.dtype):
+            raise ValueError(
+                f"A checkpoint is damaged: its state of PyTorch's random number generator is {shown(one)}."
+            )
+    try:
+        th.set_rng_state(th.from_numpy(given[0].copy()))
+    except RuntimeError as error:
+        raise ValueError(
+            f"A checkpoint is damaged: {shown(str(error))} as the state of PyTorch's generator."
+        ) from error
     random.setstate((version, tuple(numbers), gauss))
-    np.random.set_state(state["numpy"])  # noqa: NPY002
-    th.set_rng_state(th.from_numpy(state["torch"].copy()))
-    if state["cuda"] and th.cuda.is_available():
-        th.cuda.set_rng_state_all([th.from_numpy(one.copy()) for one in state["cuda"]])
+    np.random.set_state(bits)  # noqa: NPY002
+    if given[1:]:
+        th.cuda.set_rng_state_all([th.from_numpy(one.copy()) for one in given[1:]])
 
 
 def _callbacks(root: BaseCallback) -> list[BaseCallback]:
