@@ -16,6 +16,7 @@ import math
 import os
 import platform
 import random
+import secrets
 import shutil
 import signal
 import threading
@@ -105,8 +106,7 @@ class RunCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        for path in self.folder.glob(f"*{_UNFINISHED}"):
-            shutil.rmtree(path, ignore_errors=True)
+        self._remove_unfinished()
         callbacks, known = _callbacks(self._root()), [one for one, _ in self._at_start]
         self._at_start += [(one, deepcopy(_values(one))) for one in callbacks if one not in known]
         if self._pending is not None:
@@ -230,10 +230,15 @@ class RunCheckpoint(BaseCallback):
         warnings.warn(
             f"No space left for a checkpoint at step {writer.steps}: the previous one stays ({error}).", stacklevel=2
         )
-        for path in self.folder.glob(f"*{_UNFINISHED}"):
-            shutil.rmtree(path, ignore_errors=True)
+        self._remove_unfinished()
         writer.tidy()  # its segment would take up space, and the next one holds the same rows
         return None
+
+    def _remove_unfinished(self) -> None:
+        for path in self.folder.glob(f"*{_UNFINISHED}"):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in (self.folder / _SEGMENTS).glob(f"*{_UNFINISHED}"):
+            path.unlink(missing_ok=True)
 
     def _root(self) -> BaseCallback:
         root: BaseCallback = self
@@ -344,18 +349,23 @@ class _Writer(threading.Thread):
         path = self.folder / _SEGMENTS / self.segment.name
         path.parent.mkdir(parents=True, exist_ok=True)
         found = hashlib.sha256()
-        with path.open("wb") as file:
-            fault("opened rows")
-            for end, parts in self.segment.content():
-                with self._progress:
-                    self._copied = end
-                    self._progress.notify_all()
-                for part in parts:
-                    found.update(part)
-                    file.write(part)
-            fault("written rows")
-            file.flush()
-            os.fsync(file.fileno())
+        unfinished = _unfinished(path)
+        try:
+            with unfinished.open("xb") as file:
+                fault("opened rows")
+                for end, parts in self.segment.content():
+                    with self._progress:
+                        self._copied = end
+                        self._progress.notify_all()
+                    for part in parts:
+                        found.update(part)
+                        file.write(part)
+                fault("written rows")
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
         sync_folder(path.parent)
         rows = {"first": self.segment.first, "end": self.segment.end}
         self.segments.append({"name": self.segment.name, **rows, "sha256": found.hexdigest()})
@@ -822,10 +832,14 @@ def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         return {name: archive[name] for name in archive.files}, state
 
 
+def _unfinished(target: Path) -> Path:
+    """:return: path to write something under first, which no other thread, process or container uses"""
+    return target.with_name(f"{target.name}.{secrets.token_hex(8)}{_UNFINISHED}")
+
+
 def _commit(target: Path, write: Callable[[Path], None]) -> Path:
     """Write a folder atomically."""
-    unfinished = target.with_name(target.name + _UNFINISHED)
-    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished = _unfinished(target)
     unfinished.mkdir(parents=True)
     fault("begin")
     write(unfinished)
