@@ -13,6 +13,7 @@ from quad_swarm.errors import shown
 
 # Largest integers in the states of NumPy's generators, by name
 _LARGEST = {"pos": 624, "buffer_pos": 4, "has_uint32": 1, "has_gauss": 1, "uinteger": 2**32 - 1}
+MOST_STEPS = 2**53  # largest magnitude of a number: steps and metres are far below it
 
 
 def generator_state(rng: np.random.Generator) -> dict[str, Any]:
@@ -60,13 +61,17 @@ def _check_bits(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
         raise ValueError(f"This is not a state of NumPy's {own['bit_generator']}: its {shown(wrong[0])} does not fit.")
 
 
-def like(present: np.ndarray, given: Any, name: str) -> np.ndarray:
+def like(
+    present: np.ndarray, given: Any, name: str, least: float = -MOST_STEPS, most: float = MOST_STEPS
+) -> np.ndarray:
     """Copy an array that replaces another one.
 
     :param present: the array to replace
     :param given: its replacement
     :param name: name of the array, for error messages
-    :raises ValueError: if shape or data type differ
+    :param least: smallest valid number
+    :param most: largest valid number
+    :raises ValueError: if shape or data type differ, or a number is NaN or out of range
     """
     array = np.array(given)
     if array.shape != present.shape or array.dtype != present.dtype:
@@ -74,6 +79,8 @@ def like(present: np.ndarray, given: Any, name: str) -> np.ndarray:
             f"{name}: the state has {array.dtype} of shape {array.shape}, but this environment has {present.dtype} of "
             f"shape {present.shape}. A state fits only an environment with the same arguments."
         )
+    if array.dtype != bool and not ((array >= least) & (array <= most)).all():  # false for NaN too
+        raise ValueError(f"{name}: the state has numbers outside of {least:g} to {most:g}, or NaN.")
     return array
 
 

@@ -101,6 +101,35 @@ def test_a_foreign_simulator_has_no_state_to_tell():
         env.state_dict()
 
 
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("state",), np.nan),
+        (("goal",), np.inf),
+        (("plans", "x"), np.nan),
+        (("plans", "status"), 7),
+        (("beliefs", "age"), -(2**63)),
+        (("beliefs", "age"), 2**63 - 1),
+        (("chance", "factors"), 0.0),
+        (("chance", "start"), -1),
+        (("chance", "start"), 2**40),
+        (("neighbours", "others"), 10**6),
+        (("neighbours", "reverse"), -(2**40)),
+    ],
+)
+def test_numbers_of_a_state_that_no_world_has_are_refused(path, value):
+    kwargs = {**HARD, "world": {"neighbourhood": {"max_others": 2}}} if path[0] == "neighbours" else HARD
+    env = QuadSwarmEnv(**kwargs)
+    env.reset(seed=0)
+    state = env.state_dict()
+    owner = state["task"]["swarm"]
+    for name in path[:-1]:
+        owner = owner[name]
+    owner[path[-1]].flat[0] = value
+    with pytest.raises(ValueError, match="the state has numbers outside of"):
+        QuadSwarmEnv(**kwargs).load_state_dict(state)
+
+
 BITS = [np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64]
 
 
