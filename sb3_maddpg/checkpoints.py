@@ -16,6 +16,7 @@ import math
 import os
 import platform
 import random
+import secrets
 import shutil
 import signal
 import stat
@@ -38,6 +39,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.env_states import (
     NoStateError,
+    checked_bits,
     layers,
     load_vec_env_state,
     plain_entries,
@@ -106,17 +108,18 @@ class RunCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        for path in self.folder.glob(f"*{_UNFINISHED}"):
-            shutil.rmtree(path, ignore_errors=True)
+        self._remove_unfinished()
         callbacks, known = _callbacks(self._root()), [one for one, _ in self._at_start]
         self._at_start += [(one, deepcopy(_values(one))) for one in callbacks if one not in known]
         if self._pending is not None:
             try:
                 _restore(cast(MADDPG, self.model), callbacks, self._pending)
-            except (KeyError, TypeError, AttributeError, IndexError) as error:
+            except (ValueError, OSError):
+                raise
+            except Exception as error:  # from environments, wrappers and callbacks of any kind
                 raise ValueError(
                     f"A checkpoint in {self.folder} is damaged, or belongs to another environment or other callbacks "
-                    f"({type(error).__name__}: {error})."
+                    f"({type(error).__name__}: {shown(str(error))})."
                 ) from error
             self._pending = None
         else:
@@ -236,10 +239,15 @@ class RunCheckpoint(BaseCallback):
             else f"No checkpoint at step {writer.steps}: the previous one stays. {self.folder}: {error}; {remedy}.",
             stacklevel=2,
         )
-        for path in self.folder.glob(f"*{_UNFINISHED}"):
-            shutil.rmtree(path, ignore_errors=True)
+        self._remove_unfinished()
         writer.tidy()  # its segment would take up space, and the next one holds the same rows
         return None
+
+    def _remove_unfinished(self) -> None:
+        for path in self.folder.glob(f"*{_UNFINISHED}"):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in (self.folder / _SEGMENTS).glob(f"*{_UNFINISHED}"):
+            path.unlink(missing_ok=True)
 
     def _root(self) -> BaseCallback:
         root: BaseCallback = self
@@ -350,18 +358,23 @@ class _Writer(threading.Thread):
         path = self.folder / _SEGMENTS / self.segment.name
         path.parent.mkdir(parents=True, exist_ok=True)
         found = hashlib.sha256()
-        with path.open("wb") as file:
-            fault("opened rows")
-            for end, parts in self.segment.content():
-                with self._progress:
-                    self._copied = end
-                    self._progress.notify_all()
-                for part in parts:
-                    found.update(part)
-                    file.write(part)
-            fault("written rows")
-            file.flush()
-            os.fsync(file.fileno())
+        unfinished = _unfinished(path)
+        try:
+            with unfinished.open("xb") as file:
+                fault("opened rows")
+                for end, parts in self.segment.content():
+                    with self._progress:
+                        self._copied = end
+                        self._progress.notify_all()
+                    for part in parts:
+                        found.update(part)
+                        file.write(part)
+                fault("written rows")
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
         sync_folder(path.parent)
         rows = {"first": self.segment.first, "end": self.segment.end}
         self.segments.append({"name": self.segment.name, **rows, "sha256": found.hexdigest()})
@@ -649,12 +662,35 @@ def _random_state() -> dict[str, Any]:
 
 
 def _set_random_state(state: dict[str, Any]) -> None:
+    """
+    :param state: see ``_random_state``
+    :raises ValueError: if a part does not fit its generator; none is changed then
+    """
+    own = _random_state()
     version, numbers, gauss = state["python"]
+    plain = version == own["python"][0] and isinstance(numbers, list) and len(numbers) == len(own["python"][1])
+    if not (plain and all(type(one) is int and 0 <= one < 2**32 for one in numbers) and numbers[-1] < len(numbers)):
+        raise ValueError("A checkpoint is damaged: its state of Python's random number generator does not fit.")
+    if gauss is not None and not (isinstance(gauss, float) and math.isfinite(gauss)):
+        raise ValueError(f"A checkpoint is damaged: Python's random number generator has gauss={shown(gauss)}.")
+    bits = checked_bits(state["numpy"], own["numpy"])
+    present = [own["torch"], *(own["cuda"] if state["cuda"] else [])]
+    given = [state["torch"], *(state["cuda"] if own["cuda"] else [])]
+    for one, other in zip(given, present, strict=True):
+        if not isinstance(one, np.ndarray) or (one.shape, one.dtype) != (other.shape, other.dtype):
+            raise ValueError(
+                f"A checkpoint is damaged: its state of PyTorch's random number generator is {shown(one)}."
+            )
+    try:
+        th.set_rng_state(th.from_numpy(given[0].copy()))
+    except RuntimeError as error:
+        raise ValueError(
+            f"A checkpoint is damaged: {shown(str(error))} as the state of PyTorch's generator."
+        ) from error
     random.setstate((version, tuple(numbers), gauss))
-    np.random.set_state(state["numpy"])  # noqa: NPY002
-    th.set_rng_state(th.from_numpy(state["torch"].copy()))
-    if state["cuda"] and th.cuda.is_available():
-        th.cuda.set_rng_state_all([th.from_numpy(one.copy()) for one in state["cuda"]])
+    np.random.set_state(bits)  # noqa: NPY002
+    if given[1:]:
+        th.cuda.set_rng_state_all([th.from_numpy(one.copy()) for one in given[1:]])
 
 
 def _callbacks(root: BaseCallback) -> list[BaseCallback]:
@@ -815,10 +851,14 @@ def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         return {name: archive[name] for name in archive.files}, state
 
 
+def _unfinished(target: Path) -> Path:
+    """:return: path to write something under first, which no other thread, process or container uses"""
+    return target.with_name(f"{target.name}.{secrets.token_hex(8)}{_UNFINISHED}")
+
+
 def _commit(target: Path, write: Callable[[Path], None]) -> Path:
     """Write a folder atomically."""
-    unfinished = target.with_name(target.name + _UNFINISHED)
-    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished = _unfinished(target)
     unfinished.mkdir(parents=True)
     fault("begin")
     write(unfinished)

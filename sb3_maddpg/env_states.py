@@ -8,6 +8,7 @@ wrappers.
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -27,6 +28,8 @@ from sb3_maddpg.utils import shown
 from sb3_maddpg.vec_env import BorderEnv, GymnasiumVecEnv
 
 _BEFORE = ".before"
+# Largest integers in the states of NumPy's generators, by name
+_LARGEST = {"pos": 624, "buffer_pos": 4, "has_uint32": 1, "has_gauss": 1, "uinteger": 2**32 - 1}
 
 
 class NoStateError(ValueError):
@@ -68,15 +71,30 @@ class Replayable(gymnasium.Wrapper):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """:param state: see ``state_dict``"""
-        self._rng = np.random.default_rng()
-        self._rng.bit_generator.state = state["generator"]
-        self._seed, self._options = state["seed"], state["options"]
-        self._actions = []
-        if self._seed is not None:
-            self.env.reset(seed=self._seed, options=self._options)
-        for action in state["actions"]:
-            self.step(action if action.ndim else action.item())
+        """
+        :param state: see ``state_dict``
+        :raises ValueError: if the state does not fit, or has more actions than its episode has steps
+        """
+        bits = np.random.default_rng().bit_generator
+        bits.state = checked_bits(state["generator"], bits.state)
+        seed, options, actions = state["seed"], state["options"], state["actions"]
+        if not (seed is None or (type(seed) is int and 0 <= seed < 2**31)) or not isinstance(
+            options, (dict, type(None))
+        ):
+            raise ValueError(f"No episode begins with seed={shown(seed)}, options={shown(options)}.")
+        shape = self.action_space.shape
+        # Before the first step, the array of actions is empty and has no other axis
+        if not isinstance(actions, np.ndarray) or not (actions.size == 0 or actions.shape[1:] == shape):
+            raise ValueError(f"{shown(actions)} are no actions of {self.action_space}.")
+        self._rng, self._seed, self._options, self._actions = np.random.Generator(bits), seed, options, []
+        if seed is not None:
+            self.env.reset(seed=seed, options=options)
+        ended = seed is None
+        for action in actions:
+            if ended:
+                raise ValueError(f"The state has {len(actions)} actions, but its episode ends before the last of them.")
+            *_, terminated, truncated, _ = self.step(action if action.ndim else action.item())
+            ended = terminated or truncated
 
 
 def vec_env_state(env: VecEnv) -> dict[str, Any]:
@@ -297,6 +315,36 @@ def layers(env: Any) -> Iterator[Any]:
             waiting += held if isinstance(held, (list, tuple)) else [held]
 
 
+def checked_bits(state: Any, own: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Check the state of a random number generator. NumPy does not: a position outside of a generator's memory would end
+    the process.
+
+    :param state: state of a bit generator, from a file
+    :param own: the present state of the generator that it replaces
+    :return: the state
+    :raises ValueError: if it belongs to another class of generators, or a part has another type or is out of range
+    """
+
+    def fits(one: Any, own: Any, name: str) -> bool:
+        if isinstance(own, dict):
+            return (
+                isinstance(one, Mapping) and set(one) == set(own) and all(fits(one[key], own[key], key) for key in own)
+            )
+        if isinstance(own, np.ndarray):
+            return isinstance(one, np.ndarray) and (one.shape, one.dtype) == (own.shape, own.dtype)
+        if isinstance(own, float):
+            return isinstance(one, float) and math.isfinite(one)
+        if isinstance(own, str):
+            return isinstance(one, str) and one == own
+        integer = isinstance(one, (int, np.integer)) and not isinstance(one, bool)
+        return integer and 0 <= one <= _LARGEST.get(name, 2**128 - 1)
+
+    if not fits(state, own, "state"):
+        raise ValueError(f"{shown(state)} is not a state of the random number generator {own['bit_generator']}.")
+    return dict(state)
+
+
 def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
     """
     :param space: a space
@@ -314,7 +362,8 @@ def set_space_generators(space: spaces.Space, states: list[dict[str, Any] | None
     """
     for one, state in zip(_parts(space), states, strict=True):
         if state is not None:
-            one.np_random.bit_generator.state = state
+            bits = one.np_random.bit_generator
+            bits.state = checked_bits(state, bits.state)
 
 
 def _parts(space: spaces.Space) -> Iterator[spaces.Space]:

@@ -535,6 +535,45 @@ def test_last_observations_that_do_not_fit_the_environment_are_refused(value, tm
         model.learn(100, [callback], reset_num_timesteps=False)
 
 
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("python", 1, 3), -1),
+        (("python", 1, 3), 2**32),
+        (("python", 1, 3), 0.5),
+        (("python", 1, 624), 625),
+        (("python", 1, 624), -(2**31)),
+        (("python", 1), [1, 2]),
+        (("python", 0), 2),
+        (("python", 2), "x"),
+        (("python", 2), {"$": "float", "value": "nan"}),
+        (("numpy", "state", "pos"), 2**31 - 700),
+        (("numpy", "state", "pos"), -5),
+        (("numpy", "bit_generator"), "Philox"),
+        (("numpy", "gauss"), {"$": "float", "value": "inf"}),
+        (("numpy", "has_gauss"), 7),
+        (("numpy",), None),
+        (("torch",), {"$": "array", "dtype": "u1", "shape": [16], "base64": "AA==", "repeated": True}),
+        (("torch",), {"$": "array", "dtype": "u1", "shape": [5056], "base64": "/w==", "repeated": True}),
+        (("torch",), {"$": "array", "dtype": "f4", "shape": [5056], "base64": "AAAAAA==", "repeated": True}),
+        (("torch",), 1),
+    ],
+)
+def test_random_generators_of_a_checkpoint_are_checked(path, value, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+
+    def change(state):
+        owner = state["random"]
+        for key in path[:-1]:
+            owner = owner[key]
+        owner[path[-1]] = value
+
+    edit(tmp_path, change)
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    with pytest.raises(ValueError, match=r"^[^\n]*(checkpoint|generator)[^\n]*$"):
+        model.learn(100, [callback], reset_num_timesteps=False)
+
+
 @pytest.mark.parametrize("name", ["/dev/zero", "../" * 20 + "dev/zero", "..", "segments"])
 @pytest.mark.parametrize("where", ["manifest", "segment"])
 def test_a_checkpoint_names_files_in_its_folder_only(where, name, tmp_path):
