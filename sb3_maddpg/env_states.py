@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
@@ -189,7 +190,7 @@ def _class_name(owner: Any) -> str:
 def _take(owner: Any, state: dict[str, Any]) -> None:
     if state["class"] != _class_name(owner):
         raise ValueError(f"The state belongs to a {state['class']}, but this is a {_class_name(owner)}.")
-    set_plain_values(owner, state.get("values", {}))
+    set_plain_values(owner, _for_each_env(owner, state.get("values", {})))
     if "written" in state and (writer := getattr(owner, "results_writer", None)) is not None:
         _write_again(Path(writer.file_handler.name), writer.file_handler, state["written"])
 
@@ -259,6 +260,37 @@ def plain_entries(values: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
+# What SB3's vectorised environment overwrites in every step
+_SCRATCH = {"keys", "buf_obs", "buf_dones", "buf_rews", "buf_infos", "actions"}
+
+
+def _for_each_env(owner: Any, values: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param owner: a vectorised environment, or anything else
+    :param values: values that it should take on
+    :return: those that it does not overwrite anyway
+    :raises ValueError: if a list or an array does not have one entry for each environment, as it has now
+    """
+    if isinstance(owner, DummyVecEnv):
+        values = {name: value for name, value in values.items() if name not in _SCRATCH}
+    if not isinstance(owner, VecEnv):
+        return values
+    for name, value in values.items():
+        present = vars(owner).get(name)
+        kinds = {type(one) for one in present} if isinstance(present, list) and name != "_seeds" else set()
+        fits = True
+        if isinstance(present, np.ndarray) and len(np.atleast_1d(present)) == owner.num_envs:
+            # Their precision may change with the first step
+            fits = isinstance(value, np.ndarray) and value.shape == present.shape
+            fits = fits and value.dtype.kind == present.dtype.kind
+        elif isinstance(present, list) and len(present) == owner.num_envs:
+            fits = isinstance(value, list) and len(value) == len(present)
+            fits = fits and (len(kinds) != 1 or all(type(one) in kinds for one in value))
+        if not fits:
+            raise ValueError(f"{shown(value)} cannot be the {name} of a {type(owner).__name__}.")
+    return values
+
+
 def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
     """
     Set attributes.
@@ -283,8 +315,22 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
 def _same_kind(present: Any, value: Any) -> bool:
     if present is None or value is None:
         return True
-    kinds = ((bool, int, float, np.number, np.bool_), (list, tuple, deque, np.ndarray), dict, str)
+    kinds = ((bool, np.bool_), (int, float, np.number), (list, tuple, deque, np.ndarray), dict, str)
+    if isinstance(present, RunningMeanStd):
+        return isinstance(value, RunningMeanStd) and _usable(value, present)
     return isinstance(value, next((kind for kind in kinds if isinstance(present, kind)), type(present)))
+
+
+def _usable(given: RunningMeanStd, present: RunningMeanStd) -> bool:
+    """:return: whether statistics can replace others: of the same shape, finite, and counted"""
+    for name in ("mean", "var", "count"):
+        one, other = getattr(given, name, None), getattr(present, name)
+        numbers = isinstance(one, (int, float, np.number, np.ndarray)) and not isinstance(one, bool)
+        # The counts of agents may be one number before the first step
+        if not numbers or (np.shape(one) != np.shape(other) and name != "count") or not np.isfinite(one).all():
+            return False
+    shapes = ((), np.shape(present.mean))
+    return np.shape(given.count) in shapes and bool((np.asarray(given.var) >= 0).all() and np.all(given.count >= 0))
 
 
 def tells_state(env: gymnasium.Env) -> bool:

@@ -21,6 +21,7 @@ from torch.overrides import TorchFunctionMode
 
 from sb3_maddpg.typed_json import check_size, decode
 from sb3_maddpg.utils import shown
+from sb3_maddpg.validation import LARGEST
 
 # Incremented when older versions cannot read new files
 FILE_FORMAT = 3
@@ -50,12 +51,14 @@ _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
         "_stats_window_size",
     ),
     (int, float): ("_current_progress_remaining", "start_time"),
-    (bool,): ("use_sde", "use_sde_at_warmup"),
+    (bool,): ("use_sde", "use_sde_at_warmup", "normalized_observations"),
     (int, type(None)): ("seed",),
     (str, type(None)): ("tensorboard_log", "lean"),
     (dict, type(None)): ("env_spec",),
     (deque, type(None)): ("ep_info_buffer", "ep_success_buffer"),
 }
+
+_MOST = {"_stats_window_size": 10**9, "seed": 2**32 - 1}  # of these attributes
 
 
 # Attributes of the process, which files cannot hold
@@ -319,7 +322,9 @@ def check_attributes(model: Any, path: Any) -> None:
             if isinstance(value, float):  # the progress can drop slightly below 0 in the last rollout
                 fits = fits and math.isfinite(value)
             elif isinstance(value, int):
-                fits = fits and value >= 0
+                fits = fits and 0 <= value <= _MOST.get(name, LARGEST - 1)
+            elif isinstance(value, deque):
+                fits = all(isinstance(one, dict if name == "ep_info_buffer" else (bool, int, float)) for one in value)
             if not fits:
                 raise ValueError(f"{path} is damaged: its {name} is {shown(value)}.")
 
