@@ -327,6 +327,8 @@ def check_attributes(model: Any, path: Any) -> None:
                 fits = all(isinstance(one, dict if name == "ep_info_buffer" else (bool, int, float)) for one in value)
             if not fits:
                 raise ValueError(f"{path} is damaged: its {name} is {shown(value)}.")
+    if (model.ep_info_buffer is None) != (model.ep_success_buffer is None):
+        raise ValueError(f"{path} is damaged: it has only one of ep_info_buffer and ep_success_buffer.")
 
 
 def optimizer_problem(state: Mapping[str, Any], present: th.optim.Optimizer) -> str | None:

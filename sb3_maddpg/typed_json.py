@@ -103,7 +103,7 @@ def decode(value: Json, name: str, arrays: Mapping[str, np.ndarray] | None = Non
     ) as error:
         raise ValueError(f"{name} is damaged ({type(error).__name__}: {shown(str(error))}).") from error
     except ValueError as error:  # Gymnasium's have several lines
-        raise ValueError(f"{name} is damaged: {' '.join(str(error).split())[:400]}") from error
+        raise ValueError(f"{name} is damaged: {' '.join(str(error).split())}") from error
 
 
 def check_size(value: Json, name: str) -> None:

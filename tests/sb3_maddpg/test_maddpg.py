@@ -1,7 +1,9 @@
 """The algorithm: one update against a plain reference, who learns from what, logs, repeatability, bad input."""
 
 import copy
+import json
 import re
+import zipfile
 from contextlib import suppress
 
 import gymnasium
@@ -774,3 +776,17 @@ def test_an_agent_that_is_truncated_counts_in_its_own_target_only():
             keeps[agent] = 1
             alone = model.critic_target(obs[[row]], actions[[row]] * keeps[None, :, None])[0, 0, agent]
             assert found[row, agent].item() == pytest.approx(alone.item(), abs=1e-6)
+
+
+def test_a_replay_buffer_whose_neighbours_change_is_not_that_of_others_that_do_not(tmp_path):
+    model = MADDPG("MlpPolicy", OwnBit(), learning_starts=20, batch_size=8, buffer_size=60).learn(40)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    with zipfile.ZipFile(tmp_path / "buffer.pkl") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    state = json.loads(members["buffer.json"])
+    state["arguments"]["pairs_end"] = True
+    with zipfile.ZipFile(tmp_path / "other.pkl", "w") as archive:
+        for name, content in {**members, "buffer.json": json.dumps(state)}.items():
+            archive.writestr(name, content)
+    with pytest.raises(ValueError, match="holds neighbours that change: True, but the model needs"):
+        model.load_replay_buffer(tmp_path / "other.pkl")
