@@ -230,6 +230,7 @@ def put_aside(folder: Path) -> None:
 # Attributes that are not state, or are saved elsewhere
 _NOT_STATE = {"metadata", "render_mode", "spec", "class_attributes", "t_start", "num_envs", "n_envs"}
 _NOT_STATE |= {"model", "parent", "locals", "globals", "logger", "training_env", "eval_env", "callback", "callbacks"}
+_NOT_STATE |= {"callback_on_new_best"}
 # Where files are written follows from the command, since a run may be moved or copied
 _NOT_STATE |= {"log_path", "best_model_save_path", "save_path", "name_prefix", "folder", "log_dir"}
 
@@ -313,8 +314,12 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
 
 
 def _same_kind(present: Any, value: Any) -> bool:
+    if isinstance(value, int) and abs(value) >= 2**63:  # no counter of NumPy or C
+        return False
     if present is None or value is None:
         return True
+    if isinstance(value, bool) and not isinstance(present, (bool, np.bool_)):
+        return False
     kinds = ((bool, np.bool_), (int, float, np.number), (list, tuple, deque, np.ndarray), dict, str)
     if isinstance(present, RunningMeanStd):
         return isinstance(value, RunningMeanStd) and _usable(value, present)

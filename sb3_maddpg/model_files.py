@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, cast
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.save_util import open_path
 from torch.overrides import TorchFunctionMode
@@ -324,11 +325,20 @@ def check_attributes(model: Any, path: Any) -> None:
             elif isinstance(value, int):
                 fits = fits and 0 <= value <= _MOST.get(name, LARGEST - 1)
             elif isinstance(value, deque):
-                fits = all(isinstance(one, dict if name == "ep_info_buffer" else (bool, int, float)) for one in value)
+                fits = all(map(_is_episode if name == "ep_info_buffer" else _is_real, value))
             if not fits:
                 raise ValueError(f"{path} is damaged: its {name} is {shown(value)}.")
     if (model.ep_info_buffer is None) != (model.ep_success_buffer is None):
         raise ValueError(f"{path} is damaged: it has only one of ep_info_buffer and ep_success_buffer.")
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, (bool, int, float, np.bool_, np.number)) and math.isfinite(value)
+
+
+def _is_episode(value: Any) -> bool:
+    """:return: whether a value holds return and length of an episode, as SB3's ``Monitor`` tells them"""
+    return isinstance(value, Mapping) and _is_real(value.get("r")) and _is_real(value.get("l"))
 
 
 def optimizer_problem(state: Mapping[str, Any], present: th.optim.Optimizer) -> str | None:

@@ -118,6 +118,8 @@ def test_a_file_of_another_format_is_refused(tmp_path, changes):
         {"normalized_observations": []},
         {"_stats_window_size": 10**30},
         {"ep_info_buffer": {"$": "deque", "items": [1], "maxlen": 100}},
+        {"ep_info_buffer": {"$": "deque", "items": [{"r": None, "l": 3, "t": 1.0}], "maxlen": 100}},
+        {"ep_info_buffer": {"$": "deque", "items": [{"r": 1.0, "t": 1.0}], "maxlen": 100}},
     ],
 )
 def test_counters_that_no_training_wrote_are_refused(tmp_path, changes):
