@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 from sb3_maddpg.normalization import TeamVecNormalize
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
-from sb3_maddpg.utils import shown
+from sb3_maddpg.utils import arguments_of, shown
 from sb3_maddpg.vec_env import BorderEnv, GymnasiumVecEnv
 
 _BEFORE = ".before"
@@ -306,7 +306,10 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
             continue
         present = vars(owner).get(name)  # may be set only later in training
         of_all = getattr(of_class, name, None)
-        if callable(of_all) or hasattr(of_all, "__set__") or not _same_kind(present, value):
+        fits = _same_kind(present, value)
+        if value is None and isinstance(present, (int, float)):  # arguments remain numbers
+            fits = name.lstrip("_") not in arguments_of(of_class)
+        if callable(of_all) or hasattr(of_all, "__set__") or not fits:
             raise ValueError(f"{shown(value)} cannot be the {name} of a {of_class.__name__}.")
         if isinstance(present, deque) and isinstance(value, deque):  # the length follows from an argument
             value = deque(value, present.maxlen)

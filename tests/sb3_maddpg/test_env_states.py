@@ -173,7 +173,7 @@ def test_a_replay_that_no_episode_has_is_refused(name, value, message):
         Replayable(OwnBit()).load_state_dict({**state, name: value})
 
 
-@pytest.mark.parametrize("value", [10**30, -(2**63), True, "1"])
+@pytest.mark.parametrize("value", [10**30, -(2**63), True, "1", None])
 def test_a_counter_is_an_integer_that_fits_into_memory(value):
     callback = EvalCallback(DummyVecEnv([OwnBit]))
     with pytest.raises(ValueError, match="cannot be the n_eval_episodes of a EvalCallback"):
