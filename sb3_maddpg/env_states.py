@@ -332,7 +332,8 @@ def _same_kind(present: Any, value: Any) -> bool:
 def _usable(given: RunningMeanStd, present: RunningMeanStd) -> bool:
     """:return: whether statistics can replace others: of the same shape, finite, and counted"""
     for name in ("mean", "var", "count"):
-        one, other = getattr(given, name, None), getattr(present, name)
+        one: Any = getattr(given, name, None)
+        other = getattr(present, name)
         numbers = isinstance(one, (int, float, np.number, np.ndarray)) and not isinstance(one, bool)
         # The counts of agents may be one number before the first step
         if not numbers or (np.shape(one) != np.shape(other) and name != "count") or not np.isfinite(one).all():

@@ -271,9 +271,9 @@ def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
 
 def used_files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
     """Create a file of each kind, and return its content and a function that loads it and uses all that it holds."""
-    made = {}
-    settings = {"learning_starts": 20, "batch_size": 8, "train_freq": 5, "buffer_size": 60, "seed": 0}
-    prioritized = {"replay_buffer_class": PrioritizedTeamReplayBuffer, "n_steps": 2}
+    made: dict[str, tuple[bytes, Callable[[Path], Any]]] = {}
+    settings: dict[str, Any] = {"learning_starts": 20, "batch_size": 8, "train_freq": 5, "buffer_size": 60, "seed": 0}
+    prioritized: dict[str, Any] = {"replay_buffer_class": PrioritizedTeamReplayBuffer, "n_steps": 2}
 
     def env() -> SafeVecNormalize:
         return SafeVecNormalize(DummyVecEnv([lambda: Replayable(OwnBit())]))

@@ -135,7 +135,7 @@ class Neighbours:
         if self.present is not None:
             self.others = like(self.others, state["others"], "neighbours", -1, self.others.shape[1] - 1)
             self.present = like(self.present, state["present"], "presence of neighbours")
-            self.reverse = like(self.reverse, state["reverse"], "slots at neighbours", -1, self.reverse.shape[2] - 1)
+            self.reverse = like(self.reverse, state["reverse"], "slots at neighbours", -1, self.others.shape[-1] - 1)
 
     def perceived(self, places: np.ndarray) -> np.ndarray:
         """Return a mask without empty slots.
