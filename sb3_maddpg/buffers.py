@@ -280,7 +280,7 @@ class TeamReplayBuffer(ReplayBuffer):
             raise ValueError(f"A {type(self).__name__} has the counters {self._COUNTERS}, not {tuple(counters)}.")
         for name, value in counters.items():
             default = getattr(self, name)
-            if type(value) is not type(default) or not (math.isfinite(value) and value >= 0):
+            if type(value) is not type(default) or not 0 <= value < (2**53 if type(value) is int else math.inf):
                 raise ValueError(f"The replay buffer's {name} is {shown(value)}.")
             setattr(self, name, value)
         names = self.records.dtype.names or ()

@@ -16,6 +16,8 @@ import math
 import os
 import platform
 import random
+import re
+import secrets
 import shutil
 import signal
 import stat
@@ -32,12 +34,14 @@ from typing import Any, cast
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.env_states import (
     NoStateError,
+    checked_bits,
     layers,
     load_vec_env_state,
     plain_entries,
@@ -86,7 +90,7 @@ class RunCheckpoint(BaseCallback):
 
     def __init__(self, folder: str | os.PathLike[str], every: int | None = None, keep: int = 2, verbose: int = 0):
         super().__init__(verbose)
-        if (every is not None and every < 1) or keep < 1:
+        if not ((every is None or every >= 1) and keep >= 1):  # also NaN
             raise ValueError(f"every={every}, keep={keep}: both must be at least 1.")
         self.folder, self.every, self.keep = Path(folder), every, keep
         self.saved_at = 0
@@ -106,17 +110,18 @@ class RunCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        for path in self.folder.glob(f"*{_UNFINISHED}"):
-            shutil.rmtree(path, ignore_errors=True)
+        self._remove_unfinished()
         callbacks, known = _callbacks(self._root()), [one for one, _ in self._at_start]
         self._at_start += [(one, deepcopy(_values(one))) for one in callbacks if one not in known]
         if self._pending is not None:
             try:
                 _restore(cast(MADDPG, self.model), callbacks, self._pending)
-            except (KeyError, TypeError, AttributeError, IndexError) as error:
+            except (ValueError, OSError):
+                raise
+            except Exception as error:  # from environments, wrappers and callbacks of any kind
                 raise ValueError(
                     f"A checkpoint in {self.folder} is damaged, or belongs to another environment or other callbacks "
-                    f"({type(error).__name__}: {error})."
+                    f"({type(error).__name__}: {shown(str(error))})."
                 ) from error
             self._pending = None
         else:
@@ -236,10 +241,15 @@ class RunCheckpoint(BaseCallback):
             else f"No checkpoint at step {writer.steps}: the previous one stays. {self.folder}: {error}; {remedy}.",
             stacklevel=2,
         )
-        for path in self.folder.glob(f"*{_UNFINISHED}"):
-            shutil.rmtree(path, ignore_errors=True)
+        self._remove_unfinished()
         writer.tidy()  # its segment would take up space, and the next one holds the same rows
         return None
+
+    def _remove_unfinished(self) -> None:
+        for path in self.folder.glob(f"*{_UNFINISHED}"):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in (self.folder / _SEGMENTS).glob(f"*{_UNFINISHED}"):
+            path.unlink(missing_ok=True)
 
     def _root(self) -> BaseCallback:
         root: BaseCallback = self
@@ -350,18 +360,23 @@ class _Writer(threading.Thread):
         path = self.folder / _SEGMENTS / self.segment.name
         path.parent.mkdir(parents=True, exist_ok=True)
         found = hashlib.sha256()
-        with path.open("wb") as file:
-            fault("opened rows")
-            for end, parts in self.segment.content():
-                with self._progress:
-                    self._copied = end
-                    self._progress.notify_all()
-                for part in parts:
-                    found.update(part)
-                    file.write(part)
-            fault("written rows")
-            file.flush()
-            os.fsync(file.fileno())
+        unfinished = _unfinished(path)
+        try:
+            with unfinished.open("xb") as file:
+                fault("opened rows")
+                for end, parts in self.segment.content():
+                    with self._progress:
+                        self._copied = end
+                        self._progress.notify_all()
+                    for part in parts:
+                        found.update(part)
+                        file.write(part)
+                fault("written rows")
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
         sync_folder(path.parent)
         rows = {"first": self.segment.first, "end": self.segment.end}
         self.segments.append({"name": self.segment.name, **rows, "sha256": found.hexdigest()})
@@ -413,6 +428,7 @@ def resume(
     with as_damage(path, "checkpoint"):
         arrays, state = _read_state(path)
         plain = decode(state, f"{path}: state", arrays)
+        _check_values(plain)
         model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
         _compare_fingerprints(plain["fingerprint"], fingerprint(model.env))
         n_envs = len(plain["last"]["_last_episode_starts"])
@@ -427,10 +443,39 @@ def resume(
         assert isinstance(buffer, TeamReplayBuffer)
         _read_segments(Path(folder), buffer, plain["segments"], plain["counters"])
         buffer.restore(plain["counters"], {**_columns(buffer), **plain["buffer_arrays"]})
+        _check_random_state(plain["random"])
+        model.action_noise = plain["action_noise"]
+        model.action_noise = model._action_noise_for(n_envs)
         callback._segments = plain["segments"]
         callback._pending = plain
         callback.saved_at = model.num_timesteps
     return model, callback
+
+
+def _check_values(state: dict[str, Any]) -> None:
+    """
+    :param state: state in a checkpoint
+    :raises ValueError: if a value of its own, or of the logger, is not one that a checkpoint can hold
+    """
+    every, noise, logger, inexact = (state[name] for name in ("every", "action_noise", "logger", "inexact"))
+    if every is not None and not (type(every) is int and every >= 1):
+        raise ValueError(f"A checkpoint is damaged: it was one of every={shown(every)} steps.")
+    if not isinstance(noise, (ActionNoise, type(None))):
+        raise ValueError(f"A checkpoint is damaged: its action_noise is {shown(noise)}.")
+    if not isinstance(state["logger_folder"], (str, type(None))) or not isinstance(inexact, (str, type(None))):
+        raise ValueError("A checkpoint is damaged: its logger_folder or inexact is not text.")
+    written = state["fingerprint"]
+    if not isinstance(written, dict) or not all(isinstance(one, str) for pair in written.items() for one in pair):
+        raise ValueError(f"A checkpoint is damaged: its fingerprint is {shown(written)}.")
+    kinds = {
+        "name_to_value": lambda value: isinstance(value, (str, int, float, np.number)),
+        "name_to_count": lambda value: type(value) is int and 0 <= value < 2**53,
+        "name_to_excluded": lambda value: isinstance(value, (str, tuple, list, type(None))),
+    }
+    for name in _LOGGED:
+        wrong = [value for value in logger[name].values() if not kinds[name](value)]
+        if wrong or not all(isinstance(key, str) for key in logger[name]):
+            raise ValueError(f"A checkpoint is damaged: the logger's {name} holds {shown(wrong)}.")
 
 
 def newest(folder: str | os.PathLike[str]) -> Path | None:
@@ -555,7 +600,6 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         load_vec_env_state(env, state["env"])
         for name in _LAST:
             setattr(model, name, _checked_last(model, name, state["last"][name]))
-    model.action_noise = state["action_noise"]
     names = [type(one).__name__ for one in callbacks]
     states = [one for one in state["callbacks"] if one["class"] != CallbackList.__name__]
     if names != (written := [one["class"] for one in states]):
@@ -564,8 +608,8 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         set_plain_values(one, _values_to_restore(one, saved["values"], saved.get("at_start")))
         if saved["eval_env"] is not None:
             load_vec_env_state(one.eval_env, saved["eval_env"])  # type: ignore[attr-defined]
-    for name, values in state["logger"].items():
-        getattr(model.logger, name).update(values)
+    for name in _LOGGED:
+        getattr(model.logger, name).update(state["logger"][name])
     set_space_generators(model.action_space, state["spaces"])
     _set_random_state(state["random"])
 
@@ -653,7 +697,36 @@ def _random_state() -> dict[str, Any]:
     }
 
 
+def _check_random_state(state: dict[str, Any]) -> None:
+    """
+    :param state: see ``_random_state``
+    :raises ValueError: if a part does not fit the generator of this process
+    """
+    own = _random_state()
+    version, numbers, gauss = state["python"]
+    plain = version == own["python"][0] and isinstance(numbers, list) and len(numbers) == len(own["python"][1])
+    if not (plain and all(type(one) is int and 0 <= one < 2**32 for one in numbers) and numbers[-1] < len(numbers)):
+        raise ValueError("A checkpoint is damaged: its state of Python's random number generator does not fit.")
+    if gauss is not None and not (isinstance(gauss, float) and math.isfinite(gauss)):
+        raise ValueError(f"A checkpoint is damaged: Python's random number generator has gauss={shown(gauss)}.")
+    checked_bits(state["numpy"], own["numpy"])
+    for name in ("torch", "cuda"):
+        given, present = ([one] if name == "torch" else one for one in (state[name], own[name]))
+        for one, other in zip(given, present, strict=False):  # there may be no GPU here, or none before
+            if not isinstance(one, np.ndarray) or (one.shape, one.dtype) != (other.shape, other.dtype):
+                raise ValueError(
+                    f"A checkpoint is damaged: its state of PyTorch's random number generator is {shown(one)}."
+                )
+    try:
+        th.Generator().set_state(th.from_numpy(state["torch"].copy()))
+    except RuntimeError as error:
+        raise ValueError(
+            f"A checkpoint is damaged: {shown(str(error))} as the state of PyTorch's generator."
+        ) from error
+
+
 def _set_random_state(state: dict[str, Any]) -> None:
+    """:param state: see ``_random_state``, checked"""
     version, numbers, gauss = state["python"]
     random.setstate((version, tuple(numbers), gauss))
     np.random.set_state(state["numpy"])  # noqa: NPY002
@@ -775,8 +848,9 @@ def _differs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _read_segments(
     folder: Path, buffer: TeamReplayBuffer, segments: list[dict[str, Any]], counters: dict[str, Any]
 ) -> None:
-    buffer.pos, buffer.full = counters["pos"], counters["full"]
     size, stored = buffer.buffer_size, _stored(buffer)
+    _check_segments(segments, counters, size)
+    buffer.pos, buffer.full = counters["pos"], counters["full"]
     for one in segments:
         path, first, end = _file_in(folder / _SEGMENTS, one["name"]), one["first"], one["end"]
         if not 0 <= first < end <= counters["n_added"] or _size_of(buffer, first, end) > path.stat().st_size:
@@ -801,6 +875,33 @@ def _read_segments(
             buffer.next_observations[place, env] = buffer.observations[(place + 1) % size, env]
 
 
+def _check_segments(segments: list[dict[str, Any]], counters: dict[str, Any], size: int) -> None:
+    """
+    :param segments: segments of a checkpoint, oldest first
+    :param counters: counters of the replay buffer
+    :param size: number of its rows
+    :raises ValueError: if the counters contradict each other, or the segments are not all of its rows
+    """
+    n_added = counters["n_added"]
+    if type(n_added) is not int or not 0 <= n_added < 2**53:
+        raise ValueError(f"A checkpoint is damaged: its replay buffer has n_added={shown(n_added)}.")
+    if (counters["pos"], counters["full"]) != (n_added % size, n_added >= size):
+        raise ValueError(
+            f"A checkpoint is damaged: pos={shown(counters['pos'])} and full={shown(counters['full'])} of a replay "
+            f"buffer of {size} rows do not fit n_added={n_added}."
+        )
+    end = max(n_added - size, 0)
+    for one in segments:
+        if not all(type(one[name]) is int for name in ("first", "end")) or not one["first"] <= end < one["end"]:
+            raise ValueError(
+                f"A checkpoint is damaged: {shown(one['name'])} holds the rows {shown(one['first'])} to "
+                f"{shown(one['end'])}, but rows from {end} on are missing."
+            )
+        end = one["end"]
+    if end != n_added:
+        raise ValueError(f"A checkpoint is damaged: its segments end at row {end}, but it has {n_added} rows.")
+
+
 def _npz(arrays: dict[str, np.ndarray]) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
@@ -820,10 +921,14 @@ def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         return {name: archive[name] for name in archive.files}, state
 
 
+def _unfinished(target: Path) -> Path:
+    """:return: path to write something under first, which no other thread, process or container uses"""
+    return target.with_name(f"{target.name}.{secrets.token_hex(8)}{_UNFINISHED}")
+
+
 def _commit(target: Path, write: Callable[[Path], None]) -> Path:
     """Write a folder atomically."""
-    unfinished = target.with_name(target.name + _UNFINISHED)
-    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished = _unfinished(target)
     unfinished.mkdir(parents=True)
     fault("begin")
     write(unfinished)
@@ -853,7 +958,10 @@ def _damage(path: Path) -> str | None:
         for name, expected in json.loads(_file_in(path, _MANIFEST).read_text()).items():
             if _sha256(_file_in(path, name)) != expected:
                 return f"{name} is damaged"
-        for one in json.loads(_file_in(path, "state.json").read_text())["segments"]:
+        segments = json.loads(_file_in(path, "state.json").read_text())["segments"]
+        if len({one["name"] for one in segments}) < len(segments):
+            return "it names a segment twice"
+        for one in segments:
             if _sha256(_file_in(path.parent / _SEGMENTS, one["name"])) != one["sha256"]:
                 return f"segment {one['name']} is damaged"
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -870,7 +978,7 @@ def _file_in(folder: Path, name: str) -> Path:
 
 
 def _finished(folder: Path) -> list[Path]:
-    found = (path for path in folder.glob(f"{_PREFIX}*") if path.name.removeprefix(_PREFIX).isdigit())
+    found = (path for path in folder.glob(f"{_PREFIX}*") if re.fullmatch(r"[0-9]+", path.name.removeprefix(_PREFIX)))
     return sorted(found, key=lambda path: int(path.name.removeprefix(_PREFIX)))
 
 

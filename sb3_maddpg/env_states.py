@@ -8,6 +8,7 @@ wrappers.
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -17,16 +18,19 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
 from sb3_maddpg.normalization import TeamVecNormalize
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
-from sb3_maddpg.utils import shown
+from sb3_maddpg.utils import arguments_of, shown
 from sb3_maddpg.vec_env import GymnasiumVecEnv, Transparent
 
 _BEFORE = ".before"
+# Largest integers in the states of NumPy's generators, by name
+_LARGEST = {"pos": 624, "buffer_pos": 4, "has_uint32": 1, "has_gauss": 1, "uinteger": 2**32 - 1}
 
 
 class NoStateError(ValueError):
@@ -68,15 +72,30 @@ class Replayable(gymnasium.Wrapper):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """:param state: see ``state_dict``"""
-        self._rng = np.random.default_rng()
-        self._rng.bit_generator.state = state["generator"]
-        self._seed, self._options = state["seed"], state["options"]
-        self._actions = []
-        if self._seed is not None:
-            self.env.reset(seed=self._seed, options=self._options)
-        for action in state["actions"]:
-            self.step(action if action.ndim else action.item())
+        """
+        :param state: see ``state_dict``
+        :raises ValueError: if the state does not fit, or has more actions than its episode has steps
+        """
+        bits = np.random.default_rng().bit_generator
+        bits.state = checked_bits(state["generator"], bits.state)
+        seed, options, actions = state["seed"], state["options"], state["actions"]
+        if not (seed is None or (type(seed) is int and 0 <= seed < 2**31)) or not isinstance(
+            options, (dict, type(None))
+        ):
+            raise ValueError(f"No episode begins with seed={shown(seed)}, options={shown(options)}.")
+        shape = self.action_space.shape
+        # Before the first step, the array of actions is empty and has no other axis
+        if not isinstance(actions, np.ndarray) or not (actions.size == 0 or actions.shape[1:] == shape):
+            raise ValueError(f"{shown(actions)} are no actions of {self.action_space}.")
+        self._rng, self._seed, self._options, self._actions = np.random.Generator(bits), seed, options, []
+        if seed is not None:
+            self.env.reset(seed=seed, options=options)
+        ended = seed is None
+        for action in actions:
+            if ended:
+                raise ValueError(f"The state has {len(actions)} actions, but its episode ends before the last of them.")
+            *_, terminated, truncated, _ = self.step(action if action.ndim else action.item())
+            ended = terminated or truncated
 
 
 def vec_env_state(env: VecEnv) -> dict[str, Any]:
@@ -173,7 +192,7 @@ def _class_name(owner: Any) -> str:
 def _take(owner: Any, state: dict[str, Any]) -> None:
     if state["class"] != _class_name(owner):
         raise ValueError(f"The state belongs to a {state['class']}, but this is a {_class_name(owner)}.")
-    set_plain_values(owner, state.get("values", {}))
+    set_plain_values(owner, _for_each_env(owner, state.get("values", {})))
     if "written" in state and (writer := getattr(owner, "results_writer", None)) is not None:
         _write_again(Path(writer.file_handler.name), writer.file_handler, state["written"])
 
@@ -213,6 +232,7 @@ def put_aside(folder: Path) -> None:
 # Attributes that are not state, or are saved elsewhere
 _NOT_STATE = {"metadata", "render_mode", "spec", "class_attributes", "t_start", "num_envs", "n_envs"}
 _NOT_STATE |= {"model", "parent", "locals", "globals", "logger", "training_env", "eval_env", "callback", "callbacks"}
+_NOT_STATE |= {"callback_on_new_best"}
 # Where files are written follows from the command, since a run may be moved or copied
 _NOT_STATE |= {"log_path", "best_model_save_path", "save_path", "name_prefix", "folder", "log_dir"}
 
@@ -243,6 +263,37 @@ def plain_entries(values: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
+# What SB3's vectorised environment overwrites in every step
+_SCRATCH = {"keys", "buf_obs", "buf_dones", "buf_rews", "buf_infos", "actions"}
+
+
+def _for_each_env(owner: Any, values: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param owner: a vectorised environment, or anything else
+    :param values: values that it should take on
+    :return: those that it does not overwrite anyway
+    :raises ValueError: if a list or an array does not have one entry for each environment, as it has now
+    """
+    if isinstance(owner, DummyVecEnv):
+        values = {name: value for name, value in values.items() if name not in _SCRATCH}
+    if not isinstance(owner, VecEnv):
+        return values
+    for name, value in values.items():
+        present = vars(owner).get(name)
+        kinds = {type(one) for one in present} if isinstance(present, list) and name != "_seeds" else set()
+        fits = True
+        if isinstance(present, np.ndarray) and len(np.atleast_1d(present)) == owner.num_envs:
+            # Their precision may change with the first step
+            fits = isinstance(value, np.ndarray) and value.shape == present.shape
+            fits = fits and value.dtype.kind == present.dtype.kind
+        elif isinstance(present, list) and len(present) == owner.num_envs:
+            fits = isinstance(value, list) and len(value) == len(present)
+            fits = fits and (len(kinds) != 1 or all(type(one) in kinds for one in value))
+        if not fits:
+            raise ValueError(f"{shown(value)} cannot be the {name} of a {type(owner).__name__}.")
+    return values
+
+
 def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
     """
     Set attributes.
@@ -257,7 +308,10 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
             continue
         present = vars(owner).get(name)  # may be set only later in training
         of_all = getattr(of_class, name, None)
-        if callable(of_all) or hasattr(of_all, "__set__") or not _same_kind(present, value):
+        fits = _same_kind(present, value)
+        if value is None and isinstance(present, (int, float)):  # arguments remain numbers
+            fits = name.lstrip("_") not in arguments_of(of_class)
+        if callable(of_all) or hasattr(of_all, "__set__") or not fits:
             raise ValueError(f"{shown(value)} cannot be the {name} of a {of_class.__name__}.")
         if isinstance(present, deque) and isinstance(value, deque):  # the length follows from an argument
             value = deque(value, present.maxlen)
@@ -265,10 +319,29 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
 
 
 def _same_kind(present: Any, value: Any) -> bool:
+    if isinstance(value, int) and abs(value) >= 2**63:  # no counter of NumPy or C
+        return False
     if present is None or value is None:
         return True
-    kinds = ((bool, int, float, np.number, np.bool_), (list, tuple, deque, np.ndarray), dict, str)
+    if isinstance(value, bool) and not isinstance(present, (bool, np.bool_)):
+        return False
+    kinds = ((bool, np.bool_), (int, float, np.number), (list, tuple, deque, np.ndarray), dict, str)
+    if isinstance(present, RunningMeanStd):
+        return isinstance(value, RunningMeanStd) and _usable(value, present)
     return isinstance(value, next((kind for kind in kinds if isinstance(present, kind)), type(present)))
+
+
+def _usable(given: RunningMeanStd, present: RunningMeanStd) -> bool:
+    """:return: whether statistics can replace others: of the same shape, finite, and counted"""
+    for name in ("mean", "var", "count"):
+        one: Any = getattr(given, name, None)
+        other = getattr(present, name)
+        numbers = isinstance(one, (int, float, np.number, np.ndarray)) and not isinstance(one, bool)
+        # The counts of agents may be one number before the first step
+        if not numbers or (np.shape(one) != np.shape(other) and name != "count") or not np.isfinite(one).all():
+            return False
+    shapes = ((), np.shape(present.mean))
+    return np.shape(given.count) in shapes and bool((np.asarray(given.var) >= 0).all() and np.all(given.count >= 0))
 
 
 def tells_state(env: gymnasium.Env) -> bool:
@@ -299,6 +372,36 @@ def layers(env: Any) -> Iterator[Any]:
             waiting += held if isinstance(held, (list, tuple)) else [held]
 
 
+def checked_bits(state: Any, own: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Check the state of a random number generator. NumPy does not: a position outside of a generator's memory would end
+    the process.
+
+    :param state: state of a bit generator, from a file
+    :param own: the present state of the generator that it replaces
+    :return: the state
+    :raises ValueError: if it belongs to another class of generators, or a part has another type or is out of range
+    """
+
+    def fits(one: Any, own: Any, name: str) -> bool:
+        if isinstance(own, dict):
+            return (
+                isinstance(one, Mapping) and set(one) == set(own) and all(fits(one[key], own[key], key) for key in own)
+            )
+        if isinstance(own, np.ndarray):
+            return isinstance(one, np.ndarray) and (one.shape, one.dtype) == (own.shape, own.dtype)
+        if isinstance(own, float):
+            return isinstance(one, float) and math.isfinite(one)
+        if isinstance(own, str):
+            return isinstance(one, str) and one == own
+        integer = isinstance(one, (int, np.integer)) and not isinstance(one, bool)
+        return integer and 0 <= one <= _LARGEST.get(name, 2**128 - 1)
+
+    if not fits(state, own, "state"):
+        raise ValueError(f"{shown(state)} is not a state of the random number generator {own['bit_generator']}.")
+    return dict(state)
+
+
 def space_generators(space: spaces.Space) -> list[dict[str, Any] | None]:
     """
     :param space: a space
@@ -316,7 +419,8 @@ def set_space_generators(space: spaces.Space, states: list[dict[str, Any] | None
     """
     for one, state in zip(_parts(space), states, strict=True):
         if state is not None:
-            one.np_random.bit_generator.state = state
+            bits = one.np_random.bit_generator
+            bits.state = checked_bits(state, bits.state)
 
 
 def _parts(space: spaces.Space) -> Iterator[spaces.Space]:

@@ -1302,6 +1302,7 @@ class MADDPG(OffPolicyAlgorithm):
             ("observations of {}", buffer.observation_space, self.observation_space),
             ("actions of {}", buffer.action_space, self.action_space),
             ("rewards of {} neighbours of each agent", buffer.n_pairs, n_pairs),
+            ("neighbours that change: {}", buffer.pairs_end, self.replay_buffer_kwargs.get("pairs_end", False)),
         ):
             if loaded != needed:
                 raise ValueError(

@@ -15,12 +15,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, cast
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.save_util import open_path
 from torch.overrides import TorchFunctionMode
 
 from sb3_maddpg.typed_json import check_size, decode
 from sb3_maddpg.utils import shown
+from sb3_maddpg.validation import LARGEST
 
 # Incremented when older versions cannot read new files
 FILE_FORMAT = 3
@@ -50,12 +52,14 @@ _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
         "_stats_window_size",
     ),
     (int, float): ("_current_progress_remaining", "start_time"),
-    (bool,): ("use_sde", "use_sde_at_warmup"),
+    (bool,): ("use_sde", "use_sde_at_warmup", "normalized_observations"),
     (int, type(None)): ("seed",),
     (str, type(None)): ("tensorboard_log", "lean"),
     (dict, type(None)): ("env_spec",),
     (deque, type(None)): ("ep_info_buffer", "ep_success_buffer"),
 }
+
+_MOST = {"_stats_window_size": 10**9, "seed": 2**32 - 1}  # of these attributes
 
 
 # Attributes of the process, which files cannot hold
@@ -319,9 +323,22 @@ def check_attributes(model: Any, path: Any) -> None:
             if isinstance(value, float):  # the progress can drop slightly below 0 in the last rollout
                 fits = fits and math.isfinite(value)
             elif isinstance(value, int):
-                fits = fits and value >= 0
+                fits = fits and 0 <= value <= _MOST.get(name, LARGEST - 1)
+            elif isinstance(value, deque):
+                fits = all(map(_is_episode if name == "ep_info_buffer" else _is_real, value))
             if not fits:
                 raise ValueError(f"{path} is damaged: its {name} is {shown(value)}.")
+    if (model.ep_info_buffer is None) != (model.ep_success_buffer is None):
+        raise ValueError(f"{path} is damaged: it has only one of ep_info_buffer and ep_success_buffer.")
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, (bool, int, float, np.bool_, np.number)) and math.isfinite(value)
+
+
+def _is_episode(value: Any) -> bool:
+    """:return: whether a value holds return and length of an episode, as SB3's ``Monitor`` tells them"""
+    return isinstance(value, Mapping) and _is_real(value.get("r")) and _is_real(value.get("l"))
 
 
 def optimizer_problem(state: Mapping[str, Any], present: th.optim.Optimizer) -> str | None:

@@ -6,7 +6,7 @@ import base64
 import binascii
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple, TypeVar
@@ -29,7 +29,10 @@ _SMALL = 64  # arrays with more numbers may be stored outside the JSON
 _LARGEST_ARRAY = 10**7  # maximum number of values in an array, e.g. the bounds of a space
 _MOST_REPEATED = 2 * _LARGEST_ARRAY  # maximum number of values in all arrays of which only one value is written
 
+_MOST_AGENTS = 4096  # maximum number of agents of a team, or of parts of a space
+
 _Class = TypeVar("_Class", bound=type)
+_Item = TypeVar("_Item")
 _allowed: dict[str, type] = {}
 # Instances of these are written as their attributes
 _PLAIN_OBJECTS = (
@@ -99,8 +102,8 @@ def decode(value: Json, name: str, arrays: Mapping[str, np.ndarray] | None = Non
         RecursionError,
     ) as error:
         raise ValueError(f"{name} is damaged ({type(error).__name__}: {shown(str(error))}).") from error
-    except ValueError as error:
-        raise ValueError(f"{name} is damaged: {error}") from error
+    except ValueError as error:  # Gymnasium's have several lines
+        raise ValueError(f"{name} is damaged: {' '.join(str(error).split())}") from error
 
 
 def check_size(value: Json, name: str) -> None:
@@ -238,6 +241,17 @@ def _read_multi_discrete(entry: Mapping[str, Json], part: Callable[[Json], Any])
     return spaces.MultiDiscrete(nvec, nvec.dtype, start=part(entry["start"]))
 
 
+def _few(agents: Sequence[_Item]) -> Sequence[_Item]:
+    """
+    :param agents: what a file holds for each agent, or each part of a space
+    :return: the same
+    :raises ValueError: if there are more than any team has
+    """
+    if len(agents) > _MOST_AGENTS:
+        raise ValueError(f"it has {len(agents)} agents or parts of a space, more than {_MOST_AGENTS}")
+    return agents
+
+
 def _write_team(space: TeamObservation, part: Callable[[Any], Json]) -> dict[str, Json]:
     names = {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim}
     masks: dict[str, Json] = {"masks": [list(mask) for mask in space.masks]} if any(space.masks) else {}
@@ -249,7 +263,7 @@ def _read_team(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamOb
     own = max(lengths)
     agents = {
         name: spaces.Box(box.low[row, :columns], box.high[row, :columns], dtype=np.float32)
-        for row, (name, columns) in enumerate(zip(entry["names"], lengths, strict=True))
+        for row, (name, columns) in enumerate(zip(_few(entry["names"]), lengths, strict=True))
     }
     low, high = (bound[:, own:].ravel()[:length] for bound in (box.low, box.high))
     masks = dict(zip(entry["names"], entry.get("masks", []), strict=False))
@@ -297,9 +311,9 @@ _CODECS: dict[str, _Codec] = {
     ),
     "float": _Codec(float, lambda v, part: {"value": str(v)}, lambda e, part: float(e["value"])),
     "TeamObservation": _Codec(TeamObservation, _write_team, _read_team),
-    "MixedActions": _Codec(MixedActions, _agent_spaces, lambda e, part: MixedActions([*map(part, e["agents"])])),
+    "MixedActions": _Codec(MixedActions, _agent_spaces, lambda e, part: MixedActions([*map(part, _few(e["agents"]))])),
     "CategoricalActions": _Codec(
-        CategoricalActions, _agent_spaces, lambda e, part: CategoricalActions([*map(part, e["agents"])])
+        CategoricalActions, _agent_spaces, lambda e, part: CategoricalActions([*map(part, _few(e["agents"]))])
     ),
     "Box": _Codec(spaces.Box, _write_box, _read_box),
     "Discrete": _Codec(
@@ -320,12 +334,12 @@ _CODECS: dict[str, _Codec] = {
     "Dict": _Codec(
         spaces.Dict,
         lambda v, part: {"spaces": [[key, part(one)] for key, one in v.spaces.items()]},
-        lambda e, part: spaces.Dict([(key, part(one)) for key, one in e["spaces"]]),
+        lambda e, part: spaces.Dict([(key, part(one)) for key, one in _few(e["spaces"])]),
     ),
     "Tuple": _Codec(
         spaces.Tuple,
         lambda v, part: {"spaces": [*map(part, v.spaces)]},
-        lambda e, part: spaces.Tuple([*map(part, e["spaces"])]),
+        lambda e, part: spaces.Tuple([*map(part, _few(e["spaces"]))]),
     ),
     "dtype": _Codec(th.dtype, lambda v, part: {"name": str(v)}, lambda e, part: _torch_dtype(e["name"])),
 }

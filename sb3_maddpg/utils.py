@@ -10,6 +10,8 @@ import json
 import math
 import operator
 import os
+import re
+import secrets
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -128,7 +130,8 @@ def describe_env(env: VecEnv) -> dict[str, Any] | None:
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO]:
     """
-    Write a file atomically: an existing file stays until the last byte of the new one is on disk.
+    Write a file atomically: an existing file stays until the last byte of the new one is on disk. If threads, processes
+    or containers write the same file at the same time, one of their files remains, whole.
 
     :param path: path of the file; missing folders are created
     :param suffix: suffix added to a path without one, as Stable-Baselines3 does
@@ -141,11 +144,11 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
     if target.is_dir() or Path(path).name in ("", ".."):
         raise IsADirectoryError(errno.EISDIR, "This is a folder: pass the path of a file", str(target))
     # In the same folder, because a file cannot be renamed across file systems
-    temporary = target.with_name(f".{target.name}.{os.getpid()}")
+    temporary = target.with_name(f"{_prefix(target.name)}{os.getpid()}-{secrets.token_hex(8)}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         _remove_left_over(target)
-        file = temporary.open("wb")
+        file = temporary.open("xb")  # not with mkstemp, which ignores the umask
     except OSError as error:
         reason = f"Cannot write here ({error.strerror}): choose another folder"
         raise OSError(error.errno, reason, str(target)) from error
@@ -160,16 +163,21 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
         temporary.unlink(missing_ok=True)
 
 
+def _prefix(name: str) -> str:
+    return f".{name[:50]}."  # file systems limit names to 255 bytes
+
+
 def _remove_left_over(target: Path) -> None:
     """Remove temporary files of processes that were killed while writing this file."""
-    prefix = f".{target.name}."
+    prefix = _prefix(target.name)
     for path in target.parent.glob(f"{glob.escape(prefix)}*"):
-        process = path.name.removeprefix(prefix)
+        # Earlier versions named them by the process alone
+        found = re.fullmatch(r"([0-9]+)(-[0-9a-f]{16})?", path.name.removeprefix(prefix))
         with suppress(FileNotFoundError):  # its process has just renamed it
             # The process may run on another machine, but would not pause for that long
-            if not process.isdecimal() or time.time() - path.stat().st_mtime <= LEFT_OVER_SECONDS:
+            if found is None or time.time() - path.stat().st_mtime <= LEFT_OVER_SECONDS:
                 continue
-            if not process_runs(int(process)):
+            if not process_runs(int(found[1])):
                 path.unlink(missing_ok=True)
 
 

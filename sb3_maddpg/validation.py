@@ -20,8 +20,9 @@ from torch import nn
 
 from sb3_maddpg.utils import shown, suggest
 
-AtLeastZero = Annotated[float, Field(ge=0)]
-Positive = Annotated[float, Field(gt=0)]
+LARGEST_FLOAT = float(np.finfo(np.float32).max)  # larger numbers are infinite in single precision
+AtLeastZero = Annotated[float, Field(ge=0, le=LARGEST_FLOAT)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST_FLOAT)]
 Limit = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 # Outside these bounds, a price becomes 0 or infinite in single precision
 Price = Annotated[float, Field(ge=1e-12, le=1e12)]
@@ -86,21 +87,27 @@ class LearnArguments(Arguments):
         return callback
 
 
+def _frequency(train_freq: TrainFreq) -> TrainFreq:
+    if type(train_freq.frequency) is not int or not 1 <= train_freq.frequency < LARGEST:
+        raise ValueError
+    return train_freq
+
+
 class TrainingArguments(Arguments):
     """Arguments of ``MADDPG``."""
 
     # 0 is allowed, because rl_zoo3 loads models with it to render them
-    learning_rate: Annotated[float, Field(ge=0)] | Schedule = Field(
-        description="a finite number that is not negative, or a schedule"
-    )
+    learning_rate: AtLeastZero | Schedule = Field(description="a finite number that is not negative, or a schedule")
     buffer_size: Natural = Field(description="a number of transitions, at least 1")
     learning_starts: NaturalOrZero = Field(description="a number of steps, at least 0")
     batch_size: Natural = Field(description="a number of transitions, at least 1")
     tau: float = Field(gt=0, le=1, description="a number above 0 and up to 1")
     gamma: float = Field(ge=0, le=1, description="a number between 0 and 1")
-    train_freq: InstanceOf[TrainFreq] | Natural | tuple[Natural, Literal["step", "episode"]] = Field(
-        description='an integer of at least 1, or such a number with its unit, (1, "step") or (1, "episode")'
-    )
+    train_freq: (
+        Annotated[InstanceOf[TrainFreq], AfterValidator(_frequency)]
+        | Natural
+        | tuple[Natural, Literal["step", "episode"]]
+    ) = Field(description='an integer of at least 1, or such a number with its unit, (1, "step") or (1, "episode")')
     gradient_steps: Annotated[int, Field(ge=-1, lt=LARGEST)] = Field(
         description="a number of steps, or -1 for as many as environment steps"
     )
@@ -115,12 +122,12 @@ class TrainingArguments(Arguments):
         description="a standard deviation of at least 0, or two of them, the first and the last"
     )
     estimator: str = Field(description="a name of sb3_maddpg.estimators.ESTIMATORS")
-    temperature: Annotated[float, Field(ge=LEAST_TEMPERATURE)] | Schedule = Field(
+    temperature: Annotated[float, Field(ge=LEAST_TEMPERATURE, le=LARGEST_FLOAT)] | Schedule = Field(
         description=f"positive, at least {LEAST_TEMPERATURE:g}, or a schedule"
     )
     policy_delay: Natural = Field(description="a number of critic updates, an integer of at least 1")
     max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
-    policy_regularization: float = Field(ge=0, description="a finite number of at least 0")
+    policy_regularization: AtLeastZero = Field(description="a finite number of at least 0")
 
     @field_validator("threshold_price")
     @classmethod
@@ -133,8 +140,8 @@ class TrainingArguments(Arguments):
 class SmoothedTrainingArguments(TrainingArguments):
     """Arguments of ``MATD3``."""
 
-    target_policy_noise: float = Field(ge=0, description="a finite standard deviation, which must not be negative")
-    target_noise_clip: float = Field(ge=0, description="a finite number, which must not be negative")
+    target_policy_noise: AtLeastZero = Field(description="a finite standard deviation, which must not be negative")
+    target_noise_clip: AtLeastZero = Field(description="a finite number, which must not be negative")
 
 
 class ThresholdArgument(Arguments):

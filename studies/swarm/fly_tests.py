@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
@@ -247,9 +248,9 @@ def unseen(episodes: int) -> list[Job]:
 
 
 def compare_unseen(job: Job) -> list[dict[str, Any]]:
-    """Do the same as `compare`, after registering the scenarios of `UNSEEN` in this process."""
-    SCENARIOS.update(UNSEEN)
-    return compare(job)
+    """Do the same as `compare`, while the scenarios of `UNSEEN` are registered in this process."""
+    with patch.dict(SCENARIOS, UNSEEN):
+        return compare(job)
 
 
 def teams(episodes: int) -> list[Job]:

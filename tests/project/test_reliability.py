@@ -55,12 +55,13 @@ def test_many_episodes_do_not_grow_the_process(tmp_path):
 
 @pytest.mark.parametrize("seed", ["1"])
 def test_damaged_files_are_refused_or_harmless(tmp_path, seed):
-    done = study("mutated_files", "--count", "250", "--seed", seed, "--json", str(tmp_path / "files.json"))
+    counts = ("--count", "250", "--used", "120")
+    done = study("mutated_files", *counts, "--seed", seed, "--json", str(tmp_path / "files.json"))
     assert done.returncode == 0, done.stdout + done.stderr
     rows = read_rows(tmp_path / "files.json")
-    assert sum(row["count"] for row in rows) == 250
+    assert sum(row["count"] for row in rows) == 370
     assert {row["outcome"] for row in rows} == {"refused", "loaded"}
-    assert len({row["file"] for row in rows}) == 8
+    assert len({row["file"] for row in rows}) == 17
 
 
 def test_wrong_commands_are_refused_in_one_line_or_harmless(tmp_path):

@@ -101,7 +101,70 @@ def test_a_foreign_simulator_has_no_state_to_tell():
         env.state_dict()
 
 
-@pytest.mark.parametrize("bits", [np.random.PCG64, np.random.MT19937, np.random.Philox])
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("state",), np.nan),
+        (("goal",), np.inf),
+        (("plans", "x"), np.nan),
+        (("plans", "status"), 7),
+        (("beliefs", "age"), -(2**63)),
+        (("beliefs", "age"), 2**63 - 1),
+        (("chance", "factors"), 0.0),
+        (("chance", "start"), -1),
+        (("chance", "start"), 2**40),
+        (("neighbours", "others"), 10**6),
+        (("neighbours", "reverse"), -(2**40)),
+    ],
+)
+def test_numbers_of_a_state_that_no_world_has_are_refused(path, value):
+    kwargs = {**HARD, "world": {"neighbourhood": {"max_others": 2}}} if path[0] == "neighbours" else HARD
+    env = QuadSwarmEnv(**kwargs)
+    env.reset(seed=0)
+    state = env.state_dict()
+    owner = state["task"]["swarm"]
+    for name in path[:-1]:
+        owner = owner[name]
+    owner[path[-1]].flat[0] = value
+    with pytest.raises(ValueError, match="the state has numbers outside of"):
+        QuadSwarmEnv(**kwargs).load_state_dict(state)
+
+
+BITS = [np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64]
+
+
+def changes_of_generators():
+    for bits in BITS:
+        for name in ("pos", "buffer_pos", "has_uint32", "uinteger", "state", "inc", "key", "counter", "buffer"):
+            state = generator_state(np.random.Generator(bits(5)))
+            owner = state["state"] if name in state["state"] else state
+            if name not in owner:
+                continue
+            if isinstance(owner[name], np.ndarray):
+                wrong = [owner[name][:-1], owner[name].astype(float), owner[name].tolist(), None]
+            else:
+                wrong = [-1, -(2**31) + 5, 2**31 - 700, 2**130, 0.5, True, None, "1"]
+            if name in ("uinteger", "state", "inc") and not isinstance(owner[name], np.ndarray):
+                wrong.remove(2**31 - 700)  # any 32 bits
+            yield from (
+                pytest.param(bits, name, value, id=f"{bits.__name__} {name} {str(value)[:9]}") for value in wrong
+            )
+
+
+@pytest.mark.parametrize(("bits", "name", "value"), list(changes_of_generators()))
+def test_no_state_lets_a_generator_read_outside_of_its_memory(bits, name, value):
+    state = generator_state(np.random.Generator(bits(5)))
+    (state["state"] if name in state["state"] else state)[name] = value
+    with pytest.raises(ValueError, match=f"not a state of NumPy's {bits.__name__}"):
+        generator_of(state)
+    env = QuadSwarmEnv()
+    env.reset(seed=0)
+    whole = env.state_dict()
+    with pytest.raises(ValueError, match=f"not a state of NumPy's {bits.__name__}"):
+        env.load_state_dict({**whole, "generator": state})
+
+
+@pytest.mark.parametrize("bits", BITS)
 def test_a_generator_goes_on_where_it_was(bits):
     rng = np.random.Generator(bits(5))
     rng.random(3)

@@ -535,6 +535,117 @@ def test_last_observations_that_do_not_fit_the_environment_are_refused(value, tm
         model.learn(100, [callback], reset_num_timesteps=False)
 
 
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("python", 1, 3), -1),
+        (("python", 1, 3), 2**32),
+        (("python", 1, 3), 0.5),
+        (("python", 1, 624), 625),
+        (("python", 1, 624), -(2**31)),
+        (("python", 1), [1, 2]),
+        (("python", 0), 2),
+        (("python", 2), "x"),
+        (("python", 2), {"$": "float", "value": "nan"}),
+        (("numpy", "state", "pos"), 2**31 - 700),
+        (("numpy", "state", "pos"), -5),
+        (("numpy", "bit_generator"), "Philox"),
+        (("numpy", "gauss"), {"$": "float", "value": "inf"}),
+        (("numpy", "has_gauss"), 7),
+        (("numpy",), None),
+        (("torch",), {"$": "array", "dtype": "u1", "shape": [16], "base64": "AA==", "repeated": True}),
+        (("torch",), {"$": "array", "dtype": "u1", "shape": [5056], "base64": "/w==", "repeated": True}),
+        (("torch",), {"$": "array", "dtype": "f4", "shape": [5056], "base64": "AAAAAA==", "repeated": True}),
+        (("torch",), 1),
+    ],
+)
+def test_random_generators_of_a_checkpoint_are_checked(path, value, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+
+    def change(state):
+        owner = state["random"]
+        for key in path[:-1]:
+            owner = owner[key]
+        owner[path[-1]] = value
+
+    edit(tmp_path, change)
+    with pytest.raises(ValueError, match=r"^[^\n]*(checkpoint|generator)[^\n]*$"):
+        resume(tmp_path, Replayable(OwnBit()))
+
+
+NAN = {"$": "float", "value": "nan"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state: state.update(every=NAN), "every=nan"),
+        (lambda state: state.update(every=0.5), "every=0.5"),
+        (lambda state: state.update(every=-3), "every=-3"),
+        (lambda state: state.update(every=True), "every=True"),
+        (lambda state: state.update(action_noise="x"), "action_noise is 'x'"),
+        (lambda state: state.update(action_noise=0), "action_noise is 0"),
+        (lambda state: state.update(action_noise=[]), r"action_noise is \[\]"),
+        (lambda state: state.update(inexact=1), "inexact is not text"),
+        (lambda state: state.update(fingerprint=[]), r"fingerprint is \[\]"),
+        (lambda state: state["logger"]["name_to_count"].update(a=-1), "name_to_count holds"),
+        (lambda state: state["logger"]["name_to_count"].update(a=0.5), "name_to_count holds"),
+        (lambda state: state["logger"]["name_to_value"].update(a=[]), "name_to_value holds"),
+        (lambda state: state["logger"]["name_to_excluded"].update(a=1), "name_to_excluded holds"),
+        (lambda state: state["counters"].update(n_added=2**63 - 1), "n_added=9223372036854775807"),
+        (lambda state: state["counters"].update(n_added=7), "of a replay buffer of .* rows do not fit n_added=7"),
+        (lambda state: state["counters"].update(pos=3), "pos=3"),
+        (lambda state: state["segments"].pop(0), "but rows from .* are missing|its segments end at row"),
+        (lambda state: state["segments"].pop(), "but rows from .* are missing|its segments end at row"),
+    ],
+)
+def test_values_of_a_checkpoint_are_checked_when_it_is_read(change, message, tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    edit(tmp_path, change)
+    with pytest.raises(ValueError, match=rf"^[^\n]*({message})[^\n]*$"):
+        resume(tmp_path, Replayable(OwnBit()))
+
+
+def test_a_segment_counts_once(tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    edit(tmp_path, lambda state: state["segments"].extend(state["segments"][:1] * 40))
+    with pytest.warns(UserWarning, match="is skipped: it names a segment twice"):
+        assert newest(tmp_path) is None
+
+
+def test_other_names_than_numbers_are_no_checkpoints(tmp_path):
+    make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY)])
+    expected = newest(tmp_path)
+    for name in ("checkpoint-²", "checkpoint-", "checkpoint-1e9", "checkpoint-+1", "checkpoint-٣x"):
+        (tmp_path / name).mkdir()
+    assert newest(tmp_path) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("reset_infos", [1, 2]),
+        ("reset_infos", []),
+        ("_seeds", [None]),
+        ("_options", [{}]),
+        ("returns", {"$": "array", "dtype": "f8", "shape": [3], "base64": "AAAAAAAAAAA=", "repeated": True}),
+        ("training", 1),
+    ],
+)
+def test_values_of_a_vectorised_environment_fit_its_copies(name, value, tmp_path):
+    make("normalized").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+
+    def change(state):
+        owner = state["env"] if name in state["env"]["values"] else state["env"]["inner"]
+        assert name in owner["values"]
+        owner["values"][name] = value
+
+    edit(tmp_path, change)
+    model, callback = resume(tmp_path, normalized())
+    with pytest.raises(ValueError, match=f"cannot be the {name} of a"):
+        model.learn(100, [callback], reset_num_timesteps=False)
+
+
 @pytest.mark.parametrize("name", ["/dev/zero", "../" * 20 + "dev/zero", "..", "segments"])
 @pytest.mark.parametrize("where", ["manifest", "segment"])
 def test_a_checkpoint_names_files_in_its_folder_only(where, name, tmp_path):
@@ -547,11 +658,11 @@ def test_a_checkpoint_names_files_in_its_folder_only(where, name, tmp_path):
         assert newest(tmp_path) is None
 
 
-@pytest.mark.parametrize("rows", [{"end": 10**12}, {"first": -(10**12)}, {"first": 90, "end": 90}, {"end": 250}])
+@pytest.mark.parametrize("rows", [{"end": 10**12}, {"first": 90, "end": 90}, {"end": 251}, {"first": "0"}])
 def test_a_segment_holds_the_rows_that_it_claims(rows, tmp_path):
     make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
     edit(tmp_path, lambda state: state["segments"][0].update(rows))
-    with pytest.raises(ValueError, match=r"\.rows does not hold the rows"):
+    with pytest.raises(ValueError, match=r"does not hold the rows|but rows from|its segments end"):
         resume(tmp_path, Replayable(OwnBit()))
 
 

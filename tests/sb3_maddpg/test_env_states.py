@@ -124,3 +124,57 @@ def test_generators_of_spaces_and_of_their_parts_go_on():
     expected = space.sample()
     set_space_generators(other, states)
     assert np.array_equal(other.sample(), expected)
+
+
+@pytest.mark.parametrize(
+    ("bits", "name", "value"),
+    [
+        (np.random.PCG64, "has_uint32", 2),
+        (np.random.PCG64, "bit_generator", "MT19937"),
+        (np.random.MT19937, "pos", 2**31 - 700),
+        (np.random.MT19937, "pos", 625),
+        (np.random.MT19937, "pos", -5),
+        (np.random.Philox, "buffer_pos", -(2**30)),
+        (np.random.Philox, "buffer_pos", 5),
+        (np.random.SFC64, "uinteger", 2**32),
+    ],
+)
+def test_states_of_generators_that_numpy_would_not_check_are_refused(bits, name, value):
+    space = spaces.Discrete(3)
+    space._np_random = np.random.Generator(bits(5))
+    (state,) = space_generators(space)
+    expected = [space.sample() for _ in range(5)]
+    set_space_generators(space, [state])
+    assert [space.sample() for _ in range(5)] == expected
+    (state["state"] if name in state["state"] else state)[name] = value
+    with pytest.raises(ValueError, match=f"not a state of the random number generator {bits.__name__}"):
+        set_space_generators(space, [state])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("generator", {"bit_generator": "MT19937"}, "not a state of the random number generator PCG64"),
+        ("seed", -1, "No episode begins with seed=-1"),
+        ("seed", 1e30, "No episode begins with seed=1e"),
+        ("options", [1], r"options=\[1\]"),
+        ("actions", np.zeros((3, 5), np.int8), "are no actions of MultiBinary"),
+        ("actions", [[0, 1]], "are no actions of MultiBinary"),
+        ("actions", np.zeros((10**6, 9), np.int8), "has 1000000 actions, but its episode ends before"),
+    ],
+)
+def test_a_replay_that_no_episode_has_is_refused(name, value, message):
+    env = Replayable(OwnBit())
+    env.reset(seed=1)
+    env.step(np.zeros(9, np.int8))
+    state = env.state_dict()
+    Replayable(OwnBit()).load_state_dict(state)
+    with pytest.raises(ValueError, match=message):
+        Replayable(OwnBit()).load_state_dict({**state, name: value})
+
+
+@pytest.mark.parametrize("value", [10**30, -(2**63), True, "1", None])
+def test_a_counter_is_an_integer_that_fits_into_memory(value):
+    callback = EvalCallback(DummyVecEnv([OwnBit]))
+    with pytest.raises(ValueError, match="cannot be the n_eval_episodes of a EvalCallback"):
+        set_plain_values(callback, {"n_eval_episodes": value})

@@ -1,7 +1,9 @@
 """The algorithm: one update against a plain reference, who learns from what, logs, repeatability, bad input."""
 
 import copy
+import json
 import re
+import zipfile
 from contextlib import suppress
 
 import gymnasium
@@ -810,3 +812,17 @@ def test_seeds_for_the_next_reset_do_not_end_an_episode():
     before, after = model.replay_buffer.next_observations[14, 0, 0], model.replay_buffer.observations[15, 0, 0]
     assert before.tolist() == after.tolist()
     assert before[1] == 5
+
+
+def test_a_replay_buffer_whose_neighbours_change_is_not_that_of_others_that_do_not(tmp_path):
+    model = MADDPG("MlpPolicy", OwnBit(), learning_starts=20, batch_size=8, buffer_size=60).learn(40)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    with zipfile.ZipFile(tmp_path / "buffer.pkl") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    state = json.loads(members["buffer.json"])
+    state["arguments"]["pairs_end"] = True
+    with zipfile.ZipFile(tmp_path / "other.pkl", "w") as archive:
+        for name, content in {**members, "buffer.json": json.dumps(state)}.items():
+            archive.writestr(name, content)
+    with pytest.raises(ValueError, match="holds neighbours that change: True, but the model needs"):
+        model.load_replay_buffer(tmp_path / "other.pkl")

@@ -15,6 +15,9 @@ from sb3_maddpg.matd3 import MATD3
 from sb3_maddpg.model_files import FILE_FORMAT, optimizer_not_finite, read_data
 from sb3_maddpg.team_tasks import OwnBit
 
+_NAN = base64.b64encode(b"\x00\x00\xc0\x7f").decode()
+NAN_BOUND = {"$": "array", "dtype": "f4", "shape": [9], "base64": _NAN, "repeated": True}
+
 
 def learned(steps: int = 30) -> MADDPG:
     return MADDPG("MlpPolicy", OwnBit(), learning_starts=20, batch_size=16, train_freq=5, buffer_size=100).learn(steps)
@@ -104,11 +107,64 @@ def test_a_file_of_another_format_is_refused(tmp_path, changes):
     assert_equal_state(same.get_parameters(), model.get_parameters())
 
 
-@pytest.mark.parametrize("changes", [{"_n_updates": "x"}, {"num_timesteps": -1}, {"start_time": float("nan")}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"_n_updates": "x"},
+        {"num_timesteps": -1},
+        {"num_timesteps": 2**63},
+        {"start_time": float("nan")},
+        {"normalized_observations": "true"},
+        {"normalized_observations": []},
+        {"_stats_window_size": 10**30},
+        {"ep_info_buffer": {"$": "deque", "items": [1], "maxlen": 100}},
+        {"ep_info_buffer": {"$": "deque", "items": [{"r": None, "l": 3, "t": 1.0}], "maxlen": 100}},
+        {"ep_info_buffer": {"$": "deque", "items": [{"r": 1.0, "t": 1.0}], "maxlen": 100}},
+    ],
+)
 def test_counters_that_no_training_wrote_are_refused(tmp_path, changes):
     learned().save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=f"its {next(iter(changes))} is"):
         MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"train_freq": {"$": "TrainFreq", "frequency": -1, "unit": "step"}}, "train_freq=.* must be an integer"),
+        ({"train_freq": {"$": "TrainFreq", "frequency": 0.5, "unit": "step"}}, "train_freq=.* must be an integer"),
+        ({"temperature": 1e39}, r"temperature=1e\+39 must be"),
+        ({"policy_regularization": 1e39}, r"policy_regularization=1e\+39 must be"),
+        ({"ep_success_buffer": {"$": "deque", "items": ["x"], "maxlen": 100}}, "its ep_success_buffer is"),
+        ({"action_space": {"$": "Box", "low": NAN_BOUND, "high": NAN_BOUND}}, "action_space is damaged"),
+        ({"observation_space": {"$": "Box", "low": 1, "high": 0}}, "observation_space is damaged"),
+        ({"action_space": {"$": "Tuple", "spaces": [None] * 10**5}}, "100000 agents or parts of a space, more than"),
+        ({"action_space": {"$": "MixedActions", "agents": [None] * 10**5}}, "100000 agents or parts of a space"),
+    ],
+)
+def test_values_that_training_would_stumble_over_are_refused_in_one_line_when_read(tmp_path, changes, message):
+    learned().save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=rf"^[^\n]*{message}[^\n]*$"):
+        MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes))
+
+
+@pytest.mark.parametrize("name", ["target_noise_clip", "target_policy_noise"])
+def test_numbers_beyond_single_precision_are_refused(name):
+    with pytest.raises(ValueError, match=rf"{name}=1e\+39 must be a finite"):
+        MATD3("MlpPolicy", OwnBit(), **{name: 1e39})
+
+
+def test_one_of_the_two_buffers_of_episodes_is_not_enough(tmp_path):
+    learned().save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        data = json.loads(archive.read("data"))
+    data["ep_success_buffer"] = None
+    path = tmp_path / "other.zip"
+    with zipfile.ZipFile(tmp_path / "model.zip") as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, json.dumps(data) if name == "data" else old.read(name))
+    with pytest.raises(ValueError, match="only one of ep_info_buffer and ep_success_buffer"):
+        MADDPG.load(path)
 
 
 @pytest.mark.parametrize("name", ["predict", "train", "logger", "load", "_logger", "device"])

@@ -1,6 +1,11 @@
 """Files that appear whole, seeds, and what is finite."""
 
 import os
+import stat
+import subprocess
+import sys
+import threading
+import time
 from contextlib import suppress
 
 import numpy as np
@@ -98,8 +103,11 @@ def test_the_first_number_that_is_not_finite_is_found_in_single_precision():
 
 
 def test_what_killed_processes_left_of_a_file_is_removed(tmp_path):
+    token = "-0123456789abcdef"
     killed, writing, other = (tmp_path / name for name in (".m.zip.999999999", f".m.zip.{os.getppid()}", ".n.zip.1"))
-    recent = tmp_path / ".m.zip.999999998"  # may be a process of another machine
+    recent = tmp_path / f".m.zip.999999998{token}"  # may be a process of another machine
+    (tmp_path / f".m.zip.999999999{token}").touch()
+    os.utime(tmp_path / f".m.zip.999999999{token}", (0, 0))
     for path in (killed, writing, other, recent):
         path.touch()
         if path != recent:
@@ -115,3 +123,56 @@ def test_a_temporary_file_that_disappears_meanwhile_does_no_harm(tmp_path):
     with atomic_write(tmp_path / "m", suffix="zip") as file:
         file.write(b"x")
     assert (tmp_path / "m.zip").read_bytes() == b"x"
+
+
+def test_a_new_file_has_the_permissions_that_the_umask_leaves(tmp_path):
+    program = (
+        "import os, sys; from sb3_maddpg.utils import atomic_write; os.umask(int(sys.argv[2], 8))\n"
+        "with atomic_write(sys.argv[1], 'zip') as file: file.write(b'x')"
+    )
+    for mask, mode in (("022", 0o644), ("077", 0o600), ("002", 0o664)):
+        target = tmp_path / f"{mask}.zip"
+        subprocess.run([sys.executable, "-c", program, str(target), mask], check=True)
+        assert stat.S_IMODE(target.stat().st_mode) == mode
+
+
+def test_threads_and_containers_that_write_one_file_leave_it_whole(tmp_path, monkeypatch):
+    """In containers that share a folder, processes have the same ids."""
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    target, failed, over = tmp_path / "m.zip", [], threading.Event()
+    contents = [bytes([number]) * 100_000 for number in range(4)]
+
+    def write(content: bytes) -> None:
+        try:
+            for _ in range(15):
+                with atomic_write(target, suffix="zip") as file:
+                    file.write(content[:50_000])
+                    time.sleep(0)
+                    file.write(content[50_000:])
+        except BaseException as error:
+            failed.append(error)
+
+    def read() -> None:
+        while not over.is_set():
+            with suppress(FileNotFoundError):
+                if target.read_bytes() not in contents:
+                    failed.append(AssertionError("damaged"))
+
+    threads = [threading.Thread(target=write, args=(content,)) for content in contents]
+    reader = threading.Thread(target=read)
+    for thread in (*threads, reader):
+        thread.start()
+    for thread in threads:
+        thread.join()
+    over.set()
+    reader.join()
+    assert not failed
+    assert os.listdir(tmp_path) == ["m.zip"]
+    assert target.read_bytes() in contents
+
+
+def test_long_names_are_written_too(tmp_path):
+    target = tmp_path / ("ü" * 120 + ".zip")
+    with atomic_write(target, suffix="zip") as file:
+        file.write(b"x")
+    assert target.read_bytes() == b"x"

@@ -5,17 +5,22 @@ The path ``-`` stands for the standard output.
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import glob
 import io
 import json
 import os
+import secrets
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 STDOUT = Path("-")
+_LEFT_OVER = 3600  # seconds, after which a temporary file belongs to a process that was killed
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
@@ -40,22 +45,28 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text to a file, atomically. Missing folders are created."""
+    """Write text to a file, atomically. Missing folders are created.
+
+    Threads, processes and containers may write the same file at the same time; one of their files remains, whole.
+    """
     if path == STDOUT:
         sys.stdout.write(text)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", newline="", dir=path.parent, prefix=path.name, suffix=".part", delete=False
-    ) as file:
-        try:
+    prefix = f".{path.name[:50]}."  # file systems limit names to 255 bytes
+    for left in path.parent.glob(f"{glob.escape(prefix)}*.part"):
+        with contextlib.suppress(OSError):
+            if time.time() - left.stat().st_mtime > _LEFT_OVER:
+                left.unlink()
+    temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}.part")
+    try:
+        with temporary.open("x", encoding="utf-8", newline="") as file:
             file.write(text)
-            file.close()
-            os.chmod(file.name, 0o644)
-            os.replace(file.name, path)
-        except BaseException:
-            Path(file.name).unlink(missing_ok=True)
-            raise
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def check_writable(path: Path, option: str) -> None:

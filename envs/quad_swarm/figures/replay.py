@@ -118,9 +118,9 @@ def _plain_name(policy: str) -> tuple[str, str]:
 def _colliding(flight: Flight) -> list[list[int]]:
     """Return the pairs of robots that collide in each step, counting from 1: (step, robot, robot).
 
-    `Flight.min_separation` decides. With continuous collisions it takes sub-steps into account, which a flight does not
-    record. Therefore, distances on the straight line between steps are shifted so that the closest pair has this
-    distance.
+    `Flight.min_separation` decides whether any do. With continuous collisions it takes sub-steps into account, which a
+    flight does not record. The closest pair on the straight line between steps then has this distance, and others
+    those on that line.
     """
     before, after = flight.relative_pos[:-1], flight.relative_pos[1:]
     if flight.config.continuous_collisions:
@@ -128,8 +128,9 @@ def _colliding(flight: Flight) -> list[list[int]]:
         share = -(before * move).sum(axis=-1) / np.maximum((move**2).sum(axis=-1), 1e-12)
         after = before + np.clip(share, 0, 1)[..., None] * move
     apart = length(after)
-    apart += (flight.min_separation[1:] - apart.min(axis=(1, 2)))[:, None, None]
+    closest, least = apart == apart.min(axis=(1, 2), keepdims=True), flight.min_separation[1:, None, None]
     limit = 2 * flight.config.radius - flight.config.collision_tolerance
+    apart = np.where(least < limit, np.where(closest, least, apart), np.inf)
     others = other_indices(flight.n_robots)
     pairs = ([int(step) + 1, int(a), int(others[a, k])] for step, a, k in np.argwhere(apart < limit))
     return [pair for pair in pairs if pair[1] < pair[2]]

@@ -110,7 +110,7 @@ class EpisodeStatistics:
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore a state from `state_dict`."""
         for name in _STATE:
-            self._records[name] = like(self._records[name], state[name], name)
+            self._records[name] = like(self._records[name], state[name], name, 0, np.inf)
 
     def add(self, report: StepReport, n_requests: np.ndarray, collided: np.ndarray) -> None:
         """Add one step.

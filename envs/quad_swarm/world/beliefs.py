@@ -205,7 +205,7 @@ class Beliefs:
         :raises ValueError: if the state belongs to other swarms
         """
         self._remembered = like(self._remembered, state["remembered"], "remembered plans")
-        self._age = like(self._age, state["age"], "ages of plans")
+        self._age = like(self._age, state["age"], "ages of plans", 0)
         self._known = None
 
     def predict(self, pos: np.ndarray, vel: np.ndarray) -> Prediction:

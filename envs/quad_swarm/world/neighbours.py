@@ -137,9 +137,9 @@ class Neighbours:
         :raises ValueError: if the state belongs to other swarms
         """
         if self.present is not None:
-            self.others = like(self.others, state["others"], "neighbours")
+            self.others = like(self.others, state["others"], "neighbours", -1, self.others.shape[1] - 1)
             self.present = like(self.present, state["present"], "presence of neighbours")
-            self.reverse = like(self.reverse, state["reverse"], "slots at neighbours")
+            self.reverse = like(self.reverse, state["reverse"], "slots at neighbours", -1, self.others.shape[-1] - 1)
 
     def perceived(self, places: np.ndarray) -> np.ndarray:
         """Return a mask without empty slots.

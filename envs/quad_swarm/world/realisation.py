@@ -127,8 +127,14 @@ class Realisation:
 
         :raises ValueError: if the state belongs to other swarms
         """
+        limits: dict[str, tuple[float, float]] = {
+            "_start": (0, self._latest_start),
+            "_silent_from": (0, _NEVER),
+            "_factors": (1e-6, 1e6),
+        }
         for name in self._ARRAYS:
-            setattr(self, name, like(getattr(self, name), state[name.lstrip("_")], name.lstrip("_")))
+            array = like(getattr(self, name), state[name.lstrip("_")], name.lstrip("_"), *limits.get(name, ()))
+            setattr(self, name, array)
         self._rngs = [generator_of(one) for one in state["generators"]]
 
     def estimate(self, state: np.ndarray) -> np.ndarray:

@@ -14,11 +14,11 @@ import numpy as np
 
 from quad_swarm.native.pairs import advance, resample
 from quad_swarm.native.steps import measure
-from quad_swarm.planner import Planner, Plans, Problems, make_planner
+from quad_swarm.planner import Planner, Plans, PlanStatus, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.states import like
+from quad_swarm.states import MOST_STEPS, like
 from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, of_others, other_indices, resampled
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig, points
@@ -270,8 +270,12 @@ class Swarm:
         self.goal = like(self.goal, state["goal"], "goal")
         self._u = like(self._u, state["input"], "input")
         plans = state["plans"]
+        limits = {"age": (0, MOST_STEPS), "iterations": (0, MOST_STEPS), "status": (min(PlanStatus), max(PlanStatus))}
         self._plans = Plans(
-            **{name: like(one, plans[name], f"plans.{name}") for name, one in self._plans._asdict().items()}
+            **{
+                name: like(one, plans[name], f"plans.{name}", *limits.get(name, ()))
+                for name, one in self._plans._asdict().items()
+            }
         )
         if len(state["earlier"]) != len(self._earlier):
             raise ValueError(

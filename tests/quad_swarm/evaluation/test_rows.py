@@ -1,6 +1,9 @@
 """Tables of rows in files."""
 
 import json
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -52,3 +55,26 @@ def test_a_path_that_cannot_be_written_is_found_before_the_work(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="choose another folder"):
         check_writable(tmp_path / "file" / "table.json", "--json")
+
+
+def test_writers_at_the_same_time_leave_one_whole_table(tmp_path):
+    path = tmp_path / "table.json"
+    tables = [[{"a": number}] * 5_000 for number in range(4)]
+
+    def write(rows: list) -> None:
+        for _ in range(10):
+            write_rows(path, rows)
+
+    with ThreadPoolExecutor(4) as pool:
+        for done in [pool.submit(write, rows) for rows in tables]:
+            done.result()
+    assert read_rows(path) in tables
+    assert os.listdir(tmp_path) == ["table.json"]
+
+
+def test_what_kills_left_of_a_table_is_removed(tmp_path):
+    for name, age in ((".table.json.0123456789abcdef.part", 7200), (".table.json.fedcba9876543210.part", 60)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time.time() - age,) * 2)
+    write_rows(tmp_path / "table.json", [{"a": 1}])
+    assert sorted(os.listdir(tmp_path)) == [".table.json.fedcba9876543210.part", "table.json"]

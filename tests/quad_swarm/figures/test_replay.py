@@ -5,17 +5,20 @@ import io
 import itertools
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from quad_swarm.figures import replay
-from quad_swarm.figures.replay import main
+from quad_swarm.evaluation.flight import Condition, fly
+from quad_swarm.figures import replay as replay_module
+from quad_swarm.figures.replay import _colliding, main
+from quad_swarm.world.presets import make_config
 from sb3_maddpg.pretrained_models import pretrained_folder
 
-FIGURES = Path(replay.__file__).parent
+FIGURES = Path(replay_module.__file__).parent
 ANNOUNCING = str(pretrained_folder("quad-swarm-flight") / "model.zip")
 SIZES = {"phone": (390, 844), "tablet": (768, 1024), "desktop": (1280, 800), "wide": (1920, 640)}
 
@@ -63,6 +66,16 @@ def test_pairs_that_collide_are_those_that_come_closest(tmp_path):
         told = {(i, j) for k, i, j in flight["colliding"] if k == step}
         assert pairs <= told
         assert all(apart[pair] < 0.61 for pair in told)
+
+
+def test_a_pair_that_only_comes_close_is_not_marked_with_the_one_that_collides():
+    """Between steps, one pair comes 3 cm closer than on the straight line; another one passes at 0.62 m."""
+    flight = fly(Condition("none", "random", make_config("flight", n_robots=4), 3), 0)
+    state = flight.state.copy()
+    state[..., :3] = [[0, 0, 0], [0.61, 0, 0], [9, 0, 0], [9.62, 0, 0]]
+    for least, expected in ((0.58, [[2, 0, 1]]), (0.61, [])):
+        closest = np.array([0.61, 0.61, least, 0.61])
+        assert _colliding(replace(flight, state=state, min_separation=closest)) == expected
 
 
 def test_mistakes_are_told_in_one_line(tmp_path, capsys):
