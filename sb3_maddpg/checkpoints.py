@@ -600,6 +600,7 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
         load_vec_env_state(env, state["env"])
         for name in _LAST:
             setattr(model, name, _checked_last(model, name, state["last"][name]))
+    model._seeds_of_reset = model._seeds_of_env()  # the episodes begin, or go on, with what was restored
     names = [type(one).__name__ for one in callbacks]
     states = [one for one in state["callbacks"] if one["class"] != CallbackList.__name__]
     if names != (written := [one["class"] for one in states]):
