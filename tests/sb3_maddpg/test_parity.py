@@ -162,5 +162,5 @@ def test_what_a_team_has_not_is_refused(algorithm, kind):
         algorithm("MlpPolicy", toy(kind), replay_buffer_class="TeamReplayBuffer")
     env = toy(kind)
     env.observation_space = spaces.Dict({"observation": env.observation_space})
-    with pytest.raises(ValueError, match=r"shape \(n_agents, obs_dim\), not Dict.*Flatten"):
+    with pytest.raises(ValueError, match=r"shape \(n_agents, obs_dim\), not Dict.*flattened"):
         algorithm("MlpPolicy", env)

@@ -129,7 +129,7 @@ def test_arguments_are_words_or_python(words, meant):
 def test_an_argument_without_a_value_is_refused(arena, capsys, word):
     assert train("--env-kwargs", word) == 2
     error = capsys.readouterr().err
-    assert f"--env-kwargs {word}: " in error
+    assert f"--env-kwargs {word!r}: " in error
     assert error.endswith("Write key:value. (--debug shows the traceback)\n")
 
 
