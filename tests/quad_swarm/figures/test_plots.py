@@ -130,7 +130,7 @@ def test_the_animation_ends_shortly_after_all_have_arrived(flown, tmp_path):
 
 @pytest.mark.parametrize("dt", [0.1, 0.05, 0.025, 0.03, 0.004])
 def test_animations_play_in_real_time(dt, tmp_path):
-    config = make_config(planner={"dt": dt}, max_steps=30)
+    config = make_config(planner={"dt": dt, "horizon": max(10, round(0.75 / dt))}, max_steps=30)
     flight = fly(Condition("none", "symmetric_swap", config), seed=0)
     steps = len(flight.requests)
     plots.animate(Condition("none", "symmetric_swap", config), flight, tmp_path / "swarm.gif")

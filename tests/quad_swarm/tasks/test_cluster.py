@@ -25,11 +25,14 @@ pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::Resour
 @pytest.fixture(scope="module", autouse=True)
 def on_this_machine():
     """One cluster for all tests but those that begin their own."""
-    # Processes of the cluster find the tests' functions
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
-    yield
-    ray.shutdown()
+    with pytest.MonkeyPatch.context() as patch:
+        # Processes of the cluster find the tests' functions
+        patch.setenv(
+            "PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep if os.environ.get("PYTHONPATH") else None
+        )
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
+        yield
+        ray.shutdown()
 
 
 def square(x: int) -> int:

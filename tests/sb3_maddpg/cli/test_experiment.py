@@ -59,9 +59,7 @@ def test_a_folder_has_one_owner(tmp_path):
 
 def test_trainings_that_start_together_keep_their_own_files(monkeypatch):
     # Both have looked for the newest run before either made its folder
-    for module in ("rl_zoo3.exp_manager", "sb3_maddpg.cli.experiment"):
-        monkeypatch.setattr(f"{module}.get_latest_run_id", lambda path, name: 0)
-    monkeypatch.setattr("sb3_maddpg.cli.experiment.latest_curve", lambda path, name: 0)
+    monkeypatch.setattr("sb3_maddpg.cli.experiment.latest_run_number", lambda path, name: 0)
     for _ in range(2):
         assert train("-tb", "tb", "-n", "60", "--verbose", "0") == 0
     assert sorted(os.listdir("logs/maddpg")) == ["OwnBit-v0_1", "OwnBit-v0_2"]

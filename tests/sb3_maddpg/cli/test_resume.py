@@ -1,6 +1,5 @@
 """Runs of the command line that are killed and resumed end as if nothing had happened."""
 
-import contextlib
 import csv
 import json
 import os
@@ -285,11 +284,15 @@ def test_someone_elses_run_is_resumed_if_its_command_runs_no_code(killed, tmp_pa
     assert "Resuming logs" in capsys.readouterr().out
 
     monkeypatch.chdir(shutil.copytree(killed, tmp_path / "trusted"))
-    words = ["-params", "callback:[{os.mkdir: {path: caught}}]"]
+    checkpoints = "stable_baselines3.common.callbacks.CheckpointCallback"
+    words = ["-params", "n_timesteps:700", f"callback:[{{{checkpoints}: {{save_freq: 50, save_path: caught}}}}]"]
     path.write_text(json.dumps({"argv": [*argv, *words], "every": 300}))
-    with contextlib.suppress(AttributeError):  # None is not a callback
-        main(["train", "--resume", "--trust"])
-    assert Path("caught").exists()
+    assert main(["train", "--resume"]) == 2
+    assert not Path("caught").exists()
+    assert "may be a path outside" in capsys.readouterr().err
+    assert main(["train", "--resume", "--trust"]) == 2
+    assert "CheckpointCallback" in (error := capsys.readouterr().err)
+    assert "resume with the same ones" in error
 
 
 def test_a_packaged_recipe_is_not_replaced_by_a_file_of_the_present_folder(killed, tmp_path, monkeypatch):
