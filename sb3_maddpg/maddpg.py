@@ -56,6 +56,7 @@ from sb3_maddpg.model_files import (
     check_attributes,
     check_members,
     check_path,
+    keep_curves_inside,
     optimizer_not_finite,
     optimizer_problem,
     read_data,
@@ -1084,7 +1085,8 @@ class MADDPG(OffPolicyAlgorithm):
         Load a model from a file, like SB3's ``load``, without running code from the file unless ``trust`` is set.
 
         :param trust: also load pickled values, which can run code. Older files and those of ``save(pickle=True)``
-            contain them. By default, the environment variable ``SB3_MADDPG_TRUST`` decides (1 means yes).
+            contain them. By default, the environment variable ``SB3_MADDPG_TRUST`` decides (1 means yes). Without
+            it, a ``tensorboard_log`` in the file that lies outside the current folder is left out.
         :param kwargs: arguments of the algorithm, or other attributes of the model, which override those in the file
         :raises ValueError: if the file holds no model of this algorithm, is damaged, or holds pickled values that are
             not trusted; if ``kwargs`` has an unknown name
@@ -1102,6 +1104,8 @@ class MADDPG(OffPolicyAlgorithm):
                     )
                 if name not in (known := {*data, *arguments_of(cls)}):
                     raise ValueError(suggest("argument of load", name, {one for one in known if one[0] != "_"}))
+            if not ({"tensorboard_log"} & {*kwargs, *(custom_objects or {})} or trusted(trust)):
+                keep_curves_inside(values, path)
             if (statistics := values.get("observation_statistics")) is not None:
                 shape = values["observation_space"].shape
                 values["observation_statistics"] = ObservationStatistics.checked(statistics, shape, str(path))._asdict()

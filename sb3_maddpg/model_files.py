@@ -9,6 +9,7 @@ import math
 import os
 import pathlib
 import traceback
+import warnings
 import zipfile
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -246,6 +247,27 @@ def attributes(
     if wrong := sorted(key for key in set(values) - set(given) if key in _RUNTIME or _is_method(algorithm, key)):
         raise ValueError(f"{path} is damaged: it has values for {', '.join(wrong)}, which models do not save.")
     return values
+
+
+def keep_curves_inside(values: dict[str, Any], path: Any) -> None:
+    """
+    Leave out the folder for TensorBoard that a file names, if training would write outside the current folder.
+
+    :param values: attributes of the file, changed in place
+    :param path: path of the file, for the warning
+    """
+    folder = values.get("tensorboard_log")
+    if isinstance(folder, str) and not _is_below(folder, pathlib.Path.cwd()):
+        values["tensorboard_log"] = None
+        warnings.warn(
+            f"{path} logs to {shown(folder)}, which is outside the current folder: training will write no curves. If "
+            "they should go there, pass tensorboard_log to load, or set the model's tensorboard_log.",
+            stacklevel=3,
+        )
+
+
+def _is_below(path: str, folder: pathlib.Path) -> bool:
+    return "\0" not in path and pathlib.Path(path).resolve().is_relative_to(folder.resolve())
 
 
 def _is_method(cls: type, name: str) -> bool:

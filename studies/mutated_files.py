@@ -14,6 +14,7 @@ import base64
 import contextlib
 import io
 import json
+import os
 import pickle
 import random
 import resource
@@ -414,6 +415,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     rng, tally, wrong = random.Random(args.seed), Counter[tuple[str, str, str]](), []
+    started_in = Path.cwd()
     poison = [
         patch(name, _poisoned) for name in ("pickle.load", "pickle.loads", "pickle.Unpickler", "cloudpickle.loads")
     ]
@@ -421,6 +423,9 @@ def main() -> None:
         folder = Path(name)
         loaded, used = files(folder), used_files(folder)
         kinds = loaded | used
+        here = folder / "here"  # what a file makes relative to the current folder
+        here.mkdir()
+        os.chdir(here)
         originals = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
         for one in poison:
             one.start()
@@ -444,6 +449,7 @@ def main() -> None:
                         path.write_bytes(original)
         for one in poison:
             one.stop()
+        os.chdir(started_in)
     outcomes = sorted({outcome for _, _, outcome in tally})
     for kind, what in sorted({key[:2] for key in tally}):
         print(f"{kind:24} {what:10}", *(f"{outcome} {tally[kind, what, outcome]:5}" for outcome in outcomes))

@@ -322,7 +322,9 @@ class TeamExperimentManager(ExperimentManager):
     def _resume(self, run: Path, env: Any) -> MADDPG:
         assert self.checkpoints is not None
         algorithm = cast("type[MADDPG]", ALGOS[self.algo])
-        found = resume(run / CHECKPOINTS, env, algorithm, self.checkpoints.every, device=self.device)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".* logs to ")  # the command says where curves go
+            found = resume(run / CHECKPOINTS, env, algorithm, self.checkpoints.every, device=self.device)
         if found is None:
             raise ValueError(f"{run} has no complete checkpoint.")
         model, self.checkpoint = found
@@ -419,8 +421,9 @@ class TeamExperimentManager(ExperimentManager):
     def _logger(self, name: str) -> Logger:
         """:return: a logger of tables on the screen, unless there is a progress bar, and of curves for TensorBoard"""
         prints = self.verbose > 0 and not self.show_progress
-        if self.checkpoint is not None and self.checkpoint.logger_folder and self.tensorboard_log:
-            curves = str(Path(self.tensorboard_log, Path(self.checkpoint.logger_folder).name))
+        before = "" if self.checkpoint is None else Path(self.checkpoint.logger_folder or "").name
+        if self.checkpoint is not None and before not in ("", "..") and self.tensorboard_log:
+            curves = str(Path(self.tensorboard_log, before))
             logger = configure(curves, [*(["stdout"] if prints else []), "tensorboard"])
             for output in logger.output_formats:
                 if isinstance(output, TensorBoardOutputFormat):  # drop events after the checkpoint

@@ -440,3 +440,20 @@ def test_files_whose_joint_action_space_lost_data_types_still_load(tmp_path, mon
     assert np.abs(before - after).max() <= 0.5  # rounded now
     assert loaded.agent_policy(0).predict(obs[0, :2]).dtype == np.int64
     loaded.learn(30)
+
+
+def test_a_file_does_not_decide_where_curves_are_written(tmp_path, monkeypatch):
+    here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    (here / "link").symlink_to(tmp_path)
+    for folder in (str(elsewhere), "../elsewhere", "link/elsewhere"):
+        MADDPG("MlpPolicy", "OwnBit-v0", **SMALL, tensorboard_log=folder).save("model")
+        with pytest.warns(UserWarning, match=f"logs to '{folder}', which is outside the current folder.*load"):
+            model = MADDPG.load("model", env=OwnBit())
+        model.learn(30)
+        assert not elsewhere.exists()
+        for asked in ({"trust": True}, {"tensorboard_log": folder}, {"custom_objects": {"tensorboard_log": folder}}):
+            assert MADDPG.load("model", **asked).tensorboard_log == folder
+    MADDPG("MlpPolicy", "OwnBit-v0", **SMALL, tensorboard_log="curves").save("model")
+    assert MADDPG.load("model").tensorboard_log == "curves"
