@@ -601,13 +601,25 @@ class TeamReplayBuffer(ReplayBuffer):
         team_done = columns.dones * (1 - columns.timeouts)
         terminated = columns.agent_terminated
         return {
-            "dones": np.maximum(terminated, team_done[:, None]),
+            "dones": self._dones(terminated, columns.agent_active, team_done),
             "rewards": self._normalize_reward(columns.agent_rewards, env),
             "discounts": self.gamma,
             **self._next_active(columns.agent_active, terminated),
             "pair_rewards": self._normalize_reward(columns.pair_rewards, env) if self.n_pairs else None,
             "pair_goes_on": 1 - columns.pair_terminated if self.pairs_end else None,
         }
+
+    def _dones(self, gone: np.ndarray, active: np.ndarray, team_done: np.ndarray) -> np.ndarray:
+        """
+        :param gone: which agents terminated within the windows, (batch, n_agents)
+        :param active: column ``agent_active`` of the last transitions of the windows, (batch, n_agents)
+        :param team_done: whether the team's episodes ended there, other than by time limits, (batch,)
+        :return: the field ``dones`` of the samples
+        """
+        dones = np.maximum(gone, team_done[:, None])
+        if not self.handle_timeout_termination:  # which makes time limits of single agents terminations, too
+            dones = np.maximum(dones, active == _TRUNCATED)
+        return dones
 
     def _next_active(self, active: np.ndarray, terminated: np.ndarray) -> dict[str, np.ndarray | None]:
         """
@@ -666,7 +678,7 @@ class TeamReplayBuffer(ReplayBuffer):
         at_end = (last, np.arange(len(last)))
         team_done = columns.dones[at_end] * (1 - columns.timeouts[at_end])
         return (batch_inds + last) % self.buffer_size, {
-            "dones": np.maximum(gone, team_done[:, None]),
+            "dones": self._dones(gone, columns.agent_active[at_end], team_done),
             "rewards": total,
             "discounts": discounts,
             **self._next_active(columns.agent_active[at_end], terminated[at_end]),

@@ -158,6 +158,17 @@ def test_who_was_truncated_before_the_others(kwargs, said):
     assert [sample.next_truncated for sample in batch[2:]] == [None, None]
 
 
+@pytest.mark.parametrize("n_steps", [1, 2])
+@pytest.mark.parametrize("said", [True, False])
+@pytest.mark.parametrize("handled", [True, False])
+def test_an_agents_own_time_limit_ends_it_as_one_of_the_team_would(handled, said, n_steps):
+    memory = buffer(handle_timeout_termination=handled, n_steps=n_steps)
+    cut = {"agent_truncated": [0, 1, 0]} if said else {}
+    episodes(memory, {}, cut, OUT, {**OUT, "done": True})
+    assert transition(memory, 1).dones.tolist() == [[0, 0 if handled else 1, 0]]
+    assert transition(memory, 0).dones.tolist() == [[0, 0 if handled or n_steps == 1 else 1, 0]]
+
+
 @pytest.mark.parametrize(
     "steps",
     [
