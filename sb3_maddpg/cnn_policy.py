@@ -12,7 +12,16 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
-from sb3_maddpg.policies import Actor, Critic, FeaturesActor, FeaturesCritic, MADDPGPolicy, MLPActor, StackedCritic
+from sb3_maddpg.policies import (
+    Actor,
+    Critic,
+    FeaturesActor,
+    FeaturesCritic,
+    ImageScale,
+    MADDPGPolicy,
+    MLPActor,
+    StackedCritic,
+)
 from sb3_maddpg.utils import shown
 
 
@@ -24,7 +33,10 @@ class ImageFeatures(nn.Module):
     :param extractor_class: features extractor of Stable-Baselines3, which reads images with channels first
     :param extractor_kwargs: keyword arguments to pass to the features extractor
     :param normalize: whether to divide images by 255
+    :param state_factors: factors of the columns after the agents' images, (n_agents, columns), None for 1
     """
+
+    state_factors: th.Tensor | None
 
     def __init__(
         self,
@@ -32,8 +44,10 @@ class ImageFeatures(nn.Module):
         extractor_class: type[BaseFeaturesExtractor],
         extractor_kwargs: dict[str, Any],
         normalize: bool,
+        state_factors: th.Tensor | None = None,
     ):
         super().__init__()
+        self.register_buffer("state_factors", state_factors, persistent=False)
         space = _with_channels(space)
         self.shape = space.shape
         self.obs_dim = int(th.Size(space.shape).numel())
@@ -54,7 +68,10 @@ class ImageFeatures(nn.Module):
         if self.channels_last:
             images = images.permute(0, 3, 1, 2)
         features = self.extractor(images).reshape(*obs.shape[:-1], -1)
-        return th.cat([features, obs[..., self.obs_dim :]], dim=-1)
+        rest = obs[..., self.obs_dim :]
+        if self.state_factors is not None and rest.shape[-1]:
+            rest = rest * self.state_factors
+        return th.cat([features, rest], dim=-1)
 
     def single(self, agent: int) -> ImageFeatures:
         """:return: this module, which all agents share"""
@@ -78,11 +95,11 @@ class CnnPolicy(MADDPGPolicy):
         width); by default MADDPG reads it from the environment
     :param features_extractor_class: features extractor, see Stable-Baselines3
     :param features_extractor_kwargs: keyword arguments to pass to the features extractor, such as ``features_dim``
-    :param kwargs: see ``MADDPGPolicy``; ``normalize_images`` says whether to divide images by 255
+    :param kwargs: see ``MADDPGPolicy``; ``normalize_images`` says whether to divide images by 255, also the state's
     :raises ValueError: if the agents do not each observe one image of the same size
     """
 
-    env_attributes: ClassVar[tuple[str, ...]] = ("agent_names", "image_space")
+    env_attributes: ClassVar[tuple[str, ...]] = ("agent_names", "image_space", "image_columns")
 
     def __init__(
         self,
@@ -127,6 +144,9 @@ class CnnPolicy(MADDPGPolicy):
         assert isinstance(critic, StackedCritic)
         return FeaturesActor(of_actor, actor), FeaturesCritic(of_critic, critic)
 
+    def _divide_images(self) -> None:
+        """Leave it to the features extractors."""
+
     def _make_features(self) -> ImageFeatures:
         if self._extractor_class is NatureCNN:
             if not is_image_space(_with_channels(self.image_space), normalized_image=not self.normalize_images):
@@ -136,8 +156,13 @@ class CnnPolicy(MADDPGPolicy):
                     "features_extractor_class."
                 )
             self._extractor_kwargs.setdefault("normalized_image", not self.normalize_images)
+        factors = None
+        if self.image_columns is not None and self.normalize_images:
+            factors = ImageScale.of(self.image_columns, self.team).factors[:, self.team.obs_dim :]
         try:
-            return ImageFeatures(self.image_space, self._extractor_class, self._extractor_kwargs, self.normalize_images)
+            return ImageFeatures(
+                self.image_space, self._extractor_class, self._extractor_kwargs, self.normalize_images, factors
+            )
         except (AssertionError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(
                 f"features_extractor_class={self._extractor_class.__name__} cannot be created for {self.image_space} "

@@ -726,10 +726,7 @@ class MADDPGPolicy(BasePolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor, self.critic = self._make_networks(*get_actor_critic_arch(self.net_arch))
         if self.image_columns is not None and self.normalize_images:
-            assert isinstance(self.actor, MLPActor)
-            assert isinstance(self.critic, StackedCritic)
-            scales = (ImageScale.of(self.image_columns, self.team) for _ in range(2))
-            self.actor, self.critic = FeaturesActor(next(scales), self.actor), FeaturesCritic(next(scales), self.critic)
+            self._divide_images()
         self.actions = self.actor.actions
         self.actor_target = deepcopy(self.actor)
         self.critic_target = deepcopy(self.critic)
@@ -745,6 +742,12 @@ class MADDPGPolicy(BasePolicy):
                 ) from error
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
+
+    def _divide_images(self) -> None:
+        assert isinstance(self.actor, MLPActor)
+        assert isinstance(self.critic, StackedCritic)
+        scales = (ImageScale.of(self.image_columns or (), self.team) for _ in range(2))
+        self.actor, self.critic = FeaturesActor(next(scales), self.actor), FeaturesCritic(next(scales), self.critic)
 
     def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
         actions = TeamActions(

@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_maddpg import MADDPG, MATD3, CnnPolicy, TeamEnv, allow_in_files
 from toys import SMALL, Toy
@@ -252,6 +253,29 @@ def test_mlp_policies_divide_images_of_bytes_like_stable_baselines3(normalize_im
     own = model.actor.actions.columns_of(0)
     alone = model.agent_policy("a").network(unscaled[:, 0, :48])[:, own]
     assert th.allclose(alone, model.actor.logits(unscaled)[:, 0, own], atol=1e-6)
+
+
+@pytest.mark.parametrize("normalize_images", [True, False])
+def test_cnn_policies_divide_the_image_of_the_state_like_those_of_agents(normalize_images, tmp_path):
+    image = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    kwargs = {**POLICY, "normalize_images": normalize_images}
+    arguments = {**_without_kwargs(SMALL), "policy_kwargs": kwargs}
+    model = MADDPG("CnnPolicy", TeamEnv(Pictures(image, image), state=True), **arguments)
+    obs = th.as_tensor(TeamEnv(Pictures(image, image), state=True).reset(seed=0)[0][None])
+    assert obs[..., 192:].unique().tolist() == [255]
+    assert model.critic.features(obs)[..., -24:].unique().tolist() == [1 if normalize_images else 255]
+    model.learn(40)
+    model.save(tmp_path / "model")
+    loaded = MADDPG.load(tmp_path / "model")
+    actions = model.actor(obs)
+    assert th.equal(model.critic(obs, actions), loaded.critic(obs, actions))
+    assert loaded.agent_policy("a").predict(np.zeros((8, 8, 3), np.uint8)) in (0, 1)
+
+
+def test_normalised_images_are_not_divided_too():
+    model = MADDPG("MlpPolicy", Pictures(PICTURE, PICTURE), **SMALL)
+    with pytest.raises(ValueError, match="normalises images, which the policy also divides by 255"):
+        model.set_env(VecNormalize(DummyVecEnv([lambda: TeamEnv(Pictures(PICTURE, PICTURE))])))
 
 
 def test_mlp_policies_with_images_are_saved_and_loaded(tmp_path):
