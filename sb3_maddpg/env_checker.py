@@ -17,7 +17,7 @@ from sb3_maddpg.parallel import TeamEnv, explained_reset, what_to_pass
 from sb3_maddpg.relational import NeighbourViews, check_layout
 from sb3_maddpg.team import Team, TeamInfo
 from sb3_maddpg.utils import all_finite, not_finite_at, shown, suggest
-from sb3_maddpg.vec_env import ArrivalCheck, check_wrappers, watched
+from sb3_maddpg.vec_env import ArrivalCheck, check_wrappers, watched, watcher_of
 
 _SCALARS = {"is_success", "metrics", "team_reward", "episode_step"}
 _FLAGS = ("agent_terminated", "agent_truncated", "agent_active", "pair_terminated")
@@ -134,7 +134,8 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         )
     env.action_space.seed(seed)
     gone = np.zeros(team.n_agents, bool)
-    arrivals, kept = ArrivalCheck(1), _Kept()
+    arrivals, kept = ArrivalCheck(1, of_pettingzoo=isinstance(env.unwrapped, TeamEnv)), _Kept()
+    watcher = watcher_of(env)
     for step in range(1, max_steps + 1):
         obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
         where = f"in step {step}"
@@ -146,6 +147,8 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         if not all_finite(np.asarray(reward, float)):
             raise ValueError(f"The team's reward {where} is {reward}: it must be finite, also in single precision.")
         _check_info(info, team, where)
+        if watcher is not None:
+            watcher.check_entries(info)
         arrivals.check(np.array([reward], np.float32), np.asarray(obs)[np.newaxis], np.zeros(1, bool), [info], True)
         acts = np.asarray(info.get("agent_active", ~gone), bool)
         if (acts & gone).any():

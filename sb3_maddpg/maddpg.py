@@ -86,7 +86,7 @@ from sb3_maddpg.validation import (
     TrainingArguments,
     validated,
 )
-from sb3_maddpg.vec_env import ArrivalCheck, check_outside, check_vec_env, steps_its_envs
+from sb3_maddpg.vec_env import ArrivalCheck, check_outside, check_vec_env, steps_its_envs, steps_team_envs
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
@@ -935,7 +935,8 @@ class MADDPG(OffPolicyAlgorithm):
             missing = "the optimizers' state" if self.lean == "critic" else "critics and the optimizers' state"
             warnings.warn(f"This model was saved without {missing}, which are initialised afresh.", stacklevel=2)
             self.lean = None
-        self._arrivals = ArrivalCheck(self.n_envs, copied=steps_its_envs(self.env.unwrapped))
+        of_pettingzoo = steps_team_envs(self.env)
+        self._arrivals = ArrivalCheck(self.n_envs, steps_its_envs(self.env.unwrapped), of_pettingzoo)
         if self._was_reset():  # by somebody else, for example to evaluate the model
             self._last_obs = None
         broken_off = True

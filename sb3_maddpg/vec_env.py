@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from copy import deepcopy
 from typing import Any
@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_maddpg.parallel import TeamEnv, explained_reset, layers_of
-from sb3_maddpg.team import InfoKey, MixedActions, TeamObservation
+from sb3_maddpg.team import CategoricalActions, InfoKey, MixedActions, TeamObservation
 from sb3_maddpg.utils import as_seed, integers_problem, not_finite_at, shown
 
 _REWARD_WRAPPERS = (RewardWrapper, NormalizeReward)
@@ -169,7 +169,10 @@ class Transparent(Wrapper):
     :param env: an environment
     """
 
-    _own = frozenset({"env", "_action_space", "_observation_space", "_metadata", "_cached_spec", "_step"})
+    _own = frozenset(
+        {"env", "_action_space", "_observation_space", "_metadata", "_cached_spec"}
+        | {"_step", "_given_entries", "_counts_steps", "_watcher"}
+    )
 
     def __getattr__(self, name: str) -> Any:
         if "env" not in self.__dict__ or name.startswith("__"):  # a copy that is being made
@@ -191,8 +194,13 @@ class WatchedEnv(Transparent):
     :param env: a team environment
     """
 
+    def __init__(self, env: Env):
+        super().__init__(env)
+        self._step, self._counts_steps = 0, False
+        self._given_entries: frozenset[str] = frozenset()
+
     def reset(self, **kwargs: Any) -> Any:
-        self._step = 0
+        self._step, self._given_entries = 0, frozenset()
         return self.env.reset(**kwargs)
 
     def step(self, action: Any) -> Any:
@@ -202,13 +210,37 @@ class WatchedEnv(Transparent):
             info = {**info, "inner_reward": reward}
         except (TypeError, ValueError):  # for others to complain about
             return returned
-        self._step = getattr(self, "_step", 0) + 1
-        if not _OF_AGENTS.isdisjoint(info):  # otherwise nothing is lost if a wrapper skips steps
+        self._step += 1
+        self._given_entries |= _OF_AGENTS & info.keys()
+        self._counts_steps |= bool(self._given_entries)
+        if self._counts_steps:  # otherwise nothing is lost if a wrapper skips steps
             info["inner_step"] = self._step
         return observation, reward, terminated, truncated, info
 
+    def check_entries(self, info: Mapping[str, Any]) -> None:
+        """
+        :param info: what arrived of the infos of all steps since the last call
+        :raises ValueError: if entries about agents are missing
+        """
+        given, self._given_entries = self._given_entries, frozenset()
+        _check_entries(given, info, str(self.env))
+
 
 _OF_AGENTS = frozenset(InfoKey.__args__)  # type: ignore[attr-defined]
+_OF_TEAM_ENV = frozenset({"agent_rewards", "agent_terminated", "agent_truncated", "agent_active"})
+
+
+def _check_entries(given: Set[str], info: Mapping[str, Any], env: str) -> None:
+    if lost := sorted(given - info.keys()):
+        raise ValueError(
+            f"{env} gave {', '.join(lost)} in `info`, which did not arrive: a wrapper skips steps, or returns another "
+            f"`info`. Let it return the `info` that it gets, with additions. {_REMEDY}"
+        )
+
+
+def watcher_of(env: Env) -> WatchedEnv | None:
+    """:return: the ``WatchedEnv`` among an environment's wrappers, if there is one"""
+    return next((layer for layer in layers_of(env) if isinstance(layer, WatchedEnv)), None)
 
 
 def watched(env: Env) -> Env:
@@ -240,8 +272,13 @@ class BorderEnv(Transparent):
     the environment is reset, which may write into the same arrays.
 
     :param env: a team environment
-    :raises ValueError: in ``reset`` and ``step``, if an observation does not fit an observation space of integers
+    :raises ValueError: in ``reset`` and ``step``, if an observation does not fit an observation space of integers, or
+        wrappers drop what the environment says about agents
     """
+
+    def __init__(self, env: Env):
+        super().__init__(env)
+        self._watcher = watcher_of(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         with explained_reset(self.env):  # not every environment has options
@@ -252,6 +289,8 @@ class BorderEnv(Transparent):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._check(observation, "after step()")
+        if self._watcher is not None:
+            self._watcher.check_entries(info)
         if terminated or truncated:
             observation, info = np.array(observation), deepcopy(info)
         else:  # environments that are stepped one after the other may share arrays, too
@@ -287,11 +326,12 @@ def check_vec_env(vec_env: VecEnv) -> None:
         here.envs = [at_border(env) for env in envs]
     elif isinstance(inner, GymnasiumVecEnv):
         _warn_of_casts(inner.envs.unwrapped)
-    _check_spaces(f"Wrappers of {shown(inner)} change", _spaces_of(vec_env), _spaces_of(inner))
+    of_pettingzoo = steps_team_envs(vec_env)
+    _check_spaces(f"Wrappers of {shown(inner)} change", _spaces_of(vec_env), _spaces_of(inner), of_pettingzoo)
     if isinstance(inner, GymnasiumVecEnv):
         base = inner.envs.unwrapped
         own = (base.single_observation_space, base.single_action_space)
-        _check_spaces(f"Wrappers of {base} change", _spaces_of(inner), own)
+        _check_spaces(f"Wrappers of {base} change", _spaces_of(inner), own, of_pettingzoo)
     if not envs:
         for own in _team_spaces(inner):
             _check_spaces("A Gymnasium wrapper changes", _spaces_of(inner), own, always=True)
@@ -299,6 +339,15 @@ def check_vec_env(vec_env: VecEnv) -> None:
                 with suppress(NotImplementedError):
                     if any(inner.env_is_wrapped(wrapper)):
                         raise _only_team_reward(wrapper.__name__)
+
+
+def steps_team_envs(vec_env: VecEnv) -> bool:
+    """:return: whether all environments are each a ``TeamEnv``, in whichever process"""
+    inner = vec_env.unwrapped
+    if not isinstance(inner, VecEnv):
+        return False
+    envs = inner.envs if isinstance(inner, DummyVecEnv) and steps_its_envs(inner) else _single_envs(inner)
+    return all(isinstance(env.unwrapped, TeamEnv) for env in envs) if envs else bool(_team_spaces(inner))
 
 
 def steps_its_envs(vec_env: VecEnv) -> bool:
@@ -353,10 +402,10 @@ def _check_spaces(what: str, outer: Any, inner: Any, always: bool = False) -> No
     :param always: whether all spaces must stay, or only those that say what belongs to which agent
     :raises ValueError: if they differ
     """
-    for name, seen, own, of_agents in zip(
-        ("observations", "actions"), outer, inner, (TeamObservation, MixedActions), strict=True
-    ):
-        if seen != own and (always or isinstance(own, of_agents)):
+    of_agents = (TeamObservation, MixedActions, CategoricalActions)
+    for name, seen, own in zip(("observations", "actions"), outer, inner, strict=True):
+        says_more = isinstance(own, of_agents)  # also than a space of the same numbers
+        if (seen != own and (always or says_more)) or (says_more and not isinstance(seen, type(own))):
             lost = (
                 "names, padding and action masks of the agents"
                 if name == "observations"
@@ -444,9 +493,11 @@ class ArrivalCheck:
 
     :param n_envs: number of environments
     :param copied: whether the last observations are copies, see ``BorderEnv``
+    :param of_pettingzoo: whether the environments are each a ``TeamEnv``, whose infos tell about each agent
     """
 
-    def __init__(self, n_envs: int, copied: bool = False):
+    def __init__(self, n_envs: int, copied: bool = False, of_pettingzoo: bool = False):
+        self._entries: Set[str] = _OF_TEAM_ENV if of_pettingzoo else frozenset()
         # Number of each environment's last step in its episode, 0 if it is not known
         self._steps = [0] * n_envs
         # First observations of episodes that equal the last ones of the episodes before, None if one differed
@@ -469,10 +520,12 @@ class ArrivalCheck:
             own, as with ``pair_credit`` and ``use_action_cost``
         :raises ValueError: if the reward that arrived differs from what the environment gave, see ``WatchedEnv``, or in
             other processes ``info["team_reward"]``, or without it both mean and sum of ``info["agent_rewards"]``; if
-            steps are skipped, an end was dropped or made a truncation, or the last observations of episodes are the
-            first ones of the next episodes
+            steps are skipped, an end was dropped or made a truncation, or the last observations of episodes are missing
+            or are the first ones of the next episodes, or entries of infos are missing
         """
         for k, info in enumerate(infos):
+            if self._entries:
+                _check_entries(self._entries, info, f"TeamEnv in environment {k}")
             if reads_parts or "agent_rewards" in info:
                 self._check_reward(k, float(rewards[k]), info)
             step = info.get("inner_step", info.get("episode_step", 0))
@@ -496,6 +549,18 @@ class ArrivalCheck:
 
     @staticmethod
     def _check_cut(env: int, info: Mapping[str, Any]) -> None:
+        cut = np.asarray(info.get("agent_truncated", False), bool) & ~np.asarray(
+            info.get("agent_terminated", False), bool
+        )
+        if ("TimeLimit.truncated" not in info and cut.any()) or (
+            info.get("TimeLimit.truncated") and "terminal_observation" not in info
+        ):
+            lost = "TimeLimit.truncated" if "TimeLimit.truncated" not in info else "terminal_observation"
+            raise ValueError(
+                f"The episode of environment {env} was truncated, but its `info` has no {lost!r}, without which the "
+                "value of the last observation is unknown: let wrappers keep what vectorised environments of "
+                "Stable-Baselines3 add to `info`."
+            )
         if info.get("TimeLimit.truncated") and np.all(info.get("agent_terminated", False)):
             raise ValueError(
                 f"The episode of environment {env} was truncated, but all agents terminated in its last step: a "

@@ -31,7 +31,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
-from sb3_maddpg import MADDPG
+from sb3_maddpg import MADDPG, check_team_env
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.team_tasks import OwnBit
 from sb3_maddpg.vec_env import GymnasiumVecEnv
@@ -360,6 +360,101 @@ def test_steps_of_any_environment_that_a_wrapper_skips_are_noticed(rewards, mess
     envs = DummyVecEnv([make]) if vector is DummyVecEnv else GymnasiumVecEnv(SyncVectorEnv([make], **SAME_STEP))
     with pytest.raises(ValueError, match=message):
         MADDPG("MlpPolicy", envs, **SMALL).learn(40)
+
+
+class OtherInfo(gymnasium.Wrapper):
+    def step(self, action):
+        return *self.env.step(action)[:4], {"mine": 1}
+
+
+class SkipInfos(gymnasium.Wrapper):
+    """Skips steps without a word of what happened in them."""
+
+    def step(self, action):
+        for _ in range(4):
+            returned = self.env.step(action)
+            if returned[2] or returned[3]:
+                break
+        return returned
+
+
+class OtherInfoVec(VecEnvWrapper):
+    def __init__(self, venv, *lost):
+        super().__init__(venv)
+        self.lost = lost
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        *others, infos = self.venv.step_wait()
+        return *others, [{name: info[name] for name in info if name not in self.lost} for info in infos]
+
+
+@pytest.mark.parametrize(
+    ("make", "lost"),
+    [
+        (lambda: OtherInfo(toy()), "agent_active, agent_rewards, agent_terminated, agent_truncated"),
+        (lambda: OtherInfo(Equal(True)), "agent_rewards"),
+        (lambda: OtherInfo(Equal(False)), "agent_terminated"),
+        (lambda: SkipInfos(Sometimes()), "agent_terminated"),
+    ],
+)
+def test_what_an_environment_says_of_agents_arrives_or_is_refused(make, lost):
+    with pytest.raises(ValueError, match=f"gave {lost} in `info`, which did not arrive"):
+        MADDPG("MlpPolicy", make(), **SMALL).learn(40)
+    with pytest.raises(ValueError, match=f"gave {lost} in `info`, which did not arrive"):
+        check_team_env(make())
+
+
+class Sometimes(OwnBit):
+    """Speaks of agents only when one ends."""
+
+    def step(self, action):
+        *others, _ = super().step(action)
+        return *others, {"agent_terminated": np.array([True, False, False])} if self._steps == 3 else {}
+
+
+@pytest.mark.parametrize("of", [DummyVecEnv, SubprocVecEnv])
+def test_infos_of_a_team_arrive_from_other_processes_or_are_refused(of):
+    envs = of([toy], **({"start_method": "fork"} if of is SubprocVecEnv else {}))
+    try:
+        with pytest.raises(ValueError, match="gave agent_rewards in `info`, which did not arrive"):
+            MADDPG("MlpPolicy", OtherInfoVec(envs, "agent_rewards"), **SMALL).learn(40)
+        for lost in ("TimeLimit.truncated", "terminal_observation"):
+            with pytest.raises(ValueError, match=f"was truncated, but its `info` has no '{lost}'"):
+                MADDPG("MlpPolicy", OtherInfoVec(envs, lost), **SMALL).learn(40)
+    finally:
+        envs.close()
+
+
+class PlainSpaces(VecEnvWrapper):
+    """Declares the spaces anew, with the same bounds or others."""
+
+    def __init__(self, venv, low: float | None = None):
+        seen, acts = venv.observation_space, venv.action_space
+        if low is None:
+            super().__init__(venv, observation_space=spaces.Box(seen.low, seen.high))
+        else:
+            super().__init__(venv, action_space=spaces.Box(low, 1, acts.shape))
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def test_vectorised_wrappers_keep_the_spaces_of_a_team():
+    with pytest.raises(ValueError, match="change the observations of the team"):
+        MADDPG("MlpPolicy", PlainSpaces(DummyVecEnv([toy])), **SMALL)
+    with pytest.raises(ValueError, match="change the actions of the team"):
+        MADDPG("MlpPolicy", PlainSpaces(DummyVecEnv([lambda: TeamEnv(Toy("continuous"))]), -0.5), **SMALL)
+    vector = gymnasium.wrappers.vector.RescaleAction(
+        SyncVectorEnv([lambda: TeamEnv(Toy("continuous"))], **SAME_STEP), np.float32(-0.5), np.float32(0.5)
+    )
+    with pytest.raises(ValueError, match="change the actions of the team"):
+        MADDPG("MlpPolicy", GymnasiumVecEnv(vector), **SMALL)
 
 
 def test_rewards_that_are_added_up_arrive_if_agents_have_none():
