@@ -363,16 +363,19 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _check_normalization(self, env: GymEnv) -> None:
         layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
+        images = "image_space" in self.policy_kwargs or any(self.policy_kwargs.get("image_columns") or ())
+        if normalizer is not None and images and self.policy_kwargs.get("normalize_images", True):
+            raise ValueError(
+                "VecNormalize(norm_obs=True) normalises images, which the policy also divides by 255: set "
+                "norm_obs=False or policy_kwargs={'normalize_images': False}."
+            )
         if self.normalized_observations and self.num_timesteps:
             self._check_statistics(normalizer)
-        if (
-            normalizer is not None
-            and "image_space" in self.policy_kwargs
-            and self.policy_kwargs.get("normalize_images", True)
-        ):
+        elif normalizer is not None and self.num_timesteps:
             raise ValueError(
-                "VecNormalize(norm_obs=True) normalises images, which CnnPolicy also divides by 255: set "
-                "norm_obs=False or policy_kwargs={'normalize_images': False}."
+                "The model was trained on observations that were not normalised, but this environment normalises them: "
+                "set VecNormalize(norm_obs=False). If the training normalised them, too, load the model with "
+                "normalized_observations=True."
             )
         if normalizer is not None and any(getattr(normalizer.observation_space, "masks", ())):
             raise ValueError(
@@ -406,7 +409,14 @@ class MADDPG(OffPolicyAlgorithm):
                 "The model was trained with VecNormalize(norm_obs=True), but this environment does not normalise "
                 f"observations: {remedy}"
             )
-        if ObservationStatistics.of(normalizer) is None:
+        present = ObservationStatistics.of(normalizer)
+        if present is not None and stored is not None and np.max(present.observed) < np.max(stored.observed):
+            raise ValueError(
+                f"This environment's VecNormalize has seen {np.max(present.observed):.0f} observations, fewer than the "
+                f"{np.max(stored.observed):.0f} of the model's training, so that its statistics are others: wrap the "
+                f"environment in a new VecNormalize, which the statistics in the model's file complete, or {remedy}"
+            )
+        if present is None:
             if stored is None:
                 raise ValueError(
                     "The model was trained with VecNormalize(norm_obs=True), but this environment's VecNormalize has "

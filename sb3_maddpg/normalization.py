@@ -179,14 +179,23 @@ class ObservationStatistics(NamedTuple):
 
 def for_team(env: VecEnv) -> None:
     """
-    Turn each plain ``VecNormalize`` around an environment into a ``TeamVecNormalize``, in place.
+    Turn a plain ``VecNormalize`` around an environment into a ``TeamVecNormalize``, in place.
 
     :param env: a vectorised team environment
+    :raises ValueError: if there are two, of which only one would be known
     """
+    found = 0
     while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecNormalize):
+            found += 1
         if type(env) is VecNormalize:
             env.__class__ = TeamVecNormalize
         env = env.venv
+    if found > 1:
+        raise ValueError(
+            f"The environment is wrapped in VecNormalize {found} times, but a model knows the statistics of one: use a "
+            "single VecNormalize, with norm_obs and norm_reward."
+        )
 
 
 def _update(rms: RunningMeanStd, values: np.ndarray, counts: np.ndarray) -> None:

@@ -288,6 +288,37 @@ def test_a_model_goes_on_only_with_its_statistics(tmp_path):
     by_itself.agent_policy("a")
 
 
+def test_statistics_that_have_seen_less_are_not_those_of_the_training(tmp_path):
+    model = trained(tmp_path / "model")
+    begun = wrapped()
+    begun.reset()
+    with pytest.raises(ValueError, match="has seen 1 observations, fewer than the 201 of the model's training"):
+        MADDPG.load(tmp_path / "model", env=begun)
+    later = trained(tmp_path / "earlier").learn(100, reset_num_timesteps=False).get_vec_normalize_env()
+    MADDPG.load(tmp_path / "model", env=later)
+    model.set_env(model.get_env())
+
+
+def test_a_model_of_plain_observations_meets_no_others(tmp_path):
+    model = MADDPG("MlpPolicy", TeamEnv(Fragile()), **FAST).learn(40)
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="observations that were not normalised, but this environment normalises them"):
+        MADDPG.load(tmp_path / "model", env=wrapped())
+    with pytest.raises(ValueError, match=r"set VecNormalize\(norm_obs=False\)"):
+        model.set_env(wrapped())
+    rewards = VecNormalize(DummyVecEnv([lambda: TeamEnv(Fragile())]), norm_obs=False)
+    MADDPG.load(tmp_path / "model", env=rewards).learn(20, reset_num_timesteps=False)
+    untrained = MADDPG("MlpPolicy", TeamEnv(Fragile()), **FAST)
+    untrained.set_env(wrapped())
+    assert untrained.normalized_observations
+
+
+def test_a_model_knows_one_normalizer():
+    twice = VecNormalize(wrapped(), norm_obs=False)
+    with pytest.raises(ValueError, match="wrapped in VecNormalize 2 times"):
+        MADDPG("MlpPolicy", twice, **FAST)
+
+
 def test_files_without_statistics_need_those_of_the_training(tmp_path):
     """As earlier versions wrote them."""
     model = trained()
