@@ -8,10 +8,13 @@ wrappers.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import os
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +145,33 @@ def _told(env: Any) -> Any:
             "--checkpoint-every STEPS, or in Python in sb3_maddpg.env_states.Replayable."
         )
     return env.state_dict()
+
+
+def fingerprint(env: VecEnv) -> str:
+    """
+    :param env: a vectorised environment, with its wrappers
+    :return: digest of the plain values and random number generators of all that it consists of in this process, from
+        which one sees whether somebody has stepped or reset it
+    """
+    digest = hashlib.sha256()
+    for one in layers(env):
+        for name, value in vars(one).items():
+            if isinstance(value, np.random.Generator):
+                value = value.bit_generator.state
+            if name in _NOT_STATE or name == "_seeds":  # which VecEnv.seed() sets for the next reset
+                continue
+            arrays: dict[str, np.ndarray] = {}
+            with suppress(ValueError):
+                digest.update(json.dumps([name, encode(value, name, arrays)]).encode())
+                for array in arrays.values():
+                    digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def shares_an_env(env: VecEnv, other: Any) -> bool:
+    """:return: whether two environments step the same one"""
+    stepped = {id(one) for one in layers(env) if hasattr(one, "step")}
+    return any(id(one) in stepped for one in layers(other))
 
 
 def _env_state(env: gymnasium.Env) -> dict[str, Any]:

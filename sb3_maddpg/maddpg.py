@@ -20,6 +20,7 @@ import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -47,6 +48,7 @@ from sb3_maddpg.buffer_files import is_buffer_file, read_buffer, write_buffer
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, TeamReplayBufferSamples
 from sb3_maddpg.callbacks import check_success, record_metrics, widen_tables
 from sb3_maddpg.cnn_policy import CnnPolicy
+from sb3_maddpg.env_states import fingerprint, shares_an_env
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
     FILE_FORMAT,
@@ -291,6 +293,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.env_spec: dict[str, Any] | None = None
         self._stopped = False
         self._seeds_of_reset: Any = None  # SB3's environments replace them in every reset()
+        self._left_as: str | None = None  # how learn() left the environment, see fingerprint()
         self.normalized_observations = False  # whether VecNormalize normalises the observations of the networks
         self.observation_statistics: dict[str, Any] | None = None  # of a loaded file, see ObservationStatistics
         self.lean: Lean | None = None  # which networks the loaded file held, None if all or not loaded
@@ -947,7 +950,8 @@ class MADDPG(OffPolicyAlgorithm):
             self.lean = None
         of_pettingzoo = steps_team_envs(self.env)
         self._arrivals = ArrivalCheck(self.n_envs, steps_its_envs(self.env.unwrapped), of_pettingzoo)
-        if self._was_reset():  # by somebody else, for example to evaluate the model
+        # By somebody else, for example to evaluate the model
+        if self._was_reset() or (self._left_as is not None and self._left_as != fingerprint(self.env)):
             self._last_obs = None
         broken_off = True
         try:
@@ -968,6 +972,7 @@ class MADDPG(OffPolicyAlgorithm):
             if not self._custom_logger:
                 remove_empty_log_folder(self)
             self._seeds_of_reset = self._seeds_of_env()
+            self._left_as = fingerprint(self.env)
         # Log the episodes since SB3's last log, which are all of them in a short training
         if given["log_interval"] and self._episode_num % given["log_interval"]:
             self.dump_logs()
@@ -982,9 +987,24 @@ class MADDPG(OffPolicyAlgorithm):
         return self._seeds_of_reset is not None and seeds is not self._seeds_of_reset and not any(seeds or ())
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        prepared = super()._setup_learn(*args, **kwargs)
+        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         self._seeds_of_reset = self._seeds_of_env()
-        return prepared
+        self._check_evaluation(callback)
+        return total_timesteps, callback
+
+    def _check_evaluation(self, callback: BaseCallback) -> None:
+        """:raises ValueError: if a callback would evaluate the model in an environment that it is trained in"""
+        waiting = [callback]
+        while waiting:
+            one = waiting.pop()
+            assert self.env is not None
+            if (own := getattr(one, "eval_env", None)) is not None and shares_an_env(self.env, own):
+                raise ValueError(
+                    f"{type(one).__name__} evaluates the model in the environment that it is trained in, whose "
+                    "episodes would be broken off unnoticed: give it an environment of its own."
+                )
+            waiting += getattr(one, "callbacks", [])
+            waiting += [inner for inner in (getattr(one, "callback", None),) if isinstance(inner, BaseCallback)]
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         rollout = super().collect_rollouts(*args, **kwargs)
@@ -1354,6 +1374,7 @@ class MADDPG(OffPolicyAlgorithm):
             "_arrivals",
             "_stopped",
             "_seeds_of_reset",
+            "_left_as",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -15,7 +15,7 @@ from gymnasium.wrappers import NormalizeReward
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_maddpg.parallel import TeamEnv, explained_reset, layers_of
+from sb3_maddpg.parallel import TeamEnv, TurnBased, explained_reset, layers_of
 from sb3_maddpg.team import CategoricalActions, InfoKey, MixedActions, TeamObservation
 from sb3_maddpg.utils import as_seed, integers_problem, not_finite_at, shown
 
@@ -227,7 +227,8 @@ class WatchedEnv(Transparent):
 
 
 _OF_AGENTS = frozenset(InfoKey.__args__)  # type: ignore[attr-defined]
-_OF_TEAM_ENV = frozenset({"agent_rewards", "agent_terminated", "agent_truncated", "agent_active"})
+# What TeamEnv always gives, except agent_truncated, which follows from agents that act no more
+_OF_TEAM_ENV = frozenset({"agent_rewards", "agent_terminated", "agent_active"})
 
 
 def _check_entries(given: Set[str], info: Mapping[str, Any], env: str) -> None:
@@ -428,8 +429,8 @@ def check_single_envs(envs: Sequence[Env]) -> None:
     Check environments that are stepped together.
 
     :param envs: the environments, which may be wrapped
-    :raises ValueError: if two of them step the same PettingZoo environment or are of different teams, or wrappers hide
-        a ``TeamEnv`` from the algorithm
+    :raises ValueError: if two of them step the same environment or are of different teams, or wrappers hide a
+        ``TeamEnv`` from the algorithm
     """
     stepped: dict[int, int] = {}
     for index, env in enumerate(envs):
@@ -440,13 +441,15 @@ def check_single_envs(envs: Sequence[Env]) -> None:
                 "all environments with the same arguments."
             )
         check_wrappers(env)
-        team_env = env.unwrapped
-        if not isinstance(team_env, TeamEnv):
-            continue
-        if (other := stepped.setdefault(id(team_env.parallel_env.unwrapped), index)) != index:
+        inner: Any = env.unwrapped
+        if isinstance(inner, TeamEnv):
+            inner = inner.parallel_env.unwrapped
+        if isinstance(inner, TurnBased):
+            inner = inner.env.unwrapped
+        if (other := stepped.setdefault(id(inner), index)) != index:
             raise ValueError(
-                f"Environments {other} and {index} step the same PettingZoo environment, {team_env.parallel_env}: "
-                "create one for each, for example DummyVecEnv([lambda: TeamEnv(make_env()) for _ in range(2)])."
+                f"Environments {other} and {index} step the same environment, {inner}: create one for each, for "
+                "example DummyVecEnv([lambda: TeamEnv(make_env()) for _ in range(2)])."
             )
 
 

@@ -12,7 +12,13 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+)
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -792,6 +798,60 @@ def test_an_evaluation_in_the_training_environment_leaves_no_transition(n_steps)
     assert now[15, 1] == 0
     if n_steps > 1:
         assert buffer.cuts[14, 0] == 1
+
+
+class Rounds(gymnasium.Env):
+    """Observations tell episode and step."""
+
+    observation_space = spaces.Box(0, 1e6, (2, 2), np.float32)
+    action_space = spaces.MultiBinary(2)
+    episode = 0
+
+    def observe(self):
+        return np.array([[self.episode, self.steps]] * 2, np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.episode, self.steps = self.episode + 1, 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.steps += 1
+        return self.observe(), 1.0, False, self.steps == 7, {}
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("use", ["evaluate", "reset", "step", "vec_env", "nothing"])
+def test_environments_used_between_two_trainings_leave_no_transition(use, n_envs):
+    envs = [Rounds() for _ in range(n_envs)]
+    vec_env = DummyVecEnv([lambda env=env: env for env in envs])
+    model = MADDPG("MlpPolicy", envs[0] if n_envs == 1 else vec_env, **{**SMALL, "learning_starts": 1000})
+    model.learn(10 * n_envs)
+    if use == "evaluate":
+        evaluate_policy(model, envs[-1], 1, warn=False)
+    elif use == "reset":
+        envs[-1].reset()
+    elif use == "step":
+        envs[-1].step(np.zeros(2, np.int8))
+    elif use == "vec_env":
+        model.get_env().step(np.zeros((n_envs, 2), np.int8))
+    model.learn(10 * n_envs, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    assert (buffer.observations[:20, :, 0] + np.float32([0, 1]) == buffer.next_observations[:20, :, 0]).all()
+    goes_on = np.array_equal(buffer.next_observations[9], buffer.observations[10])
+    assert goes_on == (use == "nothing"), "an episode goes on unless somebody else has taken part"
+
+
+@pytest.mark.parametrize("make", [Rounds, lambda: Toy("categorical"), lambda: TeamEnv(Toy("categorical"))])
+def test_evaluations_take_an_environment_of_their_own(make):
+    env = make()
+    evaluated = TeamEnv(env) if isinstance(env, ParallelEnv) else env
+    callback = CallbackList([EveryNTimesteps(50, EvalCallback(evaluated, verbose=0))])
+    model = MADDPG("MlpPolicy", env, **SMALL)
+    with pytest.raises(ValueError, match="EvalCallback evaluates the model in the environment that it is trained in"):
+        model.learn(20, callback=callback)
+    other = make()
+    model.learn(20, callback=EvalCallback(TeamEnv(other) if isinstance(other, ParallelEnv) else other, eval_freq=9))
 
 
 def test_a_callback_that_resets_the_training_environment_is_refused():

@@ -18,6 +18,7 @@ from gymnasium.wrappers import (
     TimeLimit,
     TransformReward,
 )
+from pettingzoo.classic import tictactoe_v3
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -189,6 +190,14 @@ def test_one_pettingzoo_environment_cannot_be_stepped_twice():
         with pytest.raises(ValueError, match=r"Environments 0 and 1 step the same .*: create one for each"):
             MADDPG("MlpPolicy", envs)
     MADDPG("MlpPolicy", DummyVecEnv([lambda: TeamEnv(Toy("binary"))] * 2))
+
+
+@pytest.mark.parametrize("make", [tictactoe_v3.env, OwnBit])
+def test_no_environment_is_stepped_twice(make):
+    env = make()
+    wrap = Monitor if make is OwnBit else TeamEnv
+    with pytest.raises(ValueError, match=r"Environments 0 and 1 step the same environment, .*: create one for each"):
+        MADDPG("MlpPolicy", DummyVecEnv([lambda: wrap(env)] * 2))
 
 
 def test_environments_of_different_teams_are_refused():
@@ -394,7 +403,7 @@ class OtherInfoVec(VecEnvWrapper):
 @pytest.mark.parametrize(
     ("make", "lost"),
     [
-        (lambda: OtherInfo(toy()), "agent_active, agent_rewards, agent_terminated, agent_truncated"),
+        (lambda: OtherInfo(toy()), "agent_active, agent_rewards, agent_terminated"),
         (lambda: OtherInfo(Equal(True)), "agent_rewards"),
         (lambda: OtherInfo(Equal(False)), "agent_terminated"),
         (lambda: SkipInfos(Sometimes()), "agent_terminated"),
