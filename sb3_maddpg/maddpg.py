@@ -1033,6 +1033,8 @@ class MADDPG(OffPolicyAlgorithm):
         assert isinstance(original_obs, np.ndarray)
         reads_parts = self.use_action_cost or getattr(replay_buffer, "n_pairs", 0) > 0
         self._arrivals.check(reward, original_obs, dones, infos, reads_parts)
+        if self.env is not None and self.env.unwrapped is not (normalizer.venv if normalizer else self.env):
+            self._arrivals.check_lasts(self.env.unwrapped, original_obs, dones, infos)
         if normalizer is not None and self.env is not normalizer:
             check_outside(normalizer, new_obs, arrived)
         next_obs = original_obs.copy()

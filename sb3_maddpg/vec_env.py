@@ -505,6 +505,7 @@ class ArrivalCheck:
         self._steps = [0] * n_envs
         # First observations of episodes that equal the last ones of the episodes before, None if one differed
         self._firsts: list[list[np.ndarray] | None] = [None if copied else [] for _ in range(n_envs)]
+        self._only_firsts = 0  # episodes in a row of which wrappers changed the first observation, but not the last
 
     def check(
         self,
@@ -549,6 +550,33 @@ class ArrivalCheck:
             if dones[k] and self._firsts[k] is not None:
                 last = info.get("original_terminal_observation", info.get("terminal_observation"))
                 self._check_end(k, observations[k], last)
+
+    def check_lasts(
+        self, inner: VecEnv, observations: np.ndarray, dones: np.ndarray, infos: Sequence[Mapping[str, Any]]
+    ) -> None:
+        """
+        Warn of wrappers that change observations, but not the last ones of episodes, which come in infos.
+
+        :param inner: the vectorised environment without its wrappers, after the step
+        :param observations: see ``check``
+        :param dones: see ``check``
+        :param infos: see ``check``
+        """
+        if not (isinstance(inner, DummyVecEnv) and steps_its_envs(inner)) or self._only_firsts > _SAME_ENDS:
+            return
+        for k in np.flatnonzero(dones).tolist():
+            last: Any = infos[k].get("original_terminal_observation", infos[k].get("terminal_observation"))
+            given: Any = inner.buf_obs[None]  # type: ignore[index]  # of observations that are no dict
+            own_last: Any = inner.buf_infos[k].get("terminal_observation")
+            changed, same_last = not np.array_equal(observations[k], given[k]), np.array_equal(last, own_last)
+            self._only_firsts = self._only_firsts + 1 if changed and same_last else 0
+            if self._only_firsts == _SAME_ENDS:
+                self._only_firsts += 1
+                warnings.warn(
+                    "A wrapper changes observations, but not the last ones of episodes, which the algorithm bootstraps "
+                    "from: let it change info['terminal_observation'], too.",
+                    stacklevel=2,
+                )
 
     @staticmethod
     def _check_cut(env: int, info: Mapping[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """Gymnasium's vector environments under Stable-Baselines3: the same transitions as its own DummyVecEnv."""
 
+import warnings
 from copy import deepcopy
 
 import gymnasium
@@ -192,12 +193,16 @@ def test_one_pettingzoo_environment_cannot_be_stepped_twice():
     MADDPG("MlpPolicy", DummyVecEnv([lambda: TeamEnv(Toy("binary"))] * 2))
 
 
-@pytest.mark.parametrize("make", [tictactoe_v3.env, OwnBit])
-def test_no_environment_is_stepped_twice(make):
-    env = make()
-    wrap = Monitor if make is OwnBit else TeamEnv
-    with pytest.raises(ValueError, match=r"Environments 0 and 1 step the same environment, .*: create one for each"):
-        MADDPG("MlpPolicy", DummyVecEnv([lambda: wrap(env)] * 2))
+def test_no_environment_of_another_kind_is_stepped_twice():
+    turns, own = tictactoe_v3.env(), OwnBit()
+    for envs in (
+        DummyVecEnv([lambda: TeamEnv(turns)] * 2),
+        GymnasiumVecEnv(SyncVectorEnv([lambda: OrderEnforcing(own)] * 2, **SAME_STEP)),
+    ):
+        with pytest.raises(
+            ValueError, match=r"Environments 0 and 1 step the same environment, .*: create one for each"
+        ):
+            MADDPG("MlpPolicy", envs)
 
 
 def test_environments_of_different_teams_are_refused():
@@ -435,6 +440,38 @@ def test_infos_of_a_team_arrive_from_other_processes_or_are_refused(of):
                 MADDPG("MlpPolicy", OtherInfoVec(envs, lost), **SMALL).learn(40)
     finally:
         envs.close()
+
+
+class Halved(VecEnvWrapper):
+    """Halves observations, the last ones of episodes as well or not."""
+
+    def __init__(self, venv, with_lasts):
+        super().__init__(venv)
+        self.with_lasts = with_lasts
+
+    def reset(self):
+        return self.venv.reset() / 2
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        for k in np.flatnonzero(dones if self.with_lasts else []):
+            infos[k]["terminal_observation"] = infos[k]["terminal_observation"] / 2
+        return obs / 2, rewards, dones, infos
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_last_observations_are_changed_like_others(normalized):
+    def halved(with_lasts):
+        envs = Halved(DummyVecEnv([toy, toy]), with_lasts)
+        return VecNormalize(envs, norm_reward=False) if normalized else envs
+
+    with pytest.warns(UserWarning, match="not the last ones of episodes"):
+        MADDPG("MlpPolicy", halved(False), **SMALL).learn(80)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = MADDPG("MlpPolicy", halved(True), **SMALL).learn(80)
+        MADDPG("MlpPolicy", DummyVecEnv([toy, toy]), **SMALL).learn(80)
+    assert np.abs(model.replay_buffer.next_observations[:40]).max() <= 0.5
 
 
 class PlainSpaces(VecEnvWrapper):
