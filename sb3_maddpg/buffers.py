@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg.team import InfoKey, Team, heads_of
-from sb3_maddpg.utils import all_finite, integers_problem, not_finite_at, shown
+from sb3_maddpg.utils import all_finite, as_numbers, integers_problem, not_finite_at, shown
 from sb3_maddpg.validation import PriorityArguments, ReplayBufferArguments, validated
 
 
@@ -358,17 +358,19 @@ class TeamReplayBuffer(ReplayBuffer):
         self._read_infos("agent_rewards", new.agent_rewards, infos, new.rewards[:, None])
         self._read_infos("agent_terminated", new.agent_terminated, infos, 0.0)
         some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
-        if self._read_infos("agent_truncated", self._truncated, infos, 0.0) and self._truncated.any():
-            goes_on = (new.agent_active > 0) & (new.agent_terminated == 0) & (self._truncated == 0)
-            early = (self._truncated > 0) & (new.agent_active > 0) & goes_on.any(axis=1, keepdims=True)
-            new.agent_active[early] = _TRUNCATED
-            self.all_active &= not early.any()
+        cut_early = self._read_infos("agent_truncated", self._truncated, infos, 0.0) and self._truncated.any()
         if self.n_pairs:
             self._read_infos("pair_rewards", new.pair_rewards, infos, None)
         if self.pairs_end:
             self._read_infos("pair_terminated", new.pair_terminated, infos, None)
         if not all_finite(self._new):
             self._refuse_numbers(infos)
+        self._check_flags()
+        if cut_early:
+            goes_on = (new.agent_active > 0) & (new.agent_terminated == 0) & (self._truncated == 0)
+            early = (self._truncated > 0) & (new.agent_active > 0) & goes_on.any(axis=1, keepdims=True)
+            new.agent_active[early] = _TRUNCATED
+            self.all_active &= not early.any()
 
         pos = self.pos
         if self.optimize_memory_usage:
@@ -425,6 +427,8 @@ class TeamReplayBuffer(ReplayBuffer):
                 f"{self.n_agents} agents: it must be {shape}. A buffer fits only the team and the number of "
                 "environments that it was created for."
             )
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"The {what} is an array of {values.dtype}: it must hold real numbers.")
         values = values.reshape(shape)
         if (index := not_finite_at(values)) is None:
             if what != "action" and self.observations.dtype.kind in "iu":
@@ -463,8 +467,9 @@ class TeamReplayBuffer(ReplayBuffer):
         :param default: value for environments without the key, None if the key is required
         :return: whether any environment has the key
         """
-        if len(infos) == 1 and getattr(infos[0].get(key), "shape", None) == array.shape[1:]:
-            array[0] = infos[0][key]  # fast path for the common case
+        value = infos[0].get(key) if len(infos) == 1 else None
+        if type(value) is np.ndarray and value.dtype.kind in "bfiu" and value.shape == array.shape[1:]:
+            array[0] = value  # fast path for the common case
             return True
         values = [info[key] for info in infos if key in info]
         where: slice | list[int] = slice(None)
@@ -479,25 +484,46 @@ class TeamReplayBuffer(ReplayBuffer):
                 return False
             where = [env for env, info in enumerate(infos) if key in info]
         try:
-            rows = np.array(values, np.float32)
-        except (TypeError, ValueError):
+            rows = [as_numbers(value) for value in values]
+        except ValueError:
             self._check_shapes(key, values, array.shape[1:])
-            raise ValueError(f"info['{key}'] of {values} does not hold numbers.") from None
-        if rows.shape[1:] != array.shape[1:]:
-            self._check_shapes(key, values, array.shape[1:])
+            raise ValueError(f"info['{key}'] of {shown(values)} does not hold numbers.") from None
+        self._check_shapes(key, rows, array.shape[1:])
         array[where] = rows
         return True
 
     def _check_shapes(self, key: InfoKey, values: Sequence[Any], needed: tuple[int, ...]) -> None:
         for value in values:
-            if np.shape(value) != needed:
+            try:
+                shape = np.shape(value)
+            except (TypeError, ValueError, RuntimeError):  # of nested lists that differ, or foreign arrays
+                continue
+            if shape != needed:
                 of_pairs = key in ("pair_rewards", "pair_terminated")
                 pairs = f" and n_pairs={self.n_pairs}" if of_pairs else ""
                 remedy = "" if of_pairs else ", or leave the key out"
                 raise ValueError(
-                    f"info['{key}'] has shape {np.shape(value)}, but there are {self.n_agents} agents{pairs}: "
+                    f"info['{key}'] has shape {shape}, but there are {self.n_agents} agents{pairs}: "
                     f"the environment must return shape {needed}{remedy}."
                 )
+
+    def _check_flags(self) -> None:
+        """:raises ValueError: if what says whether agents acted or something ended is neither 1 nor 0"""
+        new = self._new_columns
+        arrays = {
+            "info['agent_terminated']": new.agent_terminated,
+            "info['agent_active']": new.agent_active,
+            "info['agent_truncated']": self._truncated,
+            "info['pair_terminated']": new.pair_terminated,
+            "The end of the episode": new.dones,
+            "info['TimeLimit.truncated']": new.timeouts,
+        }
+        for name, array in arrays.items():
+            if np.count_nonzero(array * (array - 1)):  # NaN counts
+                env, *agent = np.argwhere(array * (array - 1) != 0)[0].tolist()
+                whose = f" of agent {agent[0]} ({self.team.names[agent[0]]})" if agent else ""
+                value = array[tuple([env, *agent])]
+                raise ValueError(f"{name}{whose} is {value} {self._where(env)}: it must be True or False.")
 
     def _refuse_numbers(self, infos: Sequence[dict[str, Any]]) -> None:
         keys = ("agent_rewards", "pair_rewards", "pair_terminated", "agent_terminated", "agent_active", "rewards")

@@ -88,7 +88,15 @@ from sb3_maddpg.validation import (
     TrainingArguments,
     validated,
 )
-from sb3_maddpg.vec_env import ArrivalCheck, check_outside, check_vec_env, steps_its_envs, steps_team_envs
+from sb3_maddpg.vec_env import (
+    ArrivalCheck,
+    check_outside,
+    check_returned,
+    check_vec_env,
+    last_observation,
+    steps_its_envs,
+    steps_team_envs,
+)
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 Lean = Literal["actor", "critic"]
@@ -659,7 +667,7 @@ class MADDPG(OffPolicyAlgorithm):
         """:return: the current observations, (n_envs, n_agents, obs_dim or more)"""
         assert isinstance(self._last_obs, np.ndarray)
         self.policy.check_finite(self._last_obs)
-        return th.as_tensor(self._last_obs, dtype=th.float32, device=self.device)
+        return th.as_tensor(self._last_obs.astype(np.float32, copy=False), device=self.device)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
@@ -1025,6 +1033,7 @@ class MADDPG(OffPolicyAlgorithm):
                 "A callback has reset the training environment in the middle of an episode, whose next transition "
                 "would be false: give EvalCallback or evaluate_policy an environment of its own."
             )
+        check_returned(self.n_envs, infos, observations=new_obs, rewards=reward)
         normalizer, arrived = self._vec_normalize_env, reward
         if normalizer is None:
             self._last_original_obs, original_obs = self._last_obs, new_obs
@@ -1038,18 +1047,16 @@ class MADDPG(OffPolicyAlgorithm):
         if normalizer is not None and self.env is not normalizer:
             check_outside(normalizer, new_obs, arrived)
         next_obs = original_obs.copy()
-        for k in np.flatnonzero(dones):
-            info = infos[k]
-            # VecNormalize keeps the original besides the normalised one, which may have been clipped
-            last = info.get("original_terminal_observation", info.get("terminal_observation"))
-            if last is not None:
-                next_obs[k] = last
+        for k in np.flatnonzero(dones).tolist():
+            next_obs[k] = last_observation(k, infos[k], next_obs[k])
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
         self._last_obs = new_obs
         if normalizer is not None:
             self._last_original_obs = original_obs
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        if dones is not None:
+            check_returned(self.n_envs, infos, dones=dones)
         check_success(infos)
         super()._update_info_buffer(infos, dones)
         record_metrics(self.logger, infos)

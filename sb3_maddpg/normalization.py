@@ -18,6 +18,7 @@ from sb3_maddpg.model_files import as_damage, trusted
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import atomic_write, shown
 from sb3_maddpg.validation import NormalizationArguments, validated_as
+from sb3_maddpg.vec_env import check_returned
 
 _FORMAT = "VecNormalize 1"
 _SETTINGS = tuple(NormalizationArguments.model_fields)
@@ -52,7 +53,9 @@ class TeamVecNormalize(VecNormalize):
         if not self._is_team:
             return super().step_wait()
         obs, rewards, dones, infos = self.venv.step_wait()
+        check_returned(self.num_envs, infos, observations=obs, rewards=rewards, dones=dones)
         assert isinstance(obs, np.ndarray)
+        dones = dones.astype(bool, copy=False)
         self.old_obs, self.old_reward = obs, rewards
         # After the end of an episode, the observation is the first of the next one
         begun = self.unwrapped.reset_infos

@@ -21,7 +21,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
-from sb3_maddpg.utils import as_numbers, as_seed, not_finite_at, shown
+from sb3_maddpg.utils import as_flag, as_number, as_numbers, as_seed, not_finite_at, shown
 
 ENTRY_POINT = f"{__name__}:make"
 MASK = "action_mask"
@@ -387,23 +387,22 @@ class TeamEnv(gymnasium.Env):
             ) from None
 
     def _number(self, agent: Any, reward: Any) -> float:
-        if isinstance(reward, (int, float)) or getattr(reward, "shape", None) == ():
-            with suppress(TypeError, ValueError, OverflowError):
-                return float(reward)
-        raise ValueError(
-            f"{self.parallel_env} returned a reward of {shown(reward)} for agent {agent!r} {self._when}: a reward must "
-            "be a number."
-        )
+        try:
+            return as_number(reward)
+        except ValueError:
+            raise ValueError(
+                f"{self.parallel_env} returned a reward of {shown(reward)} for agent {agent!r} {self._when}: a reward "
+                "must be a number."
+            ) from None
 
     def _flag(self, agent: Any, name: str, value: Any) -> bool:
-        if isinstance(value, (bool, np.bool_, int, np.integer)) or getattr(value, "shape", None) == ():
-            return bool(value)
-        if isinstance(value, float) and value in (0.0, 1.0):
-            return bool(value)
-        raise ValueError(
-            f"{self.parallel_env} returned {shown(value)} as {name} of agent {agent!r} {self._when}: it must be True "
-            "or False."
-        )
+        try:
+            return as_flag(value)
+        except ValueError:
+            raise ValueError(
+                f"{self.parallel_env} returned {shown(value)} as {name} of agent {agent!r} {self._when}: it must be "
+                "True or False."
+            ) from None
 
     def _decode(self, action: Any) -> dict[Any, Any]:
         """:return: the actions of the live agents, each in its own space"""
@@ -774,7 +773,7 @@ def _flat(space: spaces.Space, value: Any) -> np.ndarray:
     :raises ValueError: if the value does not hold real numbers
     """
     if isinstance(space, spaces.Box):
-        real = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+        real = type(value) is np.ndarray and value.dtype.kind in "biuf"
         return np.ravel(value if real else as_numbers(value))
     if isinstance(space, spaces.Dict):
         return np.concatenate([_flat(part, value[name]) for name, part in space.items()])

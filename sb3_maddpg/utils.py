@@ -324,14 +324,44 @@ def as_numbers(values: Any) -> np.ndarray:
     :return: the numbers in single precision
     :raises ValueError: if they are not real numbers
     """
-    array = np.asarray(values)
-    if array.dtype.kind not in "biufO" or (array.dtype.kind == "O" and any(one is None for one in array.flat)):
-        raise ValueError("no real numbers")
     try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "biufO" or (array.dtype.kind == "O" and any(one is None for one in array.flat)):
+            raise ValueError
+        if np.ma.is_masked(values):  # NumPy would read what lies below the mask
+            raise ValueError
         with np.errstate(over="ignore"):
             return array.astype(np.float32)
-    except (TypeError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last from tensors with a gradient
         raise ValueError("no real numbers") from None
+
+
+def as_number(value: Any) -> float:
+    """
+    Convert a number to Python's.
+
+    :param value: a real number of any type, also an array without axes
+    :return: the number
+    :raises ValueError: if it is not a real number
+    """
+    if isinstance(value, (int, float)) or as_numbers(value).ndim == 0:
+        with suppress(TypeError, ValueError, OverflowError):
+            return float(value)
+    raise ValueError("no real number")
+
+
+def as_flag(value: Any) -> bool:
+    """
+    Convert a flag to Python's.
+
+    :param value: True or False, or 1 or 0 of any type
+    :return: the flag
+    :raises ValueError: if it is something else
+    """
+    number = as_number(value)
+    if number not in (0.0, 1.0):
+        raise ValueError("neither True nor False")
+    return number == 1.0
 
 
 def as_seed(seed: Any) -> int | None:

@@ -16,8 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_maddpg.parallel import TeamEnv, TurnBased, explained_reset, layers_of
-from sb3_maddpg.team import CategoricalActions, InfoKey, MixedActions, TeamObservation
-from sb3_maddpg.utils import as_seed, integers_problem, not_finite_at, shown
+from sb3_maddpg.team import CategoricalActions, InfoKey, MixedActions, TeamInfo, TeamObservation
+from sb3_maddpg.utils import as_flag, as_number, as_numbers, as_seed, integers_problem, not_finite_at, shown
 
 _REWARD_WRAPPERS = (RewardWrapper, NormalizeReward)
 _SAME_ENDS = 3  # episodes, after which it is no coincidence that one ends where the next begins
@@ -142,7 +142,7 @@ def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
     last_mask: Any = None
     everywhere = True
     for name, value in infos.items():
-        if name.startswith("_"):
+        if str(name).startswith("_"):
             continue
         parts: Any
         if isinstance(value, dict):
@@ -205,11 +205,15 @@ class WatchedEnv(Transparent):
 
     def step(self, action: Any) -> Any:
         returned = self.env.step(action)
-        try:
-            observation, reward, terminated, truncated, info = returned
-            info = {**info, "inner_reward": reward}
-        except (TypeError, ValueError):  # for others to complain about
-            return returned
+        if not isinstance(returned, (tuple, list)) or len(returned) != 5 or not isinstance(returned[4], dict):
+            raise ValueError(
+                f"step() of {self.env} returned {shown(returned)}: it must return five values, observation, reward, "
+                "terminated, truncated, and a dict of infos."
+            )
+        observation, reward, terminated, truncated, info = returned
+        # Monitor and other wrappers would fail at other types, or take them for something else
+        reward, terminated, truncated = _plain(self.env, reward, terminated, truncated)
+        info = {**info, "inner_reward": reward}
         self._step += 1
         self._given_entries |= _OF_AGENTS & info.keys()
         self._counts_steps |= bool(self._given_entries)
@@ -224,6 +228,28 @@ class WatchedEnv(Transparent):
         """
         given, self._given_entries = self._given_entries, frozenset()
         _check_entries(given, info, str(self.env))
+
+
+def _plain(env: Env, reward: Any, terminated: Any, truncated: Any) -> tuple[float, bool, bool]:
+    """
+    :param env: the environment that returned them
+    :return: reward and ends as Python's numbers and flags
+    :raises ValueError: if they are something else
+    """
+    if type(reward) is not float:
+        try:
+            reward = as_number(reward)
+        except ValueError:
+            raise ValueError(f"step() of {env} returned the reward {shown(reward)}: it must be a number.") from None
+    if type(terminated) is not bool or type(truncated) is not bool:
+        try:
+            return reward, as_flag(terminated), as_flag(truncated)
+        except ValueError:
+            raise ValueError(
+                f"step() of {env} returned terminated={shown(terminated)} and truncated={shown(truncated)}: they must "
+                "be True or False."
+            ) from None
+    return reward, terminated, truncated
 
 
 _OF_AGENTS = frozenset(InfoKey.__args__)  # type: ignore[attr-defined]
@@ -269,11 +295,11 @@ def at_border(env: Env) -> Env:
 class BorderEnv(Transparent):
     """
     Outermost wrapper of an environment that SB3's vectorised environments step. It hands on what they would spoil:
-    observations of integers are checked before they are cast, and what came with the end of an episode is copied before
-    the environment is reset, which may write into the same arrays.
+    observations are checked before they are cast and broadcast, ends before they become booleans, and what is returned
+    is copied before the environment, or another one with the same arrays, writes into it again.
 
     :param env: a team environment
-    :raises ValueError: in ``reset`` and ``step``, if an observation does not fit an observation space of integers, or
+    :raises ValueError: in ``reset`` and ``step``, if an observation does not fit its space, reward or ends are none, or
         wrappers drop what the environment says about agents
     """
 
@@ -284,26 +310,49 @@ class BorderEnv(Transparent):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         with explained_reset(self.env):  # not every environment has options
             observation, info = self.env.reset(seed=seed, **({} if options is None else {"options": options}))
-        self._check(observation, "after reset()")
-        return observation, info
+        return self._checked(observation, "after reset()"), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._check(observation, "after step()")
+        reward, terminated, truncated = _plain(self.env, reward, terminated, truncated)
+        observation = self._checked(observation, "after step()")
         if self._watcher is not None:
             self._watcher.check_entries(info)
         if terminated or truncated:
-            observation, info = np.array(observation), deepcopy(info)
-        else:  # environments that are stepped one after the other may share arrays, too
-            info = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in info.items()}
+            info = deepcopy(info)
+        else:
+            info = {name: _copied(name, value) for name, value in info.items()}
         return observation, reward, terminated, truncated, info
 
-    def _check(self, observation: Any, when: str) -> None:
+    def _checked(self, observation: Any, when: str) -> np.ndarray:
+        """:return: a copy of the observation"""
         space = self.env.observation_space
-        if space.dtype is not None and space.dtype.kind in "iu":
-            problem = integers_problem(np.asarray(observation), space.dtype)
-            if problem is not None:
-                raise ValueError(f"The observation of agent {problem} {when} of {self.env}, whose space is {space}.")
+        assert space.dtype is not None
+        array = observation
+        if type(array) is not np.ndarray or array.dtype.kind not in "biuf":
+            try:
+                array = as_numbers(array)
+                integers = np.asarray(observation) if space.dtype.kind in "iu" else array
+                array = integers if integers.dtype.kind in "iu" else array
+            except ValueError:
+                raise ValueError(
+                    f"The observation {when} of {self.env} is {shown(observation)}: it must hold real numbers."
+                ) from None
+        if array.shape != space.shape:
+            raise ValueError(f"The observation {when} of {self.env} has shape {array.shape}, but its space is {space}.")
+        if space.dtype.kind in "iu" and (problem := integers_problem(array, space.dtype)) is not None:
+            raise ValueError(f"The observation of agent {problem} {when} of {self.env}, whose space is {space}.")
+        return np.array(array)
+
+
+_TOLD = frozenset(TeamInfo.__annotations__)
+
+
+def _copied(name: str, value: Any) -> Any:
+    """:return: a copy of an entry of an info that the environment may write into again"""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    return deepcopy(value) if name in _TOLD else value
 
 
 def check_vec_env(vec_env: VecEnv) -> None:
@@ -488,6 +537,77 @@ def check_outside(normalizer: VecNormalize, obs: Any, rewards: np.ndarray) -> No
         )
 
 
+def _number_in(info: Mapping[str, Any], name: str, default: Any) -> Any:
+    """
+    :return: a number in an info
+    :raises ValueError: if it is not finite, or no number
+    """
+    if name not in info:
+        return default
+    number = math.nan
+    with suppress(ValueError):
+        number = as_number(info[name])
+    if not math.isfinite(number):
+        raise ValueError(f"info[{name!r}] is {shown(info[name])}: it must be a finite number.")
+    return number
+
+
+def check_returned(n_envs: int, infos: Any, **arrays: Any) -> None:
+    """
+    Check the form of what ``step`` of a vectorised environment, or of a wrapper of it, returned.
+
+    :param n_envs: number of environments
+    :param infos: an info for each environment
+    :param arrays: observations, (n_envs, ...), rewards, (n_envs,), and dones, (n_envs,), by these names
+    :raises ValueError: if something has another form
+    """
+    for name, values in arrays.items():
+        is_array = type(values) is np.ndarray and values.dtype.kind in "biuf"
+        if not is_array or (values.shape[:1] if name == "observations" else values.shape) != (n_envs,):
+            raise ValueError(
+                f"step() of the vectorised environment returned the {name} {shown(values)}: they must be an array of "
+                f"real numbers for {n_envs} environment(s)."
+            )
+        if name == "dones" and values.dtype != bool and not np.isin(values, (0, 1)).all():
+            raise ValueError(
+                f"step() of the vectorised environment returned the dones {shown(values)}: they must be True or False."
+            )
+    if not isinstance(infos, (list, tuple)) or len(infos) != n_envs:
+        raise ValueError(
+            f"step() of the vectorised environment returned the infos {shown(infos)}: they must be a list of "
+            f"{n_envs} dict(s), one for each environment."
+        )
+
+
+def last_observation(env: int, info: Mapping[str, Any], next_obs: np.ndarray) -> Any:
+    """
+    :param env: index of an environment whose episode ended
+    :param info: its info
+    :param next_obs: the first observation of the next episode
+    :return: the last observation of the episode, not normalised
+    :raises ValueError: if there is none although it was truncated, or it does not fit
+    """
+    # VecNormalize keeps the original besides the normalised one, which may have been clipped
+    last = info.get("original_terminal_observation", info.get("terminal_observation"))
+    if last is None:
+        if info.get("TimeLimit.truncated"):
+            raise ValueError(
+                f"The episode of environment {env} was truncated without info['terminal_observation'], the last "
+                "observation, from which the values of agents go on: return it, as Stable-Baselines3's vectorised "
+                "environments do, and keep it in wrappers."
+            )
+        return next_obs
+    array = np.asarray(last)
+    problem = None
+    if array.shape != next_obs.shape or array.dtype.kind not in "biuf":
+        problem = f"has shape {array.shape} and type {array.dtype}, but observations have shape {next_obs.shape}"
+    elif next_obs.dtype.kind in "iu" and (found := integers_problem(array, next_obs.dtype)) is not None:
+        problem = f"of agent {found.rstrip(',')}"
+    if problem is not None:
+        raise ValueError(f"info['terminal_observation'] of environment {env} {problem}.")
+    return array
+
+
 class ArrivalCheck:
     """
     Compares the transitions that arrive at the algorithm with what the environments say they gave. Wrappers in any
@@ -532,10 +652,10 @@ class ArrivalCheck:
                 _check_entries(self._entries, info, f"TeamEnv in environment {k}")
             if reads_parts or "agent_rewards" in info:
                 self._check_reward(k, float(rewards[k]), info)
-            step = info.get("inner_step", info.get("episode_step", 0))
+            step = info["inner_step"] if "inner_step" in info else _number_in(info, "episode_step", 0)
             if step and self._steps[k] and step != self._steps[k] + 1:
                 raise ValueError(
-                    f"Environment {k} went from step {self._steps[k]} to step {step} of its episode, so that what "
+                    f"Environment {k} went from step {self._steps[k]:g} to step {step:g} of its episode, so that what "
                     "happened to its agents in between is lost: a wrapper or a callback skips steps or resets the "
                     f"environment itself. {_REMEDY}"
                 )
@@ -580,19 +700,18 @@ class ArrivalCheck:
 
     @staticmethod
     def _check_cut(env: int, info: Mapping[str, Any]) -> None:
-        cut = np.asarray(info.get("agent_truncated", False), bool) & ~np.asarray(
-            info.get("agent_terminated", False), bool
-        )
-        if ("TimeLimit.truncated" not in info and cut.any()) or (
-            info.get("TimeLimit.truncated") and "terminal_observation" not in info
-        ):
-            lost = "TimeLimit.truncated" if "TimeLimit.truncated" not in info else "terminal_observation"
+        try:
+            ended = as_numbers(info.get("agent_terminated", False)).astype(bool)
+            cut = as_numbers(info.get("agent_truncated", False)).astype(bool) & ~ended
+        except ValueError:  # the replay buffer says what is wrong
+            return
+        if "TimeLimit.truncated" not in info and cut.any():
             raise ValueError(
-                f"The episode of environment {env} was truncated, but its `info` has no {lost!r}, without which the "
-                "value of the last observation is unknown: let wrappers keep what vectorised environments of "
+                f"The episode of environment {env} was truncated, but its `info` has no 'TimeLimit.truncated', without "
+                "which the value of the last observation is unknown: let wrappers keep what vectorised environments of "
                 "Stable-Baselines3 add to `info`."
             )
-        if info.get("TimeLimit.truncated") and np.all(info.get("agent_terminated", False)):
+        if info.get("TimeLimit.truncated") and ended.all():
             raise ValueError(
                 f"The episode of environment {env} was truncated, but all agents terminated in its last step: a "
                 "wrapper changes only the team's end, while the algorithm learns from the agents' ends in `info`. "
@@ -602,13 +721,12 @@ class ArrivalCheck:
     @staticmethod
     def _check_reward(env: int, arrived: float, info: Mapping[str, Any]) -> None:
         # Rewards arrive in single precision
-        own: Any = info.get("inner_reward", info.get("team_reward"))
+        own = info["inner_reward"] if "inner_reward" in info else _number_in(info, "team_reward", None)
+        if own is not None and abs(arrived - own) <= 1e-5 * max(abs(own), 1e-3):
+            return
         try:
-            own = None if own is None else float(own)
-            if own is not None and abs(arrived - own) <= 1e-5 * max(abs(own), 1e-3):
-                return
-            agents = np.asarray(info.get("agent_rewards", ()), float)
-        except (TypeError, ValueError):  # the replay buffer says what is wrong
+            agents = as_numbers(info.get("agent_rewards", ())).astype(float)
+        except ValueError:  # the replay buffer says what is wrong
             return
         if not math.isfinite(arrived):
             return

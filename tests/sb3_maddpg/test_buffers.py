@@ -373,6 +373,17 @@ def test_missing_keys_are_filled_in_environment_by_environment():
         ({}, {"agent_rewards": {"agent_0": 1.0}}, r"has shape \(\), but there are 3 agents"),
         ({}, {"agent_rewards": [0.0, np.nan, 0.0]}, r"'agent_rewards'\] of agent 1 \(agent_1\) is nan.*clip the value"),
         ({}, {"reward": np.inf}, "The team's reward is inf"),
+        ({}, {"agent_terminated": [0, 0.5, 0]}, r"agent_terminated'\] of agent 1 \(agent_1\) is 0.5 .*True or False"),
+        ({}, {"agent_active": np.array([2, 0, 1])}, r"agent_active'\] of agent 0 .* is 2.0"),
+        ({}, {"agent_truncated": [True, None, False]}, "agent_truncated'] of .*None.* does not hold numbers"),
+        ({}, {"agent_truncated": [0, np.nan, 0]}, r"agent_truncated'\] of agent 1 .* is nan"),
+        ({}, {"TimeLimit.truncated": 0.5}, r"TimeLimit.truncated'\] is 0.5"),
+        ({}, {"done": 0.5}, r"The end of the episode is 0.5"),
+        ({}, {"agent_rewards": np.ma.array([1.0, 2, 3], mask=[0, 1, 0])}, "does not hold numbers"),
+        ({}, {"agent_rewards": np.array([1j, 0, 0])}, "does not hold numbers"),
+        ({}, {"agent_rewards": th.ones(3, requires_grad=True)}, "does not hold numbers"),
+        ({}, {"agent_rewards": np.arange(3).astype("datetime64[s]")}, "does not hold numbers"),
+        ({}, {"agent_active": [[1], [1, 0], 1]}, "does not hold numbers"),
         ({"n_pairs": 2}, {}, r"'pair_rewards'\] is missing.*\(3, 2\).*leave n_pairs"),
         ({"n_pairs": 2}, {"pair_rewards": np.zeros((3, 3))}, r"shape \(3, 3\).*n_pairs=2.*\(3, 2\)"),
         ({"n_pairs": 1}, {"pair_rewards": [[0], [0], [-np.inf]]}, r"of agent 2 .* is -inf"),
@@ -386,6 +397,14 @@ def test_missing_keys_are_filled_in_environment_by_environment():
 def test_what_cannot_be_used_is_refused(kwargs, info, message):
     with pytest.raises(ValueError, match=message):
         add(buffer(**kwargs), 0, **info)
+
+
+@pytest.mark.parametrize("values", [np.full((1, N, D), 1j), np.full((1, N, D), None), np.full((1, N, D), "x")])
+def test_observations_that_are_no_real_numbers_are_refused(values):
+    memory = buffer()
+    with pytest.raises(ValueError, match=r"The next observation is an array of .*: it must hold real numbers"):
+        memory.add(np.zeros((1, N, D)), values, np.zeros((1, N * K)), np.zeros(1), np.zeros(1), [{}])
+    assert memory.size() == 0
 
 
 def prioritized(size: int = 8, n_envs: int = 1, **kwargs) -> PrioritizedTeamReplayBuffer:

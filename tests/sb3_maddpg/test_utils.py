@@ -7,11 +7,24 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
+import torch as th
 
-from sb3_maddpg.utils import all_finite, as_numbers, as_seed, atomic_write, not_finite_at, shown, suggest
+from sb3_maddpg.utils import (
+    all_finite,
+    as_flag,
+    as_number,
+    as_numbers,
+    as_seed,
+    atomic_write,
+    not_finite_at,
+    shown,
+    suggest,
+)
 
 
 def test_a_file_is_replaced_whole_and_its_folder_synced(tmp_path, monkeypatch):
@@ -176,3 +189,34 @@ def test_long_names_are_written_too(tmp_path):
     with atomic_write(target, suffix="zip") as file:
         file.write(b"x")
     assert target.read_bytes() == b"x"
+
+
+@pytest.mark.parametrize(
+    "value", [2, 2.0, True, np.float16(2), np.longdouble(2), np.array(2), th.tensor(2.0), Fraction(2), Decimal(2)]
+)
+def test_numbers_of_every_type_become_pythons(value):
+    assert as_number(value) == (1.0 if value is True else 2.0)
+    assert type(as_number(value)) is float
+
+
+@pytest.mark.parametrize(
+    "value", [None, "2", 2j, np.array([2.0]), [2], 10**400, np.ma.masked, th.tensor(2.0, requires_grad=True), object()]
+)
+def test_what_is_no_single_number_is_refused(value):
+    with pytest.raises(ValueError, match="no real number"):
+        as_number(value)
+
+
+def test_flags_are_one_or_zero():
+    assert [as_flag(value) for value in (True, 1, 0.0, np.bool_(False), np.array(1), th.tensor(True))] == [
+        True, True, False, False, True, True,
+    ]  # fmt: skip
+    for value in (2, 0.5, np.nan, None, "False", np.array([True])):
+        with pytest.raises(ValueError, match=r"neither True nor False|no real number"):
+            as_flag(value)
+
+
+def test_what_is_masked_is_no_number():
+    assert as_numbers(np.ma.array([1.0, 2.0])).tolist() == [1.0, 2.0]
+    with pytest.raises(ValueError, match="no real numbers"):
+        as_numbers(np.ma.array([1.0, 2.0], mask=[False, True]))

@@ -6,6 +6,7 @@ from copy import deepcopy
 import gymnasium
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -19,6 +20,7 @@ from gymnasium.wrappers import (
     TimeLimit,
     TransformReward,
 )
+from known import OTHERS, Giver, Known, check_stored, train
 from pettingzoo.classic import tictactoe_v3
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -36,7 +38,7 @@ import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from sb3_maddpg import MADDPG, check_team_env
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.team_tasks import OwnBit
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env import GymnasiumVecEnv, unbatch
 from toys import Toy
 
 SAME_STEP = {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -435,8 +437,11 @@ def test_infos_of_a_team_arrive_from_other_processes_or_are_refused(of):
     try:
         with pytest.raises(ValueError, match="gave agent_rewards in `info`, which did not arrive"):
             MADDPG("MlpPolicy", OtherInfoVec(envs, "agent_rewards"), **SMALL).learn(40)
-        for lost in ("TimeLimit.truncated", "terminal_observation"):
-            with pytest.raises(ValueError, match=f"was truncated, but its `info` has no '{lost}'"):
+        for lost, problem in (
+            ("TimeLimit.truncated", "was truncated, but its `info` has no 'TimeLimit.truncated'"),
+            ("terminal_observation", r"was truncated without info\['terminal_observation'\]"),
+        ):
+            with pytest.raises(ValueError, match=problem):
                 MADDPG("MlpPolicy", OtherInfoVec(envs, lost), **SMALL).learn(40)
     finally:
         envs.close()
@@ -831,3 +836,111 @@ def test_episodes_may_begin_where_the_last_one_ended():
     buffer = MADDPG("MlpPolicy", GoesOn(), **SMALL).learn(60).replay_buffer
     assert buffer.observations[:60, 0, 0, 0].tolist() == list(range(60))
     assert buffer.next_observations[:60, 0, 0, 0].tolist() == list(range(1, 61))
+
+
+def changed(slot, change) -> Known:
+    """The known team, one part of whose returned values is something else."""
+    return Known(Giver(slot, change))
+
+
+@pytest.mark.parametrize(
+    ("slot", "change", "message"),
+    [
+        ("obs", lambda obs: obs[0], r"has shape \(3,\), but its space is Box"),
+        ("obs", lambda obs: np.ma.array(obs, mask=obs == 2), "must hold real numbers"),
+        ("obs", lambda obs: obs.astype("datetime64[s]"), "must hold real numbers"),
+        ("obs", lambda obs: obs * 1j, "must hold real numbers"),
+        ("obs", lambda obs: None, "is None: it must hold real numbers"),
+        ("reward", lambda reward: np.array([[reward]]), r"returned the reward array\(.*it must be a number"),
+        ("reward", lambda reward: reward + 1j, "returned the reward .*it must be a number"),
+        ("reward", lambda reward: 10**400, "returned the reward 1000.*it must be a number"),
+        ("terminated", str, "terminated='False'.*must be True or False"),
+        ("terminated", lambda ends: np.nan, "terminated=nan.*must be True or False"),
+        ("truncated", lambda ends: np.array([ends, ends]), "truncated=array.*must be True or False"),
+        ("truncated", lambda ends: None, "truncated=None.*must be True or False"),
+        ("info", list, "must return five values, observation, reward, terminated, truncated, and a dict of infos"),
+    ],
+)
+def test_what_environments_must_not_return_is_refused(slot, change, message):
+    for env in (changed(slot, change), DummyVecEnv([lambda: Monitor(changed(slot, change))])):
+        with pytest.raises(ValueError, match=message):
+            train(env)
+
+
+@pytest.mark.parametrize("slot", ["obs", "reward", "truncated", "agent_rewards", "agent_truncated", "metrics"])
+@pytest.mark.parametrize("change", [np.array, lambda value: np.asarray(value).tolist(), th.as_tensor])
+@pytest.mark.parametrize("together", [DummyVecEnv, SyncVectorEnv])
+def test_environments_may_write_into_the_same_arrays_lists_and_tensors(slot, change, together):
+    kept, change = {}, dict if slot == "metrics" else change
+    makers = [lambda k=k: Known(Giver(slot, change, "shared", kept), first=OTHERS * k) for k in range(2)]
+    env = DummyVecEnv(makers) if together is DummyVecEnv else GymnasiumVecEnv(SyncVectorEnv(makers, **SAME_STEP))
+    check_stored(train(env), firsts=(0, OTHERS))
+
+
+class Rewritten(VecEnvWrapper):
+    """A wrapper that changes what ``step`` returned: observations, rewards, dones and infos, in a list."""
+
+    def __init__(self, venv, change):
+        super().__init__(venv)
+        self.change = change
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        returned = list(self.venv.step_wait())
+        self.change(returned)
+        return tuple(returned)
+
+
+def put(index, change):
+    def put_into(returned):
+        returned[index] = change(returned[index])
+
+    return put_into
+
+
+def lose_terminal_observations(returned):
+    for info in returned[3]:
+        info.pop("terminal_observation", None)
+
+
+def turn_terminal_observations(returned):
+    for info in returned[3]:
+        if "terminal_observation" in info:
+            info["terminal_observation"] = info["terminal_observation"].T
+
+
+@pytest.mark.parametrize("normalizes", [False, True])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (put(0, lambda obs: obs.tolist()), r"returned the observations \[\["),
+        (put(1, lambda rewards: rewards[:, None]), "returned the rewards array"),
+        (put(2, lambda dones: dones * 0.5), "returned the dones array.*must be True or False"),
+        (put(2, lambda dones: dones.tolist()), "returned the dones "),
+        (put(3, lambda infos: infos[1:]), r"returned the infos \[\]: they must be a list of 1 dict"),
+        (put(3, lambda infos: None), "returned the infos None"),
+        (lose_terminal_observations, r"was truncated without info\['terminal_observation'\]"),
+    ],
+)
+def test_what_vectorised_environments_must_not_return_is_refused(change, message, normalizes):
+    env = Rewritten(DummyVecEnv([lambda: changed("", None)]), change)
+    with pytest.raises(ValueError, match=message):
+        train(VecNormalize(env, norm_obs=False) if normalizes else env)
+
+
+def test_a_last_observation_of_another_shape_is_refused():
+    env = Rewritten(DummyVecEnv([lambda: changed("", None)]), turn_terminal_observations)
+    with pytest.raises(ValueError, match=r"'terminal_observation'\] of environment 0 has shape \(3, 2\)"):
+        train(env)
+
+
+@pytest.mark.parametrize("normalizes", [False, True])
+def test_dones_may_be_integers(normalizes):
+    env = Rewritten(DummyVecEnv([lambda: changed("", None)]), put(2, lambda dones: dones.astype(int)))
+    check_stored(train(VecNormalize(env) if normalizes else env))
+
+
+def test_names_of_infos_need_not_be_text():
+    assert unbatch({1: np.array([2.0, 3.0]), "_1": np.array([True, False])}, 2) == [{1: 2.0}, {}]
