@@ -32,16 +32,22 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path[:0] = [str(Path(__file__).parents[1] / "helpers")]  # where this is run as a script
 
 import gymnasium
+import known
+import known_wrapped
 import numpy as np
+import odd_worlds
 import pytest
 import torch as th
 import yaml
+from cases import Case, Silent, Theirs
+from foreign import Stay
 from gymnasium import spaces
 
 import quad_swarm
 import sb3_maddpg
 import sb3_maddpg.team_tasks  # registers the tasks
 from faulty import Faulty, trained
+from quad_swarm.planner import SOLVERS
 from sb3_maddpg import MADDPG, MATD3, pretrained
 from sb3_maddpg.cli.commands import main as command_line
 from sb3_maddpg.utils import shown
@@ -65,18 +71,6 @@ NONSENSE: tuple[Any, ...] = (
 )  # fmt: skip
 
 
-class Silent(Exception):
-    """Malformed input was accepted, and what came of it is wrong."""
-
-
-class Case(NamedTuple):
-    """Something that a user could do."""
-
-    name: str
-    run: Callable[[], Any]
-    """Returns where it works, and raises what the user sees."""
-
-
 class Verdict(NamedTuple):
     """What became of a case: one of ``VERDICTS``, and the message. Foreign is what Gymnasium raises before our code."""
 
@@ -94,6 +88,8 @@ def judge(case: Case) -> Verdict:
         return Verdict("clear", str(error))
     except Silent as error:
         return Verdict("silent", str(error))
+    except Theirs as error:
+        return Verdict("foreign", str(error))
     except BaseException as error:
         frames = traceback.extract_tb(error.__traceback__)
         where, told = frames[-1], f"{type(error).__name__}: {error}"
@@ -826,7 +822,11 @@ AREAS: dict[str, Callable[[Files, random.Random], Iterator[Case]]] = {
     "misbehaving environments": faulty_environments,
     "actions, resets, models": interfaces,
     "algorithms' arguments, buffers": algorithms,
+    "what environments return": lambda files, rng: known.returns(rng),
+    "wrappers": lambda files, rng: known_wrapped.wrapped(rng),
+    "worlds that do not fit": lambda files, rng: odd_worlds.worlds(rng, _call),
 }
+LETTERS = "abcdefghij"[: len(AREAS)]
 SAMPLE = 12  # of each area, in the tests
 
 
@@ -840,6 +840,7 @@ def prepare(folder: Path) -> Files:
         env = make()
         env.reset(seed=0)
         env.step(_zeros(env))
+    SOLVERS["stay"] = Stay
     os.environ["CXX"] = "no-such-compiler"  # only kernels that are there already: compiling takes too long
     return Files(folder)
 
@@ -873,12 +874,12 @@ def main() -> int:
     """Run all cases and print a table."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--all", action="store_true", help="every area (the default)")
-    parser.add_argument("--area", nargs="+", choices=[*AREAS, *"abcdef"], default=[], help="some areas, also by letter")
+    parser.add_argument("--area", nargs="+", choices=[*AREAS, *LETTERS], default=[], help="some areas, also by letter")
     parser.add_argument("--match", default="", help="only cases whose names hold this")
     parser.add_argument("--most", type=int, help="so many cases of each area at most, drawn")
     parser.add_argument("--log", type=Path, help="write what became of every case")
     args = parser.parse_args()
-    chosen = {"abcdef".index(name) if len(name) == 1 else list(AREAS).index(name) for name in args.area}
+    chosen = {LETTERS.index(name) if len(name) == 1 else list(AREAS).index(name) for name in args.area}
     log = args.log.open("w", buffering=1) if args.log else None
     with tempfile.TemporaryDirectory() as folder:
         files = prepare(Path(folder))
