@@ -86,6 +86,19 @@ def ones(pair):
     return np.ones((*pair.view.pos.shape[:3], 1))
 
 
+class Scribbling(Stay):
+    """Writes into its problems: robots and goals must not move."""
+
+    def solve(self, problems, x_guess, u_guess):
+        for array in (problems.x, problems.goal):
+            try:
+                array[...] = 3.0
+            except ValueError:
+                continue
+            raise AssertionError
+        return super().solve(problems, x_guess, u_guess)
+
+
 class Drifting:
     """A plant whose robots drift along +x at 1 m/s, whatever they are told."""
 
@@ -132,6 +145,11 @@ class Lost(Drifting):
 class Truncated(Drifting):
     def step(self, state, u, air, factors):
         return state[..., :6]
+
+
+class Imaginary(Drifting):
+    def step(self, state, u, air, factors):
+        return state + 1j
 
 
 class NoPlant:

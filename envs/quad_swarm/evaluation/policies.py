@@ -23,7 +23,7 @@ from gymnasium import spaces
 from quad_swarm.errors import shown
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.task.request_task import RequestTask
-from quad_swarm.task.rules import parse_rule
+from quad_swarm.task.rules import as_bits, parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import SwarmConfig
 
@@ -189,18 +189,19 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
         observed = task.observe()
         try:
             answer = predictor.predict(observed, **options)
-            bits = np.asarray(answer[0] if isinstance(answer, tuple) else answer, dtype=float)
+            bits = as_bits(answer[0] if isinstance(answer, tuple) else answer)
         except Exception as error:  # whatever a foreign object raises
             raise ValueError(
                 f"{name}: predict failed on the observations of {len(observed)} swarms, shape {observed.shape} "
                 f"({type(error).__name__}: {error})."
             ) from error
-        if bits.size != len(observed) * n * m * n_bits or not np.isfinite(bits).all():
+        if bits is None or bits.size != len(observed) * n * m * n_bits:
+            found = "no bits" if bits is None else f"shape {bits.shape}"
             raise ValueError(
                 f"{name}: predict answered the observations of {len(observed)} swarms, shape {observed.shape}, with "
-                f"shape {bits.shape}; it must answer with {n * m * n_bits} finite bits for each swarm."
+                f"{found}; it must answer with {n * m * n_bits} bits, 0 or 1, for each swarm."
             )
-        return bits.reshape(-1, n, m, n_bits) > 0.5
+        return bits.reshape(-1, n, m, n_bits)
 
     return request, observation
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import warnings
 from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
@@ -60,6 +59,7 @@ class PlanStatus(IntEnum):
 
 
 _TYPES = (np.dtype(float), np.dtype(float), np.dtype(bool), np.dtype(np.int64))  # of a solution's arrays
+_LARGEST = 1e9  # state or input, beyond which a solver has diverged
 _SOLVED, _BRAKING = int(PlanStatus.SOLVED), int(PlanStatus.BRAKING)  # NumPy is slow with enumerations
 
 
@@ -211,7 +211,8 @@ class Planner:
         return states
 
     def _solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
-        """Call the solver. Plans that are not finite count as failed, as do all plans if the solver raises."""
+        """Call the solver. Plans that are not finite, or absurdly large, count as failed, as do all plans if the solver
+        raises."""
         try:
             solution = _checked(self.solver.solve(problems, x_guess, u_guess), x_guess, u_guess)
         except Exception as error:
@@ -219,11 +220,11 @@ class Planner:
             warnings.warn(message, RuntimeWarning, stacklevel=3)
             hover, none = Plans.hover(problems.x, self.config.horizon), np.zeros(len(problems.x), dtype=np.int64)
             return Solution(hover.x, hover.u, none.astype(bool), none)
-        # Sums of squares are not finite if an entry is not, and cheaper than a test of each
-        if math.isfinite(np.vdot(solution.x, solution.x) + np.vdot(solution.u, solution.u)):
+        # A sum of squares is small only if all entries are, and cheaper than a test of each
+        if np.vdot(solution.x, solution.x) + np.vdot(solution.u, solution.u) < _LARGEST:
             return solution
-        finite = np.isfinite(solution.x).all(axis=(1, 2)) & np.isfinite(solution.u).all(axis=(1, 2))
-        return solution._replace(success=solution.success & finite)
+        possible = [(np.abs(array) < _LARGEST).all(axis=(1, 2)) for array in (solution.x, solution.u)]
+        return solution._replace(success=solution.success & possible[0] & possible[1])
 
     def _nearest_others(self, problems: Problems, x_guess: np.ndarray) -> Problems:
         """Reduce problems to the ``max_neighbours`` others that come closest over the horizon."""
@@ -260,7 +261,7 @@ class Planner:
 def _checked(solution: Solution, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
     """Check the form of a solution. Its arrays become those that the planner reads and writes.
 
-    :raises ValueError: if an array has another shape, or `success` is not boolean
+    :raises ValueError: if an array has another shape, `success` is not boolean, or numbers are masked or complex
     """
     count = len(x_guess)
     x, u, success, iterations = solution
@@ -272,7 +273,10 @@ def _checked(solution: Solution, x_guess: np.ndarray, u_guess: np.ndarray) -> So
         and u.flags.writeable
         and iterations.flags.writeable
     ):
-        return solution
+        return Solution(x, u, success, iterations)
+    for name, array in zip(Solution._fields, solution, strict=True):
+        if np.iscomplexobj(array) or np.ma.is_masked(array):
+            raise ValueError(f"{name} is masked or complex; a solution has real numbers")
     success = np.array(success)
     if success.dtype != bool:  # ~1 is not False
         raise ValueError(f"success has the type {success.dtype}; a solution has booleans")

@@ -59,6 +59,8 @@ def serve(connection: Connection) -> None:
                 del plants[number]
             else:
                 answer = getattr(plants[number], method)(*arguments)
+                if np.iscomplexobj(answer):
+                    raise TypeError("step() returned complex numbers")
                 answer = np.asarray(answer, dtype=float) if method == "step" else None
         except ImportError as error:
             answer = ImportError(str(error))

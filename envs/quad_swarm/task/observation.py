@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.geometry import length
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.view import View
@@ -274,6 +274,35 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
 }
 
 
+_OWN_GROUPS = frozenset(GROUPS.values())
+
+
+def _features(name: str, pair: PairView, columns: int | None = None) -> np.ndarray:
+    """Return the features of a group.
+
+    :param columns: number of columns that the group returned at first
+    :raises ValueError: if a registered group returns something else than finite numbers for every pair
+    """
+    group = GROUPS[name]
+    features = group(pair)
+    if group in _OWN_GROUPS:
+        return features
+    try:
+        array = np.asarray(features)
+    except (TypeError, ValueError):  # of lists that differ in length
+        array = np.array(None)
+    pairs = pair.view.pos.shape[:3]
+    right = array.ndim == 4 and array.shape[:3] == pairs and array.dtype.kind in "biuf"
+    with np.errstate(over="ignore"):
+        right = right and bool(np.isfinite(array.astype(np.float32)).all()) and not np.ma.is_masked(features)
+    if not right or (columns is not None and array.shape[3] != columns):
+        raise ValueError(
+            f"The observation {name!r} returned {shown(features)}: it must return finite numbers for every pair, shape "
+            f"({', '.join(map(str, pairs))}, {columns or 'any length'}), the same length each time."
+        )
+    return array
+
+
 class PairObservation:
     """Pair observation: six numbers about the robot itself, then groups of features about each of the others.
 
@@ -293,7 +322,8 @@ class PairObservation:
                 raise unknown_name("observation", name, ["paper", *GROUPS])
         self.config = config
         self.groups = [name for name in GROUPS if name in groups]
-        sizes = [GROUPS[name](self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
+        sizes = [_features(name, self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
+        self._sizes = dict(zip(self.groups, sizes, strict=True))
         self._seen = sum(sizes) - (sizes[-1] if self.groups[-1] == "critic" else 0)
         self._numbers = 6 + config.n_others * sum(sizes)  # first column of the others' numbers, if there are any
         self.size = self._numbers + (config.n_others if config.is_limited else 0)
@@ -321,7 +351,7 @@ class PairObservation:
         column = 0
         for name in self.groups:
             if name != "critic" or not self._blank:
-                features = GROUPS[name](pair)
+                features = _features(name, pair, self._sizes[name])
                 blocks[..., column : column + features.shape[-1]] = features
                 column += features.shape[-1]
         if pair.view.present is not None:

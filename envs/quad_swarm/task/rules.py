@@ -9,10 +9,11 @@ separation, within 1.5 seconds.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from quad_swarm.errors import unknown_name
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.geometry import length
 from quad_swarm.task.view import View
 
@@ -131,9 +132,45 @@ def _parse_one(text: str) -> Rule:
     if any(scaled and not length for scaled, length in zip(relative, lengths, strict=True)):
         raise ValueError(f"Rule {text!r}: only lengths ({', '.join(_LENGTHS)}) can be in separations, as in 1.2s.")
     if not any(relative):
-        return factory(*numbers)
+        return _checked(text, factory(*numbers))
 
     def rule(view: View) -> np.ndarray:
         return factory(*(n * view.separation if r else n for n, r in zip(numbers, relative, strict=True)))(view)
 
-    return rule
+    return _checked(text, rule)
+
+
+def _checked(text: str, rule: Rule) -> Rule:
+    """Return a rule that refuses what are no requests.
+
+    :raises ValueError: in the rule, if it returned something else than True or False for each of the others
+    """
+
+    def checked(view: View) -> np.ndarray:
+        answer: Any = rule(view)
+        shape, bits = view.pos.shape[:-1], answer
+        if type(answer) is not np.ndarray or answer.dtype != bool:
+            try:
+                bits = as_bits(answer)
+            except (TypeError, ValueError):
+                bits = None
+        if bits is None or bits.shape != shape:
+            raise ValueError(
+                f"Rule {text!r} returned {shown(answer)}: it must return True or False for each of the others of each "
+                f"robot, shape {shape}."
+            )
+        return bits
+
+    return checked
+
+
+def as_bits(answer: Any) -> np.ndarray | None:
+    """Return what a rule or policy answered as booleans, None if it holds anything but True and False, 1 and 0.
+
+    :raises ValueError, TypeError: if it is no array of numbers
+    """
+    array = np.asarray(answer)
+    if array.dtype.kind not in "biufO" or np.ma.is_masked(answer):
+        return None
+    bits = array.astype(float)
+    return bits == 1 if ((bits == 0) | (bits == 1)).all() else None

@@ -346,7 +346,12 @@ def points(name: str, values: Any, count: int) -> np.ndarray:
     """
     try:
         array = np.asarray(values, dtype=float)
-        valid = array.shape == (count, 3) and bool((np.abs(array) <= FARTHEST).all())
+        valid = (
+            not np.ma.is_masked(values)
+            and not np.iscomplexobj(values)
+            and array.shape == (count, 3)
+            and bool((np.abs(array) <= FARTHEST).all())
+        )
     except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:

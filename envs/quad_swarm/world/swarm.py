@@ -131,8 +131,9 @@ class Swarm:
         return self.state[..., VELOCITY]
 
     def estimate(self) -> np.ndarray:
-        """Return the robots' estimates of their own states, (E, n, 9)."""
-        return self.chance.estimate(self.state)
+        """Return the robots' estimates of their own states, (E, n, 9), which cannot be written: without errors, they
+        are the states."""
+        return _read_only(self.chance.estimate(self.state))
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (m) and velocities (m/s) of the others as each robot observes them, (E, n, n - 1, 3) each,
@@ -350,7 +351,8 @@ class Swarm:
         if self.config.planner.right_of_way:
             announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
         others = believed.reshape(-1, *believed.shape[2:])
-        return Problems(x.reshape(-1, 9), self.goal.reshape(-1, 3), others, announced=announced)
+        # A solver that writes into its problem must not move robots or goals
+        return Problems(_read_only(x.reshape(-1, 9)), _read_only(self.goal.reshape(-1, 3)), others, announced=announced)
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""
@@ -392,6 +394,12 @@ class Swarm:
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
         )
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

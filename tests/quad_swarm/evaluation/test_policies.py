@@ -188,10 +188,14 @@ def test_a_trained_model_flies_as_an_object_as_it_does_from_its_file(model):
     [
         (
             lambda o: np.ones(12),
-            r"2 swarms, shape \(2, 4, 24\), with shape \(12,\); it must answer with 12 finite bits",
+            r"2 swarms, shape \(2, 4, 24\), with shape \(12,\); it must answer with 12 bits",
         ),
-        (lambda o: np.full((2, 12), np.nan), "12 finite bits for each swarm"),
-        (lambda o: "bits", r"predict failed on the observations of 2 swarms, shape \(2, 4, 24\) \(ValueError"),
+        (lambda o: np.full((2, 12), np.nan), "with no bits; it must answer with 12 bits, 0 or 1, for each swarm"),
+        (lambda o: np.full((2, 12), 0.7), "with no bits"),
+        (lambda o: np.full((2, 12), -1), "with no bits"),
+        (lambda o: np.ma.array(np.ones((2, 12)), mask=np.eye(2, 12)), "with no bits"),
+        (lambda o: "bits", "with no bits"),
+        (lambda o: [[1], [1, 0]], r"predict failed on the observations of 2 swarms, shape \(2, 4, 24\) \(ValueError"),
         (lambda o: o.missing, r"predict failed .* \(AttributeError"),
     ],
 )

@@ -79,12 +79,22 @@ class Faulty:
             return Solution(x, u[..., :3], success, iterations)
         if self.fault == "numbers for success":
             return Solution(x, u, success.astype(int), iterations)
+        if self.fault == "complex":
+            return Solution(x, u + 1j, success, iterations)
+        if self.fault == "masked":
+            return Solution(np.ma.array(x, mask=x == 0), u, success, iterations)
+        if self.fault == "large":
+            x[0, 1] = 1e40
+            return Solution(x, u, success, iterations)
         (x if self.fault == "x" else u)[0, 1] = np.nan
         return Solution(x, u, success, iterations)
 
 
 @pytest.mark.filterwarnings("ignore:the solver 'faulty' raised")
-@pytest.mark.parametrize("fault", ["x", "u", "raises", "form", "shape of x", "shape of u", "numbers for success"])
+@pytest.mark.parametrize(
+    "fault",
+    ["x", "u", "large", "raises", "form", "shape of x", "shape of u", "numbers for success", "complex", "masked"],
+)
 def test_a_solver_that_breaks_its_contract_has_failed(fault):
     config = PlannerConfig()
     problems = crossing(3, config)
@@ -93,7 +103,7 @@ def test_a_solver_that_breaks_its_contract_has_failed(fault):
     assert np.isfinite(plans.x).all()
     assert np.isfinite(plans.u).all()
     failed = plans.status >= PlanStatus.SHIFTED
-    assert failed.tolist() == ([True, False, False] if fault in ("x", "u") else [True] * 3)
+    assert failed.tolist() == ([True, False, False] if fault in ("x", "u", "large") else [True] * 3)
 
 
 def test_a_solution_of_lists_or_of_arrays_that_cannot_be_written_is_as_good():
@@ -107,6 +117,10 @@ def test_a_solution_of_lists_or_of_arrays_that_cannot_be_written_is_as_good():
     class Lists(Plain):
         form = staticmethod(np.ndarray.tolist)
 
+    class Tuples(FatropSolver):
+        def solve(self, *arguments):
+            return tuple(super().solve(*arguments))
+
     class Frozen(Plain):
         @staticmethod
         def form(array):
@@ -117,7 +131,7 @@ def test_a_solution_of_lists_or_of_arrays_that_cannot_be_written_is_as_good():
     problems = crossing(3, config)
     problems.others[1] = np.nan  # one fails, and the planner writes into its place
     plans = []
-    for kind in (Plain, Lists, Frozen):
+    for kind in (Plain, Lists, Frozen, Tuples):
         problem = OptimalControlProblem(config, QUADROTOR, 2)
         planner = Planner(kind(problem), QuadrotorModel(QUADROTOR, config.dt), config)
         planner.checks = False
@@ -125,6 +139,7 @@ def test_a_solution_of_lists_or_of_arrays_that_cannot_be_written_is_as_good():
     assert plans[0].status.tolist() == [PlanStatus.SOLVED, PlanStatus.SHIFTED, PlanStatus.SOLVED]
     assert_same(plans[1], plans[0])
     assert_same(plans[2], plans[0])
+    assert_same(plans[3], plans[0])
 
 
 def test_a_solver_that_raises_is_told_of():

@@ -97,6 +97,7 @@ def test_an_own_plant_flies_in_every_interface(plant, speed, gazebo):
     [
         (foreign.Raising, "The simulator raised KeyError: 'battery'"),
         (foreign.Lost, r"plant='gazebo:iris' returned .*nan.*; a step returns the finite states"),
+        (foreign.Imaginary, "The simulator raised TypeError: .* returned complex numbers"),
         (foreign.Truncated, r"finite states of all robots, shape \(1, 2, 9\)"),
     ],
 )

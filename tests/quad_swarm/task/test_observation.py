@@ -124,3 +124,43 @@ def test_the_mask_names_those_who_come_near_the_own_plan_or_will_soon_be_near():
     assert np.array_equal(mask, near | ahead)
     assert 0 < near.mean() < (near | ahead).mean() < 1
     assert "action_mask" not in make_observation(CONFIG, EVERYTHING).layout
+
+
+def ones(pair, *columns):
+    return np.ones((*pair.view.pos.shape[:3], *columns))
+
+
+@pytest.mark.parametrize("form", [np.array, np.ndarray.tolist, lambda features: features.astype(int)])
+def test_a_group_of_ones_own_may_return_any_real_numbers(form, monkeypatch):
+    monkeypatch.setitem(GROUPS, "own", lambda pair: form(2 * ones(pair, 2)))
+    observation, swarm = make_observation(CONFIG, "state+own"), flown()
+    blocks = observation(swarm)[..., 6:].reshape(3, 4, 3, -1)
+    plain = make_observation(CONFIG, "state")(swarm)[..., 6:].reshape(3, 4, 3, -1)
+    assert np.array_equal(blocks[..., :-2], plain)
+    assert (blocks[..., -2:] == 2).all()
+
+
+@pytest.mark.parametrize(
+    "group",
+    [
+        lambda pair: None, lambda pair: 1.0, lambda pair: np.ones(2), ones,
+        lambda pair: ones(pair, 2) * np.nan,
+        lambda pair: ones(pair, 2) * 1e39, lambda pair: ones(pair, 2) * 1j, lambda pair: ones(pair, 2).astype(str),
+        lambda pair: ones(pair, 2)[:, :1], lambda pair: [[1.0], [1.0, 2.0]],
+        lambda pair: np.ma.array(ones(pair, 2), mask=True),
+    ],
+)  # fmt: skip
+def test_a_group_of_ones_own_that_returns_something_else_is_refused(group, monkeypatch):
+    monkeypatch.setitem(GROUPS, "own", group)
+    with pytest.raises(
+        ValueError, match=r"The observation 'own' returned .*finite numbers for every pair, shape \(1, 4, 3"
+    ):
+        make_observation(CONFIG, "state+own")
+
+
+def test_a_group_of_ones_own_has_the_same_length_each_time(monkeypatch):
+    lengths = iter((2, 3))
+    monkeypatch.setitem(GROUPS, "own", lambda pair: ones(pair, next(lengths)))
+    observation = make_observation(CONFIG, "state+own")
+    with pytest.raises(ValueError, match=r"shape \(3, 4, 3, 2\), the same length each time"):
+        observation(flown())

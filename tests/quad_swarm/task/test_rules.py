@@ -1,10 +1,12 @@
 """The hand-made rules."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.task.rules import parse_rule
+from quad_swarm.task.rules import RULES, parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.swarm import Swarm
@@ -136,3 +138,38 @@ def test_lengths_may_be_given_in_separations():
         assert parse_rule("distance:1.5s&cpa:9:2|distance:0.01")(View(swarm)).all() == asks
     with pytest.raises(ValueError, match="only lengths"):
         parse_rule("stale:3s")
+
+
+@pytest.mark.parametrize(
+    "form", [np.array, np.ndarray.tolist, lambda bits: bits.astype(float), lambda bits: bits + Fraction(0)]
+)
+@pytest.mark.parametrize("text", ["own", "own&full", "none|own"])
+def test_a_rule_may_answer_with_numbers(form, text, monkeypatch):
+    asked = np.array([[[1, 0], [0, 1], [1, 1]]], bool)
+    monkeypatch.setitem(RULES, "own", (lambda: lambda view: form(asked), ()))
+    answer = parse_rule(text)(SCENE)
+    assert answer.dtype == bool
+    assert np.array_equal(answer, asked)
+
+
+@pytest.mark.parametrize("text", ["own", "own&full", "none|own"])
+@pytest.mark.parametrize(
+    "answer",
+    [
+        None, True, "all", [[1], [1, 0]], np.full((1, 3, 2), 0.7), np.full((1, 3, 2), np.nan), np.full((1, 3, 2), -1),
+        np.ones((1, 2, 3), bool), np.ones((3, 2), bool), np.ones((1, 3, 1), bool), np.full((1, 3, 2), "x"),
+        np.full((1, 3, 2), 1j),
+        np.ma.array(np.ones((1, 3, 2)), mask=True),
+    ],
+)  # fmt: skip
+def test_a_rule_that_answers_with_something_else_is_refused(answer, text, monkeypatch):
+    monkeypatch.setitem(RULES, "own", (lambda: lambda view: answer, ()))
+    with pytest.raises(ValueError, match=r"Rule 'own' returned .*True or False .* shape \(1, 3, 2\)"):
+        parse_rule(text)(SCENE)
+
+
+def test_a_rule_cannot_move_robots():
+    swarm = Swarm(make_config("paper", n_robots=3), 1)
+    with pytest.raises(ValueError, match="read-only"):
+        View(swarm).own_pos[...] = 1.0
+    assert not swarm.state.any()

@@ -222,6 +222,8 @@ FLIGHTS = [
     (GOALS, [[0, 0, 1]], r"goals must be 2 finite points, shape \(2, 3\)"),
     (GOALS, [[0, 0, 1], [0, np.nan, 1]], "goals must be 2 finite points"),
     (GOALS, [[0, 0, 1], [0, "x", 1]], "goals must be 2 finite points"),
+    (GOALS, np.ma.array(GOALS, mask=[[0, 0, 0], [0, 1, 0]]), "goals must be 2 finite points"),
+    (np.array(GOALS) + 1j, GOALS, "starts must be 2 finite points"),
     (GOALS, [[0, 0, 1], [0, 1e5, 1]], "goals must be 2 finite points.* within 10000 m"),
 ]
 

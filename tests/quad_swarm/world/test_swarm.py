@@ -1,11 +1,12 @@
 """The world without RL: collisions at and between steps, disturbances, and swarms that do not see each other."""
 
+import foreign
 import numpy as np
 import pytest
 
 from quad_swarm.native import pairs
 from quad_swarm.native.pairs import advance
-from quad_swarm.planner import PlanStatus
+from quad_swarm.planner import SOLVERS, PlanStatus
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
 from quad_swarm.world.presets import PRESETS, make_config
@@ -219,3 +220,17 @@ def test_answers_that_contradict_what_is_seen_are_not_believed():
     assert source.tolist() == [2, 0]
     assert not believed[0].any()
     assert believed[1, 0] == pytest.approx([0.1] * 3), "a constant velocity"
+
+
+def test_a_solver_that_writes_into_its_problems_moves_neither_robots_nor_goals(monkeypatch):
+    states = []
+    for name, solver in (("stay", foreign.Stay), ("scribbling", foreign.Scribbling)):
+        monkeypatch.setitem(SOLVERS, name, solver)
+        config = make_config("paper")
+        swarm = Swarm(config, 1, name)
+        swarm.reset(0, *ScenarioSampler("symmetric_swap", 4, config.space).sample(np.random.default_rng(0))[1:])
+        for _ in range(3):
+            swarm.step(np.ones((1, 4, 3), bool))
+        assert not swarm._plans.status.any()
+        states.append(np.concatenate([swarm.state.ravel(), swarm.goal.ravel()]))
+    assert np.array_equal(*states)
