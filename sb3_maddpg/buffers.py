@@ -539,6 +539,22 @@ class TeamReplayBuffer(ReplayBuffer):
                     f"{source} is {value} {self._where(env)}: it must be finite in single precision. {_REMEDY}"
                 )
 
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> TeamReplayBufferSamples:  # type: ignore[override]
+        """
+        Sample transitions uniformly.
+
+        :param batch_size: number of transitions
+        :param env: normalises observations and rewards
+        :return: the samples
+        :raises ValueError: if the buffer is empty
+        """
+        self._check_not_empty()
+        return super().sample(batch_size, env)  # type: ignore[return-value]
+
+    def _check_not_empty(self) -> None:
+        if not self.size():
+            raise ValueError("The replay buffer is empty: add transitions first, see learning_starts.")
+
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
     ) -> TeamReplayBufferSamples:
@@ -798,8 +814,7 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         :return: the samples
         :raises ValueError: if the buffer is empty
         """
-        if not self.size():
-            raise ValueError("The replay buffer is empty: add transitions first, see learning_starts.")
+        self._check_not_empty()
         self._prioritize_new()
         shares = (np.arange(batch_size) + np.random.random(batch_size)) / batch_size  # noqa: NPY002
         indices, probabilities = self.priorities.find(shares)

@@ -654,7 +654,7 @@ class MADDPG(OffPolicyAlgorithm):
             flat = self.policy.flat_actions(obs).cpu().numpy()
         if actions.has_continuous:
             # SB3's seeded generator
-            noise = action_noise() if action_noise else np.random.normal(0.0, self.noise_std, flat.shape)  # noqa: NPY002
+            noise = np.asarray(action_noise()) if action_noise else np.random.normal(0.0, self.noise_std, flat.shape)  # noqa: NPY002
             noisy = np.clip(flat + noise, -1.0, 1.0)
             flat = np.where(actions.is_continuous, noisy, flat).astype(np.float32)
         return self._into_action_space(actions.unscale(flat)), flat
@@ -703,9 +703,7 @@ class MADDPG(OffPolicyAlgorithm):
         for _ in range(gradient_steps):
             self._n_updates += 1
             # Sample replay buffer
-            replay_data = cast(
-                TeamReplayBufferSamples, self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            )
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             obs = replay_data.observations.float()
             actions = self.policy.actions.encode(replay_data.actions)
             if replay_data.active is not None:
@@ -1028,7 +1026,7 @@ class MADDPG(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        if self._was_reset():
+        if self._was_reset() or self._last_obs is None:
             raise ValueError(
                 "A callback has reset the training environment in the middle of an episode, whose next transition "
                 "would be false: give EvalCallback or evaluate_policy an environment of its own."

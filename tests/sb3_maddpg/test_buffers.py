@@ -407,6 +407,12 @@ def test_observations_that_are_no_real_numbers_are_refused(values):
     assert memory.size() == 0
 
 
+def test_an_empty_buffer_has_no_samples():
+    for memory in (buffer(), prioritized()):
+        with pytest.raises(ValueError, match="The replay buffer is empty: add transitions first"):
+            memory.sample(4)
+
+
 def prioritized(size: int = 8, n_envs: int = 1, **kwargs) -> PrioritizedTeamReplayBuffer:
     space = spaces.MultiBinary(N * K)
     return PrioritizedTeamReplayBuffer(size, BOX, space, device="cpu", n_envs=n_envs, **kwargs)

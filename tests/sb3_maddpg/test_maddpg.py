@@ -372,6 +372,19 @@ def test_noise_that_cannot_be_added_to_actions_is_refused(noise, n_envs):
         MADDPG("MlpPolicy", env, action_noise=noise)
 
 
+def test_noise_may_be_a_tensor():
+    class Constant(NormalActionNoise):
+        def __init__(self, form):
+            super().__init__(np.zeros(6), np.ones(6))
+            self.form = form
+
+        def __call__(self):
+            return self.form(np.full(6, 0.25, np.float32))
+
+    models = [learned(TeamEnv(Toy("continuous")), 60, action_noise=Constant(form)) for form in (np.array, th.tensor)]
+    assert np.array_equal(models[0].replay_buffer.actions, models[1].replay_buffer.actions)
+
+
 def test_the_check_of_noise_leaves_the_noise_and_the_random_numbers_alone():
     env, zeros = TeamEnv(Toy("continuous")), np.zeros(6)
     plain = MADDPG("MlpPolicy", env, **SMALL)
@@ -863,6 +876,17 @@ def test_a_callback_that_resets_the_training_environment_is_refused():
 
     with pytest.raises(ValueError, match="callback has reset the training environment"):
         MADDPG("MlpPolicy", Clock()).learn(60, callback=Evaluate())
+
+
+def test_a_callback_that_sets_another_environment_is_refused():
+    class Replace(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 14:
+                self.model.set_env(Clock())
+            return True
+
+    with pytest.raises(ValueError, match="callback has reset the training environment"):
+        MADDPG("MlpPolicy", Clock()).learn(60, callback=Replace())
 
 
 def test_seeds_for_the_next_reset_do_not_end_an_episode():
