@@ -35,6 +35,7 @@ import gymnasium
 import known
 import known_wrapped
 import numpy as np
+import odd_parts
 import odd_worlds
 import pytest
 import torch as th
@@ -825,6 +826,7 @@ AREAS: dict[str, Callable[[Files, random.Random], Iterator[Case]]] = {
     "what environments return": lambda files, rng: known.returns(rng),
     "wrappers": lambda files, rng: known_wrapped.wrapped(rng),
     "worlds that do not fit": lambda files, rng: odd_worlds.worlds(rng, _call),
+    "foreign parts": lambda files, rng: odd_parts.parts(rng),
 }
 LETTERS = "abcdefghij"[: len(AREAS)]
 SAMPLE = 12  # of each area, in the tests
