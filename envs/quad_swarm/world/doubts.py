@@ -231,14 +231,14 @@ def _usual_flight(config: SwarmConfig) -> float:
 def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
     """Yield a sentence if robots cannot fly a usual distance, or climb a third of the room's height, in time."""
     planner, space, vehicle = config.planner, config.space, config.quadrotor
-    seconds = max_steps * planner.dt
     speed = max(min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle))), _TINIEST)
     climb = max(min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain), _TINIEST)
     needed = max(
         (_usual_flight(config) - config.goal_radius) / speed,
         ((space.heights[1] - space.heights[0]) / 3 - config.goal_radius) / climb,
     )
-    if needed > seconds:
+    if needed / planner.dt > max_steps:
+        seconds = max_steps * planner.dt
         yield (
             f"max_steps={max_steps}: episodes of {seconds:.2g} s are too short to reach goals at {speed:.2g} m/s, and "
             f"{climb:.2g} m/s vertically, in this room; use at least max_steps={_up(2 * needed / planner.dt)}"

@@ -176,3 +176,10 @@ def test_extreme_worlds_are_accepted_or_refused_in_one_line(seed):
             if "\n" in str(error):
                 raise
     assert 20 < accepted < 200
+
+
+@pytest.mark.parametrize("way", [lambda steps: {"max_steps": steps}, lambda steps: {"world": {"max_steps": steps}}])
+def test_episodes_may_last_for_ever(way):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DoubtfulWorld)
+        assert not make_task(**way(10**400)).swarm.state.any()
