@@ -136,13 +136,15 @@ def atomic_write(path: str | os.PathLike[str], suffix: str) -> Iterator[BinaryIO
     :param path: path of the file; missing folders are created
     :param suffix: suffix added to a path without one, as Stable-Baselines3 does
     :return: the file to write to
-    :raises OSError: if the path is a folder or cannot be written; raised before anything is written
+    :raises OSError: if the path is a folder, pipe or device, or cannot be written; raised before anything is written
     """
     target = Path(path)
     if not target.suffix:
         target = Path(f"{target}.{suffix}")
     if target.is_dir() or Path(path).name in ("", ".."):
         raise IsADirectoryError(errno.EISDIR, "This is a folder: pass the path of a file", str(target))
+    if target.exists() and not target.is_file():  # the new file would replace the device itself
+        raise OSError(errno.EINVAL, "This is a pipe or a device: pass the path of a file", str(target))
     # In the same folder, because a file cannot be renamed across file systems
     temporary = target.with_name(f"{_prefix(target.name)}{os.getpid()}-{secrets.token_hex(8)}")
     try:

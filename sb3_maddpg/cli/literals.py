@@ -153,16 +153,19 @@ def format_literal(value: Any) -> str:
 class StoreValues(argparse.Action):
     """
     Action that stores ``key:value key:value`` as a dict, for rl_zoo3's options. Unlike rl_zoo3's own action, it
-    evaluates nothing, see ``parse_value``.
+    evaluates nothing, see ``parse_value``. If the option is repeated, its pairs come together.
     """
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        pairs = {}
+        before = getattr(namespace, self.dest, None)
+        pairs: dict[str, Any] = {} if before is None or before is self.default else dict(before)
         try:
             for word in values:
                 key, _, value = word.partition(":")
                 if not key or not value:
                     raise ValueError(f"'{word}' has no value")
+                if key in pairs:
+                    raise ValueError(f"'{key}' is given twice")
                 pairs[key] = parse_value(value)
         except ValueError as error:
             raise ValueError(f"{option_string} {shown(' '.join(values))}: {error}. Write key:value.") from error

@@ -22,7 +22,7 @@ def common_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo", default="maddpg")
     parser.add_argument("--env")
-    parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--gym-packages", nargs="+", action="extend", default=[])
     return parser
 
 

@@ -42,9 +42,21 @@ class _Pipe(io.FileIO):
             return super().write(data)
 
 
+def _open_missing() -> None:
+    """Open the null device for each standard stream that is closed, before a file takes its number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
+
+
 @contextmanager
 def lasting_output() -> Iterator[None]:
     """Let a command go on when its terminal is closed: a training would be lost for the sake of a table."""
+    _open_missing()
     before = sys.stdout, sys.stderr
     for name in ("stdout", "stderr"):
         stream: Any = getattr(sys, name)

@@ -45,8 +45,10 @@ def test_a_file_is_replaced_whole_and_its_folder_synced(tmp_path, monkeypatch):
 def test_a_path_that_cannot_be_written_is_refused_before_any_work(tmp_path):
     (tmp_path / "folder.zip").mkdir()
     (tmp_path / "file").write_text("")
+    (tmp_path / "device.zip").symlink_to(os.devnull)
     for path, message in (
         (tmp_path / "folder", "This is a folder: pass the path of a file: '.*folder.zip'"),
+        (tmp_path / "device", "This is a pipe or a device: pass the path of a file: '.*device.zip'"),
         ("", "This is a folder: pass the path of a file: '.*zip'"),
         ("..", "This is a folder: pass the path of a file: '.*zip'"),
         (tmp_path / "file" / "model", "Cannot write here .*choose another folder: '.*file/model.zip'"),
@@ -55,7 +57,8 @@ def test_a_path_that_cannot_be_written_is_refused_before_any_work(tmp_path):
         with pytest.raises(OSError, match=message), atomic_write(path, suffix="zip"):
             worked = True
         assert not worked
-    assert sorted(os.listdir(tmp_path)) == ["file", "folder.zip"]
+    assert sorted(os.listdir(tmp_path)) == ["device.zip", "file", "folder.zip"]
+    assert (tmp_path / "device.zip").is_symlink()
 
 
 class Unspeakable:

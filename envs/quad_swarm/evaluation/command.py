@@ -166,6 +166,7 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
     parser.add_argument(
         "--policy",
         nargs="+",
+        action="extend",
         required=required,
         metavar="POLICY",
         help=f"a rule ({_rules_usage()}; EPS and DIST in m, or in separations of the planner with the suffix s, which "
@@ -180,13 +181,19 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
     parser.add_argument("--max-steps", type=int, help="time limit in steps (default: the preset's)")
     names = ", ".join(field.name for field in dataclasses.fields(SwarmConfig))
     parser.add_argument(
-        "--world", nargs="+", default=[], metavar="NAME=VALUE", help=f"fields of the preset, e.g. noise.wind=1: {names}"
+        "--world",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"fields of the preset, e.g. noise.wind=1: {names}",
     )
     simulated = ", ".join(simulated_vehicles())
     parser.add_argument("--plant", help=f"simulated vehicle: {MODEL} (default), or one of a simulator ({simulated})")
     parser.add_argument(
         "--gym-packages",
         nargs="+",
+        action="extend",
         metavar="MODULE",
         help="modules to import first, which add scenarios, rules, observations, solvers or simulators",
     )
@@ -259,7 +266,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_policy_arguments(parser, required=False)
     parser.add_argument(
-        "--scenario", nargs="+", default=["all"], metavar="NAME", help=f"all, or some of {', '.join(SCENARIOS)}"
+        "--scenario",
+        nargs="+",
+        action="extend",
+        metavar="NAME",
+        help=f"some of {', '.join(SCENARIOS)}, or all (default)",
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
     add_worker_arguments(parser, jobs=1)
@@ -306,6 +317,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _compare(args: argparse.Namespace) -> None:
+    args.scenario = args.scenario or ["all"]
     if "all" in args.scenario and len(args.scenario) > 1:
         raise ValueError(f"--scenario {' '.join(args.scenario)}: 'all' already names every scenario.")
     args.policy = args.policy or paper_policies()
@@ -324,15 +336,17 @@ def _compare(args: argparse.Namespace) -> None:
         for row, condition in zip(rows, conditions, strict=True)
     ]
     footer = _footer(args, rows)
-    # Files first: printing may fail, and the pieces of the evaluation are gone
-    if args.json:
-        write_rows(args.json, rows)
-    if args.csv:
-        write_csv(args.csv, rows)
-    if args.latex:
-        comment = "".join(f"% {line}\n" for line in footer)
-        write_text(args.latex, comment + _latex(table_texts(rows, args.wide)))
-    print(format_table(rows, args.wide), "", *footer, sep="\n", file=printed)
+    # Files first, and the table whether or not they are written: the pieces of the evaluation are gone
+    try:
+        if args.json:
+            write_rows(args.json, rows)
+        if args.csv:
+            write_csv(args.csv, rows)
+        if args.latex:
+            comment = "".join(f"% {line}\n" for line in footer)
+            write_text(args.latex, comment + _latex(table_texts(rows, args.wide)))
+    finally:
+        print(format_table(rows, args.wide), "", *footer, sep="\n", file=printed)
     for path in filter(None, (args.json, args.csv, args.latex)):
         if path != STDOUT:
             print(f"wrote {path}", file=printed)

@@ -47,10 +47,15 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write text to a file, atomically. Missing folders are created.
 
-    Threads, processes and containers may write the same file at the same time; one of their files remains, whole.
+    Threads, processes and containers may write the same file at the same time; one of their files remains, whole. A
+    pipe or device, such as /dev/stdout, is written to and stays.
     """
     if path == STDOUT:
         sys.stdout.write(text)
+        return
+    if _is_stream(path):
+        with path.open("w", encoding="utf-8", newline="") as file:
+            file.write(text)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     prefix = f".{path.name[:50]}."  # file systems limit names to 255 bytes
@@ -69,6 +74,11 @@ def write_text(path: Path, text: str) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def _is_stream(path: Path) -> bool:
+    """Return whether a path is a pipe or device, which a renamed file would replace."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
 def check_writable(path: Path, option: str) -> None:
     """Check that a file can be written before doing the work that it will hold. This creates its folder.
 
@@ -77,6 +87,10 @@ def check_writable(path: Path, option: str) -> None:
     :raises ValueError: if the path is a folder, or its folder cannot be created or written to
     """
     if path == STDOUT:
+        return
+    if _is_stream(path):
+        if not os.access(path, os.W_OK):
+            raise ValueError(f"{option} {path} cannot be written (Permission denied): choose another file.")
         return
     if path.is_dir():
         raise ValueError(f"{option} {path} is a folder: pass the path of a file.")

@@ -109,7 +109,13 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
     parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
-    parser.add_argument("--gym-packages", nargs="+", metavar="MODULE", help="modules to import first, with simulators")
+    parser.add_argument(
+        "--gym-packages",
+        nargs="+",
+        action="extend",
+        metavar="MODULE",
+        help="modules to import first, with simulators",
+    )
     parser.add_argument(
         "--out", type=Path, metavar="FILE", help="vehicle file to write, YAML; - is the standard output"
     )
@@ -149,6 +155,8 @@ def _write(path: Path, text: str | None) -> None:
     try:
         if path.is_dir():
             raise IsADirectoryError(0, "it is a folder")
+        if path.exists() and not path.is_file():
+            raise OSError(0, "it is a pipe or a device")
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
             if text is not None:

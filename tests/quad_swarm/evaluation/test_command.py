@@ -45,6 +45,28 @@ def test_writes_table_json_and_figures(tmp_path, capsys):
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {*figures, "swarm.gif"}
 
 
+def test_values_of_repeated_options_come_together(capsys):
+    arguments = ["--policy", "none", "--policy", "full", "--scenario", "random", "--scenario", "random_swap"]
+    assert main([*arguments, "--episodes", "1", "--world", "radius=0.2", "--world", "goal_radius=0.4"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in printed[2:6]] == [
+        ["random", "none"], ["random", "full"], ["random_swap", "none"], ["random_swap", "full"]
+    ]  # fmt: skip
+    assert "preset: paper with radius=0.2 goal_radius=0.4;" in printed[7]
+    assert main([*arguments, "--world", "radius=0.2", "--world", "radius=0.1"]) == 2
+    assert "'radius' is given twice" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="there is no device that is always full")
+def test_the_table_is_printed_even_if_a_file_cannot_be_written(tmp_path, capsys):
+    (tmp_path / "full.json").symlink_to("/dev/full")
+    arguments = ["--policy", "none", "--scenario", "random", "--episodes", "1"]
+    with pytest.raises(OSError, match="No space left"):
+        main([*arguments, "--json", str(tmp_path / "full.json")])
+    assert "episodes: 1 each" in capsys.readouterr().out
+    assert (tmp_path / "full.json").is_symlink()
+
+
 def test_the_table_names_models_shortly_where_that_tells_them_apart(capsys, tmp_path):
     path = str(pretrained_folder("quad-swarm-paper") / "model.zip")
     flags = ["--scenario", "random", "--episodes", "1"]
@@ -114,12 +136,13 @@ def test_world_can_be_changed(capsys):
     assert "robots: 3; preset: paper with noise.wind=1 planner.separation=0.7 memory=0.3;" in capsys.readouterr().out
 
 
-FEW = ["--policy", "none", "--scenario", "random", "--episodes", "1", "--max-steps", "3"]
+SHORT = ["--scenario", "random", "--episodes", "1", "--max-steps", "3"]
+FEW = ["--policy", "none", *SHORT]
 
 
-def table(path: Path, *arguments: str) -> dict:
+def table(path: Path, *arguments: str, policy: str = "none") -> dict:
     """Fly few steps and return the only row of the JSON file."""
-    assert main([*FEW, *arguments, "--json", str(path)]) == 0
+    assert main([*SHORT, "--policy", policy, *arguments, "--json", str(path)]) == 0
     (row,) = json.loads(path.read_text())
     return row
 
@@ -173,7 +196,7 @@ def test_another_model_under_the_same_name_is_seen_in_the_file(tmp_path):
     for name in ("quad-swarm-paper", "quad-swarm-dense"):
         model = pretrained_folder(name) / "model.zip"
         copy.write_bytes(model.read_bytes())
-        sums.append(table(tmp_path / "a.json", "--policy", str(copy))["model_sha256"])
+        sums.append(table(tmp_path / "a.json", policy=str(copy))["model_sha256"])
         assert sums[-1] == hashlib.sha256(model.read_bytes()).hexdigest()
     assert sums[0] != sums[1]
 

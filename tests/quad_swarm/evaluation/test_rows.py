@@ -37,6 +37,18 @@ def test_a_dash_is_the_standard_output(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
+def test_a_pipe_is_written_to_and_stays(tmp_path):
+    pipe = tmp_path / "table.json"
+    os.mkfifo(pipe)
+    check_writable(pipe, "--json")
+    with ThreadPoolExecutor() as pool:
+        read = pool.submit(pipe.read_text)
+        write_rows(pipe, [{"a": 1}])
+        assert json.loads(read.result()) == [{"a": 1}]
+    assert pipe.is_fifo()
+
+
 def test_a_table_as_comma_separated_values(tmp_path):
     write_csv(tmp_path / "table.csv", [{"a": 1, "b": None}, {"a": "x, y", "c": {"d": 0.5}}])
     assert (tmp_path / "table.csv").read_text() == 'a,b,c\n1,,\n"x, y",,"{""d"": 0.5}"\n'

@@ -96,6 +96,18 @@ def test_an_option_is_key_and_value():
             parser.parse_args(["--env-kwargs", word])
 
 
+def test_pairs_of_a_repeated_option_come_together():
+    parser = argparse.ArgumentParser()
+    default = {"given": False}
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreValues, default=default)
+    given = parser.parse_args(["--env-kwargs", "flag:false", "--env-kwargs", "preset:dense"])
+    assert given.env_kwargs == {"flag": False, "preset": "dense"}
+    assert default == {"given": False}
+    for words in (["n:1", "n:2"], ["n:1", "--env-kwargs", "n:2"]):
+        with pytest.raises(ValueError, match=r"--env-kwargs .*'n' is given twice"):
+            parser.parse_args(["--env-kwargs", *words])
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [

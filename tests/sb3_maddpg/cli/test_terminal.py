@@ -1,5 +1,6 @@
 """Output that nobody can read any more, and lines of several threads."""
 
+import json
 import os
 import pty
 import signal
@@ -123,6 +124,17 @@ def test_a_reader_that_ends_is_no_error():
     process.stdout.close()
     assert process.stderr.read() == b""
     assert process.wait(timeout=300) == 128 + signal.SIGPIPE
+
+
+@pytest.mark.skipif(os.name == "nt", reason="shells close streams there in another way")
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_commands_work_without_standard_streams(closed):
+    command = [sys.executable, "-m", "sb3_maddpg", "evaluate", "--policy", "none", "--episodes", "1"]
+    command += ["--scenario", "random", "--json", "table.json"]
+    shell = f'"$@" {" ".join(f"{number}>&-" for number in closed)}'
+    done = subprocess.run(["sh", "-c", shell, "sh", *command], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(Path("table.json").read_text())[0]["episodes"] == 1
 
 
 def test_lines_of_threads_are_printed_in_one_piece(monkeypatch):
