@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from quad_swarm.errors import shown
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorModel
@@ -149,6 +150,10 @@ class Planner:
     def _checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
         """Check the arrays of a call and convert them to their types."""
         stages, kept = self.config.horizon, self.config.max_neighbours
+        for name, value, kind in (("problems", problems, Problems), ("previous", previous, Plans)):
+            if not isinstance(value, kind):
+                remedy = "; before the first solve, Plans.hover(x, horizon)" if kind is Plans else ""
+                raise ValueError(f"{name}={shown(value)}: pass {kind.__name__}{remedy}.")
         count, *_ = (*_shape(problems.x), 0)
         n_others = shape[1] if len(shape := _shape(problems.others)) == 4 else 0
         taken = n_others if kept is None else min(n_others, kept)

@@ -27,6 +27,7 @@ _SLOW_START = 5.0  # a planner that takes longer to half of the speed is slow (s
 _TINIEST = 1e-30  # avoids division by zero
 _LIGHT_AIR = 0.01  # wind in which offsets are linear (m/s)
 _SETTLING = 2.5  # time for which a disturbed velocity moves a robot (s)
+_UNITS = {"vel": "m/s", "attitude": "rad"}
 _FASTEST_TURN = 4 * math.pi  # of the yaw (rad/s)
 
 
@@ -127,10 +128,23 @@ def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:
 
 
 def arrival_radius(config: SwarmConfig) -> float:
-    """Return the goal radius (m) below which robots hardly arrive together, from the steady wind, the gusts and the
-    noise of the velocity. The factors were measured in `flight` (docs/flight.md)."""
-    gusts = config.noise.gust * standing_offset(config, _LIGHT_AIR) / _LIGHT_AIR
-    return math.hypot(1.1 * standing_offset(config), 1.1 * gusts, _SETTLING * config.noise.vel)
+    """Return the goal radius (m) below which robots hardly arrive together."""
+    return math.hypot(*_unsteadiness(config).values())
+
+
+def _unsteadiness(config: SwarmConfig) -> dict[str, float]:
+    """Return how far each disturbance moves robots from their goals (m), by its field. The factors were measured in
+    `flight` (docs/flight.md) and `paper`; what is added in each step adds up as a random walk."""
+    noise, sensing = config.noise, config.sensing
+    per_step = 1 / math.sqrt(config.planner.dt)
+    return {
+        "noise.wind": 1.1 * standing_offset(config),
+        "noise.gust": 1.1 * noise.gust * standing_offset(config, _LIGHT_AIR) / _LIGHT_AIR,
+        "noise.vel": _SETTLING * noise.vel,
+        "noise.attitude": 0.6 * per_step * noise.attitude,
+        "sensing.vel": 0.6 * sensing.vel,
+        "sensing.attitude": 1.25 * sensing.attitude,
+    }
 
 
 def _up(number: float) -> float:
@@ -198,11 +212,7 @@ def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:
             f"place in at most {min(axis.fastest for axis in axes(planner, config.quadrotor)):.2g} m/s"
         )
     elif config.goal_radius < needed:
-        yield (
-            f"goal_radius={config.goal_radius:g}: in noise.wind={config.noise.wind:g} and "
-            f"noise.gust={config.noise.gust:g}, which planners do not know, robots stand {offset:.2f} m beside their "
-            f"goals, or are moved away, and hardly arrive; use at least goal_radius={_up(125 * needed) / 100:g}"
-        )
+        yield _too_unsteady(config, needed)
     distance, warning = far_goals(config)
     if not planner.goal_weight:
         yield "planner.goal_weight=0: robots do not fly to their goals; use a positive weight"
@@ -222,6 +232,26 @@ def _doubts_about_arriving(config: SwarmConfig) -> Iterator[str]:
         )
 
 
+def _too_unsteady(config: SwarmConfig, needed: float) -> str:
+    """Return the sentence about a goal radius that is smaller than needed."""
+    found = _unsteadiness(config)
+    name = max(found, key=lambda one: found[one])
+    if name in ("noise.wind", "noise.gust"):
+        return (
+            f"goal_radius={config.goal_radius:g}: in noise.wind={config.noise.wind:g} and "
+            f"noise.gust={config.noise.gust:g}, which planners do not know, robots stand "
+            f"{standing_offset(config):.2f} m beside their goals, or are moved away, and hardly arrive; use at least "
+            f"goal_radius={_up(125 * needed) / 100:g}"
+        )
+    part, field = name.split(".")
+    value = getattr(getattr(config, part), field)
+    most = 0.5 * value * config.goal_radius / found[name]
+    return (
+        f"{name}={value:g} is in {_UNITS[field]}: robots are moved about {found[name]:.2g} m away from their goals "
+        f"and hardly arrive within goal_radius={config.goal_radius:g}; use at most {most:.1g}"
+    )
+
+
 def _usual_flight(config: SwarmConfig) -> float:
     """Return about the mean distance of starts and goals in the scenario where it is largest (m)."""
     space = config.space
@@ -229,13 +259,14 @@ def _usual_flight(config: SwarmConfig) -> float:
 
 
 def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
-    """Yield a sentence if robots cannot fly a usual distance, or climb a third of the room's height, in time."""
+    """Yield a sentence if robots cannot fly a usual distance, with detours, or climb two thirds of the room's height in
+    time."""
     planner, space, vehicle = config.planner, config.space, config.quadrotor
     speed = max(min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle))), _TINIEST)
     climb = max(min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain), _TINIEST)
     needed = max(
-        (_usual_flight(config) - config.goal_radius) / speed,
-        ((space.heights[1] - space.heights[0]) / 3 - config.goal_radius) / climb,
+        1.5 * (_usual_flight(config) - config.goal_radius) / speed,
+        (2 / 3 * (space.heights[1] - space.heights[0]) - config.goal_radius) / climb,
     )
     if needed / planner.dt > max_steps:
         seconds = max_steps * planner.dt
@@ -254,15 +285,15 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
             f"are {oldest} steps old have no future left in a plan of planner.horizon={planner.horizon}; use at most "
             f"{max(planner.horizon - 2, 0)} together"
         )
-    for name, error in (
-        ("sensing.pos", config.sensing.pos),
-        ("sensing.others_pos", config.sensing.others_pos),
-        ("noise.pos", config.noise.pos),
+    for name, error, most in (
+        ("sensing.pos", config.sensing.pos, 0.5 * config.radius),
+        ("sensing.others_pos", config.sensing.others_pos, config.radius),
+        ("noise.pos", config.noise.pos, 0.125 * min(config.radius, config.goal_radius)),  # in each step
     ):
-        if error > config.radius:
+        if error > most:
             yield (
-                f"{name}={error:g} is in metres and exceeds radius={config.radius:g}: robots cannot keep clear of each "
-                "other by that; use a few centimetres"
+                f"{name}={error:g} is in metres and too much for radius={config.radius:g}: robots cannot keep clear of "
+                f"each other, or stay at a goal; use at most {0.5 * most:.1g}"
             )
     stride = planner.dt * min(planner.max_speed, *(axis.fastest for axis in axes(planner, config.quadrotor)))
     if not config.continuous_collisions and stride > 4 * config.radius:

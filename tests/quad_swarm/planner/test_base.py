@@ -225,6 +225,15 @@ def test_a_call_with_other_arrays_is_refused_in_one_sentence(solver, field, valu
     assert str(error.value).count(". ") == 0
 
 
+def test_what_is_no_plan_is_refused_with_the_first_one():
+    planner = make_planner(PlannerConfig(), QUADROTOR, 2)
+    problems = Problems(np.zeros((1, 9)), np.ones((1, 3)), np.full((1, 1, 10, 3), 9.0))
+    with pytest.raises(ValueError, match=r"previous=None: pass Plans; before the first solve, Plans\.hover\(x, h"):
+        planner.plan(problems, None)
+    with pytest.raises(ValueError, match=r"problems=.*: pass Problems\.$"):
+        planner.plan(tuple(problems), Plans.hover(problems.x, 10))
+
+
 def test_lists_and_single_precision_are_as_good_as_arrays():
     config = PlannerConfig()
     problems = crossing(2, config)

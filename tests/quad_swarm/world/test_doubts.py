@@ -88,8 +88,15 @@ def test_far_goals_are_reached_at_full_speed_with_the_weight_that_is_said(preset
         ("paper", {"radius": 0.05}, r"radius=0\.05: .* 0\.4 m in a step .* use continuous_collisions=true"),
         ("flight", {"goal_radius": 0.1}, r"goal_radius=0\.1: in noise\.wind=1 .* 0\.13 m .* goal_radius=0\.21"),
         ("paper", {"goal_radius": 30}, r"goal_radius=30 exceeds the distance of the goals"),
-        ("paper", {"sensing": {"pos": 5}}, r"sensing\.pos=5 is in metres and exceeds radius=0\.3"),
+        ("paper", {"sensing": {"pos": 5}}, r"sensing\.pos=5 is in metres and too much for radius=0\.3"),
+        ("dense", {"sensing": {"pos": 0.2}}, r"sensing\.pos=0\.2 is in metres .* use at most 0\.07"),
         ("paper", {"noise": {"pos": 0.5}}, r"noise\.pos=0\.5 is in metres"),
+        ("dense", {"noise": {"pos": 0.05}}, r"noise\.pos=0\.05 is in metres .* use at most 0\.02"),
+        ("flight", {"noise": {"attitude": 0.12}}, r"noise\.attitude=0\.12 is in rad: .* use at most 0\.06"),
+        ("dense", {"sensing": {"vel": 0.6}}, r"sensing\.vel=0\.6 is in m/s: .* use at most 0\.2"),
+        ("flight", {"sensing": {"attitude": 0.3}}, r"sensing\.attitude=0\.3 is in rad: .* use at most 0\.1"),
+        ("flight", {"planner": {"max_climb_rate": 0.026}}, r"max_steps=200: .* vertically"),
+        ("flight-hard", {"planner": {"max_speed": 0.4}}, r"max_steps=300: .* 0\.4 m/s"),
         ("paper", {"space": {"circle_radius": [60, 70]}, "max_steps": 999}, r"goals are more than 41 m away"),
         ("paper", {"planner": {"right_of_way": 30}}, r"right_of_way=30 is in metres and exceeds .*separation=0\.6"),
         ("paper", {"memory": 30}, r"memory=30: .* off by more than .* 0\.6 m"),
@@ -125,7 +132,9 @@ def test_what_is_recommended_is_not_doubtful():
         ("paper", {"planner": {"dt": 0.02, "horizon": 36}, "max_steps": 500}),
         ("paper", {"radio": {"delay": 8}}), ("paper", {"neighbourhood": {"range": 2.4}}),
         ("paper", {"quadrotor": {"roll_time_constant": 2}, "planner": {"horizon": 60}}),
-        ("paper", {"planner": {"separation": 3}}),
+        ("paper", {"planner": {"separation": 3}}), ("dense", {"sensing": {"pos": 0.07}}),
+        ("dense", {"noise": {"pos": 0.02}}), ("flight", {"noise": {"attitude": 0.06}}),
+        ("dense", {"sensing": {"vel": 0.2}}), ("flight", {"sensing": {"attitude": 0.1}}),
     ]  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("error")
