@@ -39,7 +39,7 @@ class Solver(Protocol):
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
         """Solve a batch of problems.
 
-        :param problems: the batch; in swarms, states and goals cannot be written
+        :param problems: the batch
         :param x_guess: initial guess of the states at stages 0..N, (B, N + 1, 9)
         :param u_guess: initial guess of the inputs, (B, N, 4)
         """

@@ -8,6 +8,7 @@ separation, within 1.5 seconds.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -134,10 +135,11 @@ def _parse_one(text: str) -> Rule:
     if not any(relative):
         return _checked(text, factory(*numbers))
 
-    def rule(view: View) -> np.ndarray:
-        return factory(*(n * view.separation if r else n for n, r in zip(numbers, relative, strict=True)))(view)
+    @functools.cache  # rules may have a state
+    def scaled(separation: float) -> Rule:
+        return factory(*(n * separation if r else n for n, r in zip(numbers, relative, strict=True)))
 
-    return _checked(text, rule)
+    return _checked(text, lambda view: scaled(view.separation)(view))
 
 
 def _checked(text: str, rule: Rule) -> Rule:

@@ -131,9 +131,11 @@ class Swarm:
         return self.state[..., VELOCITY]
 
     def estimate(self) -> np.ndarray:
-        """Return the robots' estimates of their own states, (E, n, 9), which cannot be written: without errors, they
-        are the states."""
-        return _read_only(self.chance.estimate(self.state))
+        """Return the robots' estimates of their own states, (E, n, 9), a copy: without errors, they are the states."""
+        return self._estimate().copy()
+
+    def _estimate(self) -> np.ndarray:
+        return self.chance.estimate(self.state)
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (m) and velocities (m/s) of the others as each robot observes them, (E, n, n - 1, 3) each,
@@ -142,7 +144,7 @@ class Swarm:
 
     def _seen_by_all(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the same as `observe`, but without the additional errors of the observers."""
-        estimate, neighbours = self.estimate(), self.neighbours
+        estimate, neighbours = self._estimate(), self.neighbours
         seen = of_others(estimate, neighbours.others)
         pos, vel = seen[..., POSITION], seen[..., VELOCITY]
         if neighbours.present is not None:
@@ -212,7 +214,7 @@ class Swarm:
         if self.config.is_random:
             self.chance.reset(swarm, noise_seed)
         if self.neighbours.limited:
-            estimate = self.estimate()[swarm]
+            estimate = self._estimate()[swarm]
             self.neighbours.reset(swarm, estimate[:, POSITION], estimate[:, VELOCITY])
 
     def keep(self, swarms: np.ndarray) -> None:
@@ -311,7 +313,7 @@ class Swarm:
 
         :return: whether another robot, or none, is in the slot now, (E, n, m) bool
         """
-        estimate = self.estimate()
+        estimate = self._estimate()
         changed = self.neighbours.update(estimate[..., POSITION], estimate[..., VELOCITY], self.chance.observer_errors)
         if changed.any():
             for beliefs in {self.beliefs, self.presumed_beliefs}:
@@ -342,7 +344,7 @@ class Swarm:
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""
-        x, start = self.estimate(), self.chance.start
+        x, start = self._estimate(), self.chance.start
         if start is not None:
             later = start / self.config.substeps
             x = self.planner.model.ahead(x, self._u, later * self.config.planner.dt)
@@ -351,8 +353,8 @@ class Swarm:
         if self.config.planner.right_of_way:
             announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
         others = believed.reshape(-1, *believed.shape[2:])
-        # A solver that writes into its problem must not move robots or goals
-        return Problems(_read_only(x.reshape(-1, 9)), _read_only(self.goal.reshape(-1, 3)), others, announced=announced)
+        # Copies: a solver that writes into its problem must not move robots or goals
+        return Problems(x.reshape(-1, 9).copy(), self.goal.reshape(-1, 3).copy(), others, announced=announced)
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""
@@ -394,12 +396,6 @@ class Swarm:
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
         )
-
-
-def _read_only(array: np.ndarray) -> np.ndarray:
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

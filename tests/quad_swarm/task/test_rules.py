@@ -170,6 +170,21 @@ def test_a_rule_that_answers_with_something_else_is_refused(answer, text, monkey
 
 def test_a_rule_cannot_move_robots():
     swarm = Swarm(make_config("paper", n_robots=3), 1)
-    with pytest.raises(ValueError, match="read-only"):
-        View(swarm).own_pos[...] = 1.0
+    View(swarm).own_pos[...] = 1.0
     assert not swarm.state.any()
+
+
+def test_a_rule_keeps_its_state_with_lengths_in_separations_too(monkeypatch):
+    def make(distance):
+        calls = []
+
+        def rule(view):
+            calls.append(distance)
+            return np.full(view.pos.shape[:-1], len(calls) > 1)
+
+        return rule
+
+    monkeypatch.setitem(RULES, "own", (make, ("DIST",)))
+    for text in ("own:1", "own:1s"):
+        rule = parse_rule(text)
+        assert [rule(SCENE).all() for _ in range(3)] == [False, True, True]
