@@ -659,7 +659,7 @@ def _equal(one: Any, other: Any) -> bool:
 def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
     """:return: an array of the last observations, or whether they begin episodes, if it fits the environment"""
     present: Any = model._last_episode_starts if name == "_last_episode_starts" else model._last_obs
-    if value is None and name == "_last_original_obs":  # before the first step
+    if value is None and name == "_last_original_obs" and model._vec_normalize_env is None:  # before the first step
         return value
     if not isinstance(value, np.ndarray) or value.shape != np.shape(present):
         raise ValueError(f"A checkpoint is damaged: its {name} is {shown(value)}.")

@@ -139,7 +139,7 @@ def _values(config: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 # Limits of what `read_yaml` reads
-MOST_CHARACTERS, _MOST_VALUES = 100_000, 10_000
+MOST_CHARACTERS, _MOST_VALUES, _DEEPEST = 100_000, 10_000, 100
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -147,6 +147,11 @@ class _PlainLoader(yaml.SafeLoader):
 
     yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # type: ignore[misc]  # filled below
     yaml_constructors: ClassVar[dict[Any, Any]] = {}
+
+    def fetch_flow_collection_start(self, token: type[yaml.Token]) -> None:
+        if self.flow_level > _DEEPEST:  # the time of the scanner grows with the square
+            raise RecursionError
+        super().fetch_flow_collection_start(token)
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()

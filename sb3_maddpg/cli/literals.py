@@ -23,6 +23,7 @@ CLASSES = {
 
 # Maximum number of values in a YAML file after replacing its aliases by what they stand for
 _MOST_VALUES = 100_000
+_DEEPEST = 100  # brackets around a value
 
 
 def parse_literal(text: str) -> Any:
@@ -190,6 +191,11 @@ class BoundedLoader(yaml.SafeLoader):
             if isinstance(error, (UnicodeError, Refused)):
                 raise
             raise yaml.constructor.ConstructorError(problem=f"a value is not what it seems ({told(error)})") from error
+
+    def fetch_flow_collection_start(self, token: type[yaml.Token]) -> None:
+        if self.flow_level > _DEEPEST:  # the time of the scanner grows with the square
+            raise RecursionError
+        super().fetch_flow_collection_start(token)
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()

@@ -535,6 +535,14 @@ def test_last_observations_that_do_not_fit_the_environment_are_refused(value, tm
         model.learn(100, [callback], reset_num_timesteps=False)
 
 
+def test_normalised_observations_need_the_original_ones(tmp_path):
+    make("normalized").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1)])
+    edit(tmp_path, lambda state: state["last"].update(_last_original_obs=None))
+    model, callback = resume(tmp_path, normalized())
+    with pytest.raises(ValueError, match="A checkpoint is damaged: its _last_original_obs is None"):
+        model.learn(100, [callback], reset_num_timesteps=False)
+
+
 @pytest.mark.parametrize(
     ("path", "value"),
     [

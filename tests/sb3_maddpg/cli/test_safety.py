@@ -63,9 +63,11 @@ def test_yaml_calls_nothing(run, capsys, name):
     assert f"{name} holds a value that is not plain" in capsys.readouterr().err
 
 
-def test_yaml_without_end_is_refused():
+@pytest.mark.parametrize("text", ["[" * 3000, "[" * 102 + "]" * 102, "{a: " * 3000, "- " * 3000])
+def test_yaml_that_is_nested_too_deeply_is_refused(text):
     with pytest.raises(ValueError, match="nested too deeply"):
-        yaml.load("[" * 3000, RunLoader)
+        yaml.load(text, RunLoader)
+    assert yaml.load("[" * 90 + "]" * 90, RunLoader)
 
 
 LAUGHS = "\n".join(
