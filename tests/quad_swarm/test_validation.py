@@ -92,7 +92,8 @@ def _aliases(levels: int) -> str:
     ("text", "message"),
     [
         (_aliases(9), "more than 10000 values"), ("&a [*a]", "more than 10000 values"), ("x" * 200_000, "characters"),
-        ("[" * 9000, "nested too deeply"), ("[" * 102 + "]" * 102, "nested too deeply"), ("{a: " * 9000, "nested too deeply"), ("{a: 1, a: 2}", "'a' is given twice"),
+        ("[" * 9000, "nested too deeply"), ("[" * 102 + "]" * 102, "nested too deeply"),
+        ("{a: " * 9000, "nested too deeply"), ("{a: 1, a: 2}", "'a' is given twice"),
         ("!!python/name:os.system", "constructor"), ("!!int 1:30", "1:30"), ("!!timestamp 1", "constructor"),
         ("!!binary x", "constructor"), ("[", "no valid YAML"), ("\0", "no valid YAML"), ("{[1]: 2}", "no valid YAML"),
     ],
