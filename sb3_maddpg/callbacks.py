@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
-from sb3_maddpg.utils import arguments_of, shown
+from sb3_maddpg.utils import arguments_of, as_number, shown
 from sb3_maddpg.validation import CurriculumArguments, validated
 
 # Outputs that cannot show figures and hyperparameters
@@ -154,8 +154,10 @@ class DashboardCallback(BaseCallback):
         layout: Mapping[str, Mapping[str, list[Any]]] | None = None,
     ):
         super().__init__()
+        if draw is not None and not callable(draw):
+            raise ValueError(f"draw={shown(draw)} must be a function of the model, or None.")
         self.draw = draw
-        self.layout = layout or LAYOUT
+        self.layout = LAYOUT if layout is None else check_layout(layout)
 
     def _on_training_start(self) -> None:
         for writer in self._writers():
@@ -167,7 +169,7 @@ class DashboardCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.draw is not None and self._writers():
-            for tag, value in self.draw(self.model).items():
+            for tag, value in check_drawn(self.draw(self.model)).items():
                 picture = hasattr(value, "savefig")
                 self.logger.record(
                     tag, Figure(value, close=True) if picture else value, exclude=TENSORBOARD_ONLY if picture else None
@@ -177,6 +179,51 @@ class DashboardCallback(BaseCallback):
 
     def _writers(self) -> list[TensorBoardOutputFormat]:
         return [one for one in self.logger.output_formats if isinstance(one, TensorBoardOutputFormat)]
+
+
+def check_layout(layout: Any) -> Any:
+    """
+    :param layout: see ``DashboardCallback``
+    :return: the same
+    :raises ValueError: if TensorBoard cannot show it
+    """
+    try:
+        for charts in layout.values():
+            for kind, tags in charts.values():
+                if (
+                    kind not in ("Multiline", "Margin")
+                    or isinstance(tags, str)
+                    or not all(isinstance(one, str) for one in tags)
+                ):
+                    raise ValueError
+    except (AttributeError, TypeError, ValueError):
+        raise ValueError(
+            f"layout={shown(layout)} must map titles to charts, and each chart to its kind and tags, such as "
+            '{"Learning": {"return": ["Multiline", ["rollout/ep_rew_mean"]]}}.'
+        ) from None
+    return layout
+
+
+def check_drawn(drawn: Any) -> Mapping[str, Any]:
+    """
+    :param drawn: what ``draw`` returned, see ``DashboardCallback``
+    :return: figures and Python's numbers by tag
+    :raises ValueError: if it is anything else
+    """
+    if not isinstance(drawn, Mapping):
+        raise ValueError(f"draw returned {shown(drawn)}: it must return a dict of figures and numbers by tag.")
+    found = {}
+    for tag, value in drawn.items():
+        try:
+            if not isinstance(tag, str):
+                raise ValueError
+            found[tag] = value if hasattr(value, "savefig") else as_number(value)
+        except ValueError:
+            raise ValueError(
+                f"draw returned {shown(value)} for {shown(tag)}: it must be a Matplotlib figure or a number, and its "
+                "tag a text."
+            ) from None
+    return found
 
 
 # Default layout. Each chart has one tag, because TensorBoard draws all tags of a run in the same colour

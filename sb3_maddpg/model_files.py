@@ -21,6 +21,7 @@ import torch as th
 from stable_baselines3.common.save_util import open_path
 from torch.overrides import TorchFunctionMode
 
+from sb3_maddpg.offers import OfferError
 from sb3_maddpg.typed_json import check_size, decode
 from sb3_maddpg.utils import shown
 from sb3_maddpg.validation import LARGEST
@@ -320,7 +321,7 @@ def as_damage(path: Any, kind: str = "model") -> Iterator[None]:
     """
     try:
         yield
-    except OSError:
+    except (OSError, OfferError):
         raise
     except Exception as error:
         raised_in = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)

@@ -21,7 +21,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
-from sb3_maddpg.utils import as_flag, as_number, as_numbers, as_seed, not_finite_at, shown
+from sb3_maddpg.utils import as_flag, as_number, as_numbers, as_seed, not_finite_at, shown, told
 
 ENTRY_POINT = f"{__name__}:make"
 MASK = "action_mask"
@@ -1045,20 +1045,25 @@ def _load(path: str) -> Callable[..., Any]:
     module, _, name = path.rpartition(".")
     try:
         return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"The wrapper {path} cannot be imported: {error}") from error
+    except (Exception, SystemExit) as error:  # from foreign code
+        raise ValueError(
+            f"The wrapper {path} cannot be imported ({told(error)}): name the dotted path of one, and install its "
+            "package."
+        ) from error
 
 
 def find_module(name: str) -> ModuleType | None:
     """:return: the module, or None if there is no such module"""
     try:
         return importlib.import_module(name)
-    except ImportError as error:
+    except (Exception, SystemExit) as error:  # from foreign code
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             return None
-        told = str(error).rstrip(".")
-        remedy = "" if "install" in told.lower() else ". Install what it needs"
-        raise ValueError(f"{name} cannot be imported: {told}{remedy}.") from error
+        if not isinstance(error, ImportError):
+            raise ValueError(f"{name} cannot be imported ({told(error)}): repair it.") from error
+        text = str(error).rstrip(".")
+        remedy = "" if "install" in text.lower() else ". Install what it needs"
+        raise ValueError(f"{name} cannot be imported: {text}{remedy}.") from error
 
 
 def find_parallel_env(entry: str) -> Callable[..., ParallelEnv | AECEnv]:

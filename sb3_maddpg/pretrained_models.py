@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
-from importlib.resources import files
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import ModuleType
 
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_maddpg.maddpg import MADDPG, as_vec_env
+from sb3_maddpg.offers import OfferError, broken, load_offer, offers, package_of
 from sb3_maddpg.relational import PairPolicy
-from sb3_maddpg.utils import load_offer, suggest
+from sb3_maddpg.utils import shown, suggest
 
 
 def pretrained_models() -> dict[str, Path]:
@@ -19,9 +20,24 @@ def pretrained_models() -> dict[str, Path]:
     ``sb3_maddpg.models``, which names a package with one folder per model.
 
     :return: name -> folder of the model with its ``model.zip``
+    :raises OfferError: if a package provides none, or a name that another package also has
     """
-    packages = [Path(str(files(load_offer(offer)))) for offer in entry_points(group="sb3_maddpg.models")]
-    found = {path.parent.name: path.parent for package in packages for path in package.glob("*/model.zip")}
+    found: dict[str, Path] = {}
+    providers: dict[str, EntryPoint] = {}
+    for offer in offers("models"):
+        package = load_offer(offer)
+        if not isinstance(package, ModuleType) or not hasattr(package, "__path__"):
+            raise broken(offer, f"is {shown(package)}, which is no package")
+        folders = {path.parent.name: path.parent for one in package.__path__ for path in Path(one).glob("*/model.zip")}
+        if not folders:
+            raise broken(offer, "has no folder with a model.zip")
+        for name, folder in sorted(folders.items()):
+            if found.setdefault(name, folder) != folder:
+                raise OfferError(
+                    f"{package_of(providers[name])} and {package_of(offer)} both have a pretrained model {name!r}: "
+                    "uninstall one of them."
+                )
+            providers[name] = offer
     return dict(sorted(found.items()))
 
 

@@ -8,7 +8,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from importlib.metadata import entry_points
+from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -19,8 +19,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
+from sb3_maddpg.offers import broken, load_offer, offers
 from sb3_maddpg.team import CategoricalActions, MixedActions, TeamObservation
-from sb3_maddpg.utils import load_offer, shown, suggest
+from sb3_maddpg.utils import shown, suggest
 
 Json = Any
 _TYPE = "$"
@@ -163,8 +164,10 @@ def _is_public_class(value: Any, module: Any) -> bool:
 
 @cache
 def _load_entry_points() -> None:
-    for offer in entry_points(group="sb3_maddpg.allowed_in_files"):
-        load_offer(offer)
+    for offer in offers("allowed_in_files"):
+        found = load_offer(offer)
+        if not isinstance(found, ModuleType) and not (isinstance(found, type) and found in _allowed.values()):
+            raise broken(offer, f"is {shown(found)}, neither a module nor a class registered with `allow_in_files`")
 
 
 def known_class(cls: type) -> bool:

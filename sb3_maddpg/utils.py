@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -86,24 +85,6 @@ def remove_empty_log_folder(model: BaseAlgorithm) -> None:
     if folder is not None and os.path.basename(folder).startswith("SB3-"):
         with suppress(OSError):  # it is not empty
             os.rmdir(folder)
-
-
-def load_offer(offer: EntryPoint) -> Any:
-    """
-    Load what an installed package offers.
-
-    :param offer: an entry point
-    :return: the object
-    :raises ImportError: if it cannot be loaded; the message names the package
-    """
-    try:
-        return offer.load()
-    except (Exception, SystemExit) as error:  # from foreign code
-        package = offer.dist.name if offer.dist is not None else "a package"
-        raise ImportError(
-            f"{package} is installed, but its entry point {offer.group}: {offer.name} = {offer.value} cannot be loaded "
-            f"({told(error)}): repair or uninstall {package}."
-        ) from error
 
 
 def describe_env(env: VecEnv) -> dict[str, Any] | None:

@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from difflib import get_close_matches
-from importlib.metadata import entry_points, version
+from importlib.metadata import EntryPoint, version
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -34,9 +34,10 @@ from sb3_maddpg.cli.overview import ALGORITHMS, overview
 from sb3_maddpg.cli.terminal import discard_output, is_unread, lasting_output
 from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
+from sb3_maddpg.offers import broken, load_offer, offer_named, offers
 from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.starting import interruptible
-from sb3_maddpg.utils import load_offer, shown, suggest
+from sb3_maddpg.utils import shown, suggest, told
 
 # Errors in the user's input and errors of the system. Their messages name the remedy, so no traceback is shown.
 USER_ERRORS = (
@@ -107,24 +108,25 @@ def _hand_over(group: str, argv: list[str]) -> int:
     :param argv: arguments of the command
     :return: exit status
     """
-    offers = entry_points(group=f"sb3_maddpg.{group}")
+    names = sorted({one.name for one in offers(group)})
     known, rest = common_options().parse_known_args(argv)
     import_packages(known.gym_packages)
-    if known.env is None and len(offers.names) != 1:
-        choice = f"choose one of {', '.join(sorted(offers.names))}" if offers else f"no installed package has {group}"
+    if known.env is None and len(names) != 1:
+        choice = f"choose one of {', '.join(names)}" if names else f"no installed package has {group}"
         raise ValueError(f"--env is missing: {choice}.")
-    known.env = known.env or next(iter(offers.names))
-    if known.env not in offers.names:
-        if get_close_matches(known.env, offers.names, n=1):
-            raise ValueError(suggest("environment", known.env, offers.names))
+    known.env = known.env or names[0]
+    offer = offer_named(group, known.env)
+    if offer is None:
+        if get_close_matches(known.env, names, n=1):
+            raise ValueError(suggest("environment", known.env, names))
         raise ValueError(
-            f"This command is for {', '.join(sorted(offers.names))}, not for {shown(known.env)}: no installed package "
+            f"This command is for {', '.join(names)}, not for {shown(known.env)}: no installed package "
             f"provides {group} for it. `sb3-maddpg enjoy` and `record` run models in any environment, and "
             "evaluate_policy of Stable-Baselines3 measures their returns."
         )
-    main: Callable[[list[str]], int] = load_offer(offers[known.env])
+    main = load_offer(offer)
     if helps(rest):
-        print(f"Environments (--env, by default the first): {', '.join(sorted(offers.names))}\n")
+        print(f"Environments (--env, by default the first): {', '.join(names)}\n")
     if helps(rest) and group != "identifiers":
         print(f"Models: MODEL.zip, latest:LOGDIR, {', '.join(f'pretrained:{name}' for name in pretrained_models())}\n")
     rest = [_model(word, known.algo, known.env) for word in rest]
@@ -136,7 +138,22 @@ def _hand_over(group: str, argv: list[str]) -> int:
                 if Path(path := word.partition("@")[0]).is_file() and zipfile.is_zipfile(path):
                     refuse_pickled(path, {})
         rest += ["--algo", known.algo if ":" in known.algo else f"{algorithm.__module__}:{algorithm.__qualname__}"]
-    return main(rest)
+    return _call(offer, main, rest)
+
+
+def _call(offer: EntryPoint, main: Any, argv: list[str]) -> int:
+    """:return: the exit status of a package's command"""
+    if not callable(main):
+        raise broken(offer, f"is {shown(main)}, not a function of the command's arguments")
+    try:
+        status = main(argv)
+    except USER_ERRORS:
+        raise
+    except Exception as error:  # from foreign code
+        raise broken(offer, f"failed ({told(error)})") from error
+    if status is not None and not isinstance(status, int):
+        raise broken(offer, f"returned {shown(status)}, which is no exit status")
+    return status or 0
 
 
 def _algorithm(name: str) -> Any:
@@ -145,8 +162,8 @@ def _algorithm(name: str) -> Any:
     if colon:
         try:
             return functools.reduce(getattr, qualname.split("."), importlib.import_module(module))
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(f"--algo {shown(name)} is not an importable MODULE:CLASS ({error}).") from error
+        except (Exception, SystemExit) as error:  # from foreign code
+            raise ValueError(f"--algo {shown(name)} is not an importable MODULE:CLASS ({told(error)}).") from error
     from rl_zoo3.utils import ALGOS
 
     from sb3_maddpg.cli import zoo
@@ -216,7 +233,8 @@ def _pretrained(argv: list[str]) -> int:
         shutil.copytree(folder, copy)
         print(f"copied to {copy}")
     else:
-        print((folder / "README.md").read_text())
+        if (readme := folder / "README.md").is_file():
+            print(readme.read_text())
         print(f"Files: {folder}")
     return 0
 
@@ -281,9 +299,11 @@ def examples(name: str) -> str:
     if not command.offers:
         return command.examples
     found = []
-    for offer in entry_points(group=f"sb3_maddpg.{command.offers}"):
+    for offer in offers(command.offers):
         load_offer(offer)
         own = getattr(importlib.import_module(offer.module), "EXAMPLES", "")
+        if not isinstance(own, str):
+            raise broken(offer, f"has EXAMPLES={shown(own)}, which is no text")
         found.append(own.rstrip("\n") or command.examples.replace("ENV", offer.name))
     return "\n".join(found) or command.examples
 

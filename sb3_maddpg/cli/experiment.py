@@ -1,14 +1,12 @@
 """rl_zoo3's experiment manager with fixes for environment arguments, resuming and tuning."""
 
 import contextlib
-import functools
 import itertools
 import shutil
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from importlib.metadata import entry_points
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -32,7 +30,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.callbacks import DashboardCallback
+from sb3_maddpg.callbacks import DashboardCallback, check_drawn, check_layout
 from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
 from sb3_maddpg.cli.command_files import latest_run_number, write_command
 from sb3_maddpg.cli.interrupts import noticed_interrupts
@@ -55,12 +53,12 @@ from sb3_maddpg.cli.search import (
 )
 from sb3_maddpg.env_states import Replayable, put_aside, tells_state
 from sb3_maddpg.model_files import trusted
+from sb3_maddpg.offers import broken, load_offer, offer_named, package_of
 from sb3_maddpg.team import Team
 from sb3_maddpg.utils import (
     arguments_of,
     atomic_write,
     describe_env,
-    load_offer,
     remedy_of,
     remove_empty_log_folder,
     shown,
@@ -280,22 +278,43 @@ class TeamExperimentManager(ExperimentManager):
         super().create_callbacks()
         if not self.tensorboard_log or self.optimize_hyperparameters:
             return
-        offers = entry_points(group="sb3_maddpg.dashboards")
+        draw, layout = self._dashboard()
+        evaluation = next((one for one in self.callbacks if isinstance(one, EvalCallback)), None)
+        if evaluation is None:  # without evaluations, there are no figures
+            self.callbacks.append(DashboardCallback(layout=layout))
+            return
+        evaluation.callback = DashboardCallback(draw, layout)
+        evaluation.callback.parent = evaluation
+
+    def _dashboard(self) -> tuple[Callable[[BaseAlgorithm], Any] | None, Any]:
+        """:return: the function that draws figures of the environment and the layout, None for the default"""
         name = self.env_name.gym_id
+        offer = offer_named("dashboards", name)
+        if offer is None:
+            return None, None
         try:
-            offer = load_offer(offers[name]) if name in offers.names else None
+            found = load_offer(offer)
         except ImportError as error:
+            if package_of(offer) != "sb3-maddpg":
+                raise
             raise ImportError(
                 f"--tensorboard-log draws figures of {name}, which needs the extra 'plot': in the clone, "
                 f"pip install -e '.[plot]' ({error})."
             ) from error
-        evaluation = next((one for one in self.callbacks if isinstance(one, EvalCallback)), None)
-        if evaluation is None:  # without evaluations, there are no figures
-            self.callbacks.append(DashboardCallback(layout=offer and offer.LAYOUT))
-            return
-        draw = offer and functools.partial(offer.draw, env_kwargs=self.eval_env_kwargs)
-        evaluation.callback = DashboardCallback(draw, offer and offer.LAYOUT)
-        evaluation.callback.parent = evaluation
+        if not callable(getattr(found, "draw", None)) or not hasattr(found, "LAYOUT"):
+            raise broken(offer, f"is {shown(found)}, which has no LAYOUT or no function draw(model, env_kwargs)")
+        try:
+            check_layout(found.LAYOUT)
+        except ValueError as error:
+            raise broken(offer, f"has a wrong LAYOUT ({error})") from error
+
+        def draw(model: BaseAlgorithm) -> Mapping[str, Any]:
+            try:
+                return check_drawn(found.draw(model, env_kwargs=self.eval_env_kwargs))
+            except Exception as error:  # from foreign code
+                raise broken(offer, f"could not draw the model ({told(error)})") from error
+
+        return draw, found.LAYOUT
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """

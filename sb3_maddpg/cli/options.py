@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from sb3_maddpg.utils import shown
+from sb3_maddpg.utils import shown, told
 
 PROG = "sb3-maddpg"
 
@@ -34,13 +34,16 @@ def helps(words: Iterable[str]) -> bool:
     return not {"-h", "--help"}.isdisjoint(words)
 
 
+_BROKEN = "--gym-packages {0}: it is there, but cannot be imported ({1}): repair it, or install what it needs."
+
+
 def import_packages(names: Iterable[str]) -> None:
     """
     Import the packages of ``--gym-packages``.
 
     :param names: names of packages or modules
     :raises ValueError: if a name is not the name of a module
-    :raises ImportError: if a package or one of its dependencies is missing
+    :raises ImportError: if a package or one of its dependencies is missing, or it raises an error
     """
     for name in names:
         if not all(part.isidentifier() for part in name.split(".")):
@@ -49,12 +52,14 @@ def import_packages(names: Iterable[str]) -> None:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
             if not f"{name}.".startswith(f"{error.name}."):
-                raise
+                raise ImportError(_BROKEN.format(name, told(error)), name=error.name) from error
             raise ModuleNotFoundError(
                 f"--gym-packages {name}: there is no module {error.name}, neither installed nor in this folder."
                 f"{did_you_mean(str(error.name), modules_beside(str(error.name)))}",
                 name=error.name,
             ) from None
+        except (Exception, SystemExit) as error:  # from foreign code
+            raise ImportError(_BROKEN.format(name, told(error)), name=name) from error
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import importlib
 import shutil
 import textwrap
-from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,8 +12,8 @@ import yaml
 from sb3_maddpg.iddpg import IDDPG
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.offers import load_offer, offers
 from sb3_maddpg.pretrained_models import pretrained_models
-from sb3_maddpg.utils import load_offer
 
 ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 
@@ -22,8 +21,8 @@ ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg"
 def load_environments() -> None:
     """Import the modules that register environments: the toy tasks, and those that packages name by an entry point."""
     importlib.import_module("sb3_maddpg.team_tasks")
-    for entry_point in entry_points(group="sb3_maddpg.environments"):
-        load_offer(entry_point)
+    for offer in offers("environments"):
+        load_offer(offer)
 
 
 def environments() -> list[str]:

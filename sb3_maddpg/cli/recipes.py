@@ -36,7 +36,7 @@ from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
 from sb3_maddpg.cli.options import did_you_mean, files_beside
 from sb3_maddpg.cli.overview import packaged_recipes
-from sb3_maddpg.utils import arguments_of, shown, suggest
+from sb3_maddpg.utils import arguments_of, shown, suggest, told
 from sb3_maddpg.validation import Arguments, NormalizationArguments, validated_as
 
 # Arguments of the algorithm that come from the command line
@@ -413,9 +413,9 @@ def _class_named(key: str, name: str, example: str) -> Any:
     """:return: what a dotted path in a recipe names"""
     try:
         return get_class_by_name(name)
-    except (ImportError, AttributeError, ValueError, TypeError) as error:
+    except (Exception, SystemExit) as error:  # from foreign code
         raise ValueError(
-            f"{key}: {name} in the recipe cannot be imported ({error}). Use the dotted path of a class, such as "
+            f"{key}: {name} in the recipe cannot be imported ({told(error)}). Use the dotted path of a class, such as "
             f"{example}. {_OF_WHICH}"
         ) from error
 
@@ -442,8 +442,8 @@ def _check_call(key: str, name: str, arguments: Any, source: str = "the recipe")
     where = f"{key}: {name} in {source}"
     try:
         found = get_class_by_name(name)
-    except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise ValueError(f"{where} cannot be imported ({error}). {_OF_WHICH}") from error
+    except (Exception, SystemExit) as error:  # from foreign code
+        raise ValueError(f"{where} cannot be imported ({told(error)}). {_OF_WHICH}") from error
     if not callable(found):
         raise ValueError(f"{where} is not a class. Use the dotted path of one.")
     if key == "callback" and not (isinstance(found, type) and issubclass(found, BaseCallback)):

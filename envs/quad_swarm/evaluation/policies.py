@@ -95,10 +95,12 @@ def _load(policy: str, algo: str, stamp: tuple[int, ...]) -> Any:
     try:
         loader = functools.reduce(getattr, class_name.split("."), importlib.import_module(module_name))
         load = loader.load
-    except (ImportError, AttributeError, ValueError) as error:
+    except (Exception, SystemExit) as error:  # from foreign code
         raise ValueError(f"--algo {algo!r} is not an importable module:Class with a `load` ({error}).") from error
     try:
         model = load(path, device="cpu") if _accepts(load, "device") else load(path)
+    except ImportError:  # of a package, so the file is not to blame
+        raise
     except Exception as error:  # whatever the loader raises for a damaged or foreign file
         raise ValueError(
             f"{path} cannot be loaded by {algo} ({type(error).__name__}: {error}). "
