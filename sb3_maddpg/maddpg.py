@@ -70,6 +70,7 @@ from sb3_maddpg.parallel import TeamEnv, find_module, what_to_pass
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
 from sb3_maddpg.relational import ObservationLayout, PairPolicy, check_layout, remedy_for_other_observations
 from sb3_maddpg.team import ACTION_SPACES, MixedActions, Team, into_box, plain_joint_space
+from sb3_maddpg.trial import try_out
 from sb3_maddpg.typed_json import encode
 from sb3_maddpg.utils import (
     arguments_of,
@@ -345,6 +346,8 @@ class MADDPG(OffPolicyAlgorithm):
             self.n_steps, self.buffer_size = n_steps, buffer_size
         self._create_aliases()
         self._check_memory()
+        if self.env is not None:
+            try_out(self.policy, self.estimator, self._at_present("temperature"))
         actions = self.policy.actions
         if self.action_noise is not None and not actions.has_continuous:
             raise ValueError(
@@ -497,7 +500,16 @@ class MADDPG(OffPolicyAlgorithm):
             vectorised = isinstance(noise, VectorizedActionNoise) or n_envs == 1  # or else learn() vectorises it
             if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
                 noise = VectorizedActionNoise(noise.base_noise, n_envs)
-            numbers = np.broadcast_to(deepcopy(noise)(), (n_envs, length) if vectorised else (length,))
+            self._draw(deepcopy(noise), (n_envs, length) if vectorised else (length,))
+        finally:
+            np.random.set_state(state)  # noqa: NPY002
+        return noise
+
+    def _draw(self, noise: ActionNoise, shape: tuple[int, ...]) -> np.ndarray:
+        """:return: numbers of a noise, which may be the user's own, of a shape whose last axis is the joint action"""
+        length = shape[-1]
+        try:
+            numbers = np.broadcast_to(noise(), shape)
             if not np.isfinite(numbers).all():
                 raise ValueError("it returned NaN or infinity")
         except Exception as error:  # from foreign code
@@ -506,9 +518,7 @@ class MADDPG(OffPolicyAlgorithm):
                 f"({' '.join(str(error).split())[:200]}): it must return finite numbers, as "
                 f"NormalActionNoise(np.zeros({length}), np.full({length}, 0.1)) does."
             ) from error
-        finally:
-            np.random.set_state(state)  # noqa: NPY002
-        return noise
+        return numbers
 
     def _at_present(self, name: str) -> float:
         """
@@ -608,6 +618,13 @@ class MADDPG(OffPolicyAlgorithm):
         for name in self.replay_buffer_kwargs:
             if name not in (known := arguments_of(buffer or TeamReplayBuffer) - NOT_BUFFER_KWARGS):
                 raise ValueError(suggest("argument in replay_buffer_kwargs", name, known))
+        if missing := sorted(
+            (NOT_BUFFER_KWARGS - {"args"} | {*OWN_BUFFER_KWARGS}) - arguments_of(buffer or TeamReplayBuffer)
+        ):
+            raise ValueError(
+                f"replay_buffer_class={cast(type, buffer).__name__} does not accept {', '.join(missing)}, which the "
+                "algorithm passes: add them to its __init__, or pass **kwargs on to TeamReplayBuffer's."
+            )
 
     def _check_memory(self) -> None:
         """Refuse an expectation over more actions than fit into memory."""
@@ -654,7 +671,10 @@ class MADDPG(OffPolicyAlgorithm):
             flat = self.policy.flat_actions(obs).cpu().numpy()
         if actions.has_continuous:
             # SB3's seeded generator
-            noise = np.asarray(action_noise()) if action_noise else np.random.normal(0.0, self.noise_std, flat.shape)  # noqa: NPY002
+            if action_noise:
+                noise = self._draw(action_noise, flat.shape)
+            else:
+                noise = np.random.normal(0.0, self.noise_std, flat.shape)  # noqa: NPY002
             noisy = np.clip(flat + noise, -1.0, 1.0)
             flat = np.where(actions.is_continuous, noisy, flat).astype(np.float32)
         return self._into_action_space(actions.unscale(flat)), flat
@@ -704,6 +724,11 @@ class MADDPG(OffPolicyAlgorithm):
             self._n_updates += 1
             # Sample replay buffer
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            if not isinstance(replay_data, TeamReplayBufferSamples):
+                raise ValueError(
+                    f"{type(self.replay_buffer).__name__}.sample returned {shown(replay_data)}: it must return "
+                    "TeamReplayBufferSamples, as TeamReplayBuffer does."
+                )
             obs = replay_data.observations.float()
             actions = self.policy.actions.encode(replay_data.actions)
             if replay_data.active is not None:

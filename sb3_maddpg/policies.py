@@ -99,11 +99,11 @@ class Actor(nn.Module):
 
     def clip_grad_norm_(self, max_norm: float) -> None:
         """
-        Clip the gradient of each network.
+        Clip the gradient of each network, by default of all of them together.
 
         :param max_norm: maximum norm of a network's gradient
         """
-        raise NotImplementedError
+        nn.utils.clip_grad_norm_(self.parameters(), max_norm)
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
@@ -207,11 +207,11 @@ class Critic(nn.Module):
 
     def clip_grad_norm_(self, max_norm: float) -> None:
         """
-        Clip the gradient of each network.
+        Clip the gradient of each network, by default of all of them together.
 
         :param max_norm: maximum norm of a network's gradient
         """
-        raise NotImplementedError
+        nn.utils.clip_grad_norm_(self.parameters(), max_norm)
 
     def factored(self, actions: th.Tensor) -> th.Tensor:
         """
@@ -724,7 +724,14 @@ class MADDPGPolicy(BasePolicy):
 
     @single_precision()
     def _build(self, lr_schedule: Schedule) -> None:
-        self.actor, self.critic = self._make_networks(*get_actor_critic_arch(self.net_arch))
+        networks = self._make_networks(*get_actor_critic_arch(self.net_arch))
+        match networks:
+            case (Actor(), Critic()):
+                self.actor, self.critic = networks
+            case _:
+                raise ValueError(
+                    f"{type(self).__name__}._make_networks returned {shown(networks)} instead of an Actor and a Critic."
+                )
         if self.image_columns is not None and self.normalize_images:
             self._divide_images()
         self.actions = self.actor.actions

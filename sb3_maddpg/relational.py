@@ -388,9 +388,6 @@ class PairActor(Actor):
         alone.__dict__.pop("optimizer", None)
         return _SinglePairActor(alone)
 
-    def clip_grad_norm_(self, max_norm: float) -> None:
-        nn.utils.clip_grad_norm_(self.parameters(), max_norm)
-
 
 class _SinglePairActor(nn.Module):
     """The actor of a single agent, as a team of one."""

@@ -51,7 +51,7 @@ def told(error: BaseException) -> str:
     :param error: any error
     :return: its class and message on one line, shortened if it is long
     """
-    return _shortened(f"{type(error).__name__}: {error}", 200)
+    return _shortened(f"{type(error).__name__}: {error}".removesuffix(": "), 200)
 
 
 def _shortened(text: str, most: int) -> str:
