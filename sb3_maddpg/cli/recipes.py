@@ -1,6 +1,7 @@
 """Checks of command-line options and recipes before training starts."""
 
 import argparse
+import importlib
 import inspect
 import math
 import types
@@ -248,6 +249,8 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
     if not path.endswith((".yml", ".yaml")):  # a module, which Python reads
         if not all(part.isidentifier() for part in path.split(".")):
             raise ValueError(f"--conf-file {path!r} is neither a YAML file nor a module.")
+        if not path.endswith(".py"):
+            _check_recipes(_recipes_of_module(path), path, algo, env_id)
         return
     if not Path(path).is_file():
         hint = did_you_mean(path, [*files_beside(path, "*.y*ml"), *packaged_recipes()])
@@ -261,6 +264,22 @@ def read_recipe(path: str, algo: str, env_id: str) -> None:
         raise ValueError(
             f"{path}{where}: this is not valid YAML ({getattr(error, 'problem', None) or error})."
         ) from None
+    _check_recipes(recipes, path, algo, env_id)
+
+
+def _recipes_of_module(name: str) -> Any:
+    try:
+        module = importlib.import_module(name)
+    except (Exception, SystemExit) as error:  # from foreign code
+        raise ValueError(
+            f"--conf-file {name} cannot be imported ({told(error)}): name a YAML file or a module with `hyperparams`."
+        ) from error
+    if not hasattr(module, "hyperparams"):
+        raise ValueError(f"--conf-file {name}: the module has no `hyperparams`, a dict of recipes by environment.")
+    return module.hyperparams
+
+
+def _check_recipes(recipes: Any, path: str, algo: str, env_id: str) -> None:
     form = f"Write `{env_id}:` and the keys of its recipe, indented, below it."
     if not isinstance(recipes, dict):
         raise ValueError(f"{path} holds {_kind(recipes)} instead of recipes by environment. {form}")

@@ -27,7 +27,7 @@ from stable_baselines3.common import base_class, off_policy_algorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
@@ -136,6 +136,7 @@ def no_code_from_files() -> Iterator[None]:
             (module, "SubprocVecEnv", _SubprocVecEnv),
             (module, "get_latest_run_id", latest_run_number),
             (module, "get_wrapper_class", _named_wrappers(module.get_wrapper_class)),
+            (module, "get_callback_list", _named_callbacks(module.get_callback_list)),
         ]
     changes.append((EnvSpec, "make", _named_env(EnvSpec.make)))
     if not trusted(None):
@@ -175,13 +176,35 @@ def _named_wrappers(get: Callable[..., Any]) -> Callable[..., Any]:
 
         def wrapped(env: Any) -> Any:
             try:
-                return wrap(env)
+                found = wrap(env)
             except Exception as error:  # from foreign code
                 raise ValueError(f"{key}: {shown(named)} cannot wrap the environment ({told(error)}).") from error
+            needed = VecEnv if key == "vec_env_wrapper" else gymnasium.Env
+            if not isinstance(found, needed):
+                raise ValueError(
+                    f"{key}: {shown(named)} returned {shown(found)}: it must return a {needed.__module__}."
+                    f"{needed.__name__} around the environment."
+                )
+            return found
 
         return wrapped
 
     return get_wrappers
+
+
+def _named_callbacks(get: Callable[..., Any]) -> Callable[..., Any]:
+    """:return: rl_zoo3's function that creates the callbacks of a recipe, where an error of a callback names it"""
+
+    def get_callbacks(hyperparams: dict[str, Any]) -> list[BaseCallback]:
+        try:
+            return get(hyperparams)
+        except Exception as error:  # from foreign code
+            raise ValueError(
+                f"callback: {shown(hyperparams.get('callback'))} in the recipe cannot be created ({told(error)}): "
+                "repair it, or leave it out."
+            ) from error
+
+    return get_callbacks
 
 
 def _named_env(make: Callable[..., Any]) -> Callable[..., Any]:

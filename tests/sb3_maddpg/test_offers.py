@@ -226,3 +226,54 @@ def test_a_module_that_raises_anything_when_imported_is_named(argv, code, instal
     assert {"r": "RuntimeError: a b", "d": "SyntaxError", "1": "ZeroDivisionError"}[code[0]] in told or (
         "SystemExit: 3" in told
     )
+
+
+PARTS = """
+from stable_baselines3.common.callbacks import BaseCallback
+class Abstract(BaseCallback): pass
+class Raising(BaseCallback):
+    def __init__(self): raise KeyError("key")
+    def _on_step(self): return True
+def nothing(env): return None
+class NoWrapper:
+    def __init__(self, env): pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "problem"),
+    [
+        ("callback", "Abstract", "in the recipe cannot be created (TypeError: Can't instantiate abstract class"),
+        ("callback", "Raising", "in the recipe cannot be created (KeyError: 'key'): repair it, or leave it out."),
+        ("env_wrapper", "nothing", "returned None: it must return a gymnasium.core.Env around the environment."),
+        ("env_wrapper", "NoWrapper", "it must return a gymnasium.core.Env around the environment."),
+        ("vec_env_wrapper", "nothing", "returned None: it must return a stable_baselines3."),
+        ("vec_env_wrapper", "NoWrapper", "it must return a stable_baselines3."),
+    ],
+)
+def test_what_a_recipe_names_must_be_what_it_is_used_for(key, name, problem, install, capsys):
+    install("their-package", "none", "", PARTS)
+    told = refused([*TRAIN, "-params", f"{key}:['their_package.{name}']"], capsys)
+    assert f"{key}: ['their_package.{name}'] " in told
+    assert problem in told
+
+
+@pytest.mark.parametrize(
+    ("code", "problem"),
+    [
+        ("raise RuntimeError('a\\nb')", "--conf-file their_package cannot be imported (RuntimeError: a b)"),
+        ("", "--conf-file their_package: the module has no `hyperparams`"),
+        ("hyperparams = 3", "their_package holds int 3 instead of recipes by environment."),
+        ("hyperparams = {'OwnBit-v0': 3}", "their_package: the recipe OwnBit-v0 is int 3."),
+        ("hyperparams = {'Other-v0': {}}", "their_package has no recipe for OwnBit-v0"),
+    ],
+)
+def test_a_module_of_recipes_is_checked_like_a_file(code, problem, install, capsys):
+    install("their-package", "none", "", code)
+    assert problem in refused([*TRAIN, "--conf-file", "their_package"], capsys)
+
+
+def test_a_module_of_recipes_is_used(install, capsys):
+    code = "hyperparams = {'OwnBit-v0': {'n_timesteps': 20, 'policy': 'MlpPolicy', 'learning_starts': 100}}"
+    install("their-package", "none", "", code)
+    assert main(["train", "--env", "OwnBit-v0", "--eval-freq", "-1", "--conf-file", "their_package"]) == 0
