@@ -19,8 +19,8 @@ from sb3_maddpg.normalization import SafeVecNormalize
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.pretrained_models import pretrained
+from sb3_maddpg.registry import allow_in_files
 from sb3_maddpg.relational import PairPolicy
-from sb3_maddpg.typed_json import allow_in_files
 
 __version__ = version("sb3-maddpg")
 __all__ = [

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_maddpg.actions import ActionKind, Categorical, Continuous, make_kinds
+from sb3_maddpg.errors import DivergedError, InvalidArgumentError
 from sb3_maddpg.networks import single_precision
 from sb3_maddpg.team import AgentActionSpace, into_box
 from sb3_maddpg.utils import as_numbers, atomic_write, shown
@@ -106,7 +107,9 @@ class AgentPolicy(nn.Module):
         :raises ValueError: if there is no such agent, or parameters are not finite
         """
         if problem := policy.not_finite(policy.state_dict()):
-            raise ValueError(f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file.")
+            raise DivergedError(
+                f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file."
+            )
         team, index = policy.team, policy.team.index(agent)
         network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
         columns, space = policy.actions.columns_of(index), team.action_spaces[index]
@@ -156,21 +159,25 @@ class AgentPolicy(nn.Module):
             "observation)."
         )
         if isinstance(observation, Mapping) and self.name in observation:
-            raise ValueError(f"These are observations of several agents: pass observations[{self.name!r}] alone.")
+            raise InvalidArgumentError(
+                f"These are observations of several agents: pass observations[{self.name!r}] alone."
+            )
         try:
             obs = th.as_tensor(as_numbers(observation))
         except ValueError:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"The observation of {self.name} is not an array of numbers: {shown(observation)}. {flatten}"
             ) from None
         if obs.numel() == self.obs_dim and obs.shape[-1:] != (self.obs_dim,):
             obs = obs.flatten()
         if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"An observation of {self.name} has shape ({self.obs_dim},), not {tuple(obs.shape)}. {flatten}"
             )
         if not obs.isfinite().all():
-            raise ValueError(f"The observation of {self.name} holds NaN or infinity: clip or replace such values.")
+            raise InvalidArgumentError(
+                f"The observation of {self.name} holds NaN or infinity: clip or replace such values."
+            )
         with th.no_grad():
             actions = self(obs.reshape(-1, self.obs_dim)).numpy()
         space = self.action_space
@@ -195,16 +202,16 @@ class AgentPolicy(nn.Module):
         :raises ValueError: if the suffix is unknown, a parameter is not finite, or ONNX is needed and not installed
         """
         if not isinstance(path, (str, os.PathLike)):
-            raise ValueError(f"{shown(path)} is not the path of a file.")
+            raise InvalidArgumentError(f"{shown(path)} is not the path of a file.")
         suffix = os.path.splitext(os.fspath(path))[1]
         if suffix.lower() not in ("", ".onnx", *_TORCHSCRIPT):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"{shown(os.fspath(path))} has the suffix {suffix}: end the path with .onnx for ONNX, or with .pt for "
                 "TorchScript."
             )
         for name, parameter in self.named_parameters():
             if not parameter.isfinite().all():
-                raise ValueError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
+                raise DivergedError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
         if suffix.lower() == ".onnx":
             program = self._to_onnx()
             with atomic_write(path, suffix="onnx") as file:
@@ -235,7 +242,9 @@ class AgentPolicy(nn.Module):
                     verbose=False,
                 )
         except ImportError as error:
-            raise ValueError(f'ONNX is not installed ({error}): in the clone, pip install -e ".[onnx]".') from error
+            raise InvalidArgumentError(
+                f'ONNX is not installed ({error}): in the clone, pip install -e ".[onnx]".'
+            ) from error
         finally:
             logger.setLevel(level)
         assert program is not None

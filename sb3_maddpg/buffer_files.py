@@ -14,6 +14,7 @@ import numpy as np
 import torch as th
 
 from sb3_maddpg.buffers import TeamReplayBuffer
+from sb3_maddpg.errors import InvalidFileError
 from sb3_maddpg.model_files import check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import shown
@@ -63,18 +64,18 @@ def read_buffer(path: str | pathlib.Path | io.BufferedIOBase, device: th.device 
     with zipfile.ZipFile(cast(Any, path)) as archive:
         members = {member.filename: member for member in archive.infolist()}
         if _STATE not in members or len(members) < len(archive.infolist()) or members[_STATE].file_size > _MOST_JSON:
-            raise ValueError(f"{path} holds no replay buffer of sb3-maddpg.")
+            raise InvalidFileError(f"{path} holds no replay buffer of sb3-maddpg.")
         check_not_compressed(path, archive)
         state = json.loads(archive.read(_STATE))
         if not isinstance(state, dict) or state.get("format") != _FORMAT:
-            raise ValueError(f"{path} holds no replay buffer of format {_FORMAT}.")
+            raise InvalidFileError(f"{path} holds no replay buffer of format {_FORMAT}.")
         cls, arguments, counters = (
             decode(state.get(key), f"{path}: {key}") for key in ("class", "arguments", "counters")
         )
         if not (isinstance(cls, type) and issubclass(cls, TeamReplayBuffer)):
-            raise ValueError(f"{path} holds a {shown(cls)}, but the model needs a TeamReplayBuffer.")
+            raise InvalidFileError(f"{path} holds a {shown(cls)}, but the model needs a TeamReplayBuffer.")
         if not isinstance(arguments, dict) or not isinstance(counters, dict):
-            raise ValueError(f"{path} is damaged: its arguments or counters have no names.")
+            raise InvalidFileError(f"{path} is damaged: its arguments or counters have no names.")
         buffer = cls(**arguments, device=device)
         arrays = {name: _read_array(archive, member) for name, member in members.items() if name != _STATE}
         buffer.restore(counters, {name.removesuffix(".npy"): array for name, array in arrays.items()})
@@ -88,7 +89,7 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read_header(file)
         if dtype.hasobject or math.prod(shape) * dtype.itemsize + file.tell() != member.file_size:
-            raise ValueError(
+            raise InvalidFileError(
                 f"{member.filename} has {member.file_size} bytes, not an array of {dtype} and shape {shape}."
             )
     with archive.open(member) as file:

@@ -10,6 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_maddpg.errors import DivergedError, InvalidArgumentError, InvalidEnvironmentError, InvalidFileError
+from sb3_maddpg.registry import allow_in_files
 from sb3_maddpg.team import InfoKey, Team, heads_of
 from sb3_maddpg.utils import all_finite, as_numbers, integers_problem, not_finite_at, shown
 from sb3_maddpg.validation import PriorityArguments, ReplayBufferArguments, validated
@@ -88,6 +90,7 @@ _REMEDY = "Look there for a division by zero or a diverging simulation; end the 
 _REMEDY_ACTION = "Look for diverged networks (lower learning_rate) or a Box whose bounds are equal or too large."
 
 
+@allow_in_files(name="sb3_maddpg.buffers.TeamReplayBuffer")
 class TeamReplayBuffer(ReplayBuffer):
     """
     SB3's replay buffer with rewards and terminations of each agent. It reads these entries of ``infos``:
@@ -173,12 +176,12 @@ class TeamReplayBuffer(ReplayBuffer):
         self.n_pairs = arguments.pop("n_pairs")
         self.pairs_end = arguments.pop("pairs_end")
         if self.n_steps > 1 and arguments["optimize_memory_usage"]:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"n_steps={n_steps} needs the observation after each step, which optimize_memory_usage=True does not "
                 "store at the end of an episode. Set n_steps=1 or optimize_memory_usage=False."
             )
         if arguments["optimize_memory_usage"] and arguments["handle_timeout_termination"]:
-            raise ValueError(
+            raise InvalidArgumentError(
                 "optimize_memory_usage=True drops the last observation of a truncated episode. Set it to False, or "
                 "set handle_timeout_termination=False (in replay_buffer_kwargs) to treat truncation as termination."
             )
@@ -277,25 +280,25 @@ class TeamReplayBuffer(ReplayBuffer):
             numbers that are not finite
         """
         if set(counters) != set(self._COUNTERS):
-            raise ValueError(f"A {type(self).__name__} has the counters {self._COUNTERS}, not {tuple(counters)}.")
+            raise InvalidFileError(f"A {type(self).__name__} has the counters {self._COUNTERS}, not {tuple(counters)}.")
         for name, value in counters.items():
             default = getattr(self, name)
             if type(value) is not type(default) or not 0 <= value < (2**53 if type(value) is int else math.inf):
-                raise ValueError(f"The replay buffer's {name} is {shown(value)}.")
+                raise InvalidFileError(f"The replay buffer's {name} is {shown(value)}.")
             setattr(self, name, value)
         names = self.records.dtype.names or ()
         rows = self.size() + int(self.optimize_memory_usage)
         if self.pos >= self.buffer_size:
-            raise ValueError(f"The replay buffer's pos is {self.pos}, but it has {self.buffer_size} rows.")
+            raise InvalidFileError(f"The replay buffer's pos is {self.pos}, but it has {self.buffer_size} rows.")
         if self.n_added < self.size():
-            raise ValueError(f"The replay buffer's n_added is {self.n_added}, but it holds {self.size()} rows.")
+            raise InvalidFileError(f"The replay buffer's n_added is {self.n_added}, but it holds {self.size()} rows.")
         for name in names:
             array, own = arrays.get(name), self.records[name][:rows]
             if array is None or (array.shape, array.dtype) != (own.shape, own.dtype):
                 given = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
-                raise ValueError(f"The replay buffer's {name} are {given}, not {own.dtype} of shape {own.shape}.")
+                raise InvalidFileError(f"The replay buffer's {name} are {given}, not {own.dtype} of shape {own.shape}.")
             if not all_finite(array):
-                raise ValueError(f"The replay buffer's {name} hold NaN or infinity.")
+                raise InvalidFileError(f"The replay buffer's {name} hold NaN or infinity.")
             own[...] = array
         if rows:
             self._check_stored_actions(arrays["actions"])
@@ -315,7 +318,7 @@ class TeamReplayBuffer(ReplayBuffer):
         if wrong.any():
             agent, column = self._place_of_action(place := int(np.argmax(wrong)))
             kind = "numbers" if continuous[place] else "integers"
-            raise ValueError(
+            raise InvalidFileError(
                 f"The replay buffer's actions of agent {agent} ({self.team.names[agent]}) lie between {least[place]} "
                 f"and {most[place]} in column {column}: they must be {kind} from {low[place]} to {high[place]}."
             )
@@ -422,13 +425,13 @@ class TeamReplayBuffer(ReplayBuffer):
         """
         fits = values.shape == shape or (what == "action" and values.size == math.prod(shape))
         if not fits or len(values) != self.n_envs:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The {what} has shape {values.shape}, but this replay buffer is for {self.n_envs} environment(s) of "
                 f"{self.n_agents} agents: it must be {shape}. A buffer fits only the team and the number of "
                 "environments that it was created for."
             )
         if values.dtype.kind not in "biuf":
-            raise ValueError(f"The {what} is an array of {values.dtype}: it must hold real numbers.")
+            raise InvalidEnvironmentError(f"The {what} is an array of {values.dtype}: it must hold real numbers.")
         values = values.reshape(shape)
         if (index := not_finite_at(values)) is None:
             if what != "action" and self.observations.dtype.kind in "iu":
@@ -436,7 +439,7 @@ class TeamReplayBuffer(ReplayBuffer):
             return
         env, *place = index
         agent, column = place if what != "action" else self._place_of_action(place[0])
-        raise ValueError(
+        raise DivergedError(
             f"The {what} of agent {agent} ({self.team.names[agent]}) is {values[index]} in column {column}, "
             f"{self._where(env)}: it must be finite. {_REMEDY_ACTION if what == 'action' else _REMEDY}"
         )
@@ -444,7 +447,7 @@ class TeamReplayBuffer(ReplayBuffer):
     def _check_integers(self, what: str, values: np.ndarray) -> None:
         for env, rows in enumerate(values):
             if (problem := integers_problem(rows, self.observations.dtype)) is not None:
-                raise ValueError(f"The {what} of agent {problem} {self._where(env)}. {_REMEDY}")
+                raise InvalidEnvironmentError(f"The {what} of agent {problem} {self._where(env)}. {_REMEDY}")
 
     def _place_of_action(self, column: int) -> tuple[int, int]:
         """:return: the agent that a column of the joint action belongs to, and the column in its own action"""
@@ -475,7 +478,7 @@ class TeamReplayBuffer(ReplayBuffer):
         where: slice | list[int] = slice(None)
         if len(values) < len(infos):
             if default is None:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"info['{key}'] is missing, but the buffer was created with n_pairs={self.n_pairs}: return it with "
                     f"shape {array.shape[1:]} in every step of the environment, or leave n_pairs at 0."
                 )
@@ -487,7 +490,7 @@ class TeamReplayBuffer(ReplayBuffer):
             rows = [as_numbers(value) for value in values]
         except ValueError:
             self._check_shapes(key, values, array.shape[1:])
-            raise ValueError(f"info['{key}'] of {shown(values)} does not hold numbers.") from None
+            raise InvalidEnvironmentError(f"info['{key}'] of {shown(values)} does not hold numbers.") from None
         self._check_shapes(key, rows, array.shape[1:])
         array[where] = rows
         return True
@@ -502,7 +505,7 @@ class TeamReplayBuffer(ReplayBuffer):
                 of_pairs = key in ("pair_rewards", "pair_terminated")
                 pairs = f" and n_pairs={self.n_pairs}" if of_pairs else ""
                 remedy = "" if of_pairs else ", or leave the key out"
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"info['{key}'] has shape {shape}, but there are {self.n_agents} agents{pairs}: "
                     f"the environment must return shape {needed}{remedy}."
                 )
@@ -523,7 +526,7 @@ class TeamReplayBuffer(ReplayBuffer):
                 env, *agent = np.argwhere(array * (array - 1) != 0)[0].tolist()
                 whose = f" of agent {agent[0]} ({self.team.names[agent[0]]})" if agent else ""
                 value = array[tuple([env, *agent])]
-                raise ValueError(f"{name}{whose} is {value} {self._where(env)}: it must be True or False.")
+                raise InvalidEnvironmentError(f"{name}{whose} is {value} {self._where(env)}: it must be True or False.")
 
     def _refuse_numbers(self, infos: Sequence[dict[str, Any]]) -> None:
         keys = ("agent_rewards", "pair_rewards", "pair_terminated", "agent_terminated", "agent_active", "rewards")
@@ -535,7 +538,7 @@ class TeamReplayBuffer(ReplayBuffer):
                 if key in infos[env]:
                     source = f"info['{key}'] of agent {agent} ({self.team.names[agent]})"
                     value = np.asarray(infos[env][key])[tuple(index[1:])]
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"{source} is {value} {self._where(env)}: it must be finite in single precision. {_REMEDY}"
                 )
 
@@ -553,7 +556,7 @@ class TeamReplayBuffer(ReplayBuffer):
 
     def _check_not_empty(self) -> None:
         if not self.size():
-            raise ValueError("The replay buffer is empty: add transitions first, see learning_starts.")
+            raise InvalidArgumentError("The replay buffer is empty: add transitions first, see learning_starts.")
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: np.ndarray, env: VecNormalize | None = None
@@ -729,6 +732,7 @@ class TeamReplayBuffer(ReplayBuffer):
         }
 
 
+@allow_in_files(name="sb3_maddpg.buffers.PrioritizedTeamReplayBuffer")
 class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
     """
     Team replay buffer with proportional prioritised experience replay (Schaul et al. 2016, arXiv:1511.05952,
@@ -768,22 +772,24 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         super().restore(counters, arrays)
         given = arrays.get("priorities")
         if given is None or (given.shape, given.dtype) != ((self.size() * self.n_envs,), np.dtype(float)):
-            raise ValueError(
+            raise InvalidFileError(
                 f"The replay buffer does not hold priorities of its {self.size() * self.n_envs} transitions."
             )
         if not (np.isfinite(given).all() and (given >= 0).all()):
-            raise ValueError("The replay buffer has priorities that are negative, NaN or infinite.")
+            raise InvalidFileError("The replay buffer has priorities that are negative, NaN or infinite.")
         if self.new_rows > self.size():
-            raise ValueError(f"The replay buffer's new_rows is {self.new_rows}, but it holds {self.size()} rows.")
+            raise InvalidFileError(f"The replay buffer's new_rows is {self.new_rows}, but it holds {self.size()} rows.")
         if not 0 < self.largest_priority * self.buffer_size * self.n_envs < math.inf:
-            raise ValueError(
+            raise InvalidFileError(
                 f"The replay buffer's largest_priority is {self.largest_priority}: the priorities of all its rows must "
                 "have a positive and finite sum."
             )
         with np.errstate(over="ignore"):
             total = given.sum() + self.largest_priority * self.new_rows * self.n_envs
         if self.size() and not 0 < total < math.inf:
-            raise ValueError(f"The replay buffer's priorities add up to {total}: the sum must be positive and finite.")
+            raise InvalidFileError(
+                f"The replay buffer's priorities add up to {total}: the sum must be positive and finite."
+            )
         self.priorities.set(np.arange(len(given)), given)
 
     def add(self, *args: Any, **kwargs: Any) -> None:
@@ -834,7 +840,7 @@ class PrioritizedTeamReplayBuffer(TeamReplayBuffer):
         priorities = (errors.astype(np.float64) + self.epsilon) ** self.alpha
         largest = priorities.max()
         if not math.isfinite(largest):
-            raise ValueError(
+            raise DivergedError(
                 f"The critics' error is {errors[~np.isfinite(errors)][0]}: the critics diverged. Lower the "
                 "learning_rate or scale the rewards down."
             )

@@ -9,6 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure, HParam, HumanOutputFormat, Logger, TensorBoardOutputFormat
 
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.utils import arguments_of, as_number, shown
 from sb3_maddpg.validation import CurriculumArguments, validated
 
@@ -41,7 +42,7 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
     for info in infos:
         metrics = info.get("metrics", {})
         if not isinstance(metrics, Mapping):
-            raise ValueError(f"info['metrics'] is {shown(metrics)}: it must be a dict of numbers by name.")
+            raise InvalidEnvironmentError(f"info['metrics'] is {shown(metrics)}: it must be a dict of numbers by name.")
         widen_tables(logger, map(str, metrics))
         for name, value in metrics.items():
             try:
@@ -49,7 +50,9 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
             except (TypeError, ValueError, OverflowError):
                 number = math.nan
             if not math.isfinite(number):
-                raise ValueError(f"info['metrics'][{name!r}] is {shown(value)}: a metric must be a finite number.")
+                raise InvalidEnvironmentError(
+                    f"info['metrics'][{name!r}] is {shown(value)}: a metric must be a finite number."
+                )
             logger.record_mean(name, number)
 
 
@@ -67,7 +70,7 @@ def check_success(infos: list[dict[str, Any]]) -> None:
         except ValueError:  # from an array
             known = False
         if not known:
-            raise ValueError(f"info['is_success'] is {shown(success)}: it must be True or False.")
+            raise InvalidEnvironmentError(f"info['is_success'] is {shown(success)}: it must be True or False.")
 
 
 class MetricsCallback(BaseCallback):
@@ -110,7 +113,7 @@ class CurriculumCallback(BaseCallback):
     def _on_training_start(self) -> None:
         for name in ("n_curriculum_levels", "set_curriculum_level"):
             if not self.training_env.has_attr(name):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"CurriculumCallback needs an environment with `{name}`, which this one lacks. Choose an "
                     "environment or scenario with a curriculum, or remove the callback."
                 )
@@ -121,7 +124,9 @@ class CurriculumCallback(BaseCallback):
         for info, done in zip(self.locals["infos"], self.locals["dones"], strict=True):
             if done:
                 if "is_success" not in info:
-                    raise ValueError('CurriculumCallback needs info["is_success"] at the end of every episode.')
+                    raise InvalidEnvironmentError(
+                        'CurriculumCallback needs info["is_success"] at the end of every episode.'
+                    )
                 check_success([info])
                 self.successes.append(bool(info["is_success"]))
         full = len(self.successes) == self.successes.maxlen
@@ -155,7 +160,7 @@ class DashboardCallback(BaseCallback):
     ):
         super().__init__()
         if draw is not None and not callable(draw):
-            raise ValueError(f"draw={shown(draw)} must be a function of the model, or None.")
+            raise InvalidArgumentError(f"draw={shown(draw)} must be a function of the model, or None.")
         self.draw = draw
         self.layout = LAYOUT if layout is None else check_layout(layout)
 
@@ -197,7 +202,7 @@ def check_layout(layout: Any) -> Any:
                 ):
                     raise ValueError
     except (AttributeError, TypeError, ValueError):
-        raise ValueError(
+        raise InvalidArgumentError(
             f"layout={shown(layout)} must map titles to charts, and each chart to its kind and tags, such as "
             '{"Learning": {"return": ["Multiline", ["rollout/ep_rew_mean"]]}}.'
         ) from None
@@ -211,7 +216,9 @@ def check_drawn(drawn: Any) -> Mapping[str, Any]:
     :raises ValueError: if it is anything else
     """
     if not isinstance(drawn, Mapping):
-        raise ValueError(f"draw returned {shown(drawn)}: it must return a dict of figures and numbers by tag.")
+        raise InvalidArgumentError(
+            f"draw returned {shown(drawn)}: it must return a dict of figures and numbers by tag."
+        )
     found = {}
     for tag, value in drawn.items():
         try:
@@ -219,7 +226,7 @@ def check_drawn(drawn: Any) -> Mapping[str, Any]:
                 raise ValueError
             found[tag] = value if hasattr(value, "savefig") else as_number(value)
         except ValueError:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"draw returned {shown(value)} for {shown(tag)}: it must be a Matplotlib figure or a number, and its "
                 "tag a text."
             ) from None

@@ -40,7 +40,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.buffers import TeamReplayBuffer
 from sb3_maddpg.env_states import (
-    NoStateError,
     checked_bits,
     layers,
     load_vec_env_state,
@@ -51,6 +50,7 @@ from sb3_maddpg.env_states import (
     space_generators,
     vec_env_state,
 )
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError, InvalidFileError, NoStateError, TeamError
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.model_files import as_damage, check_not_compressed
 from sb3_maddpg.typed_json import decode, encode
@@ -91,7 +91,7 @@ class RunCheckpoint(BaseCallback):
     def __init__(self, folder: str | os.PathLike[str], every: int | None = None, keep: int = 2, verbose: int = 0):
         super().__init__(verbose)
         if not ((every is None or every >= 1) and keep >= 1):  # also NaN
-            raise ValueError(f"every={every}, keep={keep}: both must be at least 1.")
+            raise InvalidArgumentError(f"every={every}, keep={keep}: both must be at least 1.")
         self.folder, self.every, self.keep = Path(folder), every, keep
         self.saved_at = 0
         # Seconds that checkpoints have cost: time of the training, and processor time of the writing threads
@@ -119,7 +119,7 @@ class RunCheckpoint(BaseCallback):
             except (ValueError, OSError):
                 raise
             except Exception as error:  # from environments, wrappers and callbacks of any kind
-                raise ValueError(
+                raise InvalidFileError(
                     f"A checkpoint in {self.folder} is damaged, or belongs to another environment or other callbacks "
                     f"({type(error).__name__}: {shown(str(error))})."
                 ) from error
@@ -433,7 +433,7 @@ def resume(
         _compare_fingerprints(plain["fingerprint"], fingerprint(model.env))
         n_envs = len(plain["last"]["_last_episode_starts"])
         if model.n_envs != n_envs:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{path} has n_envs={n_envs}, but the recipe or env has n_envs={model.n_envs} now: set it to {n_envs} "
                 "to resume this run."
             )
@@ -459,14 +459,14 @@ def _check_values(state: dict[str, Any]) -> None:
     """
     every, noise, logger, inexact = (state[name] for name in ("every", "action_noise", "logger", "inexact"))
     if every is not None and not (type(every) is int and every >= 1):
-        raise ValueError(f"A checkpoint is damaged: it was one of every={shown(every)} steps.")
+        raise InvalidFileError(f"A checkpoint is damaged: it was one of every={shown(every)} steps.")
     if not isinstance(noise, (ActionNoise, type(None))):
-        raise ValueError(f"A checkpoint is damaged: its action_noise is {shown(noise)}.")
+        raise InvalidFileError(f"A checkpoint is damaged: its action_noise is {shown(noise)}.")
     if not isinstance(state["logger_folder"], (str, type(None))) or not isinstance(inexact, (str, type(None))):
-        raise ValueError("A checkpoint is damaged: its logger_folder or inexact is not text.")
+        raise InvalidFileError("A checkpoint is damaged: its logger_folder or inexact is not text.")
     written = state["fingerprint"]
     if not isinstance(written, dict) or not all(isinstance(one, str) for pair in written.items() for one in pair):
-        raise ValueError(f"A checkpoint is damaged: its fingerprint is {shown(written)}.")
+        raise InvalidFileError(f"A checkpoint is damaged: its fingerprint is {shown(written)}.")
     kinds = {
         "name_to_value": lambda value: isinstance(value, (str, int, float, np.number)),
         "name_to_count": lambda value: type(value) is int and 0 <= value < 2**53,
@@ -475,7 +475,7 @@ def _check_values(state: dict[str, Any]) -> None:
     for name in _LOGGED:
         wrong = [value for value in logger[name].values() if not kinds[name](value)]
         if wrong or not all(isinstance(key, str) for key in logger[name]):
-            raise ValueError(f"A checkpoint is damaged: the logger's {name} holds {shown(wrong)}.")
+            raise InvalidFileError(f"A checkpoint is damaged: the logger's {name} holds {shown(wrong)}.")
 
 
 def newest(folder: str | os.PathLike[str]) -> Path | None:
@@ -514,7 +514,7 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             file.seek(0)
-            raise ValueError(f"{path} is in use by {file.read().strip() or 'another process'}.") from None
+            raise TeamError(f"{path} is in use by {file.read().strip() or 'another process'}.") from None
         file.truncate(0)
         file.write(f"process {os.getpid()} on {platform.node()}")
         file.flush()
@@ -604,7 +604,9 @@ def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]
     names = [type(one).__name__ for one in callbacks]
     states = [one for one in state["callbacks"] if one["class"] != CallbackList.__name__]
     if names != (written := [one["class"] for one in states]):
-        raise ValueError(f"The run had the callbacks {written}, but now they are {names}: resume with the same ones.")
+        raise InvalidArgumentError(
+            f"The run had the callbacks {written}, but now they are {names}: resume with the same ones."
+        )
     for one, saved in zip(callbacks, states, strict=True):
         set_plain_values(one, _values_to_restore(one, saved["values"], saved.get("at_start")))
         if saved["eval_env"] is not None:
@@ -662,7 +664,7 @@ def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
     if value is None and name == "_last_original_obs" and model._vec_normalize_env is None:  # before the first step
         return value
     if not isinstance(value, np.ndarray) or value.shape != np.shape(present):
-        raise ValueError(f"A checkpoint is damaged: its {name} is {shown(value)}.")
+        raise InvalidFileError(f"A checkpoint is damaged: its {name} is {shown(value)}.")
     return value
 
 
@@ -707,21 +709,21 @@ def _check_random_state(state: dict[str, Any]) -> None:
     version, numbers, gauss = state["python"]
     plain = version == own["python"][0] and isinstance(numbers, list) and len(numbers) == len(own["python"][1])
     if not (plain and all(type(one) is int and 0 <= one < 2**32 for one in numbers) and numbers[-1] < len(numbers)):
-        raise ValueError("A checkpoint is damaged: its state of Python's random number generator does not fit.")
+        raise InvalidFileError("A checkpoint is damaged: its state of Python's random number generator does not fit.")
     if gauss is not None and not (isinstance(gauss, float) and math.isfinite(gauss)):
-        raise ValueError(f"A checkpoint is damaged: Python's random number generator has gauss={shown(gauss)}.")
+        raise InvalidFileError(f"A checkpoint is damaged: Python's random number generator has gauss={shown(gauss)}.")
     checked_bits(state["numpy"], own["numpy"])
     for name in ("torch", "cuda"):
         given, present = ([one] if name == "torch" else one for one in (state[name], own[name]))
         for one, other in zip(given, present, strict=False):  # there may be no GPU here, or none before
             if not isinstance(one, np.ndarray) or (one.shape, one.dtype) != (other.shape, other.dtype):
-                raise ValueError(
+                raise InvalidFileError(
                     f"A checkpoint is damaged: its state of PyTorch's random number generator is {shown(one)}."
                 )
     try:
         th.Generator().set_state(th.from_numpy(state["torch"].copy()))
     except RuntimeError as error:
-        raise ValueError(
+        raise InvalidFileError(
             f"A checkpoint is damaged: {shown(str(error))} as the state of PyTorch's generator."
         ) from error
 
@@ -855,7 +857,7 @@ def _read_segments(
     for one in segments:
         path, first, end = _file_in(folder / _SEGMENTS, one["name"]), one["first"], one["end"]
         if not 0 <= first < end <= counters["n_added"] or _size_of(buffer, first, end) > path.stat().st_size:
-            raise ValueError(f"{path} does not hold the rows {shown(first)} to {shown(end)}.")
+            raise InvalidFileError(f"{path} does not hold the rows {shown(first)} to {shown(end)}.")
         same = []  # rows and environments whose next observation is the next row's observation
         with path.open("rb") as file:
             for rows in _blocks(buffer, first, end):
@@ -885,22 +887,22 @@ def _check_segments(segments: list[dict[str, Any]], counters: dict[str, Any], si
     """
     n_added = counters["n_added"]
     if type(n_added) is not int or not 0 <= n_added < 2**53:
-        raise ValueError(f"A checkpoint is damaged: its replay buffer has n_added={shown(n_added)}.")
+        raise InvalidFileError(f"A checkpoint is damaged: its replay buffer has n_added={shown(n_added)}.")
     if (counters["pos"], counters["full"]) != (n_added % size, n_added >= size):
-        raise ValueError(
+        raise InvalidFileError(
             f"A checkpoint is damaged: pos={shown(counters['pos'])} and full={shown(counters['full'])} of a replay "
             f"buffer of {size} rows do not fit n_added={n_added}."
         )
     end = max(n_added - size, 0)
     for one in segments:
         if not all(type(one[name]) is int for name in ("first", "end")) or not one["first"] <= end < one["end"]:
-            raise ValueError(
+            raise InvalidFileError(
                 f"A checkpoint is damaged: {shown(one['name'])} holds the rows {shown(one['first'])} to "
                 f"{shown(one['end'])}, but rows from {end} on are missing."
             )
         end = one["end"]
     if end != n_added:
-        raise ValueError(f"A checkpoint is damaged: its segments end at row {end}, but it has {n_added} rows.")
+        raise InvalidFileError(f"A checkpoint is damaged: its segments end at row {end}, but it has {n_added} rows.")
 
 
 def _npz(arrays: dict[str, np.ndarray]) -> bytes:
@@ -915,7 +917,7 @@ def _npz(arrays: dict[str, np.ndarray]) -> bytes:
 def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     state = json.loads((path / "state.json").read_text())
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
-        raise ValueError(f"{path} has format {shown(state.get('format'))}, but this version reads {_FORMAT}.")
+        raise InvalidFileError(f"{path} has format {shown(state.get('format'))}, but this version reads {_FORMAT}.")
     with zipfile.ZipFile(path / "arrays.npz") as members:
         check_not_compressed(path / "arrays.npz", members)
     with np.load(path / "arrays.npz", allow_pickle=False) as archive:
@@ -974,7 +976,7 @@ def _file_in(folder: Path, name: str) -> Path:
     """:return: path of a file in a folder, which is not a device, and not in another folder"""
     path = folder / name
     if path.name != name or not path.is_file():
-        raise ValueError(f"there is no file {shown(name)} in {folder}")
+        raise InvalidFileError(f"there is no file {shown(name)} in {folder}")
     return path
 
 

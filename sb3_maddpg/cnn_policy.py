@@ -12,6 +12,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.policies import (
     Actor,
     Critic,
@@ -22,9 +23,11 @@ from sb3_maddpg.policies import (
     MLPActor,
     StackedCritic,
 )
+from sb3_maddpg.registry import allow_in_files
 from sb3_maddpg.utils import shown
 
 
+@allow_in_files(name="sb3_maddpg.cnn_policy.ImageFeatures")
 class ImageFeatures(nn.Module):
     """
     Features extractor of a team, which replaces each agent's image by its features. All agents share it.
@@ -85,6 +88,7 @@ def _with_channels(space: spaces.Box) -> spaces.Box:
     return spaces.Box(space.low[np.newaxis], space.high[np.newaxis], dtype=space.dtype.type)
 
 
+@allow_in_files(name="sb3_maddpg.cnn_policy.CnnPolicy")
 class CnnPolicy(MADDPGPolicy):
     """
     Policy for teams of homogeneous agents that observe images. All agents share one convolutional features extractor
@@ -110,14 +114,14 @@ class CnnPolicy(MADDPGPolicy):
         **kwargs: Any,
     ):
         if image_space is None:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "CnnPolicy needs agents that observe images of the same size, each a Box of two or three axes, or an "
                 "`image_space` in policy_kwargs. Use MlpPolicy for other observations."
             )
         if not isinstance(features_extractor_class, type) or not issubclass(
             features_extractor_class, BaseFeaturesExtractor
         ):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"features_extractor_class={shown(features_extractor_class)}: pass a subclass of Stable-Baselines3's "
                 "BaseFeaturesExtractor, such as NatureCNN."
             )
@@ -129,7 +133,7 @@ class CnnPolicy(MADDPGPolicy):
     def _make_networks(self, actor_arch: list[int], critic_arch: list[int]) -> tuple[Actor, Critic]:
         size = int(th.Size(self.image_space.shape).numel())
         if set(self.team.obs_dims) != {size} or self.team.masks:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"image_space={self.image_space} has {size} numbers, but the agents observe {self.team.obs_dims}"
                 f"{' with action masks' if self.team.masks else ''}: CnnPolicy is for agents that observe one image "
                 "each."
@@ -150,7 +154,7 @@ class CnnPolicy(MADDPGPolicy):
     def _make_features(self) -> ImageFeatures:
         if self._extractor_class is NatureCNN:
             if not is_image_space(_with_channels(self.image_space), normalized_image=not self.normalize_images):
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"image_space={self.image_space} is not an image for NatureCNN, which needs two or three axes and "
                     "uint8 from 0 to 255. For images of floats, set normalize_images=False or write your own "
                     "features_extractor_class."
@@ -164,7 +168,7 @@ class CnnPolicy(MADDPGPolicy):
                 self.image_space, self._extractor_class, self._extractor_kwargs, self.normalize_images, factors
             )
         except (AssertionError, TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"features_extractor_class={self._extractor_class.__name__} cannot be created for {self.image_space} "
                 f"with features_extractor_kwargs={self._extractor_kwargs}: {error}"
             ) from error

@@ -13,6 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_maddpg.actions import TeamActions
 from sb3_maddpg.callbacks import check_success
+from sb3_maddpg.errors import InvalidEnvironmentError
 from sb3_maddpg.parallel import TeamEnv, explained_reset, what_to_pass
 from sb3_maddpg.relational import NeighbourViews, check_layout
 from sb3_maddpg.team import Team, TeamInfo
@@ -38,7 +39,7 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     if not isinstance(env, gymnasium.Env):
-        raise ValueError(f"{shown(env)} is not an environment: {what_to_pass(env, 'check_team_env')}.")
+        raise InvalidEnvironmentError(f"{shown(env)} is not an environment: {what_to_pass(env, 'check_team_env')}.")
     check_wrappers(env)
     env = watched(env)
     names = env.get_wrapper_attr("agent_names") if env.has_wrapper_attr("agent_names") else None
@@ -53,8 +54,10 @@ def check_team_env(env: gymnasium.Env | ParallelEnv, max_steps: int = 1000, seed
             check_env(legal, warn=False, skip_render_check=True)
         except AssertionError as error:
             if "does not match the bounds" in str(error):
-                raise ValueError(_out_of_bounds(space, legal.obs, team)) from None
-            raise ValueError(f"Stable-Baselines3's check_env: {' '.join(str(error).split())[:500]}") from error
+                raise InvalidEnvironmentError(_out_of_bounds(space, legal.obs, team)) from None
+            raise InvalidEnvironmentError(
+                f"Stable-Baselines3's check_env: {' '.join(str(error).split())[:500]}"
+            ) from error
         _check_attributes(env, team)
         _check_episode(legal, team, max_steps, seed)
     return team
@@ -107,18 +110,20 @@ def _check_attributes(env: gymnasium.Env, team: Team) -> None:
     if env.has_wrapper_attr("action_cost"):
         cost = np.asarray(env.get_wrapper_attr("action_cost"))
         if cost.dtype.kind not in "biuf" or not all_finite(cost) or (cost.ndim and cost.shape[0] != team.n_agents):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"action_cost={cost.tolist()} must be a finite number, or an array of them of shape (n_agents, width)."
             )
     curriculum = [env.has_wrapper_attr(name) for name in ("n_curriculum_levels", "set_curriculum_level")]
     if any(curriculum) and not all(curriculum):
-        raise ValueError("A curriculum needs both `n_curriculum_levels` and `set_curriculum_level(level)`.")
+        raise InvalidEnvironmentError(
+            "A curriculum needs both `n_curriculum_levels` and `set_curriculum_level(level)`."
+        )
     if all(curriculum):
         levels = env.get_wrapper_attr("n_curriculum_levels")
         if not isinstance(levels, (int, np.integer)) or levels < 1:
-            raise ValueError(f"n_curriculum_levels={shown(levels)} must be an integer of at least 1.")
+            raise InvalidEnvironmentError(f"n_curriculum_levels={shown(levels)} must be an integer of at least 1.")
         if not callable(env.get_wrapper_attr("set_curriculum_level")):
-            raise ValueError("set_curriculum_level must be a method that takes the level.")
+            raise InvalidEnvironmentError("set_curriculum_level must be a method that takes the level.")
     if env.has_wrapper_attr("observation_layout"):
         layout = env.get_wrapper_attr("observation_layout")
         check_layout(layout)
@@ -129,7 +134,7 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
     first, _ = env.reset(seed=seed)
     again, _ = env.reset(seed=seed)
     if not np.array_equal(first, again):
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"Two calls of reset(seed={seed}) returned different observations: draw all numbers from self.np_random."
         )
     env.action_space.seed(seed)
@@ -142,10 +147,14 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         kept.check("step()")
         kept.keep(observation=obs, **{f"info[{name!r}]": value for name, value in info.items()})
         if (index := not_finite_at(np.asarray(obs))) is not None:
-            raise ValueError(f"The observation of agent {team.names[index[0]]} {where} holds NaN or infinity.")
+            raise InvalidEnvironmentError(
+                f"The observation of agent {team.names[index[0]]} {where} holds NaN or infinity."
+            )
         _check_numbers_of_neighbours(env, np.asarray(obs), team, where)
         if not all_finite(np.asarray(reward, float)):
-            raise ValueError(f"The team's reward {where} is {reward}: it must be finite, also in single precision.")
+            raise InvalidEnvironmentError(
+                f"The team's reward {where} is {reward}: it must be finite, also in single precision."
+            )
         _check_info(info, team, where)
         if watcher is not None:
             watcher.check_entries(info)
@@ -153,7 +162,7 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
         acts = np.asarray(info.get("agent_active", ~gone), bool)
         if (acts & gone).any():
             name = team.names[np.flatnonzero(acts & gone)[0]]
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"Agent {name} is active {where}, although it has terminated or was truncated: set its agent_active to "
                 "False."
             )
@@ -161,7 +170,9 @@ def _check_episode(env: gymnasium.Env, team: Team, max_steps: int, seed: int) ->
             gone |= np.asarray(info.get(name, np.zeros(team.n_agents)), bool)
         if terminated or truncated:
             if env.has_wrapper_attr("n_curriculum_levels") and "is_success" not in info:
-                raise ValueError('CurriculumCallback needs info["is_success"] in the last step of an episode.')
+                raise InvalidEnvironmentError(
+                    'CurriculumCallback needs info["is_success"] in the last step of an episode.'
+                )
             env.reset()
             kept.check("reset()")
             return
@@ -185,7 +196,7 @@ class _Kept:
         """
         for name, (array, before) in self._returned.items():
             if not np.array_equal(array, before, equal_nan=array.dtype.kind == "f"):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"{call} wrote into an array that step() had returned, {name}, which vectorised environments keep "
                     "over the end of an episode: return a copy, for example `array.copy()`."
                 )
@@ -196,7 +207,7 @@ def _check_numbers_of_neighbours(env: gymnasium.Env, obs: np.ndarray, team: Team
     for agent, row in enumerate(obs[:, layout.get("who_columns", [])]):
         named = row[row != 0]
         if not set(named) <= set(range(1, team.n_agents + 1)) - {agent + 1} or len(set(named)) < len(named):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The neighbours of agent {team.names[agent]} {where}, in `who_columns` of its observation, are "
                 f"{shown(row.tolist())}: each must be another agent's index plus 1, named once, or 0 for no neighbour."
             )
@@ -206,26 +217,30 @@ def _check_info(info: dict[str, Any], team: Team, where: str) -> None:
     known = set(TeamInfo.__annotations__)
     for name in info.keys() - known:
         if name.lower().replace("_", "").rstrip("s") in {key.replace("_", "").rstrip("s") for key in known}:
-            raise ValueError(f"info {where}: {suggest('entry', name, known)}")
+            raise InvalidEnvironmentError(f"info {where}: {suggest('entry', name, known)}")
     for name in known & info.keys() - _SCALARS:
         value = np.asarray(info[name])
         of_pairs = name in ("pair_rewards", "pair_terminated")
         shape = value.shape[:1] if of_pairs and value.ndim == 2 else value.shape
         if shape != (team.n_agents,) or value.dtype.kind not in "biuf":
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"info['{name}'] {where} is {shown(info[name])}: it must hold a number for each of the {team.n_agents} "
                 f"agents{' and each of its neighbours' if of_pairs else ''}."
             )
         if (index := not_finite_at(value)) is not None:
-            raise ValueError(f"info['{name}'] of agent {team.names[index[0]]} {where} is not finite.")
+            raise InvalidEnvironmentError(f"info['{name}'] of agent {team.names[index[0]]} {where} is not finite.")
         if name in _FLAGS and not np.isin(value, (0, 1)).all():
-            raise ValueError(f"info['{name}'] {where} is {value.tolist()}: it must hold True or False for each agent.")
+            raise InvalidEnvironmentError(
+                f"info['{name}'] {where} is {value.tolist()}: it must hold True or False for each agent."
+            )
     for name in {"team_reward", "episode_step"} & info.keys():
         if not _is_number(info[name]):
-            raise ValueError(f"info['{name}'] {where} is {shown(info[name])}: it must be a finite number.")
+            raise InvalidEnvironmentError(f"info['{name}'] {where} is {shown(info[name])}: it must be a finite number.")
     metrics = info.get("metrics", {})
     if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
-        raise ValueError(f"info['metrics'] {where} is {shown(metrics)}: it must be a flat dict of finite numbers.")
+        raise InvalidEnvironmentError(
+            f"info['metrics'] {where} is {shown(metrics)}: it must be a flat dict of finite numbers."
+        )
     check_success([info])
 
 

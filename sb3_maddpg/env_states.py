@@ -25,6 +25,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
+from sb3_maddpg.errors import InvalidFileError, NoStateError
 from sb3_maddpg.normalization import TeamVecNormalize
 from sb3_maddpg.parallel import TeamEnv
 from sb3_maddpg.typed_json import encode
@@ -34,10 +35,6 @@ from sb3_maddpg.vec_env import GymnasiumVecEnv, Transparent
 _BEFORE = ".before"
 # Largest integers in the states of NumPy's generators, by name
 _LARGEST = {"pos": 624, "buffer_pos": 4, "has_uint32": 1, "has_gauss": 1, "uinteger": 2**32 - 1}
-
-
-class NoStateError(ValueError):
-    """Raised if an environment does not provide its state."""
 
 
 class Replayable(gymnasium.Wrapper):
@@ -85,18 +82,20 @@ class Replayable(gymnasium.Wrapper):
         if not (seed is None or (type(seed) is int and 0 <= seed < 2**31)) or not isinstance(
             options, (dict, type(None))
         ):
-            raise ValueError(f"No episode begins with seed={shown(seed)}, options={shown(options)}.")
+            raise InvalidFileError(f"No episode begins with seed={shown(seed)}, options={shown(options)}.")
         shape = self.action_space.shape
         # Before the first step, the array of actions is empty and has no other axis
         if not isinstance(actions, np.ndarray) or not (actions.size == 0 or actions.shape[1:] == shape):
-            raise ValueError(f"{shown(actions)} are no actions of {self.action_space}.")
+            raise InvalidFileError(f"{shown(actions)} are no actions of {self.action_space}.")
         self._rng, self._seed, self._options, self._actions = np.random.Generator(bits), seed, options, []
         if seed is not None:
             self.env.reset(seed=seed, options=options)
         ended = seed is None
         for action in actions:
             if ended:
-                raise ValueError(f"The state has {len(actions)} actions, but its episode ends before the last of them.")
+                raise InvalidFileError(
+                    f"The state has {len(actions)} actions, but its episode ends before the last of them."
+                )
             *_, terminated, truncated, _ = self.step(action if action.ndim else action.item())
             ended = terminated or truncated
 
@@ -221,7 +220,7 @@ def _class_name(owner: Any) -> str:
 
 def _take(owner: Any, state: dict[str, Any]) -> None:
     if state["class"] != _class_name(owner):
-        raise ValueError(f"The state belongs to a {state['class']}, but this is a {_class_name(owner)}.")
+        raise InvalidFileError(f"The state belongs to a {state['class']}, but this is a {_class_name(owner)}.")
     set_plain_values(owner, _for_each_env(owner, state.get("values", {})))
     if "written" in state and (writer := getattr(owner, "results_writer", None)) is not None:
         _write_again(Path(writer.file_handler.name), writer.file_handler, state["written"])
@@ -320,7 +319,7 @@ def _for_each_env(owner: Any, values: dict[str, Any]) -> dict[str, Any]:
             fits = isinstance(value, list) and len(value) == len(present)
             fits = fits and (len(kinds) != 1 or all(type(one) in kinds for one in value))
         if not fits:
-            raise ValueError(f"{shown(value)} cannot be the {name} of a {type(owner).__name__}.")
+            raise InvalidFileError(f"{shown(value)} cannot be the {name} of a {type(owner).__name__}.")
     return values
 
 
@@ -342,7 +341,7 @@ def set_plain_values(owner: Any, values: dict[str, Any]) -> None:
         if value is None and isinstance(present, (int, float)):  # arguments remain numbers
             fits = name.lstrip("_") not in arguments_of(of_class)
         if callable(of_all) or hasattr(of_all, "__set__") or not fits:
-            raise ValueError(f"{shown(value)} cannot be the {name} of a {of_class.__name__}.")
+            raise InvalidFileError(f"{shown(value)} cannot be the {name} of a {of_class.__name__}.")
         if isinstance(present, deque) and isinstance(value, deque):  # the length follows from an argument
             value = deque(value, present.maxlen)
         setattr(owner, name, value)
@@ -428,7 +427,7 @@ def checked_bits(state: Any, own: Mapping[str, Any]) -> dict[str, Any]:
         return integer and 0 <= one <= _LARGEST.get(name, 2**128 - 1)
 
     if not fits(state, own, "state"):
-        raise ValueError(f"{shown(state)} is not a state of the random number generator {own['bit_generator']}.")
+        raise InvalidFileError(f"{shown(state)} is not a state of the random number generator {own['bit_generator']}.")
     return dict(state)
 
 

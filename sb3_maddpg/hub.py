@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.normalization import read_observation_statistics
 from sb3_maddpg.utils import arguments_of, shown
@@ -124,11 +125,13 @@ def publish(
     :raises OSError: if the Hub cannot be reached, or refuses the upload
     """
     if not isinstance(repo_id, str) or repo_id.count("/") != 1 or not all(repo_id.split("/")):
-        raise ValueError(f"repo_id={shown(repo_id)} must be NAME/REPOSITORY.")
+        raise InvalidArgumentError(f"repo_id={shown(repo_id)} must be NAME/REPOSITORY.")
     try:
         from huggingface_hub import HfApi
     except ImportError as error:
-        raise ValueError(f"huggingface_hub is not installed ({error}): pip install huggingface_hub.") from error
+        raise InvalidArgumentError(
+            f"huggingface_hub is not installed ({error}): pip install huggingface_hub."
+        ) from error
     api = HfApi(token=token)
     with tempfile.TemporaryDirectory() as folder:
         write_model_folder(model, Path(folder), repo_id, run, lean)
@@ -203,7 +206,7 @@ def _statistics_of(model: MADDPG, run: Path | None) -> dict[str, Any] | None:
         if present is None and _is_small_file(path):
             present = read_observation_statistics(path, shape)
     if present is None:
-        raise ValueError(
+        raise InvalidArgumentError(
             "The model was trained with VecNormalize(norm_obs=True), and neither its file nor a vecnormalize.pkl of "
             "its run holds the statistics, without which it is useless: load it with "
             "env=SafeVecNormalize.load(PATH, env) and pass it to sb3_maddpg.hub.publish."

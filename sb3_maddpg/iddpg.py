@@ -10,8 +10,10 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
 from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.maddpg import MADDPG
 from sb3_maddpg.policies import Critic, MADDPGPolicy, StackedCritic, sharing_groups
+from sb3_maddpg.registry import allow_in_files
 from sb3_maddpg.team import Team
 
 
@@ -59,12 +61,13 @@ class IndependentCritic(StackedCritic):
         return values.squeeze(1).unflatten(1, shape).permute(2, 0, 1)
 
 
+@allow_in_files(name="sb3_maddpg.iddpg.IndependentPolicy")
 class IndependentPolicy(MADDPGPolicy):
     """``MADDPGPolicy`` with critics that read only their own agent's observation and action."""
 
     def _make_critic(self, actions: TeamActions, net_arch: list[int]) -> Critic:
         if isinstance(self.share_critic, str):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"share_critic={self.share_critic!r} requires a centralised critic, but IDDPG has independent critics. "
                 "Pass True, False or a list of lists of agents, or use MADDPG."
             )

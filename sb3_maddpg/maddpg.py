@@ -49,6 +49,14 @@ from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer, Te
 from sb3_maddpg.callbacks import check_success, record_metrics, widen_tables
 from sb3_maddpg.cnn_policy import CnnPolicy
 from sb3_maddpg.env_states import fingerprint, shares_an_env
+from sb3_maddpg.errors import (
+    DivergedError,
+    InvalidArgumentError,
+    InvalidEnvironmentError,
+    InvalidFileError,
+    UntrustedFileError,
+    UnusableParametersError,
+)
 from sb3_maddpg.estimators import ESTIMATORS
 from sb3_maddpg.model_files import (
     FILE_FORMAT,
@@ -242,11 +250,13 @@ class MADDPG(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
     ):
         if isinstance(policy, str) and policy not in self.policy_aliases:
-            raise ValueError(suggest("policy", policy, self.policy_aliases))
+            raise InvalidArgumentError(suggest("policy", policy, self.policy_aliases))
         if not isinstance(policy, (str, type)):
-            raise ValueError(f"policy={shown(policy)} is neither MlpPolicy, CnnPolicy, PairPolicy nor a policy class.")
+            raise InvalidArgumentError(
+                f"policy={shown(policy)} is neither MlpPolicy, CnnPolicy, PairPolicy nor a policy class."
+            )
         if env is None and _init_setup_model:
-            raise ValueError("env=None: pass an environment or the id of one.")
+            raise InvalidEnvironmentError("env=None: pass an environment or the id of one.")
         given = validated(
             RunArguments,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -259,7 +269,7 @@ class MADDPG(OffPolicyAlgorithm):
         )
         for name in OWN_BUFFER_KWARGS:
             if replay_buffer_kwargs and name in replay_buffer_kwargs:
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"replay_buffer_kwargs[{name!r}] is an argument of the algorithm: pass {name} to it instead."
                 )
         with _explained_id(env):
@@ -320,7 +330,7 @@ class MADDPG(OffPolicyAlgorithm):
         self._check_arguments()
         if self.env is not None:
             if is_vecenv_wrapped(self.env, VecFrameStack):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     "VecFrameStack mixes up the observations of different agents. Stack the frames of each agent with "
                     "supersuit.frame_stack_v2 on the PettingZoo environment, or in the environment itself."
                 )
@@ -339,7 +349,7 @@ class MADDPG(OffPolicyAlgorithm):
             text = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not any(words in text for words in NO_MEMORY):
                 raise
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"buffer_size={buffer_size} or the networks need more memory than there is: {text}"
             ) from error
         finally:
@@ -350,7 +360,7 @@ class MADDPG(OffPolicyAlgorithm):
             try_out(self.policy, self.estimator, self._at_present("temperature"))
         actions = self.policy.actions
         if self.action_noise is not None and not actions.has_continuous:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"action_noise={self.action_noise} is for continuous actions, but the action space is "
                 f"{self.action_space}. Leave it out: binary actions explore with a random threshold, categorical ones "
                 "by sampling."
@@ -379,25 +389,25 @@ class MADDPG(OffPolicyAlgorithm):
         layout, normalizer = self.policy_kwargs.get("observation_layout"), _normalizer_of_observations(env)
         images = "image_space" in self.policy_kwargs or any(self.policy_kwargs.get("image_columns") or ())
         if normalizer is not None and images and self.policy_kwargs.get("normalize_images", True):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "VecNormalize(norm_obs=True) normalises images, which the policy also divides by 255: set "
                 "norm_obs=False or policy_kwargs={'normalize_images': False}."
             )
         if self.normalized_observations and self.num_timesteps:
             self._check_statistics(normalizer)
         elif normalizer is not None and self.num_timesteps:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "The model was trained on observations that were not normalised, but this environment normalises them: "
                 "set VecNormalize(norm_obs=False). If the training normalised them, too, load the model with "
                 "normalized_observations=True."
             )
         if normalizer is not None and any(getattr(normalizer.observation_space, "masks", ())):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "VecNormalize(norm_obs=True) shifts the action masks in the observations, which must be positive where "
                 "an action is legal. Set norm_obs=False and scale observations in the environment."
             )
         if layout is not None and normalizer is not None and not layout.get("complete", False):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "VecNormalize(norm_obs=True) shifts the zeros that mark absent neighbours for PairPolicy: they would "
                 "all look present. Set norm_obs=False and scale observations in the environment; or, if every "
                 "neighbour is always present, set `complete: True` in the environment's observation_layout."
@@ -419,20 +429,20 @@ class MADDPG(OffPolicyAlgorithm):
         if normalizer is None:
             if stored is not None:
                 remedy = f"wrap it in VecNormalize, which the statistics in the model's file then complete, or {remedy}"
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "The model was trained with VecNormalize(norm_obs=True), but this environment does not normalise "
                 f"observations: {remedy}"
             )
         present = ObservationStatistics.of(normalizer)
         if present is not None and stored is not None and np.max(present.observed) < np.max(stored.observed):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"This environment's VecNormalize has seen {np.max(present.observed):.0f} observations, fewer than the "
                 f"{np.max(stored.observed):.0f} of the model's training, so that its statistics are others: wrap the "
                 f"environment in a new VecNormalize, which the statistics in the model's file complete, or {remedy}"
             )
         if present is None:
             if stored is None:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     "The model was trained with VecNormalize(norm_obs=True), but this environment's VecNormalize has "
                     f"not seen any observation yet, and the model's file holds no statistics: {remedy}"
                 )
@@ -453,7 +463,7 @@ class MADDPG(OffPolicyAlgorithm):
             return None
         cost = env.get_attr("action_cost", indices=0)[0] if env.has_attr("action_cost") else None
         if cost is None:
-            raise ValueError("use_action_cost=True, but the environment has no attribute `action_cost`.")
+            raise InvalidEnvironmentError("use_action_cost=True, but the environment has no attribute `action_cost`.")
         return cost
 
     def _spread(self, action_cost: Any) -> th.Tensor | None:
@@ -466,14 +476,14 @@ class MADDPG(OffPolicyAlgorithm):
         except ValueError:
             cost = np.full((), np.nan)
         if not np.isfinite(cost).all():
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"action_cost={shown(action_cost)} of the environment must be a finite number, or finite numbers of "
                 f"shape (n_agents, width) = {shape}."
             )
         try:
             cost = np.broadcast_to(cost, shape)
         except ValueError as error:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"action_cost of shape {np.shape(action_cost)} cannot be broadcast to (n_agents, width) = {shape}."
             ) from error
         return th.as_tensor(cost.copy(), device=self.device)
@@ -511,9 +521,9 @@ class MADDPG(OffPolicyAlgorithm):
         try:
             numbers = np.broadcast_to(noise(), shape)
             if not np.isfinite(numbers).all():
-                raise ValueError("it returned NaN or infinity")
+                raise InvalidArgumentError("it returned NaN or infinity")
         except Exception as error:  # from foreign code
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"action_noise={shown(self.action_noise)} cannot be added to the {length} numbers of a joint action "
                 f"({' '.join(str(error).split())[:200]}): it must return finite numbers, as "
                 f"NormalActionNoise(np.zeros({length}), np.full({length}, 0.1)) does."
@@ -535,7 +545,7 @@ class MADDPG(OffPolicyAlgorithm):
         except (TypeError, ValueError, OverflowError):
             number = math.nan
         if not least <= number < math.inf:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"The schedule {name}={shown(value)} returned {shown(given)} for the remaining progress "
                 f"{self._current_progress_remaining}: it must return a finite number of at least {least:g}."
             )
@@ -544,9 +554,9 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_arguments(self) -> None:
         if not issubclass(self.policy_class, MADDPGPolicy):
             name = self.policy_class.__name__
-            raise ValueError(f"{name} is not a policy for a team: use MlpPolicy, CnnPolicy or PairPolicy.")
+            raise InvalidArgumentError(f"{name} is not a policy for a team: use MlpPolicy, CnnPolicy or PairPolicy.")
         if not isinstance(self.estimator, str) or self.estimator not in ESTIMATORS:
-            raise ValueError(suggest("estimator", self.estimator, ESTIMATORS))
+            raise InvalidArgumentError(suggest("estimator", self.estimator, ESTIMATORS))
         names = self.arguments.model_fields
         for name, value in validated(self.arguments, **{name: getattr(self, name) for name in names}).items():
             setattr(self, name, value)
@@ -555,17 +565,17 @@ class MADDPG(OffPolicyAlgorithm):
         self._check_train_freq(self.n_envs)
         self._check_buffer_size()
         if self.threshold_price is not None and not isinstance(self.action_space, spaces.MultiBinary):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"threshold_price is for binary actions (MultiBinary), but the action space is {self.action_space}."
             )
         for name in self.policy_kwargs:
             if name in NOT_POLICY_KWARGS:
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"policy_kwargs[{name!r}] is set by the algorithm: leave it out"
                     f"{' and pass learning_rate to the algorithm' if name == 'lr_schedule' else ''}."
                 )
             if name not in (known := arguments_of(self.policy_class) - NOT_POLICY_KWARGS - {"args"}):
-                raise ValueError(suggest("argument in policy_kwargs", name, known))
+                raise InvalidArgumentError(suggest("argument in policy_kwargs", name, known))
         self._check_replay_buffer_arguments()
         if self.env is not None:  # warn before training about what save() would refuse after it
             for name in ("policy_class", "replay_buffer_class", "learning_rate", "temperature", "policy_kwargs"):
@@ -577,24 +587,24 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_train_freq(self, n_envs: int) -> None:
         frequency, unit = self.train_freq if isinstance(self.train_freq, tuple) else (self.train_freq, "step")
         if n_envs > 1 and unit in ("episode", TrainFrequencyUnit.EPISODE):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f'train_freq=({frequency}, "episode") needs a single environment, but there are {n_envs}: pass a '
                 "number of steps."
             )
 
     def _check_buffer_size(self) -> None:
         if self.batch_size > self.buffer_size:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}, from which batches are "
                 "sampled. Lower batch_size or raise buffer_size."
             )
         if self.optimize_memory_usage and self.buffer_size // self.n_envs < 2:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"buffer_size={self.buffer_size} must hold two transitions of each of the {self.n_envs} environment(s) "
                 "with optimize_memory_usage=True, which never samples one of them. Raise buffer_size."
             )
         if self.n_steps > self.buffer_size // self.n_envs:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"n_steps={self.n_steps} is more than buffer_size={self.buffer_size} stores of each of the "
                 f"{self.n_envs} environment(s): lower n_steps or raise buffer_size."
             )
@@ -602,26 +612,26 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_replay_buffer_arguments(self) -> None:
         buffer = self.replay_buffer_class
         if isinstance(buffer, str):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"replay_buffer_class={shown(buffer)} is a name, which only recipes accept: pass the class."
             )
         if buffer is not None and not isinstance(buffer, type):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"replay_buffer_class={shown(buffer)} is not a class: pass TeamReplayBuffer or a subclass of it."
             )
         if buffer is not None and not issubclass(buffer, TeamReplayBuffer):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"replay_buffer_class={buffer.__name__} does not store the rewards of agents: derive it from "
                 "sb3_maddpg.TeamReplayBuffer. Hindsight replay (HerReplayBuffer) needs goals in dictionary "
                 "observations, which a team does not have."
             )
         for name in self.replay_buffer_kwargs:
             if name not in (known := arguments_of(buffer or TeamReplayBuffer) - NOT_BUFFER_KWARGS):
-                raise ValueError(suggest("argument in replay_buffer_kwargs", name, known))
+                raise InvalidArgumentError(suggest("argument in replay_buffer_kwargs", name, known))
         if missing := sorted(
             (NOT_BUFFER_KWARGS - {"args"} | {*OWN_BUFFER_KWARGS}) - arguments_of(buffer or TeamReplayBuffer)
         ):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"replay_buffer_class={cast(type, buffer).__name__} does not accept {', '.join(missing)}, which the "
                 "algorithm passes: add them to its __init__, or pass **kwargs on to TeamReplayBuffer's."
             )
@@ -640,7 +650,7 @@ class MADDPG(OffPolicyAlgorithm):
                 widest = max(range(len(kind.agents)), key=lambda row: sum(kind.sizes[row]))
                 agent = kind.agents[widest] * team.n_agents // factors.n_agents
                 fits = MOST_BYTES_OF_ALTERNATIVES // of_sample
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"estimator='expected' evaluates each of the {kind.width} categories or binary actions of agent "
                     f"{team.names[agent]} ({team.action_spaces[agent]}): with batch_size={self.batch_size} this takes "
                     f"{self.batch_size * of_sample / 2**30:.0f} GiB or more. Choose an estimator that samples, such as "
@@ -725,7 +735,7 @@ class MADDPG(OffPolicyAlgorithm):
             # Sample replay buffer
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             if not isinstance(replay_data, TeamReplayBufferSamples):
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"{type(self.replay_buffer).__name__}.sample returned {shown(replay_data)}: it must return "
                     "TeamReplayBufferSamples, as TeamReplayBuffer does."
                 )
@@ -879,8 +889,8 @@ class MADDPG(OffPolicyAlgorithm):
         if not all(math.isfinite(parameter.sum().item()) for group in groups for parameter in group["params"]):
             raise self._diverged(self.policy.not_finite(self.policy.state_dict()) or "parameters grew without limit")
 
-    def _diverged(self, what: str) -> ValueError:
-        return ValueError(
+    def _diverged(self, what: str) -> DivergedError:
+        return DivergedError(
             f"The training diverged at step {self.num_timesteps} (update {self._n_updates}): {what}. Lower "
             f"learning_rate={self.learning_rate}, scale the rewards down (VecNormalize(norm_obs=False) divides them "
             "by their spread), or clip gradients with max_grad_norm."
@@ -898,7 +908,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         statistics = self._present_statistics() if self.normalized_observations else None
         if self.normalized_observations and self.num_timesteps and statistics is None:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "The model was trained with VecNormalize(norm_obs=True), but neither its file nor an environment holds "
                 "the statistics: load it with env=SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env), or with "
                 "normalized_observations=False if you normalise observations yourself."
@@ -957,7 +967,7 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _resizable_policy(self) -> PairPolicy:
         if not isinstance(self.policy, PairPolicy):
-            raise ValueError(f"{type(self.policy).__name__} fits a single team size; train with PairPolicy.")
+            raise InvalidArgumentError(f"{type(self.policy).__name__} fits a single team size; train with PairPolicy.")
         return self.policy
 
     def learn(
@@ -971,7 +981,7 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> SelfMADDPG:
         given = validated(LearnArguments, total_timesteps=total_timesteps, callback=callback, log_interval=log_interval)
         if self.env is None:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"This model has no environment to train in: load it with `{type(self).__name__}.load(path, env=env)`, "
                 "or call `set_env(env)` before `learn`."
             )
@@ -1030,7 +1040,7 @@ class MADDPG(OffPolicyAlgorithm):
             one = waiting.pop()
             assert self.env is not None
             if (own := getattr(one, "eval_env", None)) is not None and shares_an_env(self.env, own):
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"{type(one).__name__} evaluates the model in the environment that it is trained in, whose "
                     "episodes would be broken off unnoticed: give it an environment of its own."
                 )
@@ -1052,7 +1062,7 @@ class MADDPG(OffPolicyAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         if self._was_reset() or self._last_obs is None:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 "A callback has reset the training environment in the middle of an episode, whose next transition "
                 "would be false: give EvalCallback or evaluate_policy an environment of its own."
             )
@@ -1095,7 +1105,7 @@ class MADDPG(OffPolicyAlgorithm):
         before, n_envs = self.n_envs, env.num_envs if isinstance(env, VecEnv) else 1
         self._check_train_freq(n_envs)
         if self.replay_buffer.size() and self.replay_buffer.n_envs != n_envs:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The replay buffer holds transitions of {self.replay_buffer.n_envs} parallel environment(s) and "
                 f"cannot store those of {n_envs}: pass as many environments, or empty the buffer with "
                 "`model.replay_buffer.reset()`."
@@ -1162,11 +1172,13 @@ class MADDPG(OffPolicyAlgorithm):
             values = attributes(data, cls, path, trust, custom_objects or {})
             for name in kwargs:
                 if name in NOT_LOADED:
-                    raise ValueError(
+                    raise InvalidArgumentError(
                         f"{name}={shown(kwargs[name])} is no argument of load, which reads it from {path}."
                     )
                 if name not in (known := {*data, *arguments_of(cls)}):
-                    raise ValueError(suggest("argument of load", name, {one for one in known if one[0] != "_"}))
+                    raise InvalidArgumentError(
+                        suggest("argument of load", name, {one for one in known if one[0] != "_"})
+                    )
             if not ({"tensorboard_log"} & {*kwargs, *(custom_objects or {})} or trusted(trust)):
                 keep_curves_inside(values, path)
             if (statistics := values.get("observation_statistics")) is not None:
@@ -1215,11 +1227,11 @@ class MADDPG(OffPolicyAlgorithm):
         """
         check_path(path)
         if lean is not None and (lean not in get_args(Lean) or pickle):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"lean={shown(lean)}, pickle={pickle}: lean must be one of {get_args(Lean)}, and pickle False."
             )
         if problem := self._not_finite(self.get_parameters()):
-            raise ValueError(f"This model cannot be saved: {problem}")
+            raise DivergedError(f"This model cannot be saved: {problem}")
         statistics = self._present_statistics() if self.normalized_observations else None
         self.observation_statistics = None if statistics is None else statistics._asdict()
         write = super().save if pickle else functools.partial(self._save_without_pickle, lean=lean)
@@ -1344,7 +1356,7 @@ class MADDPG(OffPolicyAlgorithm):
                 elif trusted(trust):
                     super().load_replay_buffer(path, truncate_last_traj)
                 else:
-                    raise ValueError(
+                    raise UntrustedFileError(
                         f"{path} is not a replay buffer that this version writes. If it is pickled, it may run any "
                         "code when it is loaded: if you trust its author, load it with `trust=True` (on the "
                         "command line `--trust`)."
@@ -1358,7 +1370,7 @@ class MADDPG(OffPolicyAlgorithm):
 
     def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
         if not isinstance(buffer, TeamReplayBuffer):
-            raise ValueError(f"{path} holds a {type(buffer).__name__}, but the model needs a TeamReplayBuffer.")
+            raise InvalidFileError(f"{path} holds a {type(buffer).__name__}, but the model needs a TeamReplayBuffer.")
         n_pairs = self.replay_buffer_kwargs.get("n_pairs", 0)
         names = [cls.__name__ for cls in (type(buffer), cast(type, self.replay_buffer_class))]
         for what, loaded, needed in (
@@ -1372,7 +1384,7 @@ class MADDPG(OffPolicyAlgorithm):
             ("neighbours that change: {}", buffer.pairs_end, self.replay_buffer_kwargs.get("pairs_end", False)),
         ):
             if loaded != needed:
-                raise ValueError(
+                raise InvalidFileError(
                     f"{path} holds {what.format(loaded)}, but the model needs {what.format(needed)}: resume with the "
                     "environment and arguments of the training that saved it, or without its replay buffer."
                 )
@@ -1386,7 +1398,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         check_path(path)
         if not isinstance(self.replay_buffer, TeamReplayBuffer):
-            raise ValueError("There is no replay buffer to save.")
+            raise InvalidArgumentError("There is no replay buffer to save.")
         if not isinstance(path, (str, os.PathLike)):
             return write_buffer(self.replay_buffer, path)
         with atomic_write(path, suffix="pkl") as file:
@@ -1428,7 +1440,7 @@ def _explained_id(env: Any) -> Iterator[None]:
         with suppress(ValueError):
             if all(map(str.isidentifier, name.split("."))) and hasattr(find_module(name), "parallel_env"):
                 what = f"{name}.parallel_env()"
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"env={env!r} is no id that Gymnasium knows ({error}): pass {what} itself, or import the package that "
             "registers the id first."
         ) from error
@@ -1445,7 +1457,7 @@ def as_vec_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> V
     :raises ValueError: if the spaces do not describe a team, or see ``check_vec_env``
     """
     if not isinstance(env, (ParallelEnv, AECEnv, gymnasium.Env, VecEnv)):
-        raise ValueError(f"env={shown(env)} is not an environment: {what_to_pass(env, 'the algorithm')}.")
+        raise InvalidEnvironmentError(f"env={shown(env)} is not an environment: {what_to_pass(env, 'the algorithm')}.")
     if isinstance(env, (ParallelEnv, AECEnv)):
         env = TeamEnv(env)
     vec_env = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
@@ -1499,13 +1511,6 @@ def _normalizer_of_observations(env: GymEnv | None) -> VecNormalize | None:
     return normalizer if normalizer is not None and normalizer.norm_obs else None
 
 
-class UnusableParametersError(ValueError, RuntimeError):
-    """
-    Raised for parameters that are not finite or do not fit the networks. It is also a RuntimeError, because SB3's
-    ``load`` takes a plain ValueError for the sign of an older file.
-    """
-
-
 def _check_same_policy(given: Any, stored: Any, policy_class: Any) -> None:
     """
     Check arguments of the policy that were passed to ``load``, like SB3, but without those that the environment adds.
@@ -1516,11 +1521,11 @@ def _check_same_policy(given: Any, stored: Any, policy_class: Any) -> None:
     :raises ValueError: if they differ
     """
     if not isinstance(given, dict) or not isinstance(stored, dict):
-        raise ValueError(f"policy_kwargs={shown(given)} must be a dict of arguments by name.")
+        raise InvalidArgumentError(f"policy_kwargs={shown(given)} must be a dict of arguments by name.")
     from_env = getattr(policy_class, "env_attributes", ())
     full = {name: value for name, value in stored.items() if name in from_env} | given
     if differing := sorted(name for name in {*full, *stored} if full.get(name) != stored.get(name)):
-        raise ValueError(
+        raise InvalidArgumentError(
             f"policy_kwargs: {', '.join(differing)} differ from those of the model, {shown(stored)}. Leave them out: "
             "the networks of a model do not change."
         )
@@ -1534,7 +1539,7 @@ def _remedy_for_other_team() -> Iterator[None]:
     except ValueError as error:
         if "spaces do not match" not in str(error):
             raise
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"{error}. A model fits only the team it was trained for (the first space is the model's): create the "
             "environment with the same arguments, see `MADDPG.load(path).env_spec`, or train a new model."
         ) from error

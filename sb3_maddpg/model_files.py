@@ -8,7 +8,6 @@ import json
 import math
 import os
 import pathlib
-import traceback
 import warnings
 import zipfile
 from collections import deque
@@ -21,6 +20,7 @@ import torch as th
 from stable_baselines3.common.save_util import open_path
 from torch.overrides import TorchFunctionMode
 
+from sb3_maddpg.errors import InvalidFileError, TeamError, UntrustedFileError
 from sb3_maddpg.offers import OfferError
 from sb3_maddpg.typed_json import check_size, decode
 from sb3_maddpg.utils import shown
@@ -74,7 +74,7 @@ def check_path(path: Any) -> None:
     :raises ValueError: if it is neither
     """
     if not (isinstance(path, (str, os.PathLike)) or hasattr(path, "read")):
-        raise ValueError(f"{shown(path)} is neither a path nor a file.")
+        raise InvalidFileError(f"{shown(path)} is neither a path nor a file.")
 
 
 def read_data(path: str | pathlib.Path | io.BufferedIOBase, algorithm: str, readable: set[str]) -> dict[str, Any]:
@@ -91,11 +91,11 @@ def read_data(path: str | pathlib.Path | io.BufferedIOBase, algorithm: str, read
     def check(data: dict[str, Any]) -> None:
         written_by = data.get("algorithm")
         if written_by is not None and written_by not in list(readable):
-            raise ValueError(f"{path} holds a model of {written_by}: load it with `{written_by}.load`.")
+            raise InvalidFileError(f"{path} holds a model of {written_by}: load it with `{written_by}.load`.")
         if written_by is None and "policy_regularization" not in data:
-            raise ValueError(f"{path} holds a model of another algorithm than {algorithm}.")
+            raise InvalidFileError(f"{path} holds a model of another algorithm than {algorithm}.")
         if data.get("file_format", 1) not in _READABLE_FORMATS:
-            raise ValueError(
+            raise InvalidFileError(
                 f"{path} has format {data.get('file_format', 1)}, but this version of sb3-maddpg reads format "
                 f"{FILE_FORMAT}: install the version that wrote it, or train again."
             )
@@ -117,18 +117,18 @@ def check_members(
     check_path(path)
     with _opened(path) as file:
         if not zipfile.is_zipfile(file):
-            raise ValueError(f"{path} is not a model: models are zip files.")
+            raise InvalidFileError(f"{path} is not a model: models are zip files.")
         with zipfile.ZipFile(file) as archive:
             _check_sizes(path, archive)
             names = archive.namelist()
             data = json.loads(archive.read("data")) if "data" in names else {}
             if not isinstance(data, dict):
-                raise ValueError(
+                raise InvalidFileError(
                     f"{path} is damaged: its `data` holds a {type(data).__name__} instead of a model's attributes."
                 )
             check(data)
             if strange := {name for name in names if name not in _MEMBERS or names.count(name) > 1}:
-                raise ValueError(f"{path} has unexpected or duplicate members: {shown(sorted(strange))}.")
+                raise InvalidFileError(f"{path} has unexpected or duplicate members: {shown(sorted(strange))}.")
             for name in {*_WEIGHTS} & {*names}:
                 with archive.open(name) as member, zipfile.ZipFile(member) as weights:
                     _check_sizes(f"{path}: {name}", weights)
@@ -155,7 +155,9 @@ def _check_sizes(path: Any, archive: zipfile.ZipFile) -> None:
     for member in archive.infolist():
         most = _MOST_DATA if member.filename == "data" else _MOST_TIMES_LARGER * size
         if member.file_size > most or member.compress_size > size:
-            raise ValueError(f"{path} is too large to be a model: its {member.filename} has {member.file_size} bytes.")
+            raise InvalidFileError(
+                f"{path} is too large to be a model: its {member.filename} has {member.file_size} bytes."
+            )
 
 
 def check_not_compressed(path: Any, archive: zipfile.ZipFile) -> None:
@@ -168,7 +170,7 @@ def check_not_compressed(path: Any, archive: zipfile.ZipFile) -> None:
     """
     total = sum(member.file_size for member in archive.infolist())
     if total > _size_of(archive):
-        raise ValueError(f"{path} is damaged: it has members of {total} bytes, more than the file has.")
+        raise InvalidFileError(f"{path} is damaged: it has members of {total} bytes, more than the file has.")
 
 
 def _size_of(archive: zipfile.ZipFile) -> int:
@@ -201,7 +203,7 @@ class NetworkLimit(TorchFunctionMode):
         if func in _ALLOCATING:
             self.allocated += result.numel() * result.element_size()
             if self.allocated > self.limit:
-                raise ValueError(
+                raise UntrustedFileError(
                     f"{self.path} is damaged or asks for too much memory: its networks need more than "
                     f"{int(self.limit) >> 20} MB, many times its weights. If you trust its author, load it with "
                     "`trust=True` (on the command line `--trust`)."
@@ -235,7 +237,7 @@ def attributes(
     check_size(data, path)
     pickled = _pickled(data) - set(given)
     if pickled and not trusted(trust):
-        raise ValueError(
+        raise UntrustedFileError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), which may run any code when they are loaded. "
             "If you trust their author, load the file with `trust=True` (on the command line `--trust`), or convert it "
             f"to a file without pickled values: `sb3-maddpg convert {path} NEW.zip --trust`."
@@ -246,7 +248,7 @@ def attributes(
         if key not in pickled
     }
     if wrong := sorted(key for key in set(values) - set(given) if key in _RUNTIME or _is_method(algorithm, key)):
-        raise ValueError(f"{path} is damaged: it has values for {', '.join(wrong)}, which models do not save.")
+        raise InvalidFileError(f"{path} is damaged: it has values for {', '.join(wrong)}, which models do not save.")
     return values
 
 
@@ -292,7 +294,7 @@ def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[
     with _opened(path) as file, zipfile.ZipFile(file) as archive:
         data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
     if pickled := _pickled(data) - set(given):
-        raise ValueError(
+        raise UntrustedFileError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), as the files of most algorithms do. They may "
             "run any code when they are loaded: if you trust their author, pass --trust."
         )
@@ -305,7 +307,7 @@ def refuse_pickled_file(path: Any) -> None:
     :param path: path of the file
     :raises ValueError: always
     """
-    raise ValueError(
+    raise UntrustedFileError(
         f"{path} is a pickle, which may run any code when it is loaded: if you trust its author, pass --trust."
     )
 
@@ -321,14 +323,11 @@ def as_damage(path: Any, kind: str = "model") -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, OfferError):
+    except (OSError, OfferError, TeamError):
         raise
     except Exception as error:
-        raised_in = pathlib.Path(traceback.extract_tb(error.__traceback__)[-1].filename)
-        if isinstance(error, ValueError) and raised_in.is_relative_to(pathlib.Path(__file__).parent):
-            raise
         told = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-        raise ValueError(f"{path} is damaged or does not hold a {kind} of sb3-maddpg ({told}).") from error
+        raise InvalidFileError(f"{path} is damaged or does not hold a {kind} of sb3-maddpg ({told}).") from error
 
 
 def check_attributes(model: Any, path: Any) -> None:
@@ -350,9 +349,9 @@ def check_attributes(model: Any, path: Any) -> None:
             elif isinstance(value, deque):
                 fits = all(map(_is_episode if name == "ep_info_buffer" else _is_real, value))
             if not fits:
-                raise ValueError(f"{path} is damaged: its {name} is {shown(value)}.")
+                raise InvalidFileError(f"{path} is damaged: its {name} is {shown(value)}.")
     if (model.ep_info_buffer is None) != (model.ep_success_buffer is None):
-        raise ValueError(f"{path} is damaged: it has only one of ep_info_buffer and ep_success_buffer.")
+        raise InvalidFileError(f"{path} is damaged: it has only one of ep_info_buffer and ep_success_buffer.")
 
 
 def _is_real(value: Any) -> bool:

@@ -14,6 +14,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
+from sb3_maddpg.errors import InvalidFileError, UntrustedFileError
 from sb3_maddpg.model_files import as_damage, trusted
 from sb3_maddpg.typed_json import decode, encode
 from sb3_maddpg.utils import atomic_write, shown
@@ -163,13 +164,15 @@ class ObservationStatistics(NamedTuple):
         :raises ValueError: if they are no statistics of such observations
         """
         if not isinstance(values, dict) or set(values) != set(cls._fields):
-            raise ValueError(f"{name} is damaged: its observation_statistics are {shown(values)}.")
+            raise InvalidFileError(f"{name} is damaged: its observation_statistics are {shown(values)}.")
         rms = RunningMeanStd(shape=shape)
         moments = {"mean": values["mean"], "var": values["var"], "count": values["observed"]}
         _set_moments(rms, {key: encode(value, key) for key, value in moments.items()}, name)
         for key in ("epsilon", "clip"):
             if type(values[key]) is not float or not values[key] > 0:
-                raise ValueError(f"{name} is damaged: {key} of its observation_statistics is {shown(values[key])}.")
+                raise InvalidFileError(
+                    f"{name} is damaged: {key} of its observation_statistics is {shown(values[key])}."
+                )
         return cls(rms.mean, rms.var, rms.count, values["epsilon"], values["clip"])
 
     def fill(self, env: VecNormalize) -> None:
@@ -195,7 +198,7 @@ def for_team(env: VecEnv) -> None:
             env.__class__ = TeamVecNormalize
         env = env.venv
     if found > 1:
-        raise ValueError(
+        raise InvalidFileError(
             f"The environment is wrapped in VecNormalize {found} times, but a model knows the statistics of one: use a "
             "single VecNormalize, with norm_obs and norm_reward."
         )
@@ -263,7 +266,7 @@ class SafeVecNormalize(TeamVecNormalize):
             if start != b"{":
                 if trusted(trust):
                     return VecNormalize.load(str(path), venv)
-                raise ValueError(
+                raise UntrustedFileError(
                     f"{path} does not hold statistics that this version writes. If it is pickled, it may run any code "
                     "when it is loaded: if you trust its author, load it with `trust=True` (on the command line "
                     "`--trust`)."
@@ -306,10 +309,12 @@ def read_observation_statistics(path: Path, shape: tuple[int, ...]) -> Observati
 
 def _read(path: Path) -> dict[str, Any]:
     if path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"{path} is too large to hold statistics.")
+        raise InvalidFileError(f"{path} is too large to hold statistics.")
     data = json.loads(path.read_bytes())
     if data.get("format") != _FORMAT:
-        raise ValueError(f"{path} has format {data.get('format')}, but this version of sb3-maddpg reads {_FORMAT}.")
+        raise InvalidFileError(
+            f"{path} has format {data.get('format')}, but this version of sb3-maddpg reads {_FORMAT}."
+        )
     return data
 
 
@@ -322,14 +327,14 @@ def _set_moments(rms: RunningMeanStd, data: Any, name: str) -> None:
     mean, var, count = (decode(data[key], f"{name}: {key}") for key in ("mean", "var", "count"))
     for array in (mean, var):
         if not isinstance(array, np.ndarray) or array.shape != np.shape(rms.mean):
-            raise ValueError(
+            raise InvalidFileError(
                 f"{name} has shape {np.shape(array)}, but the environment needs {np.shape(rms.mean)}: these are "
                 "statistics of other observations."
             )
     counted = np.asarray(count, np.float64)
     if counted.shape not in ((), mean.shape) or not ((counted > 0) & np.isfinite(counted)).all():
-        raise ValueError(f"{name}: count is {shown(count)}: it must be a positive number, or one for each value.")
+        raise InvalidFileError(f"{name}: count is {shown(count)}: it must be a positive number, or one for each value.")
     if not (np.isfinite(mean).all() and np.isfinite(var).all() and (var >= 0).all()):
-        raise ValueError(f"{name} holds NaN, infinity or a negative variance.")
+        raise InvalidFileError(f"{name} holds NaN, infinity or a negative variance.")
     rms.mean, rms.var = mean.astype(np.float64), var.astype(np.float64)
     rms.count = counted if counted.ndim else float(counted)  # type: ignore[assignment]

@@ -20,6 +20,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_maddpg.errors import InvalidEnvironmentError
 from sb3_maddpg.team import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
 from sb3_maddpg.utils import as_flag, as_number, as_numbers, as_seed, not_finite_at, shown, told
 
@@ -116,7 +117,7 @@ class TeamEnv(gymnasium.Env):
         self._info_mask = info_mask
         if info_mask:
             if all(isinstance(space, spaces.Box) for space in action_spaces):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"info_mask=True, but the actions of all agents of {env} ({', '.join(map(str, agents))}) are "
                     "continuous and cannot be masked: leave info_mask out."
                 )
@@ -220,10 +221,10 @@ class TeamEnv(gymnasium.Env):
         observations, infos = self._parts("reset", returned)
         present = self._present()
         if unknown := present - self._rows.keys():
-            raise ValueError(self._unknown(unknown))
+            raise InvalidEnvironmentError(self._unknown(unknown))
         self._live = [row for row, agent in enumerate(self._agents) if agent in present]
         if not self._live:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"After reset(), `agents` of {self.parallel_env} is empty: it must list the active agents."
             )
         self._taking_part = self._live
@@ -260,7 +261,7 @@ class TeamEnv(gymnasium.Env):
             try:
                 reward, ends, cut = agent_rewards[agent], terminations[agent], truncations[agent]
             except KeyError:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"step() of {self.parallel_env} left out reward, termination or truncation of agent {agent!r} "
                     f"{self._when}: it must return them for every agent that acted."
                 ) from None
@@ -312,7 +313,7 @@ class TeamEnv(gymnasium.Env):
             if own is None:
                 continue
             if not isinstance(own, Mapping):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"infos[{agent!r}]['metrics'] of {self.parallel_env} is {shown(own)} {self._when}: it must be a "
                     "dict of numbers by name."
                 )
@@ -321,7 +322,7 @@ class TeamEnv(gymnasium.Env):
                 with suppress(TypeError, ValueError, OverflowError):
                     number = float(value)
                 if not math.isfinite(number):
-                    raise ValueError(
+                    raise InvalidEnvironmentError(
                         f"infos[{agent!r}]['metrics'][{name!r}] of {self.parallel_env} is {shown(value)} {self._when}: "
                         "a metric must be a finite number."
                     )
@@ -358,19 +359,19 @@ class TeamEnv(gymnasium.Env):
         if method == "step":
             names = ["observations", "rewards", "terminations", "truncations", "infos"]
         if not isinstance(returned, (tuple, list)) or len(returned) != len(names):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{method}() of {self.parallel_env} returned {shown(returned)}: it must return ({', '.join(names)})."
             )
         for name, part in zip(names, returned, strict=True):
             if type(part) is not dict and not isinstance(part, Mapping) and not (part is None and name == "infos"):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"{method}() of {self.parallel_env} returned {shown(part)} as {name} {self._when}: it must return "
                     "a dict with an entry for each agent."
                 )
         *others, infos = returned
         for agent, info in (infos or {}).items():
             if type(info) is not dict and info is not None and not isinstance(info, Mapping):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"{method}() of {self.parallel_env} returned {shown(info)} as info of agent {agent!r} "
                     f"{self._when}: it must be a dict."
                 )
@@ -381,7 +382,7 @@ class TeamEnv(gymnasium.Env):
         try:
             return set(agents)  # type: ignore[arg-type]
         except TypeError:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"`agents` of {self.parallel_env} is {shown(agents)} {self._when}: it must be the list of active "
                 "agents."
             ) from None
@@ -390,7 +391,7 @@ class TeamEnv(gymnasium.Env):
         try:
             return as_number(reward)
         except ValueError:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{self.parallel_env} returned a reward of {shown(reward)} for agent {agent!r} {self._when}: a reward "
                 "must be a number."
             ) from None
@@ -399,7 +400,7 @@ class TeamEnv(gymnasium.Env):
         try:
             return as_flag(value)
         except ValueError:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{self.parallel_env} returned {shown(value)} as {name} of agent {agent!r} {self._when}: it must be "
                 "True or False."
             ) from None
@@ -411,7 +412,7 @@ class TeamEnv(gymnasium.Env):
             what = f"is {shown(action)}, not an array of shape"
             if isinstance(action, np.ndarray) and action.dtype != object:
                 what = f"has shape {values.shape}, not"
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The joint action {what} {self.action_space.shape}: it must be flat, agent after agent "
                 f"({', '.join(self.agent_names)})."
             )
@@ -448,7 +449,7 @@ class TeamEnv(gymnasium.Env):
     def _refuse_action(self, values: np.ndarray) -> None:
         for agent, (begin, end, space, *_) in zip(self.agent_names, self._actions, strict=True):
             if values.dtype.kind not in "biuf" or not self._inside(values)[begin:end].all():
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"The action of agent {agent!r} is {values[begin:end].tolist()} in step {self._steps + 1} of the "
                     f"episode, but its space is {space}: pass finite numbers, binary actions as 0 or 1, and categories "
                     "counting from 0."
@@ -461,7 +462,7 @@ class TeamEnv(gymnasium.Env):
         for row in rows:
             agent, space, length = self._agents[row], self._observation_spaces[row], team.obs_dims[row]
             if agent not in observations:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"{self.parallel_env} returned no observation for agent {agent!r}, which is active or was just "
                     f"truncated, {self._when}: reset() and step() must return one."
                 )
@@ -475,7 +476,7 @@ class TeamEnv(gymnasium.Env):
             if not fits:
                 shape = getattr(observation, "shape", None)
                 what = f"is {shown(observation)}" if shape in (None, space.shape) else f"has shape {shape}"
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"The observation of agent {agent!r} {what}, but its space is {space} ({self._when} of "
                     f"{self.parallel_env})."
                 )
@@ -487,7 +488,7 @@ class TeamEnv(gymnasium.Env):
         if (index := not_finite_at(matrix)) is not None:
             row, column = index
             whose = f"The observation of agent {self._agents[row]!r}" if column < team.obs_dim else "The state"
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{whose} is {matrix[row, column]} in column {column} {self._when} of {self.parallel_env}: it must be "
                 "finite. Clip it, or end the episode before a simulation diverges."
             )
@@ -543,11 +544,15 @@ class TeamEnv(gymnasium.Env):
         try:
             state = _flat(self._state_space, self.parallel_env.state())
         except NotImplementedError as error:
-            raise ValueError(f"{self.parallel_env} has a state_space but no state(): set state=False.") from error
+            raise InvalidEnvironmentError(
+                f"{self.parallel_env} has a state_space but no state(): set state=False."
+            ) from error
         except (TypeError, ValueError, LookupError, OverflowError) as error:
-            raise ValueError(f"state() of {self.parallel_env} does not fit its state_space: {error}.") from error
+            raise InvalidEnvironmentError(
+                f"state() of {self.parallel_env} does not fit its state_space: {error}."
+            ) from error
         if state.size != size:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"state() of {self.parallel_env} has {state.size} numbers, but its state_space has {size}."
             )
         return state
@@ -562,10 +567,10 @@ class TeamEnv(gymnasium.Env):
     ) -> None:
         """Check that ``agents`` of the environment agrees with the terminations and truncations it returned."""
         if unknown := left - self._rows.keys():
-            raise ValueError(self._unknown(unknown))
+            raise InvalidEnvironmentError(self._unknown(unknown))
         for row in live:
             if (agent := self._agents[row]) not in left:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"Agent {agent!r} left {self.parallel_env} without termination or truncation{self._by_wrappers()}: "
                     "set one of them in the step that removes the agent from `agents`."
                 )
@@ -573,7 +578,7 @@ class TeamEnv(gymnasium.Env):
             # An environment may keep an agent in `agents` as long as it reports it as terminated or truncated
             if not (terminations.get(agent) or truncations.get(agent)):
                 how = "returned" if self._rows[agent] in self._taking_part else "joined"
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"Agent {agent!r} {how} in the middle of an episode: only agents that {self.parallel_env} lists "
                     "after reset() may take part, until they are terminated or truncated."
                 )
@@ -596,7 +601,7 @@ class TeamEnv(gymnasium.Env):
             for name, reward in zip(self.agent_names, rewards, strict=True)
             if not -_LARGEST_REWARD <= reward <= _LARGEST_REWARD
         )
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"{self.parallel_env} returned a reward of {wrong} {self._when}: rewards must be finite, also in single "
             "precision."
         )
@@ -619,7 +624,7 @@ class TurnBased(ParallelEnv):
     def __init__(self, env: AECEnv):
         self.metadata = dict(_metadata_of(env))
         if self.metadata.get("is_parallelizable"):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{env} is parallelizable, so its agents need not take turns: use its parallel_env, or "
                 "pettingzoo.utils.conversions.aec_to_parallel(env)."
             )
@@ -633,14 +638,14 @@ class TurnBased(ParallelEnv):
         self._observation_spaces = {}
         for agent, space in self._action_spaces.items():
             if not isinstance(space, spaces.Discrete):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"Agent {agent!r} of {env}, a turn-based environment, has the action space {space}: it must be "
                     "Discrete, because masks leave one action to agents that wait for their turn."
                 )
             seen = _space_of(env, "observation_space", agent)
             masked = isinstance(seen, spaces.Dict) and MASK in seen.spaces
             if not masked and _mask_columns(seen):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"Agent {agent!r} of {env} observes {seen}: the action mask of a turn-based environment must be an "
                     f"entry {MASK!r} of the outermost Dict."
                 )
@@ -684,7 +689,7 @@ class TurnBased(ParallelEnv):
         env = self.env
         while env.agents:
             if (mover := env.agent_selection) not in env.agents:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"agent_selection of {env} is {mover!r}, but its agents are {env.agents}: it must name the agent "
                     "whose turn it is."
                 )
@@ -813,13 +818,17 @@ def what_to_pass(env: Any, taker: str) -> str:
 
 def _possible_agents(env: Any) -> tuple[Any, ...]:
     if not isinstance(env, ParallelEnv):
-        raise ValueError(f"{shown(env)} is not an environment of PettingZoo: {what_to_pass(env, 'TeamEnv')}.")
+        raise InvalidEnvironmentError(
+            f"{shown(env)} is not an environment of PettingZoo: {what_to_pass(env, 'TeamEnv')}."
+        )
     agents = getattr(env, "possible_agents", None) or ()
     agents = tuple(agents) if isinstance(agents, Iterable) else ()
     if not agents:
-        raise ValueError(f"{env} has no possible_agents: it must name every agent that can ever take part.")
+        raise InvalidEnvironmentError(
+            f"{env} has no possible_agents: it must name every agent that can ever take part."
+        )
     if len(set(map(str, agents))) < len(agents):
-        raise ValueError(f"possible_agents of {env} contains a name twice: {', '.join(map(str, agents))}.")
+        raise InvalidEnvironmentError(f"possible_agents of {env} contains a name twice: {', '.join(map(str, agents))}.")
     return agents
 
 
@@ -830,14 +839,18 @@ def _names_of(agents: Sequence[Any]) -> tuple[str, ...]:
         for index, agent in enumerate(agents)
     )
     if len(set(names)) < len(names):
-        raise ValueError(f"possible_agents, {shown(list(agents))}, have the same name twice: {', '.join(names)}.")
+        raise InvalidEnvironmentError(
+            f"possible_agents, {shown(list(agents))}, have the same name twice: {', '.join(names)}."
+        )
     return names
 
 
 def _metadata_of(env: ParallelEnv | AECEnv) -> Mapping[str, Any]:
     metadata = getattr(env, "metadata", None) or {}
     if not isinstance(metadata, Mapping):
-        raise ValueError(f"metadata={shown(metadata)} of {type(env).__name__} must be a dict, or left out.")
+        raise InvalidEnvironmentError(
+            f"metadata={shown(metadata)} of {type(env).__name__} must be a dict, or left out."
+        )
     return metadata
 
 
@@ -867,7 +880,7 @@ def explained_reset(env: Any) -> Iterator[None]:
     except TypeError as error:
         for inner in layers_of(env) if "unexpected keyword argument" in str(error) else ():
             if missing := [f"`{name}`" for name in ("seed", "options") if not _takes(inner.reset, name)]:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"reset() of {inner} takes no {' and no '.join(missing)}: declare it as "
                     "`def reset(self, seed=None, options=None)`."
                 ) from error
@@ -890,7 +903,7 @@ def _takes(method: Any, name: str) -> bool:
 def _refuse_black_death(env: Any) -> None:
     """:raises ValueError: if SuperSuit's wrapper ``black_death`` is among the environment's wrappers"""
     if any(type(layer).__name__.startswith("black_death") for layer in layers_of(env)):
-        raise ValueError(_BLACK_DEATH.format("black_death"))
+        raise InvalidEnvironmentError(_BLACK_DEATH.format("black_death"))
 
 
 def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:
@@ -904,12 +917,12 @@ def _space_of(env: ParallelEnv, kind: str, agent: Any) -> Any:
     try:
         space = getattr(env, kind)(agent)
     except (LookupError, AttributeError, TypeError, NotImplementedError) as error:
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"{kind}({agent!r}) of {env} failed ({type(error).__name__}: {error}): it must return a space for "
             "every agent in possible_agents."
         ) from error
     if not isinstance(space, spaces.Space):
-        raise ValueError(f"{kind}({agent!r}) of {env} is {shown(space)}: it must be a Gymnasium space.")
+        raise InvalidEnvironmentError(f"{kind}({agent!r}) of {env} is {shown(space)}: it must be a Gymnasium space.")
     return space
 
 
@@ -920,11 +933,13 @@ def _flat_space(space: spaces.Space, what: str) -> spaces.Box:
     except (NotImplementedError, ValueError):  # the space is empty or of an unknown type
         flat = space
     if not isinstance(flat, spaces.Box):
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"The space that {what}, {space}, is empty or has no fixed length and cannot become a row of numbers."
         )
     if not np.prod(flat.shape):
-        raise ValueError(f"The space that {what}, {space}, is empty: use Box(0, 1, (1,)) as a placeholder.")
+        raise InvalidEnvironmentError(
+            f"The space that {what}, {space}, is empty: use Box(0, 1, (1,)) as a placeholder."
+        )
     return flat
 
 
@@ -957,7 +972,7 @@ def _mask_columns(space: spaces.Space) -> list[int]:
     """:return: the columns of a flat observation that hold the action mask, PettingZoo's dict entry of that name"""
     found = list(_masks_in(space))
     if len(found) > 1:
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"The observation space {space} holds {len(found)} parts called {MASK!r}: rename all but one, or leave out "
             "info_mask if one of them comes from it."
         )
@@ -978,7 +993,7 @@ def _masks_in(space: spaces.Space, begin: int = 0) -> Iterator[list[int]]:
 def _state_space(env: Any) -> spaces.Box:
     space = getattr(env, "state_space", None)
     if space is None:
-        raise ValueError(f"{env} has no state_space, which state=True needs: set state=False.")
+        raise InvalidEnvironmentError(f"{env} has no state_space, which state=True needs: set state=False.")
     return _flat_space(space, f"the state of {env} has")
 
 
@@ -1020,7 +1035,7 @@ def make_parallel_env(
     pairs = _wrappers(wrappers)
     for path, _ in pairs:
         if path.rpartition(".")[2].startswith("black_death"):
-            raise ValueError(_BLACK_DEATH.format(path))
+            raise InvalidEnvironmentError(_BLACK_DEATH.format(path))
     env = find_parallel_env(entry)(**kwargs)
     for path, arguments in pairs:
         env = _load(path)(env, **arguments)
@@ -1035,7 +1050,7 @@ def _wrappers(wrappers: Iterable[str | Mapping[str, Any]] | None) -> list[tuple[
         elif isinstance(wrapper, Mapping):
             pairs.extend((path, dict(arguments or {})) for path, arguments in wrapper.items())
         else:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"wrappers: {shown(wrapper)} is neither a dotted path nor a dict from one to its arguments."
             )
     return pairs
@@ -1046,7 +1061,7 @@ def _load(path: str) -> Callable[..., Any]:
     try:
         return getattr(importlib.import_module(module), name)
     except (Exception, SystemExit) as error:  # from foreign code
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"The wrapper {path} cannot be imported ({told(error)}): name the dotted path of one, and install its "
             "package."
         ) from error
@@ -1060,15 +1075,15 @@ def find_module(name: str) -> ModuleType | None:
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             return None
         if not isinstance(error, ImportError):
-            raise ValueError(f"{name} cannot be imported ({told(error)}): repair it.") from error
+            raise InvalidEnvironmentError(f"{name} cannot be imported ({told(error)}): repair it.") from error
         text = str(error).rstrip(".")
         remedy = "" if "install" in text.lower() else ". Install what it needs"
-        raise ValueError(f"{name} cannot be imported: {text}{remedy}.") from error
+        raise InvalidEnvironmentError(f"{name} cannot be imported: {text}{remedy}.") from error
 
 
 def find_parallel_env(entry: str) -> Callable[..., ParallelEnv | AECEnv]:
     module = find_module(entry)
     make_env = getattr(module, "parallel_env", None) or getattr(module, "env", None)  # the latter is turn-based
     if not callable(make_env):
-        raise ValueError(f"There is no function parallel_env in {entry}: name a module that has one.")
+        raise InvalidEnvironmentError(f"There is no function parallel_env in {entry}: name a module that has one.")
     return make_env

@@ -15,7 +15,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.networks import StackedMLP, single_precision
+from sb3_maddpg.registry import allow_in_files
 from sb3_maddpg.team import MixedActions, Team, into_box
 from sb3_maddpg.utils import all_finite, as_numbers, shown
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
@@ -42,17 +44,17 @@ def sharing_groups(share: Sharing, team: Team, argument: str) -> list[int]:
                 raise TypeError
             lists = [[team.index(agent) for agent in agents] for agents in share]
         except TypeError:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"{argument}={shown(share)} must be True, False or a list of lists of agents that share a network, "
                 f'such as {[[*team.names[:2]]]}; share_critic may also be "team".'
             ) from None
     named = [agent for agents in lists for agent in agents]
     if len(set(named)) < len(named):
-        raise ValueError(f"{argument}={share} names an agent twice, but an agent has only one network.")
+        raise InvalidArgumentError(f"{argument}={share} names an agent twice, but an agent has only one network.")
     for first, *others in filter(None, lists):
         for other in others:
             if not team.homogeneous(first, other):
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"{argument}={share}: {team.names[first]} and {team.names[other]} have different spaces and "
                     "cannot share a network. Pass lists of homogeneous agents, or False."
                 )
@@ -368,13 +370,15 @@ class ImageScale(nn.Module):
         state = th.ones(team.n_agents * -(-team.state_dim // team.n_agents))
         lengths = [*team.obs_dims, team.state_dim]
         if len(columns) != len(lengths):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"image_columns={shown(columns)} must hold lists for the {team.n_agents} agents and for the state."
             )
         for row, images, length in zip([*own, state], columns, lengths, strict=True):
             for first, end in images:
                 if not 0 <= first < end <= length:
-                    raise ValueError(f"image_columns={shown(columns)}: an observation has columns 0 to {length - 1}.")
+                    raise InvalidArgumentError(
+                        f"image_columns={shown(columns)}: an observation has columns 0 to {length - 1}."
+                    )
                 row[first:end] = 1 / 255
         return cls(th.cat([own, state.view(team.n_agents, -1)], dim=1))
 
@@ -636,6 +640,7 @@ def _places(groups: Sequence[int], agent: int) -> list[int]:
     return [order.index(other) for other in range(n)]
 
 
+@allow_in_files(name="sb3_maddpg.policies.MADDPGPolicy")
 class MADDPGPolicy(BasePolicy):
     """
     Policy of MADDPG: actors, critics and their target networks, with one multi-layer perceptron per agent.
@@ -729,7 +734,7 @@ class MADDPGPolicy(BasePolicy):
             case (Actor(), Critic()):
                 self.actor, self.critic = networks
             case _:
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"{type(self).__name__}._make_networks returned {shown(networks)} instead of an Actor and a Critic."
                 )
         if self.image_columns is not None and self.normalize_images:
@@ -744,7 +749,7 @@ class MADDPGPolicy(BasePolicy):
                 )
             except (TypeError, ValueError, RuntimeError) as error:
                 name = self.optimizer_class.__name__
-                raise ValueError(
+                raise InvalidArgumentError(
                     f"optimizer_kwargs={self.optimizer_kwargs} cannot be passed to {name}: {error}."
                 ) from error
         for target in (self.actor_target, self.critic_target):
@@ -824,19 +829,19 @@ class MADDPGPolicy(BasePolicy):
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         alone = "For one agent alone: model.agent_policy(NAME).predict(its observation)."
         if isinstance(observation, Mapping):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"observation={shown(observation)} is a dict, but a team observes an array of shape "
                 f"{self.observation_space.shape}, as sb3_maddpg.TeamEnv(env) returns it. {alone}"
             )
         try:
             numbers = as_numbers(observation)
         except ValueError:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"observation={shown(observation)} is not an array of numbers of shape {self.observation_space.shape} "
                 "or a batch of them."
             ) from None
         if numbers.shape[-2:] != self.observation_space.shape or numbers.ndim > 3:
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"The observation has shape {numbers.shape}, but a team observes {self.observation_space.shape}, or a "
                 f"batch of it. {alone}"
             )
@@ -853,7 +858,7 @@ class MADDPGPolicy(BasePolicy):
         with np.errstate(over="ignore"):
             finite = np.isfinite(observation.astype(np.float32))
         agents = np.flatnonzero(~finite.all(axis=-1).reshape(-1, self.team.n_agents).all(axis=0))
-        raise ValueError(
+        raise InvalidArgumentError(
             f"The observation of agent(s) {', '.join(self.team.names[agent] for agent in agents)} holds NaN or "
             "infinity, so it determines no action: clip or replace such values in the environment."
         )

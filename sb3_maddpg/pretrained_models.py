@@ -8,6 +8,7 @@ from types import ModuleType
 
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.maddpg import MADDPG, as_vec_env
 from sb3_maddpg.offers import OfferError, broken, load_offer, offers, package_of
 from sb3_maddpg.relational import PairPolicy
@@ -72,5 +73,5 @@ def pretrained_folder(name: str) -> Path:
     """
     known = pretrained_models()
     if not isinstance(name, str) or name not in known:
-        raise ValueError(suggest("pretrained model", name, known))
+        raise InvalidArgumentError(suggest("pretrained model", name, known))
     return known[name]

@@ -7,6 +7,7 @@ from contextlib import suppress
 from logging import WARNING
 from typing import Any
 
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.utils import shown
 
 
@@ -22,7 +23,7 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
     try:
         import ray
     except ImportError as error:
-        raise ValueError(f'Ray is not installed ({error}): in the clone, pip install -e ".[ray]".') from error
+        raise InvalidArgumentError(f'Ray is not installed ({error}): in the clone, pip install -e ".[ray]".') from error
     if ray.is_initialized():
         return ray, False
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # do not report usage unasked
@@ -38,7 +39,7 @@ def connect(address: str | None, cpus: int) -> tuple[Any, bool]:
             logging_level=WARNING,
         )
     except (OSError, OverflowError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
-        raise ValueError(
+        raise InvalidArgumentError(
             f"address={shown(address)}: no Ray cluster responds there ({shown(str(error))[1:-1]}). If it asks for a "
             "token, put the cluster's token into ~/.ray/auth_token and set RAY_AUTH_MODE=token."
         ) from error

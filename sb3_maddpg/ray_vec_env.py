@@ -11,7 +11,8 @@ from gymnasium import Wrapper
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_maddpg.env_states import NoStateError, Replayable, load_vec_env_state, tells_state, vec_env_state
+from sb3_maddpg.env_states import Replayable, load_vec_env_state, tells_state, vec_env_state
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError, NoStateError
 from sb3_maddpg.ray_cluster import connect
 from sb3_maddpg.vec_env import at_border
 
@@ -39,7 +40,9 @@ class RayVecEnv(VecEnv):
 
     def __init__(self, shards: Sequence[Callable[[], VecEnv]], snapshot_every: int = 100, address: str | None = None):
         if not shards or snapshot_every < 1:
-            raise ValueError(f"{len(shards)} shards and snapshot_every={snapshot_every}: both must be at least 1.")
+            raise InvalidArgumentError(
+                f"{len(shards)} shards and snapshot_every={snapshot_every}: both must be at least 1."
+            )
         self._ray, self._begun = connect(address, len(shards))
         self._shards = [_Remote(self._ray, make) for make in shards]
         self.snapshot_every = snapshot_every
@@ -48,7 +51,7 @@ class RayVecEnv(VecEnv):
         self._ends = np.cumsum(sizes).tolist()
         observation_space, action_space = described[0][1:]
         if any(spaces[1:] != described[0][1:] for spaces in described):
-            raise ValueError("The shards have different spaces.")
+            raise InvalidEnvironmentError("The shards have different spaces.")
         self._waiting: list[Any] = []
         self._steps = 0
         super().__init__(sum(sizes), observation_space, action_space)
@@ -159,7 +162,7 @@ class _Remote:
             except self._ray.exceptions.RayActorError as error:
                 if attempt == _ATTEMPTS:
                     reason = str(error).strip().splitlines()[-1]
-                    raise ValueError(
+                    raise InvalidEnvironmentError(
                         f"{attempt} processes died during {self._present[0]}() of a shard: {reason}"
                     ) from error
                 self._ray.kill(self._actor)  # it may only be unreachable
@@ -221,7 +224,7 @@ class _Shard:
         try:
             return vec_env_state(self.env)
         except NoStateError as error:
-            raise ValueError(f"A shard could not be restored if its process died: {error}") from error
+            raise InvalidEnvironmentError(f"A shard could not be restored if its process died: {error}") from error
 
     def _get_attr(self, indices: list[int], name: str) -> list[Any]:
         return self.env.get_attr(name, self._given(indices))

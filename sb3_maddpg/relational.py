@@ -15,7 +15,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_maddpg.actions import TeamActions
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.policies import Actor, Critic, MADDPGPolicy
+from sb3_maddpg.registry import allow_in_files
 from sb3_maddpg.team import AgentActionSpace, Team
 from sb3_maddpg.utils import shown
 from sb3_maddpg.validation import PairPolicyArguments, validated
@@ -65,12 +67,12 @@ def check_layout(layout: Any) -> None:
     """
     known = ObservationLayout.__annotations__
     if not isinstance(layout, Mapping):
-        raise ValueError(
+        raise InvalidArgumentError(
             f"observation_layout={shown(layout)} must be a dict with the entries of "
             "sb3_maddpg.relational.ObservationLayout."
         )
     if not {"own", "neighbours"} <= set(layout) <= set(known):
-        raise ValueError(
+        raise InvalidArgumentError(
             f"observation_layout has entries {sorted(map(str, layout))}, but needs `own` and `neighbours`, and may "
             "only add `who`, `who_columns`, `acts_on_neighbours`, `critic`, `action_mask` and `complete`."
         )
@@ -83,7 +85,7 @@ def check_layout(layout: Any) -> None:
         else:
             fits, what = _are_integers(value), "a list of integers"
         if not fits:
-            raise ValueError(f"observation_layout: {name}={shown(value)} must be {what}.")
+            raise InvalidArgumentError(f"observation_layout: {name}={shown(value)} must be {what}.")
 
 
 def _are_integers(values: Any) -> bool:
@@ -105,31 +107,31 @@ def _check_layout(layout: ObservationLayout, team: Team) -> Sequence[Sequence[in
         or not len(hidden) == len(mask) == len(numbers) == len(neighbours)
         or not all(0 <= column < team.obs_dim for column in used)
     ):
-        raise ValueError(
+        raise InvalidArgumentError(
             f"observation_layout={dict(layout)}: every neighbour needs the same number of columns, each from 0 to "
             f"{team.obs_dim - 1}."
         )
     binary = all(isinstance(space, spaces.MultiBinary) for space in team.action_spaces)
     if "action_mask" in layout and not (binary and layout.get("acts_on_neighbours")):
-        raise ValueError(
+        raise InvalidArgumentError(
             "observation_layout: `action_mask` is for MultiBinary actions on neighbours, but the actions are "
             f"{team.action_spaces[0]} and acts_on_neighbours={layout.get('acts_on_neighbours', False)}."
         )
     if "who_columns" in layout:
         if "who" in layout or layout.get("complete"):
-            raise ValueError(
+            raise InvalidArgumentError(
                 "observation_layout: `who_columns` is for neighbours that change, so it cannot be combined with `who` "
                 "or complete=True."
             )
         return None
     who = layout.get("who") or _others(team.n_agents)
     if {len(row) for row in who} != {len(neighbours)} or len(who) != team.n_agents:
-        raise ValueError(
+        raise InvalidArgumentError(
             f"observation_layout has columns for {len(neighbours)} neighbours, but the {team.n_agents} agents have "
             f"{[len(row) for row in who]}: add `who`, `who_columns` or the missing columns."
         )
     if not all(set(row) <= set(others) for row, others in zip(who, _others(team.n_agents), strict=True)):
-        raise ValueError(
+        raise InvalidArgumentError(
             f"observation_layout: who={who} must name other agents, by indices from 0 to {team.n_agents - 1}."
         )
     return who
@@ -157,7 +159,7 @@ class NeighbourViews(nn.Module):
         super().__init__()
         for agent in range(1, team.n_agents):
             if not team.homogeneous(0, agent):
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"PairPolicy is for teams of homogeneous agents, but {team.names[0]} and {team.names[agent]} have "
                     "different spaces: use MlpPolicy."
                 )
@@ -287,7 +289,7 @@ class PairNet(nn.Module):
     ):
         super().__init__()
         if not net_arch:
-            raise ValueError(
+            raise InvalidArgumentError(
                 "net_arch=[]: PairPolicy needs at least one hidden layer, which encodes the views of neighbours."
             )
         width, *later = net_arch
@@ -490,6 +492,7 @@ class PairCritic(Critic):
             nn.utils.clip_grad_norm_(net.parameters(), max_norm)
 
 
+@allow_in_files(name="sb3_maddpg.relational.PairPolicy")
 class PairPolicy(MADDPGPolicy):
     """
     Policy for teams of homogeneous agents that observe each other, with one relational actor and one relational critic
@@ -529,7 +532,7 @@ class PairPolicy(MADDPGPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ):
         if observation_layout is None:
-            raise ValueError(
+            raise InvalidArgumentError(
                 "PairPolicy needs to know which columns of an observation are about which neighbour: add an "
                 "`observation_layout` (see sb3_maddpg.relational.ObservationLayout) to the environment as an attribute "
                 "or to policy_kwargs, or use MlpPolicy."
@@ -618,7 +621,7 @@ def remedy_for_other_observations() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise ValueError(
+        raise InvalidEnvironmentError(
             "The model was trained with other observations or networks than this team has: create the environment "
             f"with the arguments in the model's `env_spec`, except the number of agents. {error}"
         ) from error
@@ -636,7 +639,7 @@ def _split(space: AgentActionSpace, n_parts: int) -> list[AgentActionSpace]:
     length = 1 if isinstance(space, spaces.Discrete) else space.shape[0]
     equal = not isinstance(space, spaces.MultiDiscrete) or len(set(space.nvec.tolist())) == 1
     if length % n_parts or not equal:
-        raise ValueError(
+        raise InvalidArgumentError(
             f"observation_layout says that agents act on {n_parts} neighbours, but {space} cannot be split into as "
             "many equal parts."
         )

@@ -6,13 +6,15 @@ Teams: the number of agents, their observations and their actions, read from the
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypedDict
 
 import numpy as np
 from gymnasium import spaces
 
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError, InvalidFileError
+from sb3_maddpg.typed_json import Json, add_codec, few, read_box, write_box
 from sb3_maddpg.utils import shown
 
 AgentActionSpace = spaces.MultiBinary | spaces.Box | spaces.Discrete | spaces.MultiDiscrete
@@ -322,7 +324,9 @@ class Team:
         if isinstance(agent, (int, np.integer)) and not isinstance(agent, bool) and agent in numbers:
             return numbers.index(agent)
         positions = "" if named_by_integers else f", or 0 to {self.n_agents - 1}"
-        raise ValueError(f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}{positions}.")
+        raise InvalidArgumentError(
+            f"There is no agent {shown(agent)}: the agents are {', '.join(self.names)}{positions}."
+        )
 
     def homogeneous(self, agent: int, other: int) -> bool:
         """
@@ -350,12 +354,12 @@ class Team:
         """
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 2:
             parts = ", each flattened if it is a Dict or Tuple" if hasattr(observation_space, "spaces") else ""
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"A team observation is a Box of shape (n_agents, obs_dim), not {observation_space}. {_OF_TEAMS}, or "
                 f"stack the agents' observations along a first axis{parts}."
             )
         if not all(observation_space.shape):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The observation space {observation_space} is empty: a team needs at least one agent, and an agent "
                 "needs at least one column."
             )
@@ -368,9 +372,9 @@ class Team:
             names = names or [f"agent_{index}" for index in range(n_agents)]
         names = tuple(map(str, names))
         if len(names) != n_agents:
-            raise ValueError(f"There are {len(names)} names, {', '.join(names)}, for {n_agents} agents.")
+            raise InvalidEnvironmentError(f"There are {len(names)} names, {', '.join(names)}, for {n_agents} agents.")
         if len(set(names)) < n_agents:
-            raise ValueError(f"An agent's name occurs twice: {', '.join(names)}.")
+            raise InvalidEnvironmentError(f"An agent's name occurs twice: {', '.join(names)}.")
         action_spaces = _agents_spaces(action_space, n_agents)
         for name, space in zip(names, action_spaces, strict=True):
             check_action_space(name, space)
@@ -390,7 +394,7 @@ def check_action_space(agent: Any, space: spaces.Space) -> None:
     :raises ValueError: if the action space is not supported
     """
     if not isinstance(space, ACTION_SPACES) or not heads_of(space):
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"Agent {agent!r} has the action space {space}: only Discrete, MultiDiscrete, MultiBinary and Box with at "
             "least one number are supported. Flatten it with a wrapper."
         )
@@ -399,7 +403,7 @@ def check_action_space(agent: Any, space: spaces.Space) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
             span = high - low
         if not (np.isfinite(span) & (span >= 0)).all():
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"Agent {agent!r} has the action space {space}, whose bounds are infinite or too large for single "
                 "precision. Actions are scaled to the bounds: choose smaller, finite ones."
             )
@@ -418,30 +422,34 @@ def check_mask(agent: Any, space: spaces.Space, length: int) -> None:
     expected = len(heads) if isinstance(space, spaces.MultiBinary) else sum(heads)  # 0 for continuous actions
     if length != expected:
         rule = f"needs {expected}, one per category or bit" if expected else "is continuous and takes no mask"
-        raise ValueError(f"Agent {agent!r} has an action mask of {length} numbers, but its space {space} {rule}.")
+        raise InvalidEnvironmentError(
+            f"Agent {agent!r} has an action mask of {length} numbers, but its space {space} {rule}."
+        )
 
 
 def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActionSpace, ...]:
     if isinstance(action_space, (MixedActions, CategoricalActions)):
         parts = action_space.agent_spaces
         if len(parts) != n_agents:
-            raise ValueError(f"{action_space} has {len(parts)} agents, but the observation has {n_agents} rows.")
+            raise InvalidEnvironmentError(
+                f"{action_space} has {len(parts)} agents, but the observation has {n_agents} rows."
+            )
         return parts
     if not isinstance(action_space, ACTION_SPACES) or action_space.shape is None or len(action_space.shape) != 1:
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"A team action is a flat MultiBinary, Box or MultiDiscrete of length n_agents * action_dim, not "
             f"{action_space}, with {n_agents} agents, one per row of the observation. {_OF_TEAMS}, or flatten the "
             "space in the environment and reshape actions to (n_agents, action_dim) in step()."
         )
     (length,) = action_space.shape
     if isinstance(action_space, spaces.MultiDiscrete) and action_space.start.any():
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"The categories of a team action count from 0, but those of {action_space} count from "
             f"start={action_space.start.tolist()}. Leave `start` out and add it in step(), or wrap a PettingZoo "
             "environment in a TeamEnv, which does so."
         )
     if length % n_agents:
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"A joint action of {length} numbers cannot be divided evenly among {n_agents} agents, one per row of the "
             "observation. Give every agent the same number of actions, or describe the team with "
             f"sb3_maddpg.team.MixedActions. {_OF_TEAMS}."
@@ -458,3 +466,44 @@ def _agents_spaces(action_space: spaces.Space, n_agents: int) -> tuple[AgentActi
     bounds = _bounds(action_space) if in_float else (action_space.low, action_space.high)
     lows, highs = (bound.reshape(n_agents, k) for bound in bounds)
     return tuple(spaces.Box(low, high, dtype=dtype) for low, high in zip(lows, highs, strict=True))
+
+
+def _write_observation(space: TeamObservation, part: Callable[[Any], Json]) -> dict[str, Json]:
+    names = {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim}
+    masks: dict[str, Json] = {"masks": [list(mask) for mask in space.masks]} if any(space.masks) else {}
+    return names | masks | write_box(space, part)
+
+
+def _read_observation(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamObservation:
+    box, lengths, length = read_box(entry, part), entry["lengths"], entry["state"]
+    own = max(lengths)
+    agents = {
+        name: spaces.Box(box.low[row, :columns], box.high[row, :columns], dtype=np.float32)
+        for row, (name, columns) in enumerate(zip(few(entry["names"]), lengths, strict=True))
+    }
+    low, high = (bound[:, own:].ravel()[:length] for bound in (box.low, box.high))
+    masks = dict(zip(entry["names"], entry.get("masks", []), strict=False))
+    if any(not 0 <= column < own for mask in masks.values() for column in mask):
+        raise InvalidFileError(f"it has action masks outside its observation of length {own}")
+    space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None, masks)
+    if space.shape != box.shape:
+        raise InvalidFileError(f"it has a team's observation of shape {box.shape} instead of {space.shape}")
+    return space
+
+
+def _write_agents(space: MixedActions | CategoricalActions, part: Callable[[Any], Json]) -> dict[str, Json]:
+    return {"agents": [part(one) for one in space.agent_spaces]}
+
+
+def _agents(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> list[Any]:
+    return [*map(part, few(entry["agents"]))]
+
+
+add_codec("TeamObservation", TeamObservation, _write_observation, _read_observation)
+add_codec("MixedActions", MixedActions, _write_agents, lambda entry, part: MixedActions(_agents(entry, part)))
+add_codec(
+    "CategoricalActions",
+    CategoricalActions,
+    _write_agents,
+    lambda entry, part: CategoricalActions(_agents(entry, part)),
+)

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.utils import as_seed, shown
 
 
@@ -34,7 +35,7 @@ class TeamTask(gym.Env):
 
     def __init__(self, episode_length: int = 10, render_mode: str | None = None):
         if not isinstance(episode_length, (int, np.integer)) or episode_length < 1:
-            raise ValueError(f"episode_length={shown(episode_length)} must be an integer of at least 1.")
+            raise InvalidArgumentError(f"episode_length={shown(episode_length)} must be an integer of at least 1.")
         self.episode_length = episode_length
         self.render_mode = render_mode
         self.observation_space = spaces.Box(-1.0, 1.0, (self.n_agents, self.obs_dim), np.float32)

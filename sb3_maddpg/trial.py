@@ -7,6 +7,7 @@ from typing import Any
 
 import torch as th
 
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.estimators import ESTIMATORS, Estimator
 from sb3_maddpg.networks import single_precision
 from sb3_maddpg.policies import MADDPGPolicy
@@ -26,7 +27,7 @@ def try_out(policy: MADDPGPolicy, estimator: str, temperature: float) -> None:
     """
     estimates = ESTIMATORS[estimator]
     if not isinstance(estimates, Estimator):
-        raise ValueError(
+        raise InvalidArgumentError(
             f"ESTIMATORS[{estimator!r}]={shown(estimates)} must be an Estimator of two functions, for binary and for "
             "categorical actions."
         )
@@ -88,5 +89,5 @@ def _learns(network: th.nn.Module) -> bool:
     return any(parameter.requires_grad for parameter in network.parameters())
 
 
-class TrialError(ValueError):
+class TrialError(InvalidArgumentError):
     """Raised for a part of a policy or an estimator that fails its trial."""

@@ -7,20 +7,16 @@ import binascii
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
-from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common import buffers, noise, torch_layers, utils
-from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common import buffers, utils
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
-from sb3_maddpg.offers import broken, load_offer, offers
-from sb3_maddpg.team import CategoricalActions, MixedActions, TeamObservation
+from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
+from sb3_maddpg.registry import class_in_files, name_in_files
 from sb3_maddpg.utils import shown, suggest
 
 Json = Any
@@ -32,38 +28,7 @@ _MOST_REPEATED = 2 * _LARGEST_ARRAY  # maximum number of values in all arrays of
 
 _MOST_AGENTS = 4096  # maximum number of agents of a team, or of parts of a space
 
-_Class = TypeVar("_Class", bound=type)
 _Item = TypeVar("_Item")
-_allowed: dict[str, type] = {}
-# Instances of these are written as their attributes
-_PLAIN_OBJECTS = (
-    utils.ConstantSchedule,
-    utils.LinearSchedule,
-    utils.FloatSchedule,
-    RunningMeanStd,
-    noise.NormalActionNoise,
-    noise.OrnsteinUhlenbeckActionNoise,
-    noise.VectorizedActionNoise,
-)
-
-
-def allow_in_files(cls: _Class) -> _Class:
-    """
-    Allow model files to name a custom class, such as a policy, a replay buffer, a features extractor or a schedule. The
-    class must be registered both when saving and when loading. Packages can name modules that register classes in an
-    entry point of the group ``sb3_maddpg.allowed_in_files``. Also usable as a decorator.
-
-    :param cls: the class; instances, such as schedules, are saved as their attributes
-    :return: the class
-    :raises ValueError: if ``cls`` is not a class, or cannot be imported from its module by its name
-    """
-    if not isinstance(cls, type) or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
-        raise ValueError(
-            f"{shown(cls)} cannot be named in files: pass a class that is defined at the top level of an importable "
-            "module."
-        )
-    _allowed[_name(cls)] = cls
-    return cls
 
 
 def encode(value: Any, name: str, arrays: dict[str, np.ndarray] | None = None) -> Json:
@@ -102,9 +67,9 @@ def decode(value: Json, name: str, arrays: Mapping[str, np.ndarray] | None = Non
         binascii.Error,
         RecursionError,
     ) as error:
-        raise ValueError(f"{name} is damaged ({type(error).__name__}: {shown(str(error))}).") from error
+        raise InvalidFileError(f"{name} is damaged ({type(error).__name__}: {shown(str(error))}).") from error
     except ValueError as error:  # Gymnasium's have several lines
-        raise ValueError(f"{name} is damaged: {' '.join(str(error).split())}") from error
+        raise InvalidFileError(f"{name} is damaged: {' '.join(str(error).split())}") from error
 
 
 def check_size(value: Json, name: str) -> None:
@@ -126,68 +91,7 @@ def check_size(value: Json, name: str) -> None:
         elif isinstance(part, list):
             parts.extend(part)
     if repeated > _MOST_REPEATED:
-        raise ValueError(f"{name} is damaged: it has arrays of {repeated} repeated numbers.")
-
-
-def _name(cls: type) -> str:
-    return f"{cls.__module__}.{cls.__qualname__}"
-
-
-@cache
-def _built_in() -> dict[str, type]:
-    """:return: the classes that files may always name, which are the parts of models"""
-    from sb3_maddpg import buffers as own_buffers
-    from sb3_maddpg import cnn_policy, iddpg, policies, relational
-
-    classes = [
-        *_PLAIN_OBJECTS,
-        *(
-            one
-            for module in (policies, relational, iddpg, cnn_policy)
-            for one in vars(module).values()
-            if _is_public_class(one, module)
-        ),
-        *(one for one in vars(own_buffers).values() if _is_public_class(one, own_buffers)),
-        *(one for one in vars(buffers).values() if isinstance(one, type) and issubclass(one, buffers.BaseBuffer)),
-        *(getattr(th.nn.modules.activation, one) for one in th.nn.modules.activation.__all__),
-        *(one for one in vars(th.optim).values() if isinstance(one, type) and issubclass(one, th.optim.Optimizer)),
-        *(getattr(torch_layers, one) for one in ("FlattenExtractor", "NatureCNN", "CombinedExtractor")),
-        RMSpropTFLike,
-        *(np.float32, np.float64),  # of action noise
-    ]
-    return {_name(one): one for one in classes}
-
-
-def _is_public_class(value: Any, module: Any) -> bool:
-    return isinstance(value, type) and value.__module__ == module.__name__ and not value.__name__.startswith("_")
-
-
-@cache
-def _load_entry_points() -> None:
-    for offer in offers("allowed_in_files"):
-        found = load_offer(offer)
-        if not isinstance(found, ModuleType) and not (isinstance(found, type) and found in _allowed.values()):
-            raise broken(offer, f"is {shown(found)}, neither a module nor a class registered with `allow_in_files`")
-
-
-def known_class(cls: type) -> bool:
-    """
-    :param cls: a class
-    :return: whether files may name it, see ``allow_in_files``
-    """
-    _load_entry_points()
-    return cls in (_built_in().get(_name(cls)), _allowed.get(_name(cls)))
-
-
-def _class_of(name: Any) -> type:
-    _load_entry_points()
-    known = _built_in() | _allowed
-    if not isinstance(name, str) or name not in known:
-        raise ValueError(
-            f"{suggest('class', name, known) if isinstance(name, str) else f'{shown(name)} is not a class.'} Register "
-            "custom classes with `sb3_maddpg.allow_in_files` before loading the file."
-        )
-    return known[name]
+        raise InvalidFileError(f"{name} is damaged: it has arrays of {repeated} repeated numbers.")
 
 
 class _Codec(NamedTuple):
@@ -200,7 +104,7 @@ class _Codec(NamedTuple):
 
 def _write_array(array: np.ndarray, part: Callable[[Any], Json]) -> dict[str, Json]:
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"has an array of {array.dtype}, which is not a numeric type")
+        raise InvalidArgumentError(f"has an array of {array.dtype}, which is not a numeric type")
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     header = {"dtype": array.dtype.str.lstrip("<>=|"), "shape": list(array.shape)}
     first = little.ravel()[:1]
@@ -213,9 +117,9 @@ def _write_array(array: np.ndarray, part: Callable[[Any], Json]) -> dict[str, Js
 def _read_array(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> np.ndarray:
     dtype, shape = np.dtype(f"<{entry['dtype']}"), entry["shape"]
     if dtype.kind not in "biuf":
-        raise ValueError(f"it has an array of {shown(entry['dtype'])}")
+        raise InvalidFileError(f"it has an array of {shown(entry['dtype'])}")
     if not all(isinstance(length, int) and length >= 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
-        raise ValueError(
+        raise InvalidFileError(
             f"it has an array of shape {shown(shape)}, which is invalid or has more than {_LARGEST_ARRAY} numbers"
         )
     values = np.frombuffer(base64.b64decode(entry["base64"], validate=True), dtype)
@@ -225,11 +129,13 @@ def _read_array(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> np.nd
     return values.reshape(shape).astype(dtype.newbyteorder("="))
 
 
-def _write_box(space: spaces.Box, part: Callable[[Any], Json]) -> dict[str, Json]:
+def write_box(space: spaces.Box, part: Callable[[Any], Json]) -> dict[str, Json]:
+    """:return: bounds of a space as JSON, see ``add_codec``"""
     return {"low": part(space.low), "high": part(space.high)}
 
 
-def _read_box(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> spaces.Box:
+def read_box(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> spaces.Box:
+    """:return: a space of these bounds, see ``add_codec``"""
     low, high = part(entry["low"]), part(entry["high"])
     return spaces.Box(low, high, dtype=low.dtype.type)
 
@@ -244,58 +150,26 @@ def _read_multi_discrete(entry: Mapping[str, Json], part: Callable[[Json], Any])
     return spaces.MultiDiscrete(nvec, nvec.dtype, start=part(entry["start"]))
 
 
-def _few(agents: Sequence[_Item]) -> Sequence[_Item]:
+def few(agents: Sequence[_Item]) -> Sequence[_Item]:
     """
     :param agents: what a file holds for each agent, or each part of a space
     :return: the same
     :raises ValueError: if there are more than any team has
     """
     if len(agents) > _MOST_AGENTS:
-        raise ValueError(f"it has {len(agents)} agents or parts of a space, more than {_MOST_AGENTS}")
+        raise InvalidFileError(f"it has {len(agents)} agents or parts of a space, more than {_MOST_AGENTS}")
     return agents
 
 
-def _write_team(space: TeamObservation, part: Callable[[Any], Json]) -> dict[str, Json]:
-    names = {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim}
-    masks: dict[str, Json] = {"masks": [list(mask) for mask in space.masks]} if any(space.masks) else {}
-    return names | masks | _write_box(space, part)
-
-
-def _read_team(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamObservation:
-    box, lengths, length = _read_box(entry, part), entry["lengths"], entry["state"]
-    own = max(lengths)
-    agents = {
-        name: spaces.Box(box.low[row, :columns], box.high[row, :columns], dtype=np.float32)
-        for row, (name, columns) in enumerate(zip(_few(entry["names"]), lengths, strict=True))
-    }
-    low, high = (bound[:, own:].ravel()[:length] for bound in (box.low, box.high))
-    masks = dict(zip(entry["names"], entry.get("masks", []), strict=False))
-    if any(not 0 <= column < own for mask in masks.values() for column in mask):
-        raise ValueError(f"it has action masks outside its observation of length {own}")
-    space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None, masks)
-    if space.shape != box.shape:
-        raise ValueError(f"it has a team's observation of shape {box.shape} instead of {space.shape}")
-    return space
-
-
-def _attributes_of(value: Any, part: Callable[[Any], Json]) -> dict[str, Json]:
-    return {"class": _name(type(value)), "attributes": {key: part(one) for key, one in vars(value).items()}}
-
-
 def _object_of(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> Any:
-    cls = _class_of(entry["class"])
+    cls = class_in_files(entry["class"])
     if issubclass(cls, (th.nn.Module, th.optim.Optimizer, buffers.BaseBuffer)):
-        raise ValueError(f"it has an instance of {cls.__name__}")
+        raise InvalidFileError(f"it has an instance of {cls.__name__}")
     made = cls.__new__(cls)
     vars(made).update({str(key): part(one) for key, one in entry["attributes"].items()})
     return made
 
 
-def _agent_spaces(space: MixedActions | CategoricalActions, part: Callable[[Any], Json]) -> dict[str, Json]:
-    return {"agents": [part(one) for one in space.agent_spaces]}
-
-
-# Subclasses come before their base classes
 _CODECS: dict[str, _Codec] = {
     "tuple": _Codec(tuple, lambda v, part: {"items": [*map(part, v)]}, lambda e, part: tuple(map(part, e["items"]))),
     "deque": _Codec(
@@ -313,12 +187,7 @@ _CODECS: dict[str, _Codec] = {
         np.generic, lambda v, part: _write_array(np.asarray(v), part), lambda e, part: _read_array(e, part)[()]
     ),
     "float": _Codec(float, lambda v, part: {"value": str(v)}, lambda e, part: float(e["value"])),
-    "TeamObservation": _Codec(TeamObservation, _write_team, _read_team),
-    "MixedActions": _Codec(MixedActions, _agent_spaces, lambda e, part: MixedActions([*map(part, _few(e["agents"]))])),
-    "CategoricalActions": _Codec(
-        CategoricalActions, _agent_spaces, lambda e, part: CategoricalActions([*map(part, _few(e["agents"]))])
-    ),
-    "Box": _Codec(spaces.Box, _write_box, _read_box),
+    "Box": _Codec(spaces.Box, write_box, read_box),
     "Discrete": _Codec(
         spaces.Discrete,
         lambda v, part: {"n": int(v.n), "start": int(v.start), "dtype": str(v.dtype)},
@@ -337,27 +206,48 @@ _CODECS: dict[str, _Codec] = {
     "Dict": _Codec(
         spaces.Dict,
         lambda v, part: {"spaces": [[key, part(one)] for key, one in v.spaces.items()]},
-        lambda e, part: spaces.Dict([(key, part(one)) for key, one in _few(e["spaces"])]),
+        lambda e, part: spaces.Dict([(key, part(one)) for key, one in few(e["spaces"])]),
     ),
     "Tuple": _Codec(
         spaces.Tuple,
         lambda v, part: {"spaces": [*map(part, v.spaces)]},
-        lambda e, part: spaces.Tuple([*map(part, _few(e["spaces"]))]),
+        lambda e, part: spaces.Tuple([*map(part, few(e["spaces"]))]),
     ),
     "dtype": _Codec(th.dtype, lambda v, part: {"name": str(v)}, lambda e, part: _torch_dtype(e["name"])),
 }
 
 
+_KINDS = {codec.type: kind for kind, codec in _CODECS.items()}
+
+
+def add_codec(
+    kind: str,
+    cls: type,
+    write: Callable[[Any, Callable[[Any], Json]], dict[str, Json]],
+    read: Callable[[Mapping[str, Json], Callable[[Json], Any]], Any],
+) -> None:
+    """
+    Define how files hold instances of a class and of its subclasses.
+
+    :param kind: how files name the type
+    :param cls: the class
+    :param write: returns an instance as JSON, by means of a function for its parts
+    :param read: returns an instance from this JSON, which may be of an untrusted file, likewise
+    """
+    _CODECS[kind] = _Codec(cls, write, read)
+    _KINDS[cls] = kind
+
+
 def _sizes(n: Any) -> Any:
     if math.prod(n if isinstance(n, list) else [n]) > _LARGEST_ARRAY:
-        raise ValueError(f"it has a space of {shown(n)} bits")
+        raise InvalidFileError(f"it has a space of {shown(n)} bits")
     return n
 
 
 def _torch_dtype(name: str) -> th.dtype:
     dtype = getattr(th, name.removeprefix("torch."), None)
     if not isinstance(dtype, th.dtype):
-        raise ValueError(f"{shown(name)} is not a PyTorch dtype")
+        raise InvalidFileError(f"{shown(name)} is not a PyTorch dtype")
     return dtype
 
 
@@ -368,8 +258,8 @@ def _encode_special(value: Any, arrays: dict[str, np.ndarray] | None) -> Json:
         return {_TYPE: "outside", "key": key}
     if isinstance(value, TrainFreq):
         return {_TYPE: "TrainFreq", "frequency": value.frequency, "unit": value.unit.value}
-    if isinstance(value, type) and known_class(value):
-        return {_TYPE: "class", "name": _name(value)}
+    if isinstance(value, type) and (name := name_in_files(value)) is not None:
+        return {_TYPE: "class", "name": name}
     return None
 
 
@@ -382,7 +272,7 @@ def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | N
         return _encode(one, name, depth + 1, arrays)
 
     if depth > _DEEPEST:
-        raise ValueError(f"{name} cannot be saved: it is nested more than {_DEEPEST} levels deep.")
+        raise InvalidArgumentError(f"{name} cannot be saved: it is nested more than {_DEEPEST} levels deep.")
     if _is_json(value):
         return value
     if type(value) is list:
@@ -391,14 +281,23 @@ def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | N
         return {key: part(one) for key, one in value.items()}
     if (special := _encode_special(value, arrays)) is not None:
         return special
-    if _name(type(value)) == "rl_zoo3.utils.SimpleLinearSchedule":  # in older files; reading it would need rl_zoo3
-        value = utils.LinearSchedule(value.initial_value, 0.0, 1.0)
-    for kind, codec in _CODECS.items():
-        if isinstance(value, codec.type):
-            return {_TYPE: kind} | codec.write(value, part)
-    if known_class(type(value)) and not isinstance(value, (th.nn.Module, th.optim.Optimizer)):
-        return {_TYPE: "object"} | _attributes_of(value, part)
-    raise ValueError(
+    cls = type(value)
+    if (cls.__module__, cls.__name__) == (
+        "rl_zoo3.utils",
+        "SimpleLinearSchedule",
+    ):  # in older files; reading it would need rl_zoo3
+        value, cls = utils.LinearSchedule(value.initial_value, 0.0, 1.0), utils.LinearSchedule
+    for base in cls.__mro__:
+        if base in _KINDS:
+            kind = _KINDS[base]
+            return {_TYPE: kind} | _CODECS[kind].write(value, part)
+    if (class_name := name_in_files(cls)) is not None and not isinstance(value, (th.nn.Module, th.optim.Optimizer)):
+        return {
+            _TYPE: "object",
+            "class": class_name,
+            "attributes": {key: part(one) for key, one in vars(value).items()},
+        }
+    raise InvalidArgumentError(
         f"{name}={shown(value)} cannot be saved: a {type(value).__name__} is neither a number, an array, a space nor "
         "an instance of a class that files may name. Register its class with `sb3_maddpg.allow_in_files`, leave it out "
         f"with `save(path, exclude=[{name!r}])`, or pickle it with `save(path, pickle=True)`."
@@ -410,7 +309,7 @@ def _decode(value: Json, depth: int, arrays: Mapping[str, np.ndarray]) -> Any:
         return _decode(one, depth + 1, arrays)
 
     if depth > _DEEPEST:
-        raise ValueError(f"it is nested more than {_DEEPEST} levels deep")
+        raise InvalidFileError(f"it is nested more than {_DEEPEST} levels deep")
     if isinstance(value, list):
         return [part(one) for one in value]
     if not isinstance(value, dict):
@@ -423,9 +322,9 @@ def _decode(value: Json, depth: int, arrays: Mapping[str, np.ndarray]) -> Any:
     if kind == "TrainFreq":
         return TrainFreq(value["frequency"], TrainFrequencyUnit(value["unit"]))
     if kind == "class":
-        return _class_of(value["name"])
+        return class_in_files(value["name"])
     if kind == "object":
         return _object_of(value, part)
     if not isinstance(kind, str) or kind not in _CODECS:
-        raise ValueError(suggest("type", kind, [*_CODECS, "TrainFreq", "class", "object", "outside"]))
+        raise InvalidFileError(suggest("type", kind, [*_CODECS, "TrainFreq", "class", "object", "outside"]))
     return _CODECS[kind].read(value, part)

@@ -24,6 +24,8 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_maddpg.errors import InvalidArgumentError
+
 # Arguments of gymnasium.make and make_vec that end up among the environment's own
 NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"}
 # A temporary file that has not been written to for this long is left over
@@ -316,7 +318,7 @@ def as_numbers(values: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
             return array.astype(np.float32)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last from tensors with a gradient
-        raise ValueError("no real numbers") from None
+        raise InvalidArgumentError("no real numbers") from None
 
 
 def as_number(value: Any) -> float:
@@ -330,7 +332,7 @@ def as_number(value: Any) -> float:
     if isinstance(value, (int, float)) or as_numbers(value).ndim == 0:
         with suppress(TypeError, ValueError, OverflowError):
             return float(value)
-    raise ValueError("no real number")
+    raise InvalidArgumentError("no real number")
 
 
 def as_flag(value: Any) -> bool:
@@ -343,7 +345,7 @@ def as_flag(value: Any) -> bool:
     """
     number = as_number(value)
     if number not in (0.0, 1.0):
-        raise ValueError("neither True nor False")
+        raise InvalidArgumentError("neither True nor False")
     return number == 1.0
 
 
@@ -362,5 +364,5 @@ def as_seed(seed: Any) -> int | None:
     except TypeError:
         number = -1
     if number < 0:
-        raise ValueError(f"seed={shown(seed)} must be an integer of at least 0, or None.")
+        raise InvalidArgumentError(f"seed={shown(seed)} must be an integer of at least 0, or None.")
     return number

@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.utils import shown, suggest
 
 LARGEST_FLOAT = float(np.finfo(np.float32).max)  # larger numbers are infinite in single precision
@@ -295,15 +296,15 @@ def validated_as(
         findings = error.errors(include_url=False)
     name = str(findings[0]["loc"][0])
     if findings[0]["type"] == "missing":
-        raise ValueError(f"{as_written(name)} is missing.")
+        raise InvalidArgumentError(f"{as_written(name)} is missing.")
     if findings[0]["type"] == "extra_forbidden":
-        raise ValueError(suggest("argument", as_written(name), map(as_written, arguments.model_fields)))
+        raise InvalidArgumentError(suggest("argument", as_written(name), map(as_written, arguments.model_fields)))
     given = f"{as_written(name)}={shown(values.get(name))}"
     findings = [one for one in findings if one["loc"][0] == name]
     if any(one.get("ctx", {}).get("lt") == LARGEST for one in findings):
-        raise ValueError(f"{given} is too large: it must be less than 2**63.")
+        raise InvalidArgumentError(f"{given} is too large: it must be less than 2**63.")
     if allowed := arguments.model_fields[name].description:
-        raise ValueError(f"{given} must be {allowed}.")
+        raise InvalidArgumentError(f"{given} must be {allowed}.")
     messages = [one["msg"].removeprefix("Value error, ") for one in findings]
     said = dict.fromkeys(message[:1].lower() + message[1:] for message in messages)
-    raise ValueError(f"{given}: {', or '.join(said)}.")
+    raise InvalidArgumentError(f"{given}: {', or '.join(said)}.")

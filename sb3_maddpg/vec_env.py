@@ -15,6 +15,7 @@ from gymnasium.wrappers import NormalizeReward
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.parallel import TeamEnv, TurnBased, explained_reset, layers_of
 from sb3_maddpg.team import CategoricalActions, InfoKey, MixedActions, TeamInfo, TeamObservation
 from sb3_maddpg.utils import as_flag, as_number, as_numbers, as_seed, integers_problem, not_finite_at, shown
@@ -39,13 +40,13 @@ class GymnasiumVecEnv(VecEnv):
 
     def __init__(self, envs: VectorEnv):
         if not isinstance(envs, VectorEnv):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{shown(envs)} is not a Gymnasium VectorEnv: create one with gymnasium.make_vec. For a single "
                 "environment use Stable-Baselines3's make_vec_env."
             )
         mode = envs.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The vector environment has autoreset mode {mode}; Stable-Baselines3 needs {AutoresetMode.SAME_STEP}. "
                 'Create it with gymnasium.make_vec(..., vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}).'
             )
@@ -56,7 +57,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         if any(self._options):
-            raise ValueError(f"Options for single environments, {self._options}, cannot be passed on to {self.envs}.")
+            raise InvalidArgumentError(
+                f"Options for single environments, {self._options}, cannot be passed on to {self.envs}."
+            )
         seeds = [as_seed(seed) for seed in self._seeds] if any(seed is not None for seed in self._seeds) else None
         observations, infos = self.envs.reset(seed=seeds)  # type: ignore[arg-type]  # one of each is allowed too
         self.reset_infos = unbatch(infos, self.num_envs)
@@ -75,13 +78,15 @@ class GymnasiumVecEnv(VecEnv):
         actions = np.asarray(actions)
         shape = (self.num_envs, *(self.action_space.shape or ()))
         if actions.shape != shape:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The actions have shape {actions.shape}, but there are {self.num_envs} environments with the action "
                 f"space {self.action_space}: they must have shape {shape}."
             )
         if (index := not_finite_at(actions)) is not None:
             env = index[0]
-            raise ValueError(f"The action of environment {env} is {actions[env].tolist()}: it must be finite.")
+            raise InvalidArgumentError(
+                f"The action of environment {env} is {actions[env].tolist()}: it must be finite."
+            )
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -90,7 +95,7 @@ class GymnasiumVecEnv(VecEnv):
         dones = terminations | truncations
         for k in np.flatnonzero(dones):
             if "final_obs" not in rows[k]:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"{self.envs} ended an episode of environment {k} without info['final_obs'], the final "
                     "observation, which AutoresetMode.SAME_STEP requires."
                 )
@@ -126,7 +131,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def _only_all(self, indices: VecEnvIndices, name: str) -> None:
         if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"{name!r} concerns all {self.num_envs} environments of {self.envs}, not only {indices}.")
+            raise InvalidArgumentError(
+                f"{name!r} concerns all {self.num_envs} environments of {self.envs}, not only {indices}."
+            )
 
 
 def unbatch(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
@@ -206,7 +213,7 @@ class WatchedEnv(Transparent):
     def step(self, action: Any) -> Any:
         returned = self.env.step(action)
         if not isinstance(returned, (tuple, list)) or len(returned) != 5 or not isinstance(returned[4], dict):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"step() of {self.env} returned {shown(returned)}: it must return five values, observation, reward, "
                 "terminated, truncated, and a dict of infos."
             )
@@ -240,12 +247,14 @@ def _plain(env: Env, reward: Any, terminated: Any, truncated: Any) -> tuple[floa
         try:
             reward = as_number(reward)
         except ValueError:
-            raise ValueError(f"step() of {env} returned the reward {shown(reward)}: it must be a number.") from None
+            raise InvalidEnvironmentError(
+                f"step() of {env} returned the reward {shown(reward)}: it must be a number."
+            ) from None
     if type(terminated) is not bool or type(truncated) is not bool:
         try:
             return reward, as_flag(terminated), as_flag(truncated)
         except ValueError:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"step() of {env} returned terminated={shown(terminated)} and truncated={shown(truncated)}: they must "
                 "be True or False."
             ) from None
@@ -259,7 +268,7 @@ _OF_TEAM_ENV = frozenset({"agent_rewards", "agent_terminated", "agent_active"})
 
 def _check_entries(given: Set[str], info: Mapping[str, Any], env: str) -> None:
     if lost := sorted(given - info.keys()):
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"{env} gave {', '.join(lost)} in `info`, which did not arrive: a wrapper skips steps, or returns another "
             f"`info`. Let it return the `info` that it gets, with additions. {_REMEDY}"
         )
@@ -335,13 +344,17 @@ class BorderEnv(Transparent):
                 integers = np.asarray(observation) if space.dtype.kind in "iu" else array
                 array = integers if integers.dtype.kind in "iu" else array
             except ValueError:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"The observation {when} of {self.env} is {shown(observation)}: it must hold real numbers."
                 ) from None
         if array.shape != space.shape:
-            raise ValueError(f"The observation {when} of {self.env} has shape {array.shape}, but its space is {space}.")
+            raise InvalidEnvironmentError(
+                f"The observation {when} of {self.env} has shape {array.shape}, but its space is {space}."
+            )
         if space.dtype.kind in "iu" and (problem := integers_problem(array, space.dtype)) is not None:
-            raise ValueError(f"The observation of agent {problem} {when} of {self.env}, whose space is {space}.")
+            raise InvalidEnvironmentError(
+                f"The observation of agent {problem} {when} of {self.env}, whose space is {space}."
+            )
         return np.array(array)
 
 
@@ -461,13 +474,13 @@ def _check_spaces(what: str, outer: Any, inner: Any, always: bool = False) -> No
                 if name == "observations"
                 else "which numbers belong to which agent"
             )
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"{what} the {name} of the team, from {shown(own)} to {shown(seen)}: {lost} would be lost. {_REMEDY}"
             )
 
 
-def _only_team_reward(wrapper: str) -> ValueError:
-    return ValueError(
+def _only_team_reward(wrapper: str) -> InvalidEnvironmentError:
+    return InvalidEnvironmentError(
         f"{wrapper} changes only the team's reward, but the algorithm learns from the agents' rewards in `info`. "
         f"{_REMEDY}"
     )
@@ -485,7 +498,7 @@ def check_single_envs(envs: Sequence[Env]) -> None:
     for index, env in enumerate(envs):
         spaces_of_env = (env.observation_space, env.action_space)
         if spaces_of_env != (first := (envs[0].observation_space, envs[0].action_space)):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"Environments 0 and {index} are of different teams: {shown(first)} and {shown(spaces_of_env)}. Create "
                 "all environments with the same arguments."
             )
@@ -496,7 +509,7 @@ def check_single_envs(envs: Sequence[Env]) -> None:
         if isinstance(inner, TurnBased):
             inner = inner.env.unwrapped
         if (other := stepped.setdefault(id(inner), index)) != index:
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"Environments {other} and {index} step the same environment, {inner}: create one for each, for "
                 "example DummyVecEnv([lambda: TeamEnv(make_env()) for _ in range(2)])."
             )
@@ -531,7 +544,7 @@ def check_outside(normalizer: VecNormalize, obs: Any, rewards: np.ndarray) -> No
         absent | np.isclose(obs, np.asarray(normalizer.normalize_obs(original)))
     )
     if not same_obs or not np.allclose(rewards, normalizer.normalize_reward(normalizer.get_original_reward())):
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"A wrapper outside of VecNormalize changes {'rewards' if same_obs else 'observations'}, but the algorithm "
             "learns from those that VecNormalize gets: put VecNormalize outermost."
         )
@@ -548,7 +561,7 @@ def _number_in(info: Mapping[str, Any], name: str, default: Any) -> Any:
     with suppress(ValueError):
         number = as_number(info[name])
     if not math.isfinite(number):
-        raise ValueError(f"info[{name!r}] is {shown(info[name])}: it must be a finite number.")
+        raise InvalidEnvironmentError(f"info[{name!r}] is {shown(info[name])}: it must be a finite number.")
     return number
 
 
@@ -564,16 +577,16 @@ def check_returned(n_envs: int, infos: Any, **arrays: Any) -> None:
     for name, values in arrays.items():
         is_array = type(values) is np.ndarray and values.dtype.kind in "biuf"
         if not is_array or (values.shape[:1] if name == "observations" else values.shape) != (n_envs,):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"step() of the vectorised environment returned the {name} {shown(values)}: they must be an array of "
                 f"real numbers for {n_envs} environment(s)."
             )
         if name == "dones" and values.dtype != bool and not np.isin(values, (0, 1)).all():
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"step() of the vectorised environment returned the dones {shown(values)}: they must be True or False."
             )
     if not isinstance(infos, (list, tuple)) or len(infos) != n_envs:
-        raise ValueError(
+        raise InvalidEnvironmentError(
             f"step() of the vectorised environment returned the infos {shown(infos)}: they must be a list of "
             f"{n_envs} dict(s), one for each environment."
         )
@@ -591,7 +604,7 @@ def last_observation(env: int, info: Mapping[str, Any], next_obs: np.ndarray) ->
     last = info.get("original_terminal_observation", info.get("terminal_observation"))
     if last is None:
         if info.get("TimeLimit.truncated"):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The episode of environment {env} was truncated without info['terminal_observation'], the last "
                 "observation, from which the values of agents go on: return it, as Stable-Baselines3's vectorised "
                 "environments do, and keep it in wrappers."
@@ -604,7 +617,7 @@ def last_observation(env: int, info: Mapping[str, Any], next_obs: np.ndarray) ->
     elif next_obs.dtype.kind in "iu" and (found := integers_problem(array, next_obs.dtype)) is not None:
         problem = f"of agent {found.rstrip(',')}"
     if problem is not None:
-        raise ValueError(f"info['terminal_observation'] of environment {env} {problem}.")
+        raise InvalidEnvironmentError(f"info['terminal_observation'] of environment {env} {problem}.")
     return array
 
 
@@ -654,7 +667,7 @@ class ArrivalCheck:
                 self._check_reward(k, float(rewards[k]), info)
             step = info["inner_step"] if "inner_step" in info else _number_in(info, "episode_step", 0)
             if step and self._steps[k] and step != self._steps[k] + 1:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"Environment {k} went from step {self._steps[k]:g} to step {step:g} of its episode, so that what "
                     "happened to its agents in between is lost: a wrapper or a callback skips steps or resets the "
                     f"environment itself. {_REMEDY}"
@@ -663,7 +676,7 @@ class ArrivalCheck:
             if dones[k]:
                 self._check_cut(k, info)
             elif "terminal_observation" in info:
-                raise ValueError(
+                raise InvalidEnvironmentError(
                     f"Environment {k} was reset, but a wrapper reports no end of its episode, so that the first "
                     f"observation of the next episode would pass for the next one of this one. {_REMEDY}"
                 )
@@ -706,13 +719,13 @@ class ArrivalCheck:
         except ValueError:  # the replay buffer says what is wrong
             return
         if "TimeLimit.truncated" not in info and cut.any():
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The episode of environment {env} was truncated, but its `info` has no 'TimeLimit.truncated', without "
                 "which the value of the last observation is unknown: let wrappers keep what vectorised environments of "
                 "Stable-Baselines3 add to `info`."
             )
         if info.get("TimeLimit.truncated") and ended.all():
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The episode of environment {env} was truncated, but all agents terminated in its last step: a "
                 "wrapper changes only the team's end, while the algorithm learns from the agents' ends in `info`. "
                 f"{_REMEDY}"
@@ -739,7 +752,7 @@ class ArrivalCheck:
             if own is None:
                 remedy += " If the team's reward is meant so, return it in info['team_reward'], too."
             gave = f"{given[0]:g}{f' (agents: {shown(agents.tolist())})' if agents.size else ''}"
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The team's reward of environment {env} arrived as {arrived:g}, but the environment gave {gave}: a "
                 "wrapper changes only the team's reward or adds up those of several steps, while the algorithm learns "
                 f"from its parts in `info`, or the environment writes into arrays that it has returned. {remedy}"
@@ -753,7 +766,7 @@ class ArrivalCheck:
         assert firsts is not None
         firsts.append(first.copy())
         if len(firsts) >= _SAME_ENDS and any((one != first).any() for one in firsts):
-            raise ValueError(
+            raise InvalidEnvironmentError(
                 f"The last observations of {len(firsts)} episodes of environment {env} are the first ones of the next "
                 "episodes: the environment writes into an array that it has returned. Return a copy, `obs.copy()`; if "
                 "episodes do go on where the last one ended, use DummyVecEnv."

@@ -37,7 +37,7 @@ from sb3_maddpg.cli.options import common_options, importing_from
 from sb3_maddpg.cli.recipes import DICTS, check_shown, names_of_classes
 from sb3_maddpg.model_files import refuse_pickled, refuse_pickled_file, trusted
 from sb3_maddpg.normalization import SafeVecNormalize
-from sb3_maddpg.typed_json import known_class
+from sb3_maddpg.registry import name_in_files
 from sb3_maddpg.utils import shown, told
 
 # Keys of a recipe that name classes, and the base class of those that a file of someone else may name
@@ -412,7 +412,7 @@ def _may_be_named(name: str, base: type) -> bool:
     found = getattr(sys.modules[module], attribute, None)
     if re.fullmatch(_OF_SUPERSUIT, name):
         return callable(found)
-    return isinstance(found, type) and (issubclass(found, base) or known_class(found))
+    return isinstance(found, type) and (issubclass(found, base) or name_in_files(found) is not None)
 
 
 def may_import(module: str) -> bool:

@@ -5,6 +5,7 @@ Imports are read from the source, those inside functions included.
 
 import ast
 import re
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -103,6 +104,12 @@ def test_figures_are_imported_on_request_only(name):
     tree = ast.parse(ALL[name].read_text(encoding="utf-8"))
     top = ast.Module([node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))], [])
     assert not [one for one in imports(name, top) if room(one) == "figures"]
+
+
+def test_imports_are_no_circle():
+    """Those of quad_swarm could be one within a room only, as rooms import what lies below them."""
+    graph = {name: imports_of(name) - {name, "sb3_maddpg"} for name in modules("sb3_maddpg")}
+    TopologicalSorter(graph).prepare()
 
 
 def test_every_folder_of_the_swarm_is_a_room_with_a_rule():

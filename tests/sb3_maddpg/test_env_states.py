@@ -11,7 +11,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from sb3_maddpg.env_states import (
-    NoStateError,
     Replayable,
     load_vec_env_state,
     plain_values,
@@ -20,6 +19,7 @@ from sb3_maddpg.env_states import (
     space_generators,
     vec_env_state,
 )
+from sb3_maddpg.errors import NoStateError
 from sb3_maddpg.team import MixedActions
 from sb3_maddpg.team_tasks import OwnBit
 from sb3_maddpg.typed_json import decode, encode

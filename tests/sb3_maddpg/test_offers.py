@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_maddpg import typed_json
+from sb3_maddpg import registry, typed_json
 from sb3_maddpg.cli.commands import main
 
 DASHBOARD = "LAYOUT = {'Learning': {'return': ['Multiline', ['eval/mean_reward']]}}\n"
@@ -31,9 +31,9 @@ def install(tmp_path, monkeypatch):
         (info / "entry_points.txt").write_text(f"[sb3_maddpg.{group}]\n{line}\n")
         return module.parent
 
-    typed_json._load_entry_points.cache_clear()
+    registry._load_entry_points.cache_clear()
     yield install
-    typed_json._load_entry_points.cache_clear()
+    registry._load_entry_points.cache_clear()
     for name in set(sys.modules) - imported:
         if name.startswith(("their_", "other_")):
             del sys.modules[name]

@@ -12,10 +12,9 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
-from sb3_maddpg import MADDPG, PairPolicy, allow_in_files
+from sb3_maddpg import PairPolicy
 from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer
 from sb3_maddpg.team import CategoricalActions, MixedActions, TeamObservation
-from sb3_maddpg.team_tasks import OwnBit
 from sb3_maddpg.typed_json import decode, encode
 
 BOX = spaces.Box(-np.arange(1, 4, dtype=np.float32), np.float32(np.inf), (3,))
@@ -114,37 +113,10 @@ def test_action_noise_comes_back_in_the_middle_of_its_process():
         assert np.array_equal(loaded(), expected)
 
 
-class Falling:
-    """A schedule of somebody else's."""
-
-    def __init__(self, start: float):
-        self.start = start
-
-    def __call__(self, progress: float) -> float:
-        return self.start * progress
-
-
-def test_a_class_of_ones_own_is_written_once_it_is_allowed(tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_maddpg.typed_json._allowed", {})
-    with pytest.warns(UserWarning, match="learning_rate=.*Falling.* cannot be saved"):
-        model = MADDPG("MlpPolicy", OwnBit(), learning_rate=Falling(0.5), buffer_size=100, batch_size=10)
-    with pytest.raises(ValueError, match=r"learning_rate=.*Falling.*sb3_maddpg\.allow_in_files"):
-        model.save(tmp_path / "model")
-    assert allow_in_files(Falling) is Falling
-    model.save(tmp_path / "model")
-    assert MADDPG.load(tmp_path / "model").learning_rate(0.5) == 0.25
-    monkeypatch.setattr("sb3_maddpg.typed_json._allowed", {})
-    with pytest.raises(ValueError, match=r"model: learning_rate is damaged: Unknown class '.*Falling'.*allow_in_files"):
-        MADDPG.load(tmp_path / "model")
-
-
-def test_only_what_can_be_imported_may_be_named():
+def test_what_is_no_plain_value_is_not_written():
     class Local:
         pass
 
-    for wrong in (Local, Local(), lambda x: x):
-        with pytest.raises(ValueError, match="cannot be named in files"):
-            allow_in_files(wrong)
     for wrong in (Local, Local(), lambda x: x, object(), np.array(["text"]), np.array([None])):
         with pytest.raises(ValueError, match=r"array of|cannot be saved"):
             encode(wrong, "value")

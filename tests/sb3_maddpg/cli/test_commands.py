@@ -11,7 +11,7 @@ import quad_swarm
 import sb3_maddpg
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.scenarios import SCENARIOS
-from sb3_maddpg import MADDPG, typed_json
+from sb3_maddpg import MADDPG, registry
 from sb3_maddpg.cli import commands
 from sb3_maddpg.cli.commands import COMMANDS, examples, main
 from sb3_maddpg.cli.overview import ALGORITHMS, packaged_recipes
@@ -186,10 +186,10 @@ def test_a_package_that_cannot_be_loaded_is_named(group, argv, code, tmp_path, m
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path / "elsewhere")
-    typed_json._load_entry_points.cache_clear()
+    registry._load_entry_points.cache_clear()
     try:
         assert main(argv) == 2
     finally:
-        typed_json._load_entry_points.cache_clear()
+        registry._load_entry_points.cache_clear()
     (told,) = capsys.readouterr().err.strip().splitlines()
     assert f"their-package is installed, but its entry point sb3_maddpg.{group}: Broken-v0" in told
