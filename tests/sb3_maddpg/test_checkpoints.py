@@ -662,7 +662,7 @@ def test_a_checkpoint_names_files_in_its_folder_only(where, name, tmp_path):
         edit(tmp_path, lambda state: state["segments"][0].update(name=name))
     else:
         (newest(tmp_path) / "manifest.json").write_text(json.dumps({name: "x"}))
-    with pytest.warns(UserWarning, match=r"is skipped: ValueError: there is no file .* in"):
+    with pytest.warns(UserWarning, match=r"is skipped: InvalidFileError: there is no file .* in"):
         assert newest(tmp_path) is None
 
 

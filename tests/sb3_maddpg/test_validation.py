@@ -5,6 +5,7 @@ import pytest
 import torch as th
 
 from sb3_maddpg import MADDPG
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.policies import MADDPGPolicy
 from sb3_maddpg.team import MixedActions, Team
 from sb3_maddpg.team_tasks import OwnBit
@@ -38,7 +39,7 @@ def test_values_become_what_is_expected():
 def test_other_values_are_refused_in_one_line(name, value):
     with pytest.raises(ValueError, match=rf"^{name}=.* must be .*\.$") as refused:
         validated(PolicyArguments, **{**GOOD, name: value})
-    assert type(refused.value) is ValueError
+    assert type(refused.value) is InvalidArgumentError
     assert repr(value) in str(refused.value)
 
 
