@@ -306,8 +306,11 @@ class TeamActions(nn.Module):
             for space in action_spaces
         ]
         self.low, self.high = (np.concatenate(bound).astype(np.float32) for bound in zip(*boxes, strict=True))
+        self._range = self.high - self.low
+        # Avoid a division by zero where both bounds are equal
+        self._span = np.where(self.high > self.low, self._range, 1.0)
         self.is_continuous = np.concatenate([np.array(heads_of(space)) == 0 for space in action_spaces])
-        self.has_continuous = bool(self.is_continuous.any())
+        self.has_continuous, self.only_continuous = bool(self.is_continuous.any()), bool(self.is_continuous.all())
 
     def _make_tables(self) -> None:
         """Tabulate which number of the encoded action is which number of the buffer action, and vice versa."""
@@ -537,15 +540,13 @@ class TeamActions(nn.Module):
         :param actions: environment actions, (batch, length)
         :return: buffer actions, (batch, length)
         """
-        # Avoid a division by zero where both bounds are equal
-        span = np.where(self.high > self.low, self.high - self.low, 1.0)
-        scaled = 2.0 * (actions - self.low) / span - 1.0
-        return np.where(self.is_continuous, scaled, actions)
+        scaled = 2.0 * (actions - self.low) / self._span - 1.0
+        return scaled if self.only_continuous else np.where(self.is_continuous, scaled, actions)
 
     def unscale(self, actions: np.ndarray) -> np.ndarray:
         """
         :param actions: buffer actions, (batch, length)
         :return: environment actions, (batch, length)
         """
-        unscaled = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
-        return np.where(self.is_continuous, unscaled, actions)
+        unscaled = self.low + 0.5 * (actions + 1.0) * self._range
+        return unscaled if self.only_continuous else np.where(self.is_continuous, unscaled, actions)

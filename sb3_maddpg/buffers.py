@@ -85,6 +85,7 @@ _VIEWS = {
     "_new",
     "_new_columns",
     "_truncated",
+    "_flags",
 }
 _REMEDY = "Look there for a division by zero or a diverging simulation; end the episode earlier, or clip the value."
 _REMEDY_ACTION = "Look for diverged networks (lower learning_rate) or a Box whose bounds are equal or too large."
@@ -223,6 +224,10 @@ class TeamReplayBuffer(ReplayBuffer):
         self._new = np.zeros(self.numbers.shape[1:], np.float32)
         self._truncated = np.zeros((self.n_envs, self.n_agents), np.float32)
         self._new_columns = self._columns(self._new)
+        # Columns of all numbers that are 1 or 0
+        every = self._columns(np.arange(self.numbers.shape[-1]))
+        flags = (every.agent_terminated, every.agent_active, every.dones, every.timeouts, every.pair_terminated)
+        self._flags = np.concatenate([np.ravel(columns) for columns in flags])
 
     def _columns(self, numbers: np.ndarray) -> _Columns:
         """
@@ -361,26 +366,30 @@ class TeamReplayBuffer(ReplayBuffer):
         self._read_infos("agent_rewards", new.agent_rewards, infos, new.rewards[:, None])
         self._read_infos("agent_terminated", new.agent_terminated, infos, 0.0)
         some_say = self._read_infos("agent_active", new.agent_active, infos, 1.0)
-        cut_early = self._read_infos("agent_truncated", self._truncated, infos, 0.0) and self._truncated.any()
+        self._read_infos("agent_truncated", self._truncated, infos, 0.0)
+        cut_early = np.count_nonzero(self._truncated)
         if self.n_pairs:
             self._read_infos("pair_rewards", new.pair_rewards, infos, None)
         if self.pairs_end:
             self._read_infos("pair_terminated", new.pair_terminated, infos, None)
         if not all_finite(self._new):
             self._refuse_numbers(infos)
-        self._check_flags()
+        flags = self._new.take(self._flags, axis=1)
+        if cut_early or np.count_nonzero(flags * (flags - 1)):
+            self._check_flags()
         if cut_early:
             goes_on = (new.agent_active > 0) & (new.agent_terminated == 0) & (self._truncated == 0)
             early = (self._truncated > 0) & (new.agent_active > 0) & goes_on.any(axis=1, keepdims=True)
             new.agent_active[early] = _TRUNCATED
-            self.all_active &= not early.any()
+            self.all_active = self.all_active and not early.any()
 
         pos = self.pos
         if self.optimize_memory_usage:
             # This observation takes the place of the last next observation. Where another episode begins although the
             # last one did not end, the last transition is treated as its end, like a time limit.
             self.dones[pos - 1][(self.observations[pos] != obs).any(axis=(1, 2))] = 1
-        if some_say and not new.agent_active.all():
+        some_left = some_say and np.count_nonzero(new.agent_active) < new.agent_active.size
+        if some_left:
             self._mark_departures(obs, new.agent_active)
         self.observations[pos] = obs
         if self.optimize_memory_usage:
@@ -389,8 +398,7 @@ class TeamReplayBuffer(ReplayBuffer):
             self.next_observations[pos] = next_obs
         self.actions[pos] = action.reshape(self.n_envs, self.action_dim)
         self.numbers[pos] = self._new
-        if some_say and self.all_active:
-            self.all_active = bool(new.agent_active.all())
+        self.all_active = self.all_active and not some_left
         if self.n_steps > 1:
             self.cuts[pos - 1] = (self.next_observations[pos - 1] != self.observations[pos]).any(axis=(1, 2))
         self.n_added += 1
@@ -423,6 +431,8 @@ class TeamReplayBuffer(ReplayBuffer):
         :param shape: the required shape; actions may have another shape of the same size
         :raises ValueError: if the shape differs, or a value is NaN or infinite
         """
+        if values.shape == shape and values.dtype == self.observations.dtype == np.float32 and all_finite(values):
+            return
         fits = values.shape == shape or (what == "action" and values.size == math.prod(shape))
         if not fits or len(values) != self.n_envs:
             raise InvalidEnvironmentError(
@@ -522,8 +532,8 @@ class TeamReplayBuffer(ReplayBuffer):
             "info['TimeLimit.truncated']": new.timeouts,
         }
         for name, array in arrays.items():
-            if np.count_nonzero(array * (array - 1)):  # NaN counts
-                env, *agent = np.argwhere(array * (array - 1) != 0)[0].tolist()
+            if (wrong := np.argwhere(array * (array - 1) != 0)).size:  # NaN counts
+                env, *agent = wrong[0].tolist()
                 whose = f" of agent {agent[0]} ({self.team.names[agent[0]]})" if agent else ""
                 value = array[tuple([env, *agent])]
                 raise InvalidEnvironmentError(f"{name}{whose} is {value} {self._where(env)}: it must be True or False.")

@@ -40,7 +40,9 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
     :raises ValueError: if a metric is not a finite number
     """
     for info in infos:
-        metrics = info.get("metrics", {})
+        if "metrics" not in info:
+            continue
+        metrics = info["metrics"]
         if not isinstance(metrics, Mapping):
             raise InvalidEnvironmentError(f"info['metrics'] is {shown(metrics)}: it must be a dict of numbers by name.")
         widen_tables(logger, map(str, metrics))

@@ -1075,13 +1075,15 @@ class MADDPG(OffPolicyAlgorithm):
         assert isinstance(original_obs, np.ndarray)
         reads_parts = self.use_action_cost or getattr(replay_buffer, "n_pairs", 0) > 0
         self._arrivals.check(reward, original_obs, dones, infos, reads_parts)
-        if self.env is not None and self.env.unwrapped is not (normalizer.venv if normalizer else self.env):
+        assert self.env is not None
+        if self.env.unwrapped is not (normalizer.venv if normalizer else self.env):
             self._arrivals.check_lasts(self.env.unwrapped, original_obs, dones, infos)
         if normalizer is not None and self.env is not normalizer:
             check_outside(normalizer, new_obs, arrived)
         next_obs = original_obs.copy()
-        for k in np.flatnonzero(dones).tolist():
-            next_obs[k] = last_observation(k, infos[k], next_obs[k])
+        if np.count_nonzero(dones):
+            for k in np.flatnonzero(dones).tolist():
+                next_obs[k] = last_observation(k, infos[k], next_obs[k])
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
         self._last_obs = new_obs
         if normalizer is not None:
@@ -1093,7 +1095,7 @@ class MADDPG(OffPolicyAlgorithm):
         check_success(infos)
         super()._update_info_buffer(infos, dones)
         record_metrics(self.logger, infos)
-        if dones is not None and dones.any():  # a wrapper may have ended an episode, unknown to its TeamEnv
+        if dones is not None and np.count_nonzero(dones):  # a wrapper may have ended an episode, unknown to its TeamEnv
             assert self.env is not None
             begun = [self.env.unwrapped.reset_infos[k] for k in np.flatnonzero(dones)]
             record_metrics(self.logger, [{"metrics": info["last_metrics"]} for info in begun if "last_metrics" in info])

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
+from contextlib import ContextDecorator
 from itertools import chain, pairwise
 
 import torch as th
 from torch import nn
 
 
-@contextmanager
-def single_precision() -> Iterator[None]:
+class single_precision(ContextDecorator):
     """Create tensors in single precision, whatever ``torch.set_default_dtype`` says. Also a decorator."""
-    default = th.get_default_dtype()
-    if default is th.float32:
-        yield
-        return
-    th.set_default_dtype(th.float32)
-    try:
-        yield
-    finally:
-        th.set_default_dtype(default)
+
+    def __init__(self) -> None:
+        self._defaults: list[th.dtype] = []
+
+    def __enter__(self) -> None:
+        self._defaults.append(th.get_default_dtype())
+        if self._defaults[-1] is not th.float32:
+            th.set_default_dtype(th.float32)
+
+    def __exit__(self, *exception: object) -> None:
+        if (default := self._defaults.pop()) is not th.float32:
+            th.set_default_dtype(default)
 
 
 class StackedMLP(nn.Module):

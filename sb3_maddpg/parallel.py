@@ -127,6 +127,7 @@ class TeamEnv(gymnasium.Env):
             ]
         if (images := _image_space(self._observation_spaces)) is not None:
             self.image_space = images
+        self._box_shapes = [one.shape if isinstance(one, spaces.Box) else None for one in self._observation_spaces]
         self.parallel_env = env
         self.metadata = {"render_modes": [], **_metadata_of(env)}
         self.render_mode = getattr(env, "render_mode", None)
@@ -285,13 +286,13 @@ class TeamEnv(gymnasium.Env):
             self._refuse_rewards(rewards)
         self._live = live
         info = _agent_infos(infos)
+        self._read_agents_infos(infos, info)
         info["agent_rewards"] = np.array(rewards, np.float32)
         info["agent_terminated"] = np.array(terminated)
         info["agent_truncated"] = np.array(truncated)
         info["agent_active"] = np.array(active)
         over = not live
         cut = over and any(truncated[row] and not terminated[row] for row in acted)
-        self._read_agents_infos(infos, info)
         self._lengths |= dict.fromkeys(set(acted).difference(live), self._steps)
         if self._successes:
             info["is_success"] = all(self._successes.values())
@@ -303,6 +304,8 @@ class TeamEnv(gymnasium.Env):
 
     def _read_agents_infos(self, infos: Mapping[Any, Any], info: dict[str, Any]) -> None:
         """Keep whether agents have succeeded so far, and add the means of their metrics to the team's info."""
+        if not info:  # no agent has one
+            return
         metrics: dict[str, list[float]] = {}
         for agent, one in infos.items():
             if not one or agent not in self._rows:
@@ -467,6 +470,10 @@ class TeamEnv(gymnasium.Env):
                     f"truncated, {self._when}: reset() and step() must return one."
                 )
             observation = observations[agent]
+            is_array = type(observation) is np.ndarray and observation.dtype.kind in "fiub"
+            if is_array and observation.shape == self._box_shapes[row]:
+                matrix[row, :length] = observation.ravel()
+                continue
             try:
                 fits = _fits(space, observation)
                 if fits:

@@ -178,7 +178,7 @@ class Transparent(Wrapper):
 
     _own = frozenset(
         {"env", "_action_space", "_observation_space", "_metadata", "_cached_spec"}
-        | {"_step", "_given_entries", "_counts_steps", "_watcher"}
+        | {"_step", "_given_entries", "_counts_steps", "_watcher", "_alone", "_space"}
     )
 
     def __getattr__(self, name: str) -> Any:
@@ -267,7 +267,8 @@ _OF_TEAM_ENV = frozenset({"agent_rewards", "agent_terminated", "agent_active"})
 
 
 def _check_entries(given: Set[str], info: Mapping[str, Any], env: str) -> None:
-    if lost := sorted(given - info.keys()):
+    if not given <= info.keys():
+        lost = sorted(given - info.keys())
         raise InvalidEnvironmentError(
             f"{env} gave {', '.join(lost)} in `info`, which did not arrive: a wrapper skips steps, or returns another "
             f"`info`. Let it return the `info` that it gets, with additions. {_REMEDY}"
@@ -296,9 +297,9 @@ def watched(env: Env) -> Env:
     return env
 
 
-def at_border(env: Env) -> Env:
+def at_border(env: Env, alone: bool = False) -> Env:
     """:return: the environment in a ``BorderEnv``, and watched"""
-    return env if isinstance(env, BorderEnv) else BorderEnv(watched(env))
+    return env if isinstance(env, BorderEnv) else BorderEnv(watched(env), alone)
 
 
 class BorderEnv(Transparent):
@@ -308,18 +309,19 @@ class BorderEnv(Transparent):
     is copied before the environment, or another one with the same arrays, writes into it again.
 
     :param env: a team environment
+    :param alone: whether no other environment is stepped before SB3 copies the infos of this one
     :raises ValueError: in ``reset`` and ``step``, if an observation does not fit its space, reward or ends are none, or
         wrappers drop what the environment says about agents
     """
 
-    def __init__(self, env: Env):
+    def __init__(self, env: Env, alone: bool = False):
         super().__init__(env)
-        self._watcher = watcher_of(env)
+        self._watcher, self._alone, self._space = watcher_of(env), alone, env.observation_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         with explained_reset(self.env):  # not every environment has options
             observation, info = self.env.reset(seed=seed, **({} if options is None else {"options": options}))
-        return self._checked(observation, "after reset()"), info
+        return self._checked(observation, "after reset()").copy(), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -327,15 +329,15 @@ class BorderEnv(Transparent):
         observation = self._checked(observation, "after step()")
         if self._watcher is not None:
             self._watcher.check_entries(info)
-        if terminated or truncated:
-            info = deepcopy(info)
-        else:
-            info = {name: _copied(name, value) for name, value in info.items()}
+        if terminated or truncated:  # the environment is reset next
+            return observation.copy(), reward, terminated, truncated, deepcopy(info)
+        if not self._alone:
+            observation, info = observation.copy(), {name: _copied(name, value) for name, value in info.items()}
         return observation, reward, terminated, truncated, info
 
     def _checked(self, observation: Any, when: str) -> np.ndarray:
-        """:return: a copy of the observation"""
-        space = self.env.observation_space
+        """:return: the observation as an array"""
+        space = self._space
         assert space.dtype is not None
         array = observation
         if type(array) is not np.ndarray or array.dtype.kind not in "biuf":
@@ -355,14 +357,17 @@ class BorderEnv(Transparent):
             raise InvalidEnvironmentError(
                 f"The observation of agent {problem} {when} of {self.env}, whose space is {space}."
             )
-        return np.array(array)
+        return array
 
 
 _TOLD = frozenset(TeamInfo.__annotations__)
+_IMMUTABLE = frozenset({float, int, bool, str, type(None)})
 
 
 def _copied(name: str, value: Any) -> Any:
     """:return: a copy of an entry of an info that the environment may write into again"""
+    if type(value) in _IMMUTABLE:
+        return value
     if isinstance(value, np.ndarray):
         return value.copy()
     return deepcopy(value) if name in _TOLD else value
@@ -386,7 +391,7 @@ def check_vec_env(vec_env: VecEnv) -> None:
     if envs:
         check_single_envs(envs)
     if here is not None:
-        here.envs = [at_border(env) for env in envs]
+        here.envs = [at_border(env, alone=len(envs) == 1) for env in envs]
     elif isinstance(inner, GymnasiumVecEnv):
         _warn_of_casts(inner.envs.unwrapped)
     of_pettingzoo = steps_team_envs(vec_env)
@@ -555,8 +560,10 @@ def _number_in(info: Mapping[str, Any], name: str, default: Any) -> Any:
     :return: a number in an info
     :raises ValueError: if it is not finite, or no number
     """
-    if name not in info:
-        return default
+    number = info.get(name, default)
+    plain = (type(number) is float and math.isfinite(number)) or (type(number) is int and abs(number) < 2**53)
+    if plain or name not in info:
+        return number
     number = math.nan
     with suppress(ValueError):
         number = as_number(info[name])
@@ -581,7 +588,7 @@ def check_returned(n_envs: int, infos: Any, **arrays: Any) -> None:
                 f"step() of the vectorised environment returned the {name} {shown(values)}: they must be an array of "
                 f"real numbers for {n_envs} environment(s)."
             )
-        if name == "dones" and values.dtype != bool and not np.isin(values, (0, 1)).all():
+        if name == "dones" and values.dtype.kind != "b" and not np.isin(values, (0, 1)).all():
             raise InvalidEnvironmentError(
                 f"step() of the vectorised environment returned the dones {shown(values)}: they must be True or False."
             )
@@ -661,10 +668,10 @@ class ArrivalCheck:
             or are the first ones of the next episodes, or entries of infos are missing
         """
         for k, info in enumerate(infos):
-            if self._entries:
+            if not self._entries <= info.keys():
                 _check_entries(self._entries, info, f"TeamEnv in environment {k}")
             if reads_parts or "agent_rewards" in info:
-                self._check_reward(k, float(rewards[k]), info)
+                self._check_reward(k, rewards.item(k), info)
             step = info["inner_step"] if "inner_step" in info else _number_in(info, "episode_step", 0)
             if step and self._steps[k] and step != self._steps[k] + 1:
                 raise InvalidEnvironmentError(
