@@ -27,7 +27,7 @@ import quad_swarm
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.task.request_task import RequestTask
 from sb3_maddpg.cli.bench import timed
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 
 EXACT = {
     "sensing": dict.fromkeys(("pos", "vel", "attitude", "others_pos", "others_vel"), 0.0),

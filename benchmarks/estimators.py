@@ -14,8 +14,8 @@ import torch as th
 
 from quad_swarm.evaluation.rows import write_rows
 from sb3_maddpg import MADDPG
-from sb3_maddpg.estimators import ESTIMATORS
-from sb3_maddpg.team_tasks import BINARY_TASKS, OwnCategory, TeamTask
+from sb3_maddpg.common.estimators import ESTIMATORS
+from sb3_maddpg.team.toys import BINARY_TASKS, OwnCategory, TeamTask
 
 # Arguments for all estimators, and the steps after which the deterministic policy is evaluated
 RECIPE: dict[str, Any] = {

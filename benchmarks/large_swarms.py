@@ -34,7 +34,7 @@ from gymnasium import spaces
 
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.task.request_task import RequestTask, make_task
-from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.relational.policy import PairPolicy
 
 SIZES = (4, 8, 16, 32, 64, 128)
 PERCEIVED = ("all", "planned", "limited")

@@ -34,8 +34,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from quad_swarm.figures.colours import RULES, STYLE, colour_of
-from sb3_maddpg import IDDPG, MADDPG, MATD3, parallel
-from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg import IDDPG, MADDPG, MATD3
+from sb3_maddpg.team import pettingzoo as parallel
+from sb3_maddpg.team.pettingzoo import TeamEnv
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = {

@@ -23,9 +23,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from quad_swarm.evaluation.rows import write_rows
-from sb3_maddpg.ray_vec_env import RayVecEnv
-from sb3_maddpg.team_tasks import OwnBit
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.team.toys import OwnBit
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
+from sb3_maddpg.vec_env.ray import RayVecEnv
 
 
 class Slow(OwnBit):

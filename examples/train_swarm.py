@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from quad_swarm.evaluation.command import main as evaluate
 from sb3_maddpg import MADDPG
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--quick", action="store_true", help="only a few steps, as a test")

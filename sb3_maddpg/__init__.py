@@ -7,20 +7,20 @@ end_on_interrupt()  # before the imports, which take seconds
 # ruff: noqa: E402
 from importlib.metadata import version
 
-from sb3_maddpg.agent_policy import AgentPolicy
-from sb3_maddpg.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
-from sb3_maddpg.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
-from sb3_maddpg.cnn_policy import CnnPolicy
-from sb3_maddpg.env_checker import check_team_env
-from sb3_maddpg.iddpg import IDDPG
-from sb3_maddpg.maddpg import MADDPG
-from sb3_maddpg.matd3 import MATD3
-from sb3_maddpg.normalization import SafeVecNormalize
-from sb3_maddpg.parallel import TeamEnv
-from sb3_maddpg.policies import MADDPGPolicy
-from sb3_maddpg.pretrained_models import pretrained
-from sb3_maddpg.registry import allow_in_files
-from sb3_maddpg.relational import PairPolicy
+from sb3_maddpg.common.agent_policy import AgentPolicy
+from sb3_maddpg.common.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
+from sb3_maddpg.common.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
+from sb3_maddpg.common.env_checker import check_team_env
+from sb3_maddpg.common.policies import MADDPGPolicy
+from sb3_maddpg.files.registry import allow_in_files
+from sb3_maddpg.hub.pretrained import pretrained
+from sb3_maddpg.iddpg.iddpg import IDDPG
+from sb3_maddpg.images.cnn_policy import CnnPolicy
+from sb3_maddpg.maddpg.maddpg import MADDPG
+from sb3_maddpg.matd3.matd3 import MATD3
+from sb3_maddpg.relational.policy import PairPolicy
+from sb3_maddpg.team.pettingzoo import TeamEnv
+from sb3_maddpg.vec_env.normalize import SafeVecNormalize
 
 __version__ = version("sb3-maddpg")
 __all__ = [

@@ -122,7 +122,7 @@ class TrainingArguments(Arguments):
     exploration_noise: AtLeastZero | tuple[AtLeastZero, AtLeastZero] = Field(
         description="a standard deviation of at least 0, or two of them, the first and the last"
     )
-    estimator: str = Field(description="a name of sb3_maddpg.estimators.ESTIMATORS")
+    estimator: str = Field(description="a name of sb3_maddpg.common.estimators.ESTIMATORS")
     temperature: Annotated[float, Field(ge=LEAST_TEMPERATURE, le=LARGEST_FLOAT)] | Schedule = Field(
         description=f"positive, at least {LEAST_TEMPERATURE:g}, or a schedule"
     )

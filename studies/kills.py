@@ -29,8 +29,9 @@ from tqdm import tqdm
 
 import quad_swarm  # noqa: F401 - registers the environment
 from quad_swarm.evaluation.rows import write_rows
-from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer, checkpoints
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
+from sb3_maddpg.checkpoints import checkpoints
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 
 SWARMS, EVERY = 8, 400
 POINTS = (

@@ -40,10 +40,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
 from quad_swarm.evaluation.rows import write_rows
-from sb3_maddpg import MADDPG, MATD3, PrioritizedTeamReplayBuffer, SafeVecNormalize, checkpoints
+from sb3_maddpg import MADDPG, MATD3, PrioritizedTeamReplayBuffer, SafeVecNormalize
+from sb3_maddpg.checkpoints import checkpoints
 from sb3_maddpg.cli.safety import RunLoader
-from sb3_maddpg.env_states import Replayable
-from sb3_maddpg.team_tasks import FollowTarget, OwnBit
+from sb3_maddpg.team.toys import FollowTarget, OwnBit
+from sb3_maddpg.vec_env.states import Replayable
 
 SECONDS, BYTES = 1.0, 2**30
 # Errors that a loader may raise; all others count as failures

@@ -32,10 +32,10 @@ from sb3_maddpg.cli.options import (
 )
 from sb3_maddpg.cli.overview import ALGORITHMS, overview
 from sb3_maddpg.cli.terminal import discard_output, is_unread, lasting_output
-from sb3_maddpg.maddpg import MADDPG, Lean
-from sb3_maddpg.model_files import TRUST_VARIABLE, refuse_pickled, trusted
+from sb3_maddpg.files.model_files import TRUST_VARIABLE, refuse_pickled, trusted
+from sb3_maddpg.hub.pretrained import pretrained_folder, pretrained_models
+from sb3_maddpg.maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.offers import broken, load_offer, offer_named, offers
-from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
 from sb3_maddpg.starting import interruptible
 from sb3_maddpg.utils import shown, suggest, told
 
@@ -272,7 +272,7 @@ def _publish(argv: list[str]) -> int:
     parser.add_argument("--private", action="store_true", help="make a new repository private")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write it all into this folder instead")
     args = parser.parse_args(argv)
-    from sb3_maddpg import hub
+    from sb3_maddpg.hub import model_card as hub
 
     path = Path(_model(args.model, args.algo, args.env))
     model, lean = ALGORITHMS[args.algo].load(path, device="cpu"), None if args.whole else "critic"

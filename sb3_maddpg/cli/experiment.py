@@ -30,8 +30,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.callbacks import DashboardCallback, check_drawn, check_layout
-from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
+from sb3_maddpg.checkpoints.checkpoints import RunCheckpoint, locked, resume
 from sb3_maddpg.cli.command_files import latest_run_number, write_command
 from sb3_maddpg.cli.interrupts import noticed_interrupts
 from sb3_maddpg.cli.literals import format_literal, parse_literal
@@ -51,10 +50,10 @@ from sb3_maddpg.cli.search import (
     sign,
     tell_best,
 )
-from sb3_maddpg.env_states import Replayable, put_aside, tells_state
-from sb3_maddpg.model_files import trusted
+from sb3_maddpg.common.callbacks import DashboardCallback, check_drawn, check_layout
+from sb3_maddpg.files.model_files import trusted
 from sb3_maddpg.offers import broken, load_offer, offer_named, package_of
-from sb3_maddpg.team import Team
+from sb3_maddpg.team.team import Team
 from sb3_maddpg.utils import (
     arguments_of,
     atomic_write,
@@ -65,7 +64,8 @@ from sb3_maddpg.utils import (
     suggest,
     told,
 )
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
+from sb3_maddpg.vec_env.states import Replayable, put_aside, tells_state
 
 # Default number of log tables when training an off-policy algorithm. SB3's default of one every four episodes floods
 # the screen, and short trainings end before the first table.

@@ -9,18 +9,18 @@ from pathlib import Path
 import gymnasium
 import yaml
 
-from sb3_maddpg.iddpg import IDDPG
-from sb3_maddpg.maddpg import MADDPG
-from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.hub.pretrained import pretrained_models
+from sb3_maddpg.iddpg.iddpg import IDDPG
+from sb3_maddpg.maddpg.maddpg import MADDPG
+from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.offers import load_offer, offers
-from sb3_maddpg.pretrained_models import pretrained_models
 
 ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
 
 
 def load_environments() -> None:
     """Import the modules that register environments: the toy tasks, and those that packages name by an entry point."""
-    importlib.import_module("sb3_maddpg.team_tasks")
+    importlib.import_module("sb3_maddpg.team.toys")
     for offer in offers("environments"):
         load_offer(offer)
 

@@ -20,7 +20,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from supersuit import concat_vec_envs_v1, pettingzoo_env_to_vec_env_v1
 
-from sb3_maddpg import MADDPG, parallel
+from sb3_maddpg import MADDPG
+from sb3_maddpg.team import pettingzoo as parallel
 
 
 def shares_parameters(algorithm: type[BaseAlgorithm], env_id: str) -> bool:

@@ -6,7 +6,7 @@ import re
 
 import gymnasium
 
-from sb3_maddpg.parallel import ENTRY_POINT, find_module, find_parallel_env, make
+from sb3_maddpg.team.pettingzoo import ENTRY_POINT, find_module, find_parallel_env, make
 
 
 def register(env_id: str) -> bool:

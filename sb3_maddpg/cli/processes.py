@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from sb3_maddpg.cli.terminal import tell
-from sb3_maddpg.ray_cluster import connect
 from sb3_maddpg.utils import suggest
+from sb3_maddpg.vec_env.ray_cluster import connect
 
 ENGINES = ("local", "ray")
 SECONDS_TO_END = 60.0  # time for a process to write its last checkpoint

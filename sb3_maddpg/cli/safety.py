@@ -29,16 +29,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_maddpg import parallel
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.command_files import latest_run_number, own_words
 from sb3_maddpg.cli.literals import BoundedLoader, Refused, parse_literal
 from sb3_maddpg.cli.options import common_options, importing_from
 from sb3_maddpg.cli.recipes import DICTS, check_shown, names_of_classes
-from sb3_maddpg.model_files import refuse_pickled, refuse_pickled_file, trusted
-from sb3_maddpg.normalization import SafeVecNormalize
-from sb3_maddpg.registry import name_in_files
+from sb3_maddpg.files.model_files import refuse_pickled, refuse_pickled_file, trusted
+from sb3_maddpg.files.registry import name_in_files
+from sb3_maddpg.team import pettingzoo as parallel
 from sb3_maddpg.utils import shown, told
+from sb3_maddpg.vec_env.normalize import SafeVecNormalize
 
 # Keys of a recipe that name classes, and the base class of those that a file of someone else may name
 _BASES: dict[str, type] = {

@@ -5,9 +5,9 @@ from typing import Any
 
 import optuna
 
-from sb3_maddpg.actions import TeamActions
-from sb3_maddpg.estimators import ESTIMATORS
-from sb3_maddpg.team import Team
+from sb3_maddpg.common.actions import TeamActions
+from sb3_maddpg.common.estimators import ESTIMATORS
+from sb3_maddpg.team.team import Team
 
 BATCH_SIZES = [256, 512, 1024, 2048]
 NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "large": [256, 256]}

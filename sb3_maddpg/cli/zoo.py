@@ -27,8 +27,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
-from sb3_maddpg import parallel
-from sb3_maddpg.checkpoints import newest
+from sb3_maddpg.checkpoints.checkpoints import newest
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.command_files import COMMAND_FILE, latest_run_number, read_command, recipe_of, resumable
 from sb3_maddpg.cli.experiment import CHECKPOINTS, Checkpoints, TeamExperimentManager
@@ -51,7 +50,8 @@ from sb3_maddpg.cli.safety import check_links, check_words, no_code_from_files, 
 from sb3_maddpg.cli.search import search
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
-from sb3_maddpg.model_files import trusted
+from sb3_maddpg.files.model_files import trusted
+from sb3_maddpg.team import pettingzoo as parallel
 from sb3_maddpg.utils import suggest
 
 

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 import quad_swarm  # noqa: F401 - registers the environment
 from quad_swarm.figures.colours import INK, LEARNED, RULES, STYLE
 from sb3_maddpg import MADDPG
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

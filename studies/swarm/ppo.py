@@ -28,7 +28,7 @@ from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 from studies.swarm.protocol import ROOT, VALIDATION, condition, fly_kept
 
 RECIPE = ROOT / "zoo_configs" / "quad_swarm_paper.yml"

@@ -17,7 +17,7 @@ from quad_swarm.evaluation.evaluation import Rows, fly_all
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.rows import read_rows, write_rows
-from quad_swarm.tasks.journal import default_folder
+from quad_swarm.jobs.journal import default_folder
 from quad_swarm.world.presets import SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 

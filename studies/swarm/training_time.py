@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from quad_swarm.evaluation.rows import write_rows
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.bench import timed
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 
 
 def measure(recipe: str, steps: int | None) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.vec_env import GymnasiumVecEnv
+from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 from toys import SMALL
 
 LENGTH = 5  # of an episode

@@ -14,7 +14,7 @@ from known import TRAINED, Giver, Known, check_stored
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 
-import sb3_maddpg.team_tasks  # noqa: F401 - registers the tasks
+import sb3_maddpg.team.toys  # noqa: F401 - registers the tasks
 from quad_swarm.evaluation.flight import Condition, run_episodes
 from quad_swarm.planner import SOLVERS, RtiSolver, Solution
 from quad_swarm.plants.base import SIMULATORS, Simulator

@@ -8,7 +8,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.policies import MADDPGPolicy
+from sb3_maddpg.common.policies import MADDPGPolicy
 
 SGD = {"net_arch": [8], "optimizer_class": th.optim.SGD}
 

@@ -5,8 +5,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_maddpg.parallel import TeamEnv
-from sb3_maddpg.team import heads_of
+from sb3_maddpg.team.pettingzoo import TeamEnv
+from sb3_maddpg.team.spaces import heads_of
 
 # The agents of a team act alike in all but "mixed", but never in spaces of one size
 AGENT_SPACES: dict[str, tuple[spaces.Space, ...]] = {

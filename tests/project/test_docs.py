@@ -11,10 +11,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 # Registered before the first page, so that they stay so after it
 import quad_swarm
-import sb3_maddpg.team_tasks  # noqa: F401
+import sb3_maddpg.team.toys  # noqa: F401
 from quad_swarm.task.rules import RULES
 from sb3_maddpg import MADDPG, MATD3, MADDPGPolicy, PairPolicy
-from sb3_maddpg.estimators import ESTIMATORS
+from sb3_maddpg.common.estimators import ESTIMATORS
 
 ROOT = Path(__file__).parents[2]
 TRIED = "benchmarks/results/action_spaces.json"

@@ -46,7 +46,7 @@ from gymnasium import spaces
 
 import quad_swarm
 import sb3_maddpg
-import sb3_maddpg.team_tasks  # registers the tasks
+import sb3_maddpg.team.toys  # registers the tasks
 from faulty import Faulty, trained
 from quad_swarm.planner import SOLVERS
 from sb3_maddpg import MADDPG, MATD3, pretrained

@@ -18,7 +18,7 @@ from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
-from sb3_maddpg.pretrained_models import pretrained_folder
+from sb3_maddpg.hub.pretrained import pretrained_folder
 from studies.swarm import counterfactual, fly_tests, ppo, protocol, tune_rules, tune_thresholds
 from studies.swarm import report as page
 

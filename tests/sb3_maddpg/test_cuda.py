@@ -6,7 +6,7 @@ import torch as th
 
 from quad_swarm import QuadSwarmEnv
 from sb3_maddpg import MADDPG, MATD3, PrioritizedTeamReplayBuffer
-from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.team.toys import OwnBit
 
 DEVICE = "cuda"
 pytestmark = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")

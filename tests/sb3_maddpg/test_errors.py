@@ -16,8 +16,8 @@ from sb3_maddpg.errors import (
     TeamError,
     UntrustedFileError,
 )
-from sb3_maddpg.model_files import as_damage
-from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.files.model_files import as_damage
+from sb3_maddpg.team.toys import OwnBit
 
 SMALL = {"buffer_size": 100, "batch_size": 10, "learning_starts": 20, "seed": 0}
 

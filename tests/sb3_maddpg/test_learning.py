@@ -7,8 +7,8 @@ import pytest
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_maddpg import MADDPG, MATD3
-from sb3_maddpg.estimators import ESTIMATORS
-from sb3_maddpg.team_tasks import (
+from sb3_maddpg.common.estimators import ESTIMATORS
+from sb3_maddpg.team.toys import (
     BINARY_TASKS,
     AllBits,
     FollowTarget,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sb3_maddpg import registry, typed_json
 from sb3_maddpg.cli.commands import main
+from sb3_maddpg.files import registry, typed_json
 
 DASHBOARD = "LAYOUT = {'Learning': {'return': ['Multiline', ['eval/mean_reward']]}}\n"
 TRAIN = ["train", "--env", "OwnBit-v0", "-n", "100", "--eval-freq", "50", "--eval-episodes", "1", "--n-eval-envs", "1"]

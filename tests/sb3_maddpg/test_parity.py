@@ -11,8 +11,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.matd3 import MATD3
-from sb3_maddpg.parallel import TeamEnv
+from sb3_maddpg.matd3.matd3 import MATD3
+from sb3_maddpg.team.pettingzoo import TeamEnv
 from toys import AGENT_SPACES, SMALL, Toy, toy
 
 pytestmark = [pytest.mark.parametrize("kind", AGENT_SPACES), pytest.mark.parametrize("algorithm", [MADDPG, MATD3])]

@@ -16,9 +16,9 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
-from sb3_maddpg.parallel import TeamEnv
-from sb3_maddpg.team import plain_joint_space
-from sb3_maddpg.team_tasks import OtherBit, OwnBit
+from sb3_maddpg.team.pettingzoo import TeamEnv
+from sb3_maddpg.team.spaces import plain_joint_space
+from sb3_maddpg.team.toys import OtherBit, OwnBit
 from toys import Toy
 
 SMALL = {"learning_starts": 20, "batch_size": 16, "train_freq": 5, "buffer_size": 1000, "seed": 0}
@@ -431,7 +431,7 @@ def test_files_whose_joint_action_space_lost_data_types_still_load(tmp_path, mon
             self.spaces = tuple(spaces.Box(0, 9, (2,), np.int64) for _ in self.spaces)
 
     with monkeypatch.context() as earlier:
-        earlier.setattr("sb3_maddpg.parallel.joint_action_space", plain_joint_space)
+        earlier.setattr("sb3_maddpg.team.pettingzoo.joint_action_space", plain_joint_space)
         model = MADDPG("MlpPolicy", Integers(), **SMALL)
         model.save(tmp_path / "model")
     loaded = MADDPG.load(tmp_path / "model", env=Integers())

@@ -7,8 +7,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_maddpg import MADDPG
-from sb3_maddpg.actions import TeamActions
-from sb3_maddpg.maddpg import _price_up_to
+from sb3_maddpg.common.actions import TeamActions
+from sb3_maddpg.maddpg.maddpg import _price_up_to
 from toys import SMALL, Neighbours
 
 PRICES = (0.001, 1.0)

@@ -5,10 +5,11 @@ import pytest
 import torch as th
 
 from sb3_maddpg import MADDPG
+from sb3_maddpg.common.policies import MADDPGPolicy
 from sb3_maddpg.errors import InvalidArgumentError
-from sb3_maddpg.policies import MADDPGPolicy
-from sb3_maddpg.team import MixedActions, Team
-from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.team.spaces import MixedActions
+from sb3_maddpg.team.team import Team
+from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.validation import PairPolicyArguments, PolicyArguments, validated
 from toys import toy
 

@@ -19,11 +19,11 @@ from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.policies import is_model, load_model, short_name, short_names, trained_in
 from quad_swarm.evaluation.provenance import provenance
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_csv, write_rows, write_text
+from quad_swarm.jobs import ENGINES
+from quad_swarm.jobs.journal import default_folder
 from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
 from quad_swarm.task.rules import RULES
-from quad_swarm.tasks import ENGINES
-from quad_swarm.tasks.journal import default_folder
 from quad_swarm.validation import read_yaml
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler

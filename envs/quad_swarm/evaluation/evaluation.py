@@ -20,14 +20,14 @@ from tqdm import tqdm
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model, make_policy, name_of
+from quad_swarm.jobs import Journal, make_executor
+from quad_swarm.jobs.cluster import other_code
+from quad_swarm.jobs.journal import differences, origin
 from quad_swarm.planner import SOLVERS, make_planner
 from quad_swarm.plants.base import MODEL, SIMULATORS, PlantDied, parse_plant, simulator_of
 from quad_swarm.task.episode_statistics import exchange_bytes, is_row
 from quad_swarm.task.observation import GROUPS
 from quad_swarm.task.rules import RULES
-from quad_swarm.tasks import Journal, make_executor
-from quad_swarm.tasks.cluster import other_code
-from quad_swarm.tasks.journal import differences, origin
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 

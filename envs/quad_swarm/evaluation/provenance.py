@@ -12,8 +12,8 @@ from typing import Any
 from quad_swarm.evaluation.evaluation import user_modules
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.policies import is_model
+from quad_swarm.jobs.journal import sources_digest
 from quad_swarm.plants.base import MODEL, parse_plant
-from quad_swarm.tasks.journal import sources_digest
 from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig
 
 

@@ -16,7 +16,7 @@ from quad_swarm.task.rules import RULES
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from quad_swarm.world.swarm import Swarm
-from sb3_maddpg.pretrained_models import pretrained_folder
+from sb3_maddpg.hub.pretrained import pretrained_folder
 
 KEYS = {
     "policy", "scenario", "preset", "episodes", "collisions", "collision_low", "collision_high",

@@ -20,12 +20,12 @@ from quad_swarm.evaluation import evaluation
 from quad_swarm.evaluation.command import paper_policies
 from quad_swarm.evaluation.evaluation import evaluate, fly_all, summarise
 from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
+from quad_swarm.jobs import Journal
 from quad_swarm.native import BuildError
 from quad_swarm.planner import SOLVERS, RtiSolver
 from quad_swarm.plants import SIMULATORS, PlantError, Simulator
 from quad_swarm.task.observation import GROUPS
 from quad_swarm.task.rules import RULES, distance
-from quad_swarm.tasks import Journal
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS, random
 
@@ -232,9 +232,9 @@ def test_pieces_are_told_apart_by_all_that_they_depend_on(tmp_path, monkeypatch)
         without.setattr(RtiSolver, "compile", no_compiler)
         with pytest.warns(RuntimeWarning, match="plans with fatrop"):
             keys.append(evaluation._key(one, episodes))
-    monkeypatch.setattr("quad_swarm.tasks.journal.sources_digest", lambda name: "other code")
+    monkeypatch.setattr("quad_swarm.jobs.journal.sources_digest", lambda name: "other code")
     keys.append(evaluation._key(one, episodes))
-    monkeypatch.setattr("quad_swarm.tasks.journal.machine", lambda: "another machine")
+    monkeypatch.setattr("quad_swarm.jobs.journal.machine", lambda: "another machine")
     keys.append(evaluation._key(one, episodes))
     assert len(set(keys)) == len(keys)
     assert evaluation._key(one, episodes) == keys[-1]

@@ -16,7 +16,7 @@ from quad_swarm.figures.replay import replay_page
 from quad_swarm.task.request_task import requests_of
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
-from sb3_maddpg.pretrained_models import pretrained_folder
+from sb3_maddpg.hub.pretrained import pretrained_folder
 
 ALGO = "sb3_maddpg:MADDPG"
 

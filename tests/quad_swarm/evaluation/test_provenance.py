@@ -6,8 +6,8 @@ import pytest
 
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.evaluation.provenance import plant_name, provenance
+from quad_swarm.jobs.journal import sources_digest
 from quad_swarm.task.rules import RULES
-from quad_swarm.tasks.journal import sources_digest
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 

@@ -16,7 +16,7 @@ from quad_swarm.evaluation.flight import Condition, fly
 from quad_swarm.figures import replay as replay_module
 from quad_swarm.figures.replay import _colliding, main
 from quad_swarm.world.presets import make_config
-from sb3_maddpg.pretrained_models import pretrained_folder
+from sb3_maddpg.hub.pretrained import pretrained_folder
 
 FIGURES = Path(replay_module.__file__).parent
 ANNOUNCING = str(pretrained_folder("quad-swarm-flight") / "model.zip")

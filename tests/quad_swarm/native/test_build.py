@@ -17,6 +17,7 @@ import pytest
 from planning import QUADROTOR, assert_same
 
 from quad_swarm import planner
+from quad_swarm.jobs.journal import default_folder
 from quad_swarm.native import build as build_module
 from quad_swarm.native import pairs
 from quad_swarm.planner import (
@@ -30,7 +31,6 @@ from quad_swarm.planner import (
 )
 from quad_swarm.planner.rti.codegen import generate_model
 from quad_swarm.planner.rti.solver import build_kernel
-from quad_swarm.tasks.journal import default_folder
 
 CONFIG = PlannerConfig(horizon=3)
 SOURCES = Path(planner.__file__).parent / "rti"

@@ -11,11 +11,12 @@ import quad_swarm
 import sb3_maddpg
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.scenarios import SCENARIOS
-from sb3_maddpg import MADDPG, registry
+from sb3_maddpg import MADDPG
 from sb3_maddpg.cli import commands
 from sb3_maddpg.cli.commands import COMMANDS, examples, main
 from sb3_maddpg.cli.overview import ALGORITHMS, packaged_recipes
-from sb3_maddpg.pretrained_models import pretrained_folder, pretrained_models
+from sb3_maddpg.files import registry
+from sb3_maddpg.hub.pretrained import pretrained_folder, pretrained_models
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import configure
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.commands import main
 from sb3_maddpg.cli.experiment import claim_folder
-from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.team.toys import OwnBit
 
 RECIPE = {
     "n_timesteps": 400,

@@ -26,7 +26,11 @@ def test_what_names_no_package_is_refused(name):
 
 @pytest.mark.parametrize(
     ("name", "nearest"),
-    [("my_ruls", "my_rules"), ("sb3_madpg", "sb3_maddpg"), ("sb3_maddpg.estimator", "sb3_maddpg.estimators")],
+    [
+        ("my_ruls", "my_rules"),
+        ("sb3_madpg", "sb3_maddpg"),
+        ("sb3_maddpg.checkpoint", "sb3_maddpg.checkpoints"),
+    ],
 )
 def test_the_nearest_module_is_named(tmp_path, monkeypatch, name, nearest):
     monkeypatch.chdir(tmp_path)

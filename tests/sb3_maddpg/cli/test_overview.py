@@ -4,7 +4,7 @@ import gymnasium
 import yaml
 
 from sb3_maddpg.cli.overview import ALGORITHMS, environments, overview, packaged_recipes
-from sb3_maddpg.pretrained_models import pretrained_models
+from sb3_maddpg.hub.pretrained import pretrained_models
 
 
 def test_everything_that_is_registered_is_named(monkeypatch):

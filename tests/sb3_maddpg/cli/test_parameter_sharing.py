@@ -14,7 +14,7 @@ from sb3_maddpg.cli.commands import latest_model, main
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, SharedPolicy, shares_parameters
 from sb3_maddpg.cli.pettingzoo_ids import register
 from sb3_maddpg.cli.zoo import register as register_all
-from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.matd3.matd3 import MATD3
 
 SPREAD, TAG, SWARM = "mpe2/simple_spread_v3", "mpe2/simple_tag_v3", "quad_swarm/parallel_env"
 PADDED = ["supersuit.pad_observations_v0", "supersuit.pad_action_space_v0"]

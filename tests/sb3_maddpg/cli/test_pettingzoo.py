@@ -15,7 +15,7 @@ from sb3_maddpg.cli.pettingzoo_ids import register
 from sb3_maddpg.cli.recipes import check_env_kwargs, check_keys
 from sb3_maddpg.cli.zoo import packaged_config
 from sb3_maddpg.cli.zoo import register as register_all
-from sb3_maddpg.matd3 import MATD3
+from sb3_maddpg.matd3.matd3 import MATD3
 
 SPREAD = ["--env", "mpe2/simple_spread_v3"]
 

@@ -278,7 +278,7 @@ def test_someone_elses_run_is_resumed_if_its_command_runs_no_code(killed, tmp_pa
     monkeypatch.chdir(shutil.copytree(killed, tmp_path / "copy"))
     (path,) = Path("logs").rglob("command.json")
     argv = json.loads(path.read_text())["argv"]
-    words = ["-params", "n_timesteps:700", "policy:sb3_maddpg.policies.MADDPGPolicy"]
+    words = ["-params", "n_timesteps:700", "policy:sb3_maddpg.MADDPGPolicy"]
     path.write_text(json.dumps({"argv": [*argv, *words], "every": 300}))
     assert main(["train", "--resume"]) == 0
     assert "Resuming logs" in capsys.readouterr().out

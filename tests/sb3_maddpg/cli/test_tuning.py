@@ -21,8 +21,8 @@ from sb3_maddpg.cli.commands import main
 from sb3_maddpg.cli.experiment import as_yaml
 from sb3_maddpg.cli.literals import parse_literal
 from sb3_maddpg.cli.zoo import register
-from sb3_maddpg.matd3 import MATD3
-from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.matd3.matd3 import MATD3
+from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.utils import arguments_of
 from toys import Neighbours, toy
 
@@ -146,7 +146,7 @@ def test_agents_that_are_alike_may_share():
 
     from mpe2 import simple_tag_v3
 
-    from sb3_maddpg.parallel import TeamEnv
+    from sb3_maddpg.team.pettingzoo import TeamEnv
 
     tag = TeamEnv(simple_tag_v3.parallel_env(continuous_actions=True))
     trials = [sample("maddpg", tag, seed=seed) for seed in range(9)]

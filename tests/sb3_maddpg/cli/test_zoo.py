@@ -21,7 +21,7 @@ PACKAGE = """
 import json, sys
 import gymnasium
 from stable_baselines3.common.callbacks import BaseCallback
-from sb3_maddpg.team_tasks import OwnBit
+from sb3_maddpg.team.toys import OwnBit
 
 MADE = []  # arguments of every environment, in order
 PROGRESS = []
@@ -233,7 +233,7 @@ def test_evaluation_is_handed_to_the_environments_evaluator(arena, capsys):
     assert main(["evaluate", "--env", "Arena-v0", "--algo", "ppo", "none"]) == 3
     assert json.loads(capsys.readouterr().out) == ["none", "--algo", "stable_baselines3.ppo.ppo:PPO"]
     assert main(["evaluate", "--env", "Arena-v0", "--algo", "matd3", "none"]) == 3
-    assert json.loads(capsys.readouterr().out) == ["none", "--algo", "sb3_maddpg.matd3:MATD3"]
+    assert json.loads(capsys.readouterr().out) == ["none", "--algo", "sb3_maddpg.matd3.matd3:MATD3"]
 
 
 @pytest.mark.parametrize(

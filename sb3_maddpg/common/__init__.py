@@ -1,0 +1,1 @@
+"""What all algorithms share: actions, estimators, networks, policies, replay buffers, callbacks."""

@@ -1,0 +1,263 @@
+"""The policy of a single agent, as a robot runs it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_maddpg.common.actions import ActionKind, Categorical, Continuous, make_kinds
+from sb3_maddpg.common.networks import single_precision
+from sb3_maddpg.errors import DivergedError, InvalidArgumentError
+from sb3_maddpg.team.spaces import AgentActionSpace, into_box
+from sb3_maddpg.utils import as_numbers, atomic_write, shown
+
+if TYPE_CHECKING:
+    from sb3_maddpg.common.policies import MADDPGPolicy
+    from sb3_maddpg.vec_env.normalize import ObservationStatistics
+
+_TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
+
+
+class AgentPolicy(nn.Module):
+    """
+    Policy of a single agent, which maps its observation to its action without critics, team or exploration. Create it
+    with ``model.agent_policy("robot_2")``.
+
+    :param name: name of the agent
+    :param network: network that maps observations, (batch, obs_dim), to outputs, (batch, width or more)
+    :param columns: columns of the agent's outputs, see ``TeamActions.columns_of``
+    :param action_space: the agent's action space
+    :param obs_dim: length of the agent's observation
+    :param threshold: threshold of binary actions, see ``Binary``
+    :param mask: columns of the observation that hold the action mask, see ``TeamObservation``; empty without one
+    :param statistics: mean and standard deviation of observations, (obs_dim,), and the limit of normalised ones, None
+        for observations that are not normalised
+    """
+
+    columns: th.Tensor
+    mask: th.Tensor
+    low: th.Tensor
+    high: th.Tensor
+    own_low: th.Tensor
+    own_high: th.Tensor
+    start: th.Tensor
+    mean: th.Tensor
+    std: th.Tensor
+
+    def __init__(
+        self,
+        name: str,
+        network: nn.Module,
+        columns: Sequence[int],
+        action_space: AgentActionSpace,
+        obs_dim: int,
+        threshold: float,
+        mask: Sequence[int] = (),
+        statistics: tuple[np.ndarray, np.ndarray, float] | None = None,
+    ):
+        super().__init__()
+        self.limit = None if statistics is None else statistics[2]
+        if statistics is not None:
+            self.register_buffer("mean", th.as_tensor(statistics[0]).double())
+            self.register_buffer("std", th.as_tensor(statistics[1]).double())
+        self.name = name
+        self.network = network
+        self.action_space = action_space
+        self.obs_dim = obs_dim
+        self.kind: ActionKind = make_kinds([action_space], threshold)[0]
+        self.register_buffer("columns", th.tensor(columns))
+        self.has_mask = bool(mask)
+        if self.has_mask:
+            # Where encoded actions are padded, any column serves
+            full = np.zeros(self.kind.width, int)
+            full[self.kind.real[0].numpy()] = mask
+            self.register_buffer("mask", th.tensor(full))
+        if isinstance(self.kind, Categorical):
+            start = th.as_tensor(np.ravel(getattr(action_space, "start", 0)), dtype=th.int64)
+            self.register_buffer("start", start)
+        self.flat = isinstance(action_space, spaces.Discrete) or len(action_space.shape or ()) == 1
+        self.shape: tuple[int, ...] = action_space.shape or ()
+        self.dtype = th.as_tensor(np.zeros(1, action_space.dtype)).dtype
+        self.whole = isinstance(action_space, spaces.Box) and np.issubdtype(action_space.dtype, np.integer)
+        if isinstance(action_space, spaces.Box):
+            for bound in ("low", "high"):
+                limit = np.ravel(getattr(action_space, bound))
+                self.register_buffer(bound, th.as_tensor(limit).float())
+                self.register_buffer(f"own_{bound}", th.as_tensor(_as_double(limit, bound)))
+
+    @classmethod
+    @single_precision()
+    def of(cls, policy: MADDPGPolicy, agent: str | int, statistics: ObservationStatistics | None = None) -> AgentPolicy:
+        """
+        Extract an agent's policy from the team's.
+
+        :param policy: policy of the team
+        :param agent: name or index of the agent
+        :param statistics: how ``VecNormalize`` normalises the team's observations, None if it does not
+        :return: the agent's policy
+        :raises ValueError: if there is no such agent, or parameters are not finite
+        """
+        if problem := policy.not_finite(policy.state_dict()):
+            raise DivergedError(
+                f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file."
+            )
+        team, index = policy.team, policy.team.index(agent)
+        network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
+        columns, space = policy.actions.columns_of(index), team.action_spaces[index]
+        mask = team.masks[index] if team.masks else ()
+        own = None
+        if statistics is not None:
+            mean, var = (part[index, : team.obs_dims[index]] for part in (statistics.mean, statistics.var))
+            own = (mean, np.sqrt(var + statistics.epsilon), statistics.clip)
+        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask, own)
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: observations, (batch, obs_dim)
+        :return: actions in the environment's units, in the data type of the agent's action space and within its bounds:
+            batch first and then the space's shape, but (batch, 1) for ``Discrete``
+        """
+        if self.limit is not None:
+            obs = ((obs - self.mean) / self.std).clamp(-self.limit, self.limit).float()
+        logits = self.network(obs)[:, self.columns].unsqueeze(1)
+        if self.has_mask:
+            logits = self.kind.mask(logits, (obs[:, self.mask] > 0).unsqueeze(1))
+        actions = self.kind.act(logits, deterministic=True).squeeze(1)
+        if isinstance(self.kind, Continuous):
+            actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+            actions = (actions.round() if self.whole else actions).clamp(self.low, self.high)
+            if self.dtype != th.float32:  # bounds may not be numbers of single precision
+                actions = actions.double().clamp(self.own_low, self.own_high).to(self.dtype)
+        elif isinstance(self.kind, Categorical):
+            actions = (actions.unflatten(-1, self.kind.shape).argmax(dim=-1) + self.start).to(self.dtype)
+        else:
+            actions = actions.to(self.dtype)
+        return actions if self.flat else actions.reshape(-1, *self.shape)
+
+    @single_precision()
+    def predict(self, observation: np.ndarray) -> np.ndarray:
+        """
+        Choose the action for an observation.
+
+        :param observation: an array, such as an image, or a flat observation, (obs_dim,), or a batch of flat ones,
+            (batch, obs_dim), flattened as by Gymnasium's ``flatten``
+        :return: an action of the agent's action space, or a batch of them: batch first and then the space's shape, but
+            (batch, 1) for ``Discrete``
+        :raises ValueError: if the observation has another length or holds NaN or infinity
+        """
+        flatten = (
+            f"Flatten an observation as TeamEnv does: gymnasium.spaces.flatten(env.observation_space({self.name!r}), "
+            "observation)."
+        )
+        if isinstance(observation, Mapping) and self.name in observation:
+            raise InvalidArgumentError(
+                f"These are observations of several agents: pass observations[{self.name!r}] alone."
+            )
+        try:
+            obs = th.as_tensor(as_numbers(observation))
+        except ValueError:
+            raise InvalidArgumentError(
+                f"The observation of {self.name} is not an array of numbers: {shown(observation)}. {flatten}"
+            ) from None
+        if obs.numel() == self.obs_dim and obs.shape[-1:] != (self.obs_dim,):
+            obs = obs.flatten()
+        if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
+            raise InvalidArgumentError(
+                f"An observation of {self.name} has shape ({self.obs_dim},), not {tuple(obs.shape)}. {flatten}"
+            )
+        if not obs.isfinite().all():
+            raise InvalidArgumentError(
+                f"The observation of {self.name} holds NaN or infinity: clip or replace such values."
+            )
+        with th.no_grad():
+            actions = self(obs.reshape(-1, self.obs_dim)).numpy()
+        space = self.action_space
+        if isinstance(space, spaces.Box):
+            actions = into_box(space, actions)
+        actions = actions.astype(space.dtype, copy=False)
+        if obs.dim() == 2:
+            return actions
+        return actions[0, 0] if isinstance(space, spaces.Discrete) else actions[0].reshape(space.shape)
+
+    @single_precision()
+    def export(self, path: str | os.PathLike[str]) -> None:
+        """
+        Export the policy as a program that runs without this package. The program maps float32 observations of shape
+        (batch, obs_dim) to the actions that ``forward`` returns.
+
+        The suffix ``.onnx`` selects ONNX, for ONNX Runtime and compilers for embedded processors (input
+        ``observation``, output ``action``; needs the extra ``onnx``). The suffixes ``.pt``, ``.pth``, ``.ts`` and
+        ``.torchscript`` select TorchScript, for ``torch.jit.load`` and libtorch (C++).
+
+        :param path: path of the file; ``.pt`` is added to a path without a suffix
+        :raises ValueError: if the suffix is unknown, a parameter is not finite, or ONNX is needed and not installed
+        """
+        if not isinstance(path, (str, os.PathLike)):
+            raise InvalidArgumentError(f"{shown(path)} is not the path of a file.")
+        suffix = os.path.splitext(os.fspath(path))[1]
+        if suffix.lower() not in ("", ".onnx", *_TORCHSCRIPT):
+            raise InvalidArgumentError(
+                f"{shown(os.fspath(path))} has the suffix {suffix}: end the path with .onnx for ONNX, or with .pt for "
+                "TorchScript."
+            )
+        for name, parameter in self.named_parameters():
+            if not parameter.isfinite().all():
+                raise DivergedError(f"The policy of {self.name} cannot be exported: {name} holds NaN or infinity.")
+        if suffix.lower() == ".onnx":
+            program = self._to_onnx()
+            with atomic_write(path, suffix="onnx") as file:
+                file.write(program)
+            return
+        example, other = th.zeros(2, self.obs_dim), th.linspace(-2.0, 2.0, 5 * self.obs_dim).view(5, -1)
+        with warnings.catch_warnings():
+            # Torch recommends torch.export instead, but its programs need a compiler to run without Python
+            warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+            script = th.jit.trace(self, example, check_inputs=[(other,)])
+            with atomic_write(path, suffix="pt") as file:
+                th.jit.save(script, file)
+
+    def _to_onnx(self) -> bytes:
+        logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+        level = logger.level
+        logger.setLevel(logging.ERROR)  # it warns that torchvision is missing, which is not needed
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # they concern the exporter's internals
+                program = th.onnx.export(
+                    self,
+                    (th.zeros(2, self.obs_dim),),
+                    dynamo=True,
+                    dynamic_shapes=({0: th.export.Dim("batch")},),
+                    input_names=["observation"],
+                    output_names=["action"],
+                    verbose=False,
+                )
+        except ImportError as error:
+            raise InvalidArgumentError(
+                f'ONNX is not installed ({error}): in the clone, pip install -e ".[onnx]".'
+            ) from error
+        finally:
+            logger.setLevel(level)
+        assert program is not None
+        return program.model_proto.SerializeToString()
+
+
+def _as_double(limits: np.ndarray, bound: str) -> np.ndarray:
+    """:return: the limits in double precision, not beyond those of large integers"""
+    double = limits.astype(np.float64)
+    if limits.dtype.kind not in "iu":
+        return double
+    beyond = [
+        int(one) > limit if bound == "high" else int(one) < limit
+        for one, limit in zip(double, limits.tolist(), strict=True)
+    ]
+    return np.where(beyond, np.nextafter(double, 0.0), double)
