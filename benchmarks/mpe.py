@@ -34,7 +34,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from quad_swarm.figures.colours import RULES, STYLE, colour_of
-from sb3_maddpg import IDDPG, MADDPG, MATD3
+from sb3_maddpg import IDDPG, MADDPG, MASAC, MATD3
+from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.team import pettingzoo as parallel
 from sb3_maddpg.team.pettingzoo import TeamEnv
 
@@ -46,7 +47,7 @@ MODULES = {
     "simple_adversary": "mpe2/simple_adversary_v3",
 }
 ENVS = (*MODULES, "simple_spread:discrete")
-ALGOS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
+ALGOS: dict[str, type[TeamAlgorithm]] = {"maddpg": MADDPG, "matd3": MATD3, "masac": MASAC, "iddpg": IDDPG}
 EVAL_FREQ, EVAL_EPISODES = 10_000, 100
 SHOWN = (50_000, 100_000)
 # Mean returns that an implementation should reach, slightly worse than those of XuanCe and a plain PyTorch loop

@@ -17,6 +17,7 @@ from sb3_maddpg.hub.pretrained import pretrained
 from sb3_maddpg.iddpg.iddpg import IDDPG
 from sb3_maddpg.images.cnn_policy import CnnPolicy
 from sb3_maddpg.maddpg.maddpg import MADDPG
+from sb3_maddpg.masac.masac import MASAC
 from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.relational.policy import PairPolicy
 from sb3_maddpg.team.pettingzoo import TeamEnv
@@ -26,6 +27,7 @@ __version__ = version("sb3-maddpg")
 __all__ = [
     "IDDPG",
     "MADDPG",
+    "MASAC",
     "MATD3",
     "AgentPolicy",
     "CnnPolicy",

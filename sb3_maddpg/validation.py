@@ -94,8 +94,8 @@ def _frequency(train_freq: TrainFreq) -> TrainFreq:
     return train_freq
 
 
-class TrainingArguments(Arguments):
-    """Arguments of ``MADDPG``."""
+class TeamArguments(Arguments):
+    """Arguments of every algorithm for teams."""
 
     # 0 is allowed, because rl_zoo3 loads models with it to render them
     learning_rate: AtLeastZero | Schedule = Field(description="a finite number that is not negative, or a schedule")
@@ -116,6 +116,12 @@ class TrainingArguments(Arguments):
     optimize_memory_usage: bool = Field(description="True or False")
     n_steps: Natural = Field(description="a number of steps of at least 1")
     use_action_cost: bool = Field(description="True or False")
+    max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
+
+
+class TrainingArguments(TeamArguments):
+    """Arguments of ``MADDPG``."""
+
     threshold_price: tuple[Price, Price] | None = Field(
         description="a positive price and a higher one, both from 1e-12 to 1e12, or None"
     )
@@ -127,7 +133,6 @@ class TrainingArguments(Arguments):
         description=f"positive, at least {LEAST_TEMPERATURE:g}, or a schedule"
     )
     policy_delay: Natural = Field(description="a number of critic updates, an integer of at least 1")
-    max_grad_norm: Positive | None = Field(description="positive, or None for no limit")
     policy_regularization: AtLeastZero = Field(description="a finite number of at least 0")
 
     @field_validator("threshold_price")

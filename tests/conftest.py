@@ -2,9 +2,14 @@
 
 import os
 import shutil
+import signal
 import tempfile
 
 import pytest
+
+# Whoever starts the tests in the background, as scripts and cron do, ignores interrupts, and children inherit that
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # The key that signs commands of runs does not belong into the home of whoever runs the tests

@@ -39,6 +39,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.common.buffers import TeamReplayBuffer
+from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError, InvalidFileError, NoStateError, TeamError
 from sb3_maddpg.files.model_files import as_damage, check_not_compressed
 from sb3_maddpg.files.typed_json import decode, encode
@@ -115,7 +116,7 @@ class RunCheckpoint(BaseCallback):
         self._at_start += [(one, deepcopy(_values(one))) for one in callbacks if one not in known]
         if self._pending is not None:
             try:
-                _restore(cast(MADDPG, self.model), callbacks, self._pending)
+                _restore(cast(TeamAlgorithm, self.model), callbacks, self._pending)
             except (ValueError, OSError):
                 raise
             except Exception as error:  # from environments, wrappers and callbacks of any kind
@@ -162,7 +163,7 @@ class RunCheckpoint(BaseCallback):
 
     def _on_step(self) -> bool:
         if self._writer is not None:
-            buffer = cast(MADDPG, self.model).replay_buffer
+            buffer = cast(TeamAlgorithm, self.model).replay_buffer
             assert isinstance(buffer, TeamReplayBuffer)
             # The transition of this step overwrites the oldest row, and without next_observations part of the next one
             overwritten = buffer.n_added - buffer.buffer_size + int(buffer.optimize_memory_usage)
@@ -180,7 +181,7 @@ class RunCheckpoint(BaseCallback):
         return self.cost + expected <= _SHARE * (now - self._started + expected)
 
     def _bytes_to_write(self) -> int:
-        buffer = cast(MADDPG, self.model).replay_buffer
+        buffer = cast(TeamAlgorithm, self.model).replay_buffer
         assert isinstance(buffer, TeamReplayBuffer)
         first, end = self._new_rows(buffer)
         return _size_of(buffer, first, end)
@@ -197,7 +198,7 @@ class RunCheckpoint(BaseCallback):
     def _begin(self) -> None:
         """Take a checkpoint, which a thread then writes."""
         self._finish()
-        model = cast(MADDPG, self.model)
+        model = cast(TeamAlgorithm, self.model)
         buffer = model.replay_buffer
         assert isinstance(buffer, TeamReplayBuffer)
         started = time.monotonic()
@@ -313,7 +314,7 @@ class _Writer(threading.Thread):
     def __init__(
         self,
         folder: Path,
-        model: MADDPG,
+        model: TeamAlgorithm,
         segment: _Segment,
         kept: list[dict[str, Any]],
         state: dict[str, Any],
@@ -403,11 +404,11 @@ class _Writer(threading.Thread):
 def resume(
     folder: str | os.PathLike[str],
     env: GymEnv,
-    algorithm: type[MADDPG] = MADDPG,
+    algorithm: type[TeamAlgorithm] = MADDPG,
     every: int | None = None,
     keep: int = 2,
     device: th.device | str = "auto",
-) -> tuple[MADDPG, RunCheckpoint] | None:
+) -> tuple[TeamAlgorithm, RunCheckpoint] | None:
     """
     Load the newest checkpoint of a run. Continue training with ``model.learn(total_timesteps - model.num_timesteps,
     [callback, ...], reset_num_timesteps=False)``, with the same environment and callbacks as in the run. The callbacks'
@@ -521,7 +522,7 @@ def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
         yield
 
 
-def digest(model: MADDPG) -> str:
+def digest(model: TeamAlgorithm) -> str:
     """
     :param model: a model with its replay buffer
     :return: SHA-256 of parameters, optimizers, replay buffer, counters and random number generators
@@ -540,7 +541,7 @@ def digest(model: MADDPG) -> str:
 
 
 def _state_of(
-    model: MADDPG, callbacks: list[BaseCallback], at_start: Sequence[tuple[BaseCallback, dict[str, Any]]]
+    model: TeamAlgorithm, callbacks: list[BaseCallback], at_start: Sequence[tuple[BaseCallback, dict[str, Any]]]
 ) -> dict[str, Any]:
     """
     :param model: the model
@@ -587,7 +588,7 @@ def _env_state_or_reason(env: VecEnv) -> tuple[str | None, dict[str, Any] | None
         return str(error), None
 
 
-def _restore(model: MADDPG, callbacks: list[BaseCallback], state: dict[str, Any]) -> None:
+def _restore(model: TeamAlgorithm, callbacks: list[BaseCallback], state: dict[str, Any]) -> None:
     """Restore everything but the networks and the replay buffer, after learn() has begun."""
     env = cast(VecEnv, model.env)
     if state["env"] is None:
@@ -658,7 +659,7 @@ def _equal(one: Any, other: Any) -> bool:
     return json.dumps(encode(one, "value")) == json.dumps(encode(other, "value"))
 
 
-def _checked_last(model: MADDPG, name: str, value: Any) -> Any:
+def _checked_last(model: TeamAlgorithm, name: str, value: Any) -> Any:
     """:return: an array of the last observations, or whether they begin episodes, if it fits the environment"""
     present: Any = model._last_episode_starts if name == "_last_episode_starts" else model._last_obs
     if value is None and name == "_last_original_obs" and model._vec_normalize_env is None:  # before the first step

@@ -32,9 +32,10 @@ from sb3_maddpg.cli.options import (
 )
 from sb3_maddpg.cli.overview import ALGORITHMS, overview
 from sb3_maddpg.cli.terminal import discard_output, is_unread, lasting_output
+from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.files.model_files import TRUST_VARIABLE, refuse_pickled, trusted
+from sb3_maddpg.files.saving import Lean
 from sb3_maddpg.hub.pretrained import pretrained_folder, pretrained_models
-from sb3_maddpg.maddpg.maddpg import MADDPG, Lean
 from sb3_maddpg.offers import broken, load_offer, offer_named, offers
 from sb3_maddpg.starting import interruptible
 from sb3_maddpg.utils import shown, suggest, told
@@ -51,7 +52,7 @@ USER_ERRORS = (
 )
 
 DESCRIPTION = """\
-Multi-agent reinforcement learning with MADDPG and MATD3 for Stable-Baselines3.
+Multi-agent reinforcement learning with MADDPG, MATD3 and MASAC for Stable-Baselines3.
 
 {commands}
 
@@ -132,7 +133,7 @@ def _hand_over(group: str, argv: list[str]) -> int:
     rest = [_model(word, known.algo, known.env) for word in rest]
     if known.algo != "maddpg":
         algorithm = _algorithm(known.algo)
-        ours = isinstance(algorithm, type) and issubclass(algorithm, MADDPG)
+        ours = isinstance(algorithm, type) and issubclass(algorithm, TeamAlgorithm)
         if not ours and not trusted(None):
             for word in rest:
                 if Path(path := word.partition("@")[0]).is_file() and zipfile.is_zipfile(path):

@@ -29,7 +29,6 @@ from stable_baselines3.common.utils import LinearSchedule, configure_logger, saf
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.utils.tensorboard import SummaryWriter
 
-from sb3_maddpg import MADDPG
 from sb3_maddpg.checkpoints.checkpoints import RunCheckpoint, locked, resume
 from sb3_maddpg.cli.command_files import latest_run_number, write_command
 from sb3_maddpg.cli.interrupts import noticed_interrupts
@@ -51,7 +50,9 @@ from sb3_maddpg.cli.search import (
     tell_best,
 )
 from sb3_maddpg.common.callbacks import DashboardCallback, check_drawn, check_layout
+from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.files.model_files import trusted
+from sb3_maddpg.maddpg.maddpg import MADDPG
 from sb3_maddpg.offers import broken, load_offer, offer_named, package_of
 from sb3_maddpg.team.team import Team
 from sb3_maddpg.utils import (
@@ -338,9 +339,9 @@ class TeamExperimentManager(ExperimentManager):
         env.seed(self.seed)
         return self._maybe_normalize(env, eval_env)
 
-    def _resume(self, run: Path, env: Any) -> MADDPG:
+    def _resume(self, run: Path, env: Any) -> TeamAlgorithm:
         assert self.checkpoints is not None
-        algorithm = cast("type[MADDPG]", ALGOS[self.algo])
+        algorithm = cast("type[TeamAlgorithm]", ALGOS[self.algo])
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".* logs to ")  # the command says where curves go
             found = resume(run / CHECKPOINTS, env, algorithm, self.checkpoints.every, device=self.device)
@@ -411,7 +412,7 @@ class TeamExperimentManager(ExperimentManager):
             kwargs["log_interval"] = None
             total = self.n_timesteps + (model.num_timesteps if self.checkpoint is not None else 0)
             self.callbacks.append(RegularTables(max(total // TABLES, FEWEST_STEPS_PER_TABLE)))
-        if self.checkpoints is not None and isinstance(model, MADDPG):
+        if self.checkpoints is not None and isinstance(model, TeamAlgorithm):
             folder = Path(self.save_path, CHECKPOINTS)
             if self.checkpoint is None:
                 self.checkpoint = RunCheckpoint(folder, self.checkpoints.every)

@@ -9,13 +9,15 @@ from pathlib import Path
 import gymnasium
 import yaml
 
+from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.hub.pretrained import pretrained_models
 from sb3_maddpg.iddpg.iddpg import IDDPG
 from sb3_maddpg.maddpg.maddpg import MADDPG
+from sb3_maddpg.masac.masac import MASAC
 from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.offers import load_offer, offers
 
-ALGORITHMS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "matd3": MATD3, "iddpg": IDDPG}
+ALGORITHMS: dict[str, type[TeamAlgorithm]] = {"maddpg": MADDPG, "matd3": MATD3, "masac": MASAC, "iddpg": IDDPG}
 
 
 def load_environments() -> None:

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from supersuit import concat_vec_envs_v1, pettingzoo_env_to_vec_env_v1
 
-from sb3_maddpg import MADDPG
+from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.team import pettingzoo as parallel
 
 
@@ -30,7 +30,7 @@ def shares_parameters(algorithm: type[BaseAlgorithm], env_id: str) -> bool:
     :param env_id: Gymnasium id
     :return: whether training shares one policy among all agents: a single-agent algorithm in a PettingZoo environment
     """
-    return not issubclass(algorithm, MADDPG) and gymnasium.spec(env_id).entry_point == parallel.ENTRY_POINT
+    return not issubclass(algorithm, TeamAlgorithm) and gymnasium.spec(env_id).entry_point == parallel.ENTRY_POINT
 
 
 class AgentsVecEnv(VecEnv):
@@ -50,10 +50,13 @@ class AgentsVecEnv(VecEnv):
     def __init__(self, env_id: str, n_envs: int, env_kwargs: dict[str, Any]):
         if env_kwargs.get("state"):
             raise ValueError(
-                "state:True is for critics of MADDPG and MATD3: a shared policy only sees its own agent's observation."
+                "state:True is for centralised critics, of MADDPG, MATD3 and MASAC: a shared policy only sees its own "
+                "agent's observation."
             )
         if env_kwargs.get("info_mask"):
-            raise ValueError("info_mask:True is for MADDPG, MATD3 and IDDPG: a shared policy reads no action masks.")
+            raise ValueError(
+                "info_mask:True is for MADDPG, MATD3, MASAC and IDDPG: a shared policy reads no action masks."
+            )
         self.spec = copy.deepcopy(gymnasium.spec(env_id))
         self.spec.kwargs.update(env_kwargs)
         env = parallel.make_parallel_env(
@@ -159,7 +162,7 @@ def _homogeneous_agents(env_id: str, env: ParallelEnv) -> Sequence[Any]:
         first = space_of(agents[0])
         for agent in agents:
             if space_of(agent) != first:
-                remedy = "train with --algo maddpg, matd3 or iddpg"
+                remedy = "train with --algo maddpg, matd3, masac or iddpg"
                 if pads:
                     remedy = f"add supersuit.{wrapper} to `wrappers` of env_kwargs, or {remedy}"
                 else:

@@ -1,4 +1,4 @@
-"""Search spaces of ``sb3-maddpg train -optimize`` for MADDPG, MATD3 and IDDPG."""
+"""Search spaces of ``sb3-maddpg train -optimize`` for MADDPG, MATD3, MASAC and IDDPG."""
 
 import json
 from typing import Any
@@ -52,6 +52,23 @@ def sample_matd3_params(
     return convert_params(trial.params)
 
 
+def sample_masac_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Sample MASAC's hyperparameters, see ``sample_maddpg_params``.
+
+    :param trial: trial of a study
+    :param n_actions: unused
+    :param n_envs: number of environments
+    :param additional_args: see ``sample_maddpg_params``
+    :return: arguments of the algorithm
+    """
+    _suggest_shared(trial, n_envs, additional_args)
+    trial.suggest_categorical("ent_coef", ["auto_0.1", "auto_0.01", 0.1, 0.01, 0.001])
+    return convert_params(trial.params)
+
+
 def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     Convert the parameters of a trial.
@@ -74,6 +91,24 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) -> TeamActions:
     """
+    Suggest the hyperparameters that MADDPG has.
+
+    :return: the team's actions
+    """
+    actions = _suggest_shared(trial, n_envs, additional_args)
+    trial.suggest_float("policy_regularization", 1e-5, 1e-2, log=True)
+    if actions.has_continuous and "action_noise" not in additional_args["hyperparams"]:
+        trial.suggest_float("first_noise", 0.1, 1.0, log=True)
+        trial.suggest_float("last_noise", 0.01, 0.3, log=True)
+    if actions.discrete:
+        estimator = trial.suggest_categorical("estimator", list(ESTIMATORS))
+        if estimator not in WITHOUT_TEMPERATURE:
+            trial.suggest_float("temperature", 0.2, 2.0, log=True)
+    return actions
+
+
+def _suggest_shared(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) -> TeamActions:
+    """
     Suggest the hyperparameters that all algorithms have.
 
     :return: the team's actions
@@ -94,14 +129,6 @@ def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) 
     trial.suggest_categorical("gradient_steps", [1, 2, 4])
     trial.suggest_int("n_steps", 1, 5)
     trial.suggest_categorical("net_arch", list(NET_ARCHS))
-    trial.suggest_float("policy_regularization", 1e-5, 1e-2, log=True)
-    if actions.has_continuous and "action_noise" not in additional_args["hyperparams"]:
-        trial.suggest_float("first_noise", 0.1, 1.0, log=True)
-        trial.suggest_float("last_noise", 0.01, 0.3, log=True)
-    if actions.discrete:
-        estimator = trial.suggest_categorical("estimator", list(ESTIMATORS))
-        if estimator not in WITHOUT_TEMPERATURE:
-            trial.suggest_float("temperature", 0.2, 2.0, log=True)
     if "share_actor" in additional_args["policy_arguments"] and (groups := _homogeneous_groups(team)):
         # Optuna does not support lists as choices
         sharing = ["false", "true" if len(groups[0]) == team.n_agents else json.dumps(groups)]

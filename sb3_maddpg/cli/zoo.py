@@ -1,4 +1,4 @@
-"""``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3, IDDPG and the installed environments."""
+"""``sb3-maddpg train|tune|enjoy|record``: rl_zoo3 with MADDPG, MATD3, MASAC, IDDPG and the installed environments."""
 
 import argparse
 import difflib
@@ -49,7 +49,7 @@ from sb3_maddpg.cli.recipes import LengthOption, check_env_kwargs, check_options
 from sb3_maddpg.cli.safety import check_links, check_words, no_code_from_files, run_settings, shown_with
 from sb3_maddpg.cli.search import search
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
-from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_matd3_params
+from sb3_maddpg.cli.tuning import convert_params, sample_maddpg_params, sample_masac_params, sample_matd3_params
 from sb3_maddpg.files.model_files import trusted
 from sb3_maddpg.team import pettingzoo as parallel
 from sb3_maddpg.utils import suggest
@@ -59,7 +59,7 @@ def register() -> None:
     """Register the algorithms and all installed environments in rl_zoo3."""
     ALGOS.update(ALGORITHMS)
     HYPERPARAMS_SAMPLER.update(dict.fromkeys(ALGORITHMS, sample_maddpg_params))
-    HYPERPARAMS_SAMPLER["matd3"] = sample_matd3_params
+    HYPERPARAMS_SAMPLER.update(matd3=sample_matd3_params, masac=sample_masac_params)
     HYPERPARAMS_CONVERTER.update(dict.fromkeys(ALGORITHMS, convert_params))
     rl_zoo3.train.ExperimentManager = TeamExperimentManager  # type: ignore[misc]
     for module in (rl_zoo3.train, rl_zoo3.enjoy, rl_zoo3.utils):  # record imports it from the last

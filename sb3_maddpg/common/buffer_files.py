@@ -12,12 +12,14 @@ from typing import Any, cast
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_maddpg.common.buffers import TeamReplayBuffer
-from sb3_maddpg.errors import InvalidFileError
-from sb3_maddpg.files.model_files import check_not_compressed
+from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError, UntrustedFileError
+from sb3_maddpg.files.model_files import as_damage, check_not_compressed, check_path, trusted
 from sb3_maddpg.files.typed_json import decode, encode
-from sb3_maddpg.utils import shown
+from sb3_maddpg.utils import atomic_write, shown
 
 _FORMAT = 1
 _STATE = "buffer.json"
@@ -94,3 +96,83 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray
             )
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
+
+
+class SavesReplayBuffer(OffPolicyAlgorithm):
+    """An algorithm whose replay buffer is a team's, and is saved and loaded without running code."""
+
+    replay_buffer: TeamReplayBuffer
+
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+        trust: bool | None = None,
+    ) -> None:
+        """
+        Load a replay buffer from a file, like SB3's ``load_replay_buffer``, without running code from the file unless
+        ``trust`` is set. The model's ``gamma`` and ``handle_timeout_termination`` apply from now on, whereas the
+        buffer keeps its size.
+
+        :param trust: also load a pickled buffer, which can run code; older versions write such files, see ``load``
+        :raises ValueError: if the buffer is of another class, team, ``n_steps``, layout or number of environments, or
+            is pickled and not trusted; the model keeps its buffer then
+        """
+        check_path(path)
+        if isinstance(path, (str, os.PathLike)) and not pathlib.Path(path).suffix:
+            path = f"{path}.pkl"  # as SB3 does
+        present = self.replay_buffer
+        try:
+            with as_damage(path, "replay buffer"):
+                if is_buffer_file(path):
+                    self.replay_buffer = read_buffer(path, self.device)
+                elif trusted(trust):
+                    super().load_replay_buffer(path, truncate_last_traj)
+                else:
+                    raise UntrustedFileError(
+                        f"{path} is not a replay buffer that this version writes. If it is pickled, it may run any "
+                        "code when it is loaded: if you trust its author, load it with `trust=True` (on the "
+                        "command line `--trust`)."
+                    )
+            self._check_replay_buffer(self.replay_buffer, path)
+            self.replay_buffer.gamma = self.gamma
+            self.replay_buffer.handle_timeout_termination = present.handle_timeout_termination
+        except BaseException:
+            self.replay_buffer = present
+            raise
+
+    def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
+        if not isinstance(buffer, TeamReplayBuffer):
+            raise InvalidFileError(f"{path} holds a {type(buffer).__name__}, but the model needs a TeamReplayBuffer.")
+        n_pairs = self.replay_buffer_kwargs.get("n_pairs", 0)
+        names = [cls.__name__ for cls in (type(buffer), cast(type, self.replay_buffer_class))]
+        for what, loaded, needed in (
+            ("transitions in a {}", *names),
+            ("windows of n_steps={}", buffer.n_steps, self.n_steps),
+            ("transitions with optimize_memory_usage={}", buffer.optimize_memory_usage, self.optimize_memory_usage),
+            ("transitions of {} parallel environment(s)", buffer.n_envs, self.n_envs),
+            ("observations of {}", buffer.observation_space, self.observation_space),
+            ("actions of {}", buffer.action_space, self.action_space),
+            ("rewards of {} neighbours of each agent", buffer.n_pairs, n_pairs),
+            ("neighbours that change: {}", buffer.pairs_end, self.replay_buffer_kwargs.get("pairs_end", False)),
+        ):
+            if loaded != needed:
+                raise InvalidFileError(
+                    f"{path} holds {what.format(loaded)}, but the model needs {what.format(needed)}: resume with the "
+                    "environment and arguments of the training that saved it, or without its replay buffer."
+                )
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer as JSON and arrays. The file's suffix defaults to ``.pkl``, because rl_zoo3 looks for
+        that, but nothing in it is pickled.
+
+        :raises ValueError: if there is no replay buffer, or files may not name its class, see ``allow_in_files``
+        """
+        check_path(path)
+        if not isinstance(self.replay_buffer, TeamReplayBuffer):
+            raise InvalidArgumentError("There is no replay buffer to save.")
+        if not isinstance(path, (str, os.PathLike)):
+            return write_buffer(self.replay_buffer, path)
+        with atomic_write(path, suffix="pkl") as file:
+            write_buffer(self.replay_buffer, file)  # type: ignore[arg-type]

@@ -56,6 +56,16 @@ class TeamReplayBufferSamples(NamedTuple):
     indices: np.ndarray | None = None
     weights: th.Tensor | None = None
 
+    def mean(self, values: th.Tensor, active: th.Tensor | None) -> th.Tensor:
+        """
+        :param values: values to average, (batch, n)
+        :param active: 1 for the values that count, else 0, (batch, n), None for all
+        :return: the means over the batch, with its importance weights, (n,)
+        """
+        if self.weights is not None:
+            values = values * self.weights.unsqueeze(1)
+        return values.mean(dim=0) if active is None else (values * active).sum(dim=0) / active.sum(dim=0).clamp(min=1.0)
+
 
 _TRUNCATED = 2.0
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import ContextDecorator
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ContextDecorator, contextmanager
 from itertools import chain, pairwise
 
 import torch as th
@@ -24,6 +24,16 @@ class single_precision(ContextDecorator):
     def __exit__(self, *exception: object) -> None:
         if (default := self._defaults.pop()) is not th.float32:
             th.set_default_dtype(default)
+
+
+@contextmanager
+def no_gradients(network: nn.Module) -> Iterator[None]:
+    """Exclude the network's parameters from the backward pass, where only the gradients of its inputs are needed."""
+    network.requires_grad_(False)
+    try:
+        yield
+    finally:
+        network.requires_grad_(True)
 
 
 class StackedMLP(nn.Module):

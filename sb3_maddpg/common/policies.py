@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_maddpg.common.actions import TeamActions
+from sb3_maddpg.common.heads import TeamHead, ValueHeads
 from sb3_maddpg.common.networks import StackedMLP, single_precision
 from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.files.registry import allow_in_files
@@ -169,22 +170,18 @@ class Critic(nn.Module):
     agent, and each agent has the same number of them. By default, each agent has one head and one factor.
 
     :param factors: the actions of the factors
-    :param n_agents: number of agents
-    :param values_per_agent: number of value heads per agent
+    :param heads: whose rewards the values predict
     :param n_critics: number of critics per agent (two for MATD3)
     """
 
     optimizer: th.optim.Optimizer
-    agent_of_value: th.Tensor
 
-    def __init__(self, factors: TeamActions, n_agents: int, values_per_agent: int = 1, n_critics: int = 1):
+    def __init__(self, factors: TeamActions, heads: ValueHeads, n_critics: int = 1):
         super().__init__()
         self.factors = factors
-        self.n_agents = n_agents
+        self.heads = heads
+        self.n_agents = heads.n_agents
         self.n_critics = n_critics
-        self.register_buffer(
-            "agent_of_value", th.arange(n_agents).repeat_interleave(values_per_agent), persistent=False
-        )
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -225,69 +222,6 @@ class Critic(nn.Module):
         """
         return actions.reshape(len(actions), -1, self.factors.width)
 
-    def rewards(self, of_agents: th.Tensor) -> th.Tensor:
-        """
-        :param of_agents: rewards of the agents, (batch, n_agents)
-        :return: rewards of the value heads, (batch, n_values)
-        """
-        return of_agents
-
-    def per_value(self, of_agents: th.Tensor) -> th.Tensor:
-        """
-        Broadcast values of agents to their value heads.
-
-        :param of_agents: values of the agents, (batch, n_agents)
-        :return: values of the heads, (batch, n_values)
-        """
-        one_each = len(self.agent_of_value) == self.n_agents
-        return of_agents if one_each else of_agents[..., self.agent_of_value]
-
-    def owners(self, values: th.Tensor) -> th.Tensor:
-        """
-        :param values: indices of value heads, (n,)
-        :return: indices of the agents whose values these heads predict
-        """
-        return self.agent_of_value[values]
-
-    def heads_of(self, agent: int) -> th.Tensor:
-        """
-        :param agent: index of an agent
-        :return: indices of the value heads that predict this agent's rewards alone, (n,)
-        """
-        return (self.agent_of_value == agent).nonzero().flatten()
-
-    def cost_of_factors(self, action_cost: th.Tensor) -> th.Tensor:
-        """
-        :param action_cost: costs of the agents' actions, (n_agents, width)
-        :return: costs of the factors' actions in units of a value head, (n_factors, factor width)
-        """
-        return self.factored(action_cost.unsqueeze(0))[0]
-
-    def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
-        """
-        Sum over the value heads or factors of each agent.
-
-        :param values: values of all heads or factors, (..., n)
-        :return: sums, (..., n_agents)
-        """
-        # Every agent has the same number, so a reshape replaces index_add
-        one_each = values.shape[-1] == self.n_agents
-        return values if one_each else values.unflatten(-1, (self.n_agents, -1)).sum(dim=-1)
-
-    def known_cost(self, actions: th.Tensor, action_cost: th.Tensor) -> th.Tensor:
-        """
-        Compute the cost of actions for each value head, as its rewards contain it.
-
-        :param actions: encoded actions, (batch, n_agents, width)
-        :param action_cost: price of one unit of the encoded action, (n_agents, width)
-        :return: the costs, (batch, n_values)
-        """
-        cost = self.factored(actions * action_cost).sum(dim=-1)
-        if cost.shape[-1] == len(self.agent_of_value):
-            return cost
-        values_per_agent = len(self.agent_of_value) // self.n_agents
-        return self.per_value(self.sum_by_agent(cost)) / values_per_agent
-
 
 class FeaturesActor(Actor):
     """
@@ -323,14 +257,9 @@ class FeaturesCritic(Critic):
     """
 
     def __init__(self, features: nn.Module, head: StackedCritic):
-        super().__init__(head.factors, head.n_agents, n_critics=head.n_critics)
+        super().__init__(head.factors, head.heads, head.n_critics)
         self.features = features
         self.head = head
-
-        self.agent_of_value = head.agent_of_value
-        # Whose values the heads are
-        for name in ("rewards", "per_value", "owners", "heads_of", "cost_of_factors", "sum_by_agent", "known_cost"):
-            setattr(self, name, getattr(head, name))
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         return self.head(self.features(obs), actions)
@@ -418,6 +347,7 @@ class StackedCritic(Critic):
     :param activation_fn: activation function between the layers
     :param groups: index of each agent's network
     :param n_critics: number of critics per agent
+    :param heads: whose rewards the values predict, by default one agent's each
     """
 
     def __init__(
@@ -429,8 +359,9 @@ class StackedCritic(Critic):
         activation_fn: type[nn.Module],
         groups: Sequence[int],
         n_critics: int,
+        heads: ValueHeads | None = None,
     ):
-        super().__init__(actions, team.n_agents, n_critics=n_critics)
+        super().__init__(actions, heads or ValueHeads(team.n_agents), n_critics)
         # Fails at once if the networks exceed the memory, before the list below fills it
         th.empty(n_critics, team.n_agents, in_features, *net_arch[:1])
         networks = [group + (max(groups) + 1) * copy for copy in range(n_critics) for group in groups]
@@ -581,30 +512,8 @@ class TeamCritic(StackedCritic):
     ):
         self.seen_dim = team.state_dim or team.n_agents * team.obs_dim
         n_inputs = self.seen_dim + team.n_agents * actions.width
-        super().__init__(team, actions, n_inputs, net_arch, activation_fn, [0], n_critics)
+        super().__init__(team, actions, n_inputs, net_arch, activation_fn, [0], n_critics, TeamHead(team.n_agents))
         self.team = team
-        self.agent_of_value = th.zeros(1, dtype=th.long)
-
-    def rewards(self, of_agents: th.Tensor) -> th.Tensor:
-        return of_agents.mean(dim=-1, keepdim=True)
-
-    def per_value(self, of_agents: th.Tensor) -> th.Tensor:
-        return of_agents.amax(dim=-1, keepdim=True)
-
-    def owners(self, values: th.Tensor) -> th.Tensor:
-        return th.arange(self.n_agents)
-
-    def heads_of(self, agent: int) -> th.Tensor:
-        return th.empty(0, dtype=th.long, device=self.agent_of_value.device)
-
-    def sum_by_agent(self, values: th.Tensor) -> th.Tensor:
-        return values.expand(*values.shape[:-1], self.n_agents)
-
-    def known_cost(self, actions: th.Tensor, action_cost: th.Tensor) -> th.Tensor:
-        return self.rewards((actions * action_cost).sum(dim=-1))
-
-    def cost_of_factors(self, action_cost: th.Tensor) -> th.Tensor:
-        return super().cost_of_factors(action_cost) / self.n_agents
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         inputs = th.cat(_joint_inputs(self.team, obs, actions), dim=1).T

@@ -50,7 +50,7 @@ def _try_out(policy: MADDPGPolicy, name: str, estimates: Estimator, temperature:
     own_obs = obs[:, 0, : team.obs_dims[0]]
     _result(f"{its_actor}.single(0)", (1, width), lambda: actor.single(0)(own_obs))
     actions = policy.actions.act(logits).detach()
-    n_values = len(critic.agent_of_value)
+    n_values = len(critic.heads)
     _result(f"{its_critic}.forward", (critic.n_critics, 1, n_values), lambda: critic(obs, actions), _learns(critic))
     factored = critic.factored(logits)
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidArgumentError
-from sb3_maddpg.maddpg.maddpg import MADDPG, Lean
+from sb3_maddpg.files.saving import Lean
 from sb3_maddpg.utils import arguments_of, shown
 from sb3_maddpg.vec_env.normalize import read_observation_statistics
 
@@ -25,7 +26,7 @@ _CURVES = {"timesteps", "results", "ep_lengths", "successes"}
 
 
 def write_model_folder(
-    model: MADDPG, folder: Path, repo_id: str, run: Path | None = None, lean: Lean | None = "critic"
+    model: TeamAlgorithm, folder: Path, repo_id: str, run: Path | None = None, lean: Lean | None = "critic"
 ) -> None:
     """
     Write the files that ``publish`` uploads: ``model.zip``, the model card ``README.md``, and from the run the recipe
@@ -48,7 +49,7 @@ def write_model_folder(
     (folder / "README.md").write_text(model_card(model, repo_id, curve), encoding="utf-8")
 
 
-def model_card(model: MADDPG, repo_id: str, evaluations: Path | None = None) -> str:
+def model_card(model: TeamAlgorithm, repo_id: str, evaluations: Path | None = None) -> str:
     """
     :param model: the model
     :param repo_id: id of the repository
@@ -104,7 +105,7 @@ def model_card(model: MADDPG, repo_id: str, evaluations: Path | None = None) -> 
 
 
 def publish(
-    model: MADDPG,
+    model: TeamAlgorithm,
     repo_id: str,
     run: Path | None = None,
     lean: Lean | None = "critic",
@@ -161,7 +162,7 @@ def _is_small_file(path: Path) -> bool:
     return path.is_file() and not path.is_symlink() and path.stat().st_size <= _MOST_BYTES
 
 
-def _recipe_of(model: MADDPG, run: Path | None) -> Path | None:
+def _recipe_of(model: TeamAlgorithm, run: Path | None) -> Path | None:
     """:return: the recipe of a run: the only ``config.yml`` that holds arguments of the algorithm and nothing else"""
     known = arguments_of(type(model)) | _RECIPE
     found = []
@@ -192,7 +193,7 @@ def _curves_of(run: Path | None) -> Path | None:
     return None
 
 
-def _statistics_of(model: MADDPG, run: Path | None) -> dict[str, Any] | None:
+def _statistics_of(model: TeamAlgorithm, run: Path | None) -> dict[str, Any] | None:
     """
     :return: the statistics with which the model's observations were normalised, None if they were not
     :raises ValueError: if they are not known

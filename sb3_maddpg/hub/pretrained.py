@@ -9,10 +9,11 @@ from types import ModuleType
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_maddpg.errors import InvalidArgumentError
-from sb3_maddpg.maddpg.maddpg import MADDPG, as_vec_env
+from sb3_maddpg.maddpg.maddpg import MADDPG
 from sb3_maddpg.offers import OfferError, broken, load_offer, offers, package_of
 from sb3_maddpg.relational.policy import PairPolicy
 from sb3_maddpg.utils import shown, suggest
+from sb3_maddpg.vec_env.wrap import as_vec_env
 
 
 def pretrained_models() -> dict[str, Path]:

@@ -146,7 +146,7 @@ class MATD3(MADDPG):
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
         if _init_setup_model:
-            self._setup_model()
+            self._setup_new_model()
 
     def _target_actions(self, next_obs: th.Tensor) -> th.Tensor:
         actions = self.actor_target.act(next_obs, deterministic=False)

@@ -12,6 +12,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_maddpg.common.actions import TeamActions
+from sb3_maddpg.common.heads import PairHeads, ValueHeads
 from sb3_maddpg.common.layout import NeighbourViews
 from sb3_maddpg.common.policies import Actor, Critic
 from sb3_maddpg.errors import InvalidArgumentError
@@ -182,7 +183,8 @@ class PairCritic(Critic):
         pair_credit: bool = False,
         n_critics: int = 1,
     ):
-        super().__init__(factors, views.n_agents, views.n_neighbours if pair_credit else 1, n_critics)
+        heads = PairHeads(views.n_agents, views.n_neighbours) if pair_credit else ValueHeads(views.n_agents)
+        super().__init__(factors, heads, n_critics)
         self.pair_credit = pair_credit
         self.views = views
         self.on_neighbours = on_neighbours
@@ -228,7 +230,7 @@ class PairCritic(Critic):
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         of_pairs = self.of_pairs(obs, actions)
-        return of_pairs if self.pair_credit else self.sum_by_agent(of_pairs)
+        return of_pairs if self.pair_credit else self.heads.sum_by_agent(of_pairs)
 
     def forward_alternatives(
         self, obs: th.Tensor, actions: th.Tensor, own: th.Tensor, factors: th.Tensor | None = None

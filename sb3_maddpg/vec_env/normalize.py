@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
-from sb3_maddpg.errors import InvalidFileError, UntrustedFileError
+from sb3_maddpg.errors import InvalidEnvironmentError, InvalidFileError, UntrustedFileError
 from sb3_maddpg.files.model_files import as_damage, trusted
 from sb3_maddpg.files.typed_json import decode, encode
 from sb3_maddpg.utils import atomic_write, shown
@@ -338,3 +339,71 @@ def _set_moments(rms: RunningMeanStd, data: Any, name: str) -> None:
         raise InvalidFileError(f"{name} holds NaN, infinity or a negative variance.")
     rms.mean, rms.var = mean.astype(np.float64), var.astype(np.float64)
     rms.count = counted if counted.ndim else float(counted)  # type: ignore[assignment]
+
+
+def normalizer_of_observations(env: GymEnv | None) -> VecNormalize | None:
+    """:return: the wrapper that normalises this environment's observations, if there is one"""
+    normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
+    return normalizer if normalizer is not None and normalizer.norm_obs else None
+
+
+def check_unshifted(normalizer: VecNormalize, policy_kwargs: Mapping[str, Any]) -> None:
+    """
+    :param normalizer: a wrapper that normalises observations
+    :param policy_kwargs: arguments of the policy, with what it reads from the environment
+    :raises InvalidEnvironmentError: if normalising changes what numbers in the observations mean
+    """
+    images = "image_space" in policy_kwargs or any(policy_kwargs.get("image_columns") or ())
+    if images and policy_kwargs.get("normalize_images", True):
+        raise InvalidEnvironmentError(
+            "VecNormalize(norm_obs=True) normalises images, which the policy also divides by 255: set "
+            "norm_obs=False or policy_kwargs={'normalize_images': False}."
+        )
+    if any(getattr(normalizer.observation_space, "masks", ())):
+        raise InvalidEnvironmentError(
+            "VecNormalize(norm_obs=True) shifts the action masks in the observations, which must be positive where "
+            "an action is legal. Set norm_obs=False and scale observations in the environment."
+        )
+    layout = policy_kwargs.get("observation_layout")
+    if layout is not None and not layout.get("complete", False):
+        raise InvalidEnvironmentError(
+            "VecNormalize(norm_obs=True) shifts the zeros that mark absent neighbours for PairPolicy: they would "
+            "all look present. Set norm_obs=False and scale observations in the environment; or, if every "
+            "neighbour is always present, set `complete: True` in the environment's observation_layout."
+        )
+
+
+def check_statistics(normalizer: VecNormalize | None, stored: ObservationStatistics | None) -> None:
+    """
+    Check that an environment normalises observations as they were in training, and complete statistics that are
+    empty by those of the model's file.
+
+    :param normalizer: the environment's wrapper that normalises observations
+    :param stored: the statistics in the model's file
+    :raises InvalidEnvironmentError: if there is none, or it has no statistics and the file neither
+    """
+    remedy = (
+        "load the statistics of the training, SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env). If the "
+        "environment normalises by itself, load the model with normalized_observations=False."
+    )
+    if normalizer is None:
+        if stored is not None:
+            remedy = f"wrap it in VecNormalize, which the statistics in the model's file then complete, or {remedy}"
+        raise InvalidEnvironmentError(
+            "The model was trained with VecNormalize(norm_obs=True), but this environment does not normalise "
+            f"observations: {remedy}"
+        )
+    present = ObservationStatistics.of(normalizer)
+    if present is not None and stored is not None and np.max(present.observed) < np.max(stored.observed):
+        raise InvalidEnvironmentError(
+            f"This environment's VecNormalize has seen {np.max(present.observed):.0f} observations, fewer than the "
+            f"{np.max(stored.observed):.0f} of the model's training, so that its statistics are others: wrap the "
+            f"environment in a new VecNormalize, which the statistics in the model's file complete, or {remedy}"
+        )
+    if present is None:
+        if stored is None:
+            raise InvalidEnvironmentError(
+                "The model was trained with VecNormalize(norm_obs=True), but this environment's VecNormalize has "
+                f"not seen any observation yet, and the model's file holds no statistics: {remedy}"
+            )
+        stored.fill(normalizer)

@@ -1,10 +1,16 @@
 """The scripts in examples/ run."""
 
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch as th
+from mpe2 import simple_spread_v3
+
+from reference import drawn
+from sb3_maddpg import MADDPG
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -16,3 +22,59 @@ def test_runs_in_its_short_form(name, tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout
     assert f"]({name})" in (EXAMPLES / "README.md").read_text()
+
+
+def test_the_single_file_does_the_update_of_the_package():
+    """Networks and batch are the package's; what they are after one update is compared."""
+    spec = importlib.util.spec_from_file_location("single_file", EXAMPLES / "maddpg_single_file.py")
+    single = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(single)
+    env = simple_spread_v3.parallel_env(continuous_actions=True)
+    model = MADDPG("MlpPolicy", env, gamma=single.GAMMA, tau=single.TAU, batch_size=64, learning_starts=100, seed=0)
+    model.learn(300)
+    policy = model.policy
+    n, obs_dim, width = 3, policy.team.obs_dim, policy.actions.width
+    agents = [single.Agent(obs_dim, width, n * obs_dim, n * width) for _ in range(n)]
+    names = ("actor", "critic", "actor_target", "critic_target")
+    for row, agent in enumerate(agents):
+        for name in names:
+            getattr(agent, name).load_state_dict(network_of(getattr(policy, name), row).state_dict())
+        for name in ("actor", "critic"):
+            state = getattr(policy, name).optimizer.state
+            mine = getattr(agent, f"{name}_optimizer")
+            layers = [*getattr(policy, name).net.layers()]
+            for (weight, bias), linear in zip(
+                layers, [one for one in getattr(agent, name) if hasattr(one, "bias")], strict=True
+            ):
+                for parameter, own in ((weight, linear.weight), (bias, linear.bias)):
+                    mine.state[own] = {
+                        key: one.clone() if one.dim() == 0 else one[row].reshape(own.shape).clone()
+                        for key, one in state[parameter].items()
+                    }
+    data = drawn(model, 64)
+    single.update(
+        agents,
+        *(
+            [part[:, row] for row in range(n)]
+            for part in (
+                data.observations,
+                policy.actions.encode(data.actions),
+                data.rewards,
+                data.next_observations,
+                data.dones,
+            )
+        ),
+    )
+    before = [parameter.clone() for parameter in policy.parameters()]
+    model.train(1, batch_size=64)
+    assert any((old != new).any() for old, new in zip(before, policy.parameters(), strict=True))
+    for row, agent in enumerate(agents):
+        for name in names:
+            for own, theirs in zip(
+                getattr(agent, name).parameters(), network_of(getattr(policy, name), row).parameters(), strict=True
+            ):
+                assert th.allclose(own, theirs, atol=1e-6), name
+
+
+def network_of(networks, row):
+    return networks.net.single(row, networks.net.layers()[0][0].shape[2])

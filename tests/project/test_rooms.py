@@ -20,6 +20,7 @@ LIBRARY = [
     "hub",
     "checkpoints",
     "iddpg",
+    "masac",
     "matd3",
     "maddpg",
     "images",
@@ -54,12 +55,17 @@ DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command"}
 NEED_NO_TEST = {"sb3_maddpg.__main__", "sb3_maddpg.callbacks", "quad_swarm.figures.colours"}
 # Modules that are tested through what is built on them
 TESTED_WITH = {
+    "sb3_maddpg.common.action_noise": "sb3_maddpg.common.actions",
+    "sb3_maddpg.common.arguments": "sb3_maddpg.maddpg.maddpg",
     "sb3_maddpg.common.layout": "sb3_maddpg.relational.policy",
+    "sb3_maddpg.common.team_algorithm": "sb3_maddpg.maddpg.maddpg",
     "sb3_maddpg.relational.networks": "sb3_maddpg.relational.policy",
+    "sb3_maddpg.relational.resizing": "sb3_maddpg.relational.training",
     "sb3_maddpg.team.spaces": "sb3_maddpg.team.team",
     "sb3_maddpg.vec_env.arrivals": "sb3_maddpg.vec_env.checks",
     "sb3_maddpg.vec_env.border": "sb3_maddpg.vec_env.checks",
     "sb3_maddpg.vec_env.gymnasium": "sb3_maddpg.vec_env.checks",
+    "sb3_maddpg.vec_env.wrap": "sb3_maddpg.vec_env.checks",
 }
 
 

@@ -92,8 +92,8 @@ def test_floats_become_binary_actions():
     ("kwargs", "message"),
     [
         ({}, "heterogeneous agents: the observation space of adversary_0 is .*add supersuit.pad_observations_v0"),
-        ({"wrappers": PADDED, "state": True}, "state:True is for critics"),
-        ({"wrappers": PADDED, "info_mask": True}, "info_mask:True is for MADDPG, MATD3 and IDDPG"),
+        ({"wrappers": PADDED, "state": True}, "state:True is for centralised critics"),
+        ({"wrappers": PADDED, "info_mask": True}, "info_mask:True is for MADDPG, MATD3, MASAC and IDDPG"),
     ],
 )
 def test_teams_that_cannot_share_a_policy_are_refused(kwargs, message):

@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
+from sb3_maddpg.common.action_cost import ActionCost
 from sb3_maddpg.common.actions import TeamActions
 from sb3_maddpg.common.policies import MADDPGPolicy, MLPActor, MLPCritic, TeamCritic, sharing_groups
 from sb3_maddpg.team.pettingzoo import TeamEnv
@@ -90,14 +91,15 @@ def test_alternatives_of_a_team_critic_equal_substituted_actions(net_arch, n_cri
 def test_a_team_critic_values_means_and_goes_on_with_the_last_agent():
     built = team_critic()
     of_agents = th.tensor([[1.0, 2.0, 3.0, 6.0], [0.0, 0.0, 0.0, 0.0]])
-    assert built.rewards(of_agents).tolist() == [[3.0], [0.0]]
-    assert built.per_value((of_agents > 5).float()).tolist() == [[1.0], [0.0]]
+    assert built.heads.of_factors(of_agents).tolist() == [[3.0], [0.0]]
+    assert built.heads.per_value((of_agents > 5).float()).tolist() == [[1.0], [0.0]]
     actions, cost = batch()[1], th.rand(N, K)
     spent = (actions * cost).sum(dim=(1, 2)) / N
-    assert th.allclose(built.known_cost(actions, cost)[:, 0], spent)
+    known = ActionCost(cost)
+    assert th.allclose(known.of(actions, built)[:, 0], spent)
     # What each agent's own action takes from the value adds up to the same
-    assert th.allclose((actions * built.cost_of_factors(cost)).sum(dim=(1, 2)), spent)
-    assert built.owners(th.tensor([0])).tolist() == list(range(N))
+    assert th.allclose(known.of_alternatives(actions.unsqueeze(2), None, built).sum(dim=(1, 2)), spent)
+    assert built.heads.owners(th.tensor([0])).tolist() == list(range(N))
 
 
 @pytest.mark.parametrize("n_critics", [1, 2])

@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
 from sb3_maddpg import IDDPG, MADDPG, MATD3
+from sb3_maddpg.common.action_cost import ActionCost
 from sb3_maddpg.common.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
 from sb3_maddpg.common.callbacks import MetricsCallback
 from sb3_maddpg.common.estimators import ESTIMATORS
@@ -260,7 +261,7 @@ def test_an_environment_with_a_wrong_cost_is_not_set():
         with pytest.raises(ValueError, match=message):
             model.set_env(other)
         assert model.get_env() is before
-        assert (model.action_cost, model._cost_of_encoded.unique().tolist()) == (0.4, [np.float32(0.4)])
+        assert (model.action_cost, model.cost.price.unique().tolist()) == (0.4, [np.float32(0.4)])
 
 
 def test_a_cost_is_known_only_if_wanted():
@@ -791,7 +792,7 @@ def test_an_agent_that_is_truncated_counts_in_its_own_target_only():
     model = MADDPG("MlpPolicy", Toy("continuous"), **SMALL)
     obs, actions = th.rand(4, 3, 4) - 0.5, th.rand(4, 3, 2) - 0.5
     truncated = th.tensor([[0.0, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0]])
-    found = model._next_q_values(obs, actions, truncated, None)
+    found = model._next_q_values(obs, actions, truncated, ActionCost())
     for row in range(4):
         for agent in range(3):
             keeps = 1 - truncated[row]

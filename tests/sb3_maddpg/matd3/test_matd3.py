@@ -9,6 +9,7 @@ import torch as th
 
 from reference import SGD, assert_close, assert_moved, drawn, updated
 from sb3_maddpg import MADDPG
+from sb3_maddpg.common.action_cost import ActionCost
 from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.team.pettingzoo import TeamEnv
 from toys import SMALL, Toy
@@ -33,7 +34,7 @@ def test_one_update_is_that_of_separate_agents_with_twin_critics(kind, priced, n
     )
     n_agents, width = model.policy.team.n_agents, model.policy.actions.width
     cost = np.full((n_agents, width), 0.7, np.float32) if priced else None
-    model._cost_of_encoded = None if cost is None else th.as_tensor(cost)
+    model.cost = ActionCost(None if cost is None else th.as_tensor(cost))
     model.learn(60)
     old, data = copy.deepcopy(model.policy), drawn(model, 32)
     th.manual_seed(5)

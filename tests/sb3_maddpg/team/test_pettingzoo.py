@@ -20,8 +20,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from sb3_maddpg import MADDPG, check_team_env
-from sb3_maddpg.maddpg.maddpg import as_vec_env
 from sb3_maddpg.team.pettingzoo import TeamEnv
+from sb3_maddpg.vec_env.wrap import as_vec_env
 from toys import Toy
 
 SHORT = spaces.Box(-1, 1, (2,))

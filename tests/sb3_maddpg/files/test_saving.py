@@ -147,12 +147,12 @@ def test_the_price_of_actions_is_that_of_the_environment(tmp_path):
     model = learned(env, use_action_cost=True)
     model.save(tmp_path / "model")
     loaded = MADDPG.load(tmp_path / "model")
-    assert th.equal(loaded._cost_of_encoded, model._cost_of_encoded)
-    assert model._cost_of_encoded.tolist() == env.action_cost.tolist()
+    assert th.equal(loaded.cost.price, model.cost.price)
+    assert model.cost.price.tolist() == env.action_cost.tolist()
     for env.action_cost in (0.5, 2.0):
         loaded.set_env(env)
-        assert (loaded._cost_of_encoded == env.action_cost).all()
-        assert (MADDPG.load(tmp_path / "model", env=env)._cost_of_encoded == env.action_cost).all()
+        assert (loaded.cost.price == env.action_cost).all()
+        assert (MADDPG.load(tmp_path / "model", env=env).cost.price == env.action_cost).all()
     with pytest.raises(ValueError, match="no attribute `action_cost`"):
         loaded.set_env(OwnBit())
 

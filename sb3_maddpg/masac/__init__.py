@@ -1,0 +1,5 @@
+"""The algorithm MASAC."""
+
+from sb3_maddpg.masac.masac import MASAC
+
+__all__ = ["MASAC"]
