@@ -254,7 +254,7 @@ def plot(rows: Sequence[Row], file: Path) -> None:
     envs = list(dict.fromkeys(env for env, _, _ in groups))
     labels = list(dict.fromkeys((algo, actions) for _, actions, algo in groups))
     with rc_context(STYLE):
-        figure = Figure(figsize=(8, 2.6 * math.ceil(len(envs) / 2)), layout="constrained")
+        figure = Figure(figsize=(8, 2.9 * math.ceil(len(envs) / 2)), layout="constrained")
         panels = list(figure.subplots(math.ceil(len(envs) / 2), min(len(envs), 2), squeeze=False).flat)
         for axes, env in zip(panels, envs, strict=False):
             for (of, actions, algo), seeds in groups.items():
@@ -266,7 +266,7 @@ def plot(rows: Sequence[Row], file: Path) -> None:
             axes.set_ylabel("return, mean over agents")
             axes.set_xlabel("environment steps (thousands)")
         shown = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3)
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2)
         file.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(file)
     print(f"Figure: {file}")
