@@ -11,11 +11,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_maddpg import MADDPG
+from sb3_maddpg.masac.masac import MASAC
 from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.team.pettingzoo import TeamEnv
 from toys import AGENT_SPACES, SMALL, Toy, toy
 
-pytestmark = [pytest.mark.parametrize("kind", AGENT_SPACES), pytest.mark.parametrize("algorithm", [MADDPG, MATD3])]
+pytestmark = [
+    pytest.mark.parametrize("kind", AGENT_SPACES),
+    pytest.mark.parametrize("algorithm", [MADDPG, MATD3, MASAC]),
+]
 
 
 def learned(algorithm, env, steps: int = 60, **kwargs):
@@ -47,7 +51,8 @@ def test_runs_and_acts_in_the_action_space(algorithm, kind, n_envs):
     after = learned(algorithm, env)
     assert after.num_timesteps == 60
     assert after._n_updates > 0
-    for network in ("actor", "critic", "actor_target", "critic_target"):
+    # Targets of MASAC read the actors themselves
+    for network in ("actor", "critic", "critic_target", *(() if algorithm is MASAC else ("actor_target",))):
         old, new = (getattr(model.policy, network).parameters() for model in (before, after))
         assert all(b.isfinite().all() and not th.equal(a, b) for a, b in zip(old, new, strict=True))
     obs = observations(after)
@@ -66,8 +71,8 @@ def test_deterministic_predictions_repeat_and_others_vary(algorithm, kind):
     obs = observations(model)
     assert np.array_equal(model.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
     exploring = [model.predict(obs)[0] for _ in range(2)]
-    # The noise of numbers is the algorithm's, as in Stable-Baselines3
-    varies = ~model.policy.actions.is_continuous
+    # The noise of numbers is the algorithm's, as in Stable-Baselines3, but MASAC's actors draw them
+    varies = ~model.policy.actions.is_continuous | (algorithm is MASAC)
     assert np.array_equal((exploring[0] != exploring[1]).any(axis=0), varies)
 
 
