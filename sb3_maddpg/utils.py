@@ -1,5 +1,7 @@
 """Small helpers shared by the algorithm, its policy, its buffer and the zoo."""
 
+from __future__ import annotations
+
 import difflib
 import errno
 import functools
@@ -17,14 +19,15 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.errors import InvalidArgumentError
+
+if TYPE_CHECKING:  # the command line's help should not wait for PyTorch
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
 
 # Arguments of gymnasium.make and make_vec that end up among the environment's own
 NOT_THE_TASK = {"render_mode", "num_envs", "vectorization_mode", "vector_kwargs"}
@@ -77,6 +80,17 @@ def suggest(kind: str, name: Any, known: Iterable[str]) -> str:
     return f"Unknown {kind} '{name[:100]}'. Choose one of: {', '.join(known)}."
 
 
+def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.7) -> str:
+    """
+    :param name: an unknown name
+    :param known: the known names
+    :param cutoff: minimum similarity, see ``difflib``
+    :return: a question about the closest known name, to append to a message; empty if there is none
+    """
+    nearest = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
+    return f" Did you mean '{nearest[0]}'?" if nearest else ""
+
+
 def remove_empty_log_folder(model: BaseAlgorithm) -> None:
     """
     Remove the folder that Stable-Baselines3 creates among the temporary files for a logger without files.
@@ -97,6 +111,8 @@ def describe_env(env: VecEnv) -> dict[str, Any] | None:
     :return: ``{"id": ..., "kwargs": ...}`` without arguments that do not define the task, such as the render mode. None
         if the environment was not created by ``gymnasium.make`` or its arguments cannot be written as JSON.
     """
+    from gymnasium.envs.registration import EnvSpec
+
     try:
         spec = env.get_attr("spec", indices=0)[0]
     except (AttributeError, NotImplementedError):  # e.g. a SuperSuit vector environment

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
-import json
 import os
 import random
 import shutil
@@ -31,9 +30,8 @@ from tqdm import tqdm
 
 from quad_swarm.evaluation import command as evaluation
 from quad_swarm.evaluation.rows import write_rows
-from sb3_maddpg.cli import zoo
-from sb3_maddpg.cli.commands import main as command_line
-from sb3_maddpg.cli.experiment import TeamExperimentManager
+from sb3_maddpg.cli import study, training
+from sb3_maddpg.cli.main import main as command_line
 from sb3_maddpg.cli.safety import RunLoader
 
 SECONDS = 60.0
@@ -216,23 +214,20 @@ def run_folders(rng: random.Random, folder: Path) -> list[str]:
     return [command, "--env", "OwnBit-v0", "-n", "20", *(["--no-render"] if command == "enjoy" else [])]
 
 
-def commands_of_runs(rng: random.Random, folder: Path) -> list[str]:
-    """Resume the run of someone else whose command is wrong."""
-    path = folder / "logs/maddpg/OwnBit-v0_1/command.json"
-    command = json.loads(path.read_text()) | {"signature": "someone else's"}
-    kind = rng.choice(("words", "words", "words", "value", "text"))
-    if kind == "words":
-        words = rng.choice((parameters, env_arguments, options))(rng, folder)[3:]
-        command["argv"] = [*command["argv"], *words]
-    elif kind == "value":
-        command[rng.choice(list(command))] = rng.choice([one for one in NASTY if not isinstance(one, bytes)])
-    text = json.dumps(command)
-    path.write_text(text[: rng.randrange(len(text))] if kind == "text" else text)
-    return ["train", "--resume", str(path.parent)]
+def resumed_runs(rng: random.Random, folder: Path) -> list[str]:
+    """Resume the run of someone else whose options or recipe are wrong."""
+    path = folder / "logs/maddpg/OwnBit-v0_1/OwnBit-v0" / rng.choice(("config.yml", "args.yml"))
+    values = dict(yaml.load(path.read_bytes(), RunLoader))
+    text = yaml.dump(_mutated(values, rng))
+    if rng.random() < 0.2:
+        text = rng.choice((text[: rng.randrange(len(text))], _text(rng.choice(NASTY))))
+    path.write_text(text, errors="surrogateescape")
+    words = rng.choice((parameters, env_arguments, options))(rng, folder)[3:] if rng.random() < 0.3 else []
+    return ["train", "--resume", str(path.parents[1]), *words]
 
 
 KINDS: tuple[Callable[[random.Random, Path], list[str]], ...] = (
-    *(parameters, env_arguments, recipe, options, worlds, policies, run_folders, commands_of_runs),
+    *(parameters, env_arguments, recipe, options, worlds, policies, run_folders, resumed_runs),
 )
 
 
@@ -320,10 +315,10 @@ def main() -> None:
         recorder = Recorder(folder)
         flies = (patch.object(evaluation, "evaluate", _accept), patch("quad_swarm.figures.replay.replay_page", _accept))
         trains = (
-            patch.object(TeamExperimentManager, "learn", _accept),
-            patch.object(TeamExperimentManager, "hyperparameters_optimization", _accept),
-            patch.object(zoo, "train_seeds", _accept),
-            patch.object(zoo, "search", _accept),
+            patch.object(training.Training, "learn", _accept),
+            patch.object(study.Search, "run", _accept),
+            patch.object(training, "train_seeds", _accept),
+            patch.object(study, "search", _accept),
         )
         with contextlib.ExitStack() as stack:
             for one in (*flies, *trains):

@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import tempfile
 
 import pytest
 
@@ -12,9 +11,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# The key that signs commands of runs does not belong into the home of whoever runs the tests
-_STATE = tempfile.TemporaryDirectory(prefix="sb3-maddpg-state-")
-os.environ["XDG_STATE_HOME"] = _STATE.name
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,9 @@
 """``sb3-maddpg bench``: how fast a recipe trains on this machine, and where the time goes."""
 
+from __future__ import annotations
+
+import argparse
 import contextlib
-import functools
 import json
 import sys
 import tempfile
@@ -10,13 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import rl_zoo3.train
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_maddpg.cli import zoo
-from sb3_maddpg.cli.experiment import TeamExperimentManager
-from sb3_maddpg.cli.options import check_writable, common_options
-from sb3_maddpg.cli.recipes import LengthOption, check_options
+from sb3_maddpg.cli.experiment import begin, given_recipe
+from sb3_maddpg.cli.options import check_writable
+from sb3_maddpg.cli.training import Training
 
 # Timed parts of an algorithm and their methods. A method that the algorithm lacks counts as 0 seconds.
 PARTS = {"learning": "train", "acting": "_sample_action"}
@@ -41,23 +42,12 @@ def timed(function: Callable[..., Any], total: list[float]) -> Callable[..., Any
     return call
 
 
-class BenchManager(TeamExperimentManager):
-    """
-    Experiment manager that measures training times and saves nothing else.
+class _Timed(Training):
+    """Training that measures times and saves no model."""
 
-    :param result: receives the times, since rl_zoo3 does not expose its manager
-    """
+    result: dict[str, Any]
 
-    def __init__(self, result: dict[str, Any], *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.result = result
-
-    def learn(self, model: BaseAlgorithm) -> None:
-        """
-        Train a model and measure the times.
-
-        :param model: a new model
-        """
+    def learn(self, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
         totals = {name: [0.0] for name in (*PARTS, "environments")}
         for name, attribute in PARTS.items():
             if hasattr(model, attribute):
@@ -65,64 +55,54 @@ class BenchManager(TeamExperimentManager):
         assert model.env is not None
         model.env.step = timed(model.env.step, totals["environments"])  # type: ignore[method-assign]
         started = time.perf_counter()
-        super().learn(model)
+        super().learn(model, callbacks)
         seconds = time.perf_counter() - started
         shares = {name: total[0] / seconds for name, total in totals.items()}
         shares["rest"] = 1 - sum(shares.values())
-        self.result.update(
-            env=self.env_name.gym_id,
-            algo=self.algo,
-            steps=model.num_timesteps,
-            updates=getattr(model, "_n_updates", 0),
-            seconds=seconds,
-            steps_per_second=model.num_timesteps / seconds,
+        self.result = {
+            "env": self.args.env,
+            "algo": self.args.algo,
+            "steps": model.num_timesteps,
+            "updates": getattr(model, "_n_updates", 0),
+            "seconds": seconds,
+            "steps_per_second": model.num_timesteps / seconds,
             **{f"share_{name}": share for name, share in shares.items()},
-        )
+        }
 
-    def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """
-        Do nothing.
-
-        :param model: unused
-        """
+    def save(self, model: BaseAlgorithm) -> None:
+        """Do nothing, unless the training was interrupted."""
+        if self.interrupted:
+            raise KeyboardInterrupt
 
 
-def main(argv: list[str]) -> int:
+def bench(args: argparse.Namespace, words: list[str]) -> int:
     """
-    :param argv: options of ``sb3-maddpg train``, and ``--json FILE``, where ``-`` is the standard output
+    :param args: options of ``bench``
+    :param words: unused
     :return: exit status
     """
-    parser = common_options()
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--n-timesteps", "-n", type=int, default=20_000)
-    known, given = parser.parse_known_args(argv)
-    piped = known.json == Path("-")
+    piped = args.json == Path("-")
     printed = sys.stderr if piped else sys.stdout
-    if known.json and not piped:
-        check_writable(known.json)
-    check_options(known, LengthOption)
-    zoo.register()
-    result: dict[str, Any] = {}
-    rl_zoo3.train.ExperimentManager = functools.partial(BenchManager, result)  # type: ignore[assignment,misc]
-    with tempfile.TemporaryDirectory() as folder:
-        options = ["--algo", known.algo, "--n-timesteps", str(known.n_timesteps), "--log-folder", folder]
-        options += ["--env", known.env] if known.env else []
-        options += ["--progress"] if sys.stderr.isatty() else []
-        with contextlib.redirect_stdout(printed):
-            zoo.train([*options, "--eval-freq", "-1", "--verbose", "0", "--seed", "0", *given], "bench")
+    if args.json and not piped:
+        check_writable(args.json)
+    args.n_timesteps = 20_000 if args.n_timesteps < 0 else args.n_timesteps
+    args.progress = args.progress or sys.stderr.isatty()
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(printed):
+        args.log_folder = folder
+        begin(args)
+        training = _Timed(args, *given_recipe(args))
+        training.run()
+    result = training.result
     print(
-        f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: ", end="", file=printed
+        f"{result['steps']} steps and {result['updates']} updates in {result['seconds']:.1f} s: "
+        f"{result['steps_per_second']:.0f} steps/s",
+        file=printed,
     )
-    print(f"{result['steps_per_second']:.0f} steps/s", file=printed)
     for name in ("environments", "learning", "acting", "rest"):
         print(f"  {name:13} {result[f'share_{name}']:6.1%}", file=printed)
     if piped:
         print(json.dumps(result))
-    elif known.json:
-        known.json.write_text(json.dumps(result) + "\n")
-        print(f"wrote {known.json}")
+    elif args.json:
+        args.json.write_text(json.dumps(result) + "\n")
+        print(f"wrote {args.json}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit("error: this module is not a command: use `sb3-maddpg bench` or `python -m sb3_maddpg bench`.")

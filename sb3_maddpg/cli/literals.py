@@ -1,25 +1,25 @@
 """Parsing of values on the command line and in recipes without running code."""
 
-import argparse
+from __future__ import annotations
+
 import ast
+import importlib
 import itertools
 import math
 from typing import Any
 
-import torch
 import yaml
-from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
 from sb3_maddpg.utils import shown, told
 
 WORDS = {"true": True, "false": False, "null": None, "none": None}
 NOT_FINITE = ("nan", "inf", "infinity")
-SEQUENCES = {"list": list, "tuple": tuple}
-# Modules of the classes that recipes of rl_zoo3 name: activation functions and optimizers
+# The classes that recipes of rl_zoo3 name: activation functions and optimizers
 CLASSES = {
-    **{name: (torch.nn, torch.nn.Module) for name in ("nn", "th.nn", "torch.nn")},
-    **{name: (torch.optim, torch.optim.Optimizer) for name in ("th.optim", "torch.optim")},
+    **dict.fromkeys(("nn", "th.nn", "torch.nn"), ("torch.nn", "Module")),
+    **dict.fromkeys(("th.optim", "torch.optim"), ("torch.optim", "Optimizer")),
 }
+_LITERALS = (ast.Expression, ast.Constant, ast.List, ast.Tuple, ast.Dict, ast.Load)
 
 # Maximum number of values in a YAML file after replacing its aliases by what they stand for
 _MOST_VALUES = 100_000
@@ -36,7 +36,7 @@ def parse_literal(text: str) -> Any:
     :raises ValueError: if the text is anything else, or contains a number that is not finite
     """
     try:
-        return _finite(_value(ast.parse(text.strip(), mode="eval").body))
+        return _finite(ast.literal_eval(_Literals().visit(ast.parse(text.strip(), mode="eval"))))
     except SyntaxError as error:
         raise ValueError(f"{shown(text)} is not valid Python: {error.msg}") from error
     except (RecursionError, MemoryError):  # Python's parser raises either
@@ -81,44 +81,75 @@ def _is_word(text: str) -> bool:
     return any(isinstance(node, ast.Name) for node in ast.walk(tree))
 
 
-def _value(node: ast.expr) -> Any:
-    match node:
-        case ast.Constant(value=bool() | int() | float() | str() | None as value):
-            return value
-        case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=ast.Constant(value=int() | float() as value)):
-            return -value if isinstance(node.op, ast.USub) else value
-        case ast.List(elts=elements):
-            return [_value(element) for element in elements]
-        case ast.Tuple(elts=elements):
-            return tuple(_value(element) for element in elements)
-        case ast.Dict(keys=keys, values=values) if None not in keys:
-            return {_key(key): _value(value) for key, value in zip(keys, values, strict=True)}
-        case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(one.arg for one in keywords):
-            return {one.arg: _value(one.value) for one in keywords}
-        case ast.Call(func=ast.Name(id="list" | "tuple" as name), args=[argument], keywords=[]):
-            if isinstance(elements := _value(argument), (list, tuple)):
-                return SEQUENCES[name](elements)
-            raise ValueError(f"{name}({shown(elements)}) needs a list or a tuple: write {name}([...])")
-        case ast.Name(id="RMSpropTFLike"):
-            return RMSpropTFLike
-        case ast.Attribute(value=module, attr=name) if ast.unparse(module) in CLASSES:
-            package, base = CLASSES[ast.unparse(module)]
-            found = getattr(package, name, None)
-            if isinstance(found, type) and issubclass(found, base):
-                return found
-            raise ValueError(f"there is no class {name} in {package.__name__}")
-    raise ValueError(
-        f"{ast.unparse(node)} is not evaluated: write numbers, quoted text, lists, dicts or classes of torch.nn"
-    )
+class _Literals(ast.NodeTransformer):
+    """
+    Makes a tree one for ``ast.literal_eval``: calls of dict, list and tuple become displays, and classes of PyTorch
+    become constants. It refuses all else.
+    """
+
+    def visit(self, node: ast.AST) -> Any:
+        found = super().visit(node)
+        if not isinstance(found, _LITERALS):
+            raise ValueError(
+                f"{_text(node)} is not evaluated: write numbers, quoted text, lists, dicts or classes of torch.nn"
+            )
+        return found
+
+    def visit_Constant(self, node: ast.Constant) -> Any:
+        return node if isinstance(node.value, (bool, int, float, str, type(None))) else ast.Pass()
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> Any:
+        match node:
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=ast.Constant(value=int() | float() as value)):
+                return ast.Constant(-value if isinstance(node.op, ast.USub) else value)
+        return node
+
+    def visit_Dict(self, node: ast.Dict) -> Any:
+        if None in node.keys:  # {**more}
+            return ast.Pass()
+        node = self.generic_visit(node)  # type: ignore[assignment]
+        for key in node.keys:
+            try:
+                hash(ast.literal_eval(key))  # type: ignore[arg-type]
+            except TypeError:
+                raise ValueError(f"{_text(key)} cannot be the key of a dict") from None
+        return node
+
+    def visit_Call(self, node: ast.Call) -> Any:
+        match node:
+            case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(one.arg for one in keywords):
+                return ast.Dict(
+                    [ast.Constant(one.arg) for one in keywords], [self.visit(one.value) for one in keywords]
+                )
+            case ast.Call(func=ast.Name(id="list" | "tuple" as name), args=[argument], keywords=[]):
+                elements = self.visit(argument)
+                if not isinstance(elements, (ast.List, ast.Tuple)):
+                    raise ValueError(f"{_text(node)} needs a list or a tuple: write {name}([...])")
+                return (ast.List if name == "list" else ast.Tuple)(elements.elts, ast.Load())
+        return node
+
+    def visit_Name(self, node: ast.Name) -> Any:
+        return ast.Constant(_rmsprop()) if node.id == "RMSpropTFLike" else node
+
+    def visit_Attribute(self, node: ast.Attribute) -> Any:
+        if (name := ast.unparse(node.value)) not in CLASSES:
+            return node
+        package, base = CLASSES[name]
+        module = importlib.import_module(package)
+        found = getattr(module, node.attr, None)
+        if not (isinstance(found, type) and issubclass(found, getattr(module, base))):
+            raise ValueError(f"there is no class {node.attr} in {package}")
+        return ast.Constant(found)  # type: ignore[arg-type]
 
 
-def _key(node: ast.expr | None) -> Any:
-    key = _value(node)  # type: ignore[arg-type]
-    try:
-        hash(key)
-    except TypeError:
-        raise ValueError(f"{shown(key)} cannot be the key of a dict") from None
-    return key
+def _text(node: Any) -> str:
+    return ast.unparse(node)[:200]
+
+
+def _rmsprop() -> Any:
+    from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+
+    return RMSpropTFLike
 
 
 def _finite(value: Any) -> Any:
@@ -146,31 +177,10 @@ def format_literal(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(map(format_literal, value)) + "]"
     if isinstance(value, type):
-        module = "optim" if issubclass(value, torch.optim.Optimizer) else "nn"
-        return value.__name__ if value is RMSpropTFLike else f"th.{module}.{value.__name__}"
+        if value.__name__ == "RMSpropTFLike":
+            return value.__name__
+        return f"th.{'optim' if value.__module__.startswith('torch.optim') else 'nn'}.{value.__name__}"
     return repr(value)
-
-
-class StoreValues(argparse.Action):
-    """
-    Action that stores ``key:value key:value`` as a dict, for rl_zoo3's options. Unlike rl_zoo3's own action, it
-    evaluates nothing, see ``parse_value``. If the option is repeated, its pairs come together.
-    """
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        before = getattr(namespace, self.dest, None)
-        pairs: dict[str, Any] = {} if before is None or before is self.default else dict(before)
-        try:
-            for word in values:
-                key, _, value = word.partition(":")
-                if not key or not value:
-                    raise ValueError(f"'{word}' has no value")
-                if key in pairs:
-                    raise ValueError(f"'{key}' is given twice")
-                pairs[key] = parse_value(value)
-        except ValueError as error:
-            raise ValueError(f"{option_string} {shown(' '.join(values))}: {error}. Write key:value.") from error
-        setattr(namespace, self.dest, pairs)
 
 
 class Refused(ValueError):

@@ -1,4 +1,4 @@
-"""Overview of algorithms, environments, models and recipes for ``--help``, read from the registries."""
+"""Overview of algorithms, environments, models and recipes for ``--help-all``, read from the registries."""
 
 import importlib
 import shutil
@@ -9,15 +9,9 @@ from pathlib import Path
 import gymnasium
 import yaml
 
-from sb3_maddpg.common.team_algorithm import TeamAlgorithm
+from sb3_maddpg.cli.algorithms import ALGORITHMS, SINGLE_AGENT
 from sb3_maddpg.hub.pretrained import pretrained_models
-from sb3_maddpg.iddpg.iddpg import IDDPG
-from sb3_maddpg.maddpg.maddpg import MADDPG
-from sb3_maddpg.masac.masac import MASAC
-from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.offers import load_offer, offers
-
-ALGORITHMS: dict[str, type[TeamAlgorithm]] = {"maddpg": MADDPG, "matd3": MATD3, "masac": MASAC, "iddpg": IDDPG}
 
 
 def load_environments() -> None:
@@ -52,7 +46,7 @@ def overview() -> str:
     :return: text that lists algorithms, environments, pretrained models and recipes
     """
     found = {
-        "algorithms": [*ALGORITHMS, "rl_zoo3's (`train --help`)"],
+        "algorithms": [*ALGORITHMS, *SINGLE_AGENT],
         "environments": [*environments(), "PACKAGE/MODULE of PettingZoo"],
         "models": [f"pretrained:{name}" for name in pretrained_models()],
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import ctypes
 import os
@@ -15,11 +16,12 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Protocol
 
+from sb3_maddpg.cli.options import ENGINES
 from sb3_maddpg.cli.terminal import tell
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.utils import suggest
 from sb3_maddpg.vec_env.ray_cluster import connect
 
-ENGINES = ("local", "ray")
 SECONDS_TO_END = 60.0  # time for a process to write its last checkpoint
 _RETRIES = 3  # number of times that Ray restarts a process whose machine was lost
 
@@ -54,14 +56,14 @@ def run_all(jobs: Sequence[Job], parallel: int, engine: str = "local", address: 
         a command whose process or machine is lost is then repeated elsewhere
     :param address: address of the cluster, see ``connect``; its size then decides how many processes run at a time
     :return: exit status of the first command that failed, 0 if none did
-    :raises ValueError: if arguments are invalid
+    :raises InvalidArgumentError: if arguments are invalid
     """
     if parallel < 1:
-        raise ValueError(f"--jobs {parallel} must be at least 1.")
+        raise InvalidArgumentError(f"--jobs {parallel} must be at least 1.")
     if engine not in ENGINES:
-        raise ValueError(suggest("engine", engine, ENGINES))
+        raise InvalidArgumentError(suggest("engine", engine, ENGINES))
     if address is not None and engine != "ray":
-        raise ValueError(f"--address {address} is for --engine ray only; leave it out.")
+        raise InvalidArgumentError(f"--address {address} is for --engine ray only; leave it out.")
     runs = _ClusterProcesses(address, parallel) if engine == "ray" else _Processes()
     handlers = {}
     for name in ("SIGTERM", "SIGHUP"):
@@ -89,6 +91,18 @@ def run_all(jobs: Sequence[Job], parallel: int, engine: str = "local", address: 
         for number, handler in handlers.items():
             signal.signal(number, handler)
     return failed
+
+
+def without_processes(words: list[str]) -> list[str]:
+    """
+    :param words: options of ``train``
+    :return: the options without those that say how many processes run, and where
+    """
+    parser = argparse.ArgumentParser(add_help=False)
+    for option in ("--seeds", "--seed", "--jobs", "--engine", "--address"):  # --seed is not an abbreviation of --seeds
+        parser.add_argument(option)
+    known, rest = parser.parse_known_args(words)
+    return rest if known.seed is None else [*rest, "--seed", known.seed]
 
 
 class _Processes:

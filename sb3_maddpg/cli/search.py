@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import optuna
-from huggingface_sb3 import EnvironmentName
 from optuna.storages import BaseStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 from optuna.trial import TrialState
 
 from sb3_maddpg.cli.options import PROG
-from sb3_maddpg.cli.processes import run_all
+from sb3_maddpg.cli.processes import run_all, without_processes
+from sb3_maddpg.cli.runs import name_of
+from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
 from sb3_maddpg.utils import process_runs, told
 
 STUDY = "search"
@@ -67,7 +68,7 @@ def open_storage(storage: str) -> BaseStorage | str:
         RecursionError,
         AssertionError,
     ) as error:
-        raise ValueError(
+        raise InvalidFileError(
             f"--storage {storage} is not a journal of Optuna ({told(error)}): name another file."
         ) from error
 
@@ -128,7 +129,7 @@ def check_trials(study: optuna.Study, storage: str) -> None:
             if any(isinstance(one, bool) or not isinstance(one, (int, float)) for one in numbers):
                 raise TypeError(f"trial {trial.number} has values that are no numbers")
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
-        raise ValueError(f"--storage {storage} is damaged ({told(error)}): name another one.") from error
+        raise InvalidFileError(f"--storage {storage} is damaged ({told(error)}): name another one.") from error
 
 
 def as_absolute(storage: str) -> str:
@@ -139,26 +140,26 @@ def as_absolute(storage: str) -> str:
     return str(Path(storage).resolve()) if storage.endswith(".log") else storage
 
 
-def enlist(study: optuna.Study) -> None:
+def register_worker(study: optuna.Study) -> None:
     """
     Note that this process works on a study. Call it before the first trial: a process may be killed after Optuna
-    created a trial and before ``sign``.
+    created a trial and before ``mark_owner``.
 
     :param study: a study
     """
     study.set_user_attr(_WORKER + _me(), True)
 
 
-def sign(trial: optuna.Trial) -> None:
+def mark_owner(trial: optuna.Trial) -> None:
     """
-    Mark a trial as run by this process, for ``bring_back``.
+    Mark a trial as run by this process, for ``retry_lost_trials``.
 
     :param trial: a trial that starts
     """
     trial.set_user_attr(_PROCESS, _me())
 
 
-def bring_back(study: optuna.Study) -> int:
+def retry_lost_trials(study: optuna.Study) -> int:
     """
     Mark the trials of dead processes on this machine as failed and queue their hyperparameters again. Trials of other
     machines are left alone, since it is unknown whether they are still running, except those of a worker that a cluster
@@ -184,35 +185,28 @@ def bring_back(study: optuna.Study) -> int:
     return count
 
 
-def search(argv: list[str], jobs: int, log_folder: str, engine: str = "local", address: str | None = None) -> int:
+def search(args: argparse.Namespace, words: list[str]) -> int:
     """
     Search with several workers, which share a study, and print where the best trial is.
 
-    :param argv: arguments of ``tune``, without the log folder
-    :param jobs: number of workers
-    :param log_folder: folder of the logs; the output of each worker goes to ``search_K.log`` there
-    :param engine: see ``run_all``
-    :param address: see ``run_all``
+    :param args: options of ``tune``
+    :param words: the options as they were given; the output of each worker goes to ``search_K.log`` in the log folder
     :return: exit status of the first worker that failed, 0 if none did
-    :raises ValueError: if arguments are invalid
+    :raises InvalidArgumentError: if arguments are invalid
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--algo", default="maddpg")
-    parser.add_argument("--env")
-    parser.add_argument("--storage")
-    parser.add_argument("--study-name")
-    parser.add_argument("--n-trials", type=int, default=500)
-    parser.add_argument("--max-total-trials", type=int)
-    known, _ = parser.parse_known_args(argv)
-    if known.storage is None or known.study_name is None:
-        raise ValueError("--jobs and --engine ray need --storage and --study-name: the workers share that study.")
-    total = known.max_total_trials or known.n_trials
-    argv = [*argv, "--log-folder", log_folder, "--max-total-trials", str(total)]
-    Path(log_folder).mkdir(parents=True, exist_ok=True)
-    workers = [_Worker(number, argv, Path(log_folder)) for number in range(1, max(min(jobs, total), 1) + 1)]
-    failed = run_all(workers, jobs, engine, address)
-    if not failed and known.env is not None:
-        tell_best(known.algo, known.env, best_recipe(Path(log_folder, known.algo), EnvironmentName(known.env)))
+    if args.storage is None or args.study_name is None:
+        raise InvalidArgumentError(
+            "--jobs and --engine ray need --storage and --study-name: the workers share that study."
+        )
+    jobs = 1 if args.jobs is None else args.jobs
+    total = args.max_total_trials or args.n_trials
+    words = [*without_processes(words), "--max-total-trials", str(total)]
+    folder = Path(args.log_folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    workers = [_Worker(number, words, folder) for number in range(1, max(min(jobs, total), 1) + 1)]
+    failed = run_all(workers, jobs, args.engine, args.address)
+    if not failed and args.env is not None:
+        tell_best(args.algo, args.env, best_recipe(folder / args.algo, name_of(args.env)))
     return failed
 
 
@@ -234,7 +228,7 @@ def tell_best(algo: str, env_id: str, best: Path) -> None:
 @dataclass(frozen=True)
 class _Worker:
     number: int
-    argv: list[str]
+    words: list[str]
     log_folder: Path
     identity: str = field(default_factory=lambda: uuid.uuid4().hex)
 
@@ -251,7 +245,7 @@ class _Worker:
         return {_IDENTITY: self.identity}
 
     def command(self) -> tuple[list[str], str]:
-        return ["train", *self.argv], "starts"
+        return ["tune", *self.words], "starts"
 
 
 def _me() -> str:

@@ -6,16 +6,36 @@ import argparse
 import contextlib
 import re
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from sb3_maddpg.checkpoints.checkpoints import locked, newest
-from sb3_maddpg.cli.command_files import COMMAND_FILE, read_command, resumable, write_command
-from sb3_maddpg.cli.experiment import CHECKPOINTS
-from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all
+from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all, without_processes
+from sb3_maddpg.cli.resuming import parsed
+from sb3_maddpg.cli.runs import CHECKPOINTS
+from sb3_maddpg.cli.safety import as_yaml, read_settings
+from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.utils import shown
 
 MOST_SEEDS = 10_000  # of a range
+# Options that do not change a training
+_ASIDE = (
+    "resume",
+    "seeds",
+    "jobs",
+    "engine",
+    "address",
+    "log_folder",
+    "debug",
+    "quiet",
+    "trust",
+    "command",
+    "progress",
+)
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -24,49 +44,37 @@ def parse_seeds(text: str) -> list[int]:
 
     :param text: numbers and ranges, such as ``0-4,7``
     :return: the seeds without duplicates
-    :raises ValueError: if the text is anything else
+    :raises InvalidArgumentError: if the text is anything else
     """
     seeds: dict[int, None] = {}
     for part in text.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
         if match is None or (match[2] and int(match[2]) < int(match[1])):
-            raise ValueError(f"--seeds {shown(text)}: write numbers and ranges, such as 0-4 or 0,3,7-9.")
+            raise InvalidArgumentError(f"--seeds {shown(text)}: write numbers and ranges, such as 0-4 or 0,3,7-9.")
         first, last = int(match[1]), int(match[2] or match[1])
         if last - first >= MOST_SEEDS:
-            raise ValueError(f"--seeds {shown(text)}: a range holds at most {MOST_SEEDS} seeds.")
+            raise InvalidArgumentError(f"--seeds {shown(text)}: a range holds at most {MOST_SEEDS} seeds.")
         seeds |= dict.fromkeys(range(first, last + 1))
     return list(seeds)
 
 
-def train_seeds(
-    argv: list[str],
-    seeds: list[int],
-    jobs: int,
-    log_folder: str,
-    every: int | None = None,
-    engine: str = "local",
-    address: str | None = None,
-) -> int:
+def train_seeds(args: argparse.Namespace, words: list[str], seeds: list[int], jobs: int) -> int:
     """
     Train once per seed. Killed trainings are resumed, and finished ones are skipped.
 
-    :param argv: arguments of ``train``, without seed, log folder and checkpoints
+    :param args: options of ``train``
+    :param words: the options as they were given
     :param seeds: see ``parse_seeds``
-    :param jobs: number of trainings at a time
-    :param log_folder: folder of the runs; the output of each training goes to ``seed_K.log`` there
-    :param every: number of steps between checkpoints, None for checkpoints by time
-    :param engine: see ``run_all``
-    :param address: see ``run_all``
+    :param jobs: number of trainings at a time; the output of each goes to ``seed_K.log`` in the folder of the runs
     :return: exit status of the first training that failed, 0 if none did
-    :raises ValueError: if arguments are invalid
+    :raises InvalidArgumentError: if arguments are invalid
     """
-    options = argparse.ArgumentParser(add_help=False)  # rl_zoo3 accepts abbreviations
-    options.add_argument("--seed")
-    if options.parse_known_args(argv)[0].seed is not None:
-        raise ValueError("--seeds and --seed exclude each other: pass only one of them.")
-    folder = Path(log_folder)
+    if args.seed != -1:
+        raise InvalidArgumentError("--seeds and --seed exclude each other: pass only one of them.")
+    folder = Path(args.log_folder)
     folder.mkdir(parents=True, exist_ok=True)
-    return run_all([_Training(seed, argv, folder, every) for seed in seeds], jobs, engine, address)
+    words = without_processes(words)
+    return run_all([_Training(seed, words, folder) for seed in seeds], jobs, args.engine, args.address)
 
 
 @dataclass(frozen=True)
@@ -74,9 +82,8 @@ class _Training:
     """A training, which continues the run of an earlier command if that was killed."""
 
     seed: int
-    argv: list[str]
+    words: list[str]
     log_folder: Path
-    every: int | None
 
     @property
     def name(self) -> str:
@@ -91,28 +98,28 @@ class _Training:
         return {}
 
     def command(self) -> tuple[list[str], str]:
-        argv = [*self.argv, "--seed", str(self.seed), "--log-folder", str(self.log_folder)]
-        run = self._run_of(resumable(argv))
+        words = [*self.words, "--seed", str(self.seed)]
+        run = self._run_of(parsed(words))
         if run is not None:
             _wait_until_free(run / CHECKPOINTS)
             if newest(run / CHECKPOINTS) is not None:
-                command = read_command(run)
-                if command.folder is None:  # started elsewhere, but the user gives the same command here
-                    write_command(run, command.argv, command.every)
-                return ["train", "--resume", str(run)], f"resumes {run}"
+                return ["train", *words, "--resume", str(run)], f"resumes {run}"
             if not (run / CHECKPOINTS).exists() and any(run.glob("*.zip")):
                 return [], f"finished before, {run}"
-        every = [] if self.every is None else ["--checkpoint-every", str(self.every)]
-        return ["train", *argv, *every], "starts"
+        return ["train", *words], "starts"
 
-    def _run_of(self, argv: list[str]) -> Path | None:
-        """:return: the newest run that this command started, if there is one"""
-        found = []
-        for path in self.log_folder.glob(f"*/*/{COMMAND_FILE}"):
-            with contextlib.suppress(ValueError):
-                if resumable(read_command(path.parent).argv) == argv:
-                    found.append(path.parent)
-        return max(found, key=lambda run: (run / COMMAND_FILE).stat().st_mtime, default=None)
+    def _run_of(self, args: argparse.Namespace) -> Path | None:
+        """:return: the newest run that these options started, if there is one"""
+        expected, found = _compared(as_yaml(vars(args))), []
+        for path in self.log_folder.glob(f"{args.algo}/*/*/args.yml"):
+            with contextlib.suppress(OSError, ValueError, yaml.YAMLError):
+                if _compared(read_settings(path)) == expected:
+                    found.append((path.stat().st_mtime, path.parent.parent))
+        return max(found)[1] if found else None
+
+
+def _compared(options: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in options.items() if key not in _ASIDE and value not in (None, [], "", {})}
 
 
 def _wait_until_free(folder: Path) -> None:

@@ -1,7 +1,10 @@
-"""Search spaces of ``sb3-maddpg train -optimize`` for MADDPG, MATD3, MASAC and IDDPG."""
+"""Search spaces of ``sb3-maddpg tune`` for MADDPG, MATD3, MASAC and IDDPG."""
+
+from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple
 
 import optuna
 
@@ -16,55 +19,55 @@ WITHOUT_TEMPERATURE = ("expected", "score")
 MOST_UPDATES, FEWEST_UPDATES = 4, 200
 
 
-def sample_maddpg_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
+class Searched(NamedTuple):
+    """What a search space depends on."""
+
+    env: Any
+    """The environment, or anything with its spaces"""
+    hyperparams: Mapping[str, Any]
+    """Arguments of the algorithm in the recipe"""
+    policy_arguments: Collection[str]
+    """Names of the policy's arguments"""
+    n_envs: int
+    """Number of environments"""
+
+
+def sample_maddpg_params(trial: optuna.Trial, searched: Searched) -> dict[str, Any]:
     """
     Sample MADDPG's hyperparameters, as far as they matter to the team.
 
     :param trial: trial of a study
-    :param n_actions: unused, part of rl_zoo3's interface
-    :param n_envs: number of environments
-    :param additional_args: arguments of ``TeamExperimentManager``: ``env``, ``hyperparams`` (of the recipe) and
-        ``policy_arguments`` (names of the policy's arguments)
+    :param searched: what the search space depends on
     :return: arguments of the algorithm
     """
-    _suggest(trial, n_envs, additional_args)
+    _suggest(trial, searched)
     return convert_params(trial.params)
 
 
-def sample_matd3_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
+def sample_matd3_params(trial: optuna.Trial, searched: Searched) -> dict[str, Any]:
     """
     Sample MATD3's hyperparameters, see ``sample_maddpg_params``.
 
     :param trial: trial of a study
-    :param n_actions: unused
-    :param n_envs: number of environments
-    :param additional_args: see ``sample_maddpg_params``
+    :param searched: see ``sample_maddpg_params``
     :return: arguments of the algorithm
     """
-    actions = _suggest(trial, n_envs, additional_args)
+    actions = _suggest(trial, searched)
     trial.suggest_int("policy_delay", 1, 4)
     if actions.has_continuous:
         trial.suggest_float("target_policy_noise", 0.02, 0.5, log=True)
     return convert_params(trial.params)
 
 
-def sample_masac_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
+def sample_masac_params(trial: optuna.Trial, searched: Searched) -> dict[str, Any]:
     """
     Sample MASAC's hyperparameters, see ``sample_maddpg_params``.
 
     :param trial: trial of a study
-    :param n_actions: unused
-    :param n_envs: number of environments
-    :param additional_args: see ``sample_maddpg_params``
+    :param searched: see ``sample_maddpg_params``
     :return: arguments of the algorithm
     """
-    _suggest_shared(trial, n_envs, additional_args)
+    _suggest_shared(trial, searched)
     trial.suggest_categorical("ent_coef", ["auto_0.1", "auto_0.01", 0.1, 0.01, 0.001])
     return convert_params(trial.params)
 
@@ -89,15 +92,15 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return {**params, "policy_kwargs": policy_kwargs} if policy_kwargs else params
 
 
-def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) -> TeamActions:
+def _suggest(trial: optuna.Trial, searched: Searched) -> TeamActions:
     """
     Suggest the hyperparameters that MADDPG has.
 
     :return: the team's actions
     """
-    actions = _suggest_shared(trial, n_envs, additional_args)
+    actions = _suggest_shared(trial, searched)
     trial.suggest_float("policy_regularization", 1e-5, 1e-2, log=True)
-    if actions.has_continuous and "action_noise" not in additional_args["hyperparams"]:
+    if actions.has_continuous and "action_noise" not in searched.hyperparams:
         trial.suggest_float("first_noise", 0.1, 1.0, log=True)
         trial.suggest_float("last_noise", 0.01, 0.3, log=True)
     if actions.discrete:
@@ -107,29 +110,30 @@ def _suggest(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) 
     return actions
 
 
-def _suggest_shared(trial: optuna.Trial, n_envs: int, additional_args: dict[str, Any]) -> TeamActions:
+def _suggest_shared(trial: optuna.Trial, searched: Searched) -> TeamActions:
     """
     Suggest the hyperparameters that all algorithms have.
 
     :return: the team's actions
     """
-    env = additional_args["env"]
-    team = Team.from_spaces(env.observation_space, env.action_space)
+    team = Team.from_spaces(searched.env.observation_space, searched.env.action_space)
     actions = TeamActions(team.action_spaces)
     trial.suggest_float("learning_rate", 1e-4, 3e-2, log=True)
     # A batch must not be larger than the replay buffer, whose size the recipe sets
-    buffer_size = int(additional_args["hyperparams"].get("buffer_size", max(BATCH_SIZES)))
+    buffer_size = int(searched.hyperparams.get("buffer_size", max(BATCH_SIZES)))
     sizes = [size for size in BATCH_SIZES if size <= buffer_size] or [buffer_size]
     trial.suggest_categorical("batch_size", sizes)
     trial.suggest_float("tau", 1e-3, 5e-2, log=True)
     one_minus_gamma = trial.suggest_float("one_minus_gamma", 5e-3, 2e-1, log=True)
     trial.set_user_attr("gamma", 1 - one_minus_gamma)
     # Counted in steps of all environments at once
-    trial.suggest_int("train_freq", max(MOST_UPDATES // n_envs, 1), max(FEWEST_UPDATES // n_envs, 1), log=True)
+    trial.suggest_int(
+        "train_freq", max(MOST_UPDATES // searched.n_envs, 1), max(FEWEST_UPDATES // searched.n_envs, 1), log=True
+    )
     trial.suggest_categorical("gradient_steps", [1, 2, 4])
     trial.suggest_int("n_steps", 1, 5)
     trial.suggest_categorical("net_arch", list(NET_ARCHS))
-    if "share_actor" in additional_args["policy_arguments"] and (groups := _homogeneous_groups(team)):
+    if "share_actor" in searched.policy_arguments and (groups := _homogeneous_groups(team)):
         # Optuna does not support lists as choices
         sharing = ["false", "true" if len(groups[0]) == team.n_agents else json.dumps(groups)]
         trial.suggest_categorical("share_actor", sharing)
@@ -148,3 +152,11 @@ def _homogeneous_groups(team: Team) -> list[list[int]]:
         else:
             groups.append([agent])
     return [group for group in groups if len(group) > 1]
+
+
+SPACES: dict[str, Callable[[optuna.Trial, Searched], dict[str, Any]]] = {
+    "maddpg": sample_maddpg_params,
+    "matd3": sample_matd3_params,
+    "masac": sample_masac_params,
+    "iddpg": sample_maddpg_params,
+}

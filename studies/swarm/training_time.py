@@ -11,12 +11,12 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
+from pydoc import locate
 from typing import Any
 
 import gymnasium
 import torch as th
 import yaml
-from rl_zoo3.utils import get_class_by_name
 from stable_baselines3.common.vec_env import VecMonitor
 
 from quad_swarm.evaluation.rows import write_rows
@@ -33,7 +33,7 @@ def measure(recipe: str, steps: int | None) -> dict[str, Any]:
     steps = steps or hyperparams["n_timesteps"]
     del hyperparams["n_timesteps"]
     if "replay_buffer_class" in hyperparams:
-        hyperparams["replay_buffer_class"] = get_class_by_name(hyperparams["replay_buffer_class"])
+        hyperparams["replay_buffer_class"] = locate(hyperparams["replay_buffer_class"])
     rate = float(str(hyperparams.pop("learning_rate")).removeprefix("lin_"))
     envs = gymnasium.make_vec("QuadSwarm-v0", hyperparams.pop("n_envs"), **hyperparams.pop("env_kwargs"))
     env = VecMonitor(GymnasiumVecEnv(envs))

@@ -1,6 +1,7 @@
 """The scripts in examples/ run."""
 
 import importlib.util
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,13 +16,40 @@ from sb3_maddpg import MADDPG
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
+WORDS = {"rl_zoo3_train.py": ["--algo", "masac", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "100"]}
+RECIPE = "OwnBit-v0: {n_timesteps: 300, policy: MlpPolicy, learning_starts: 50, batch_size: 16, buffer_size: 500}\n"
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
 def test_runs_in_its_short_form(name, tmp_path):
-    command = [sys.executable, str(EXAMPLES / name), "--quick"]
+    (tmp_path / "r.yml").write_text(RECIPE)
+    command = [sys.executable, str(EXAMPLES / name), *WORDS.get(name, ["--quick"])]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout
     assert f"]({name})" in (EXAMPLES / "README.md").read_text()
+
+
+@pytest.mark.parametrize("by", ["sb3_maddpg", "rl_zoo3"])
+def test_both_zoos_show_and_plot_the_runs_of_each_other(by, tmp_path):
+    """Folders, files and options are the same."""
+    (tmp_path / "r.yml").write_text(RECIPE)
+    zoo = [sys.executable, str(EXAMPLES / "rl_zoo3_train.py")]
+    own = [sys.executable, "-m", "sb3_maddpg"]
+    words = ["--algo", "maddpg", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "100", "--verbose", "0"]
+    enjoy = ["--algo", "maddpg", "--env", "OwnBit-v0", "-f", "logs", "-n", "30", "--no-render"]
+    hook = f"import runpy; runpy.run_path({str(EXAMPLES / 'rl_zoo3_train.py')!r}); "
+    plot = [sys.executable, "-m", "rl_zoo3.plots.plot_train", "--algo", "maddpg", "--env", "OwnBit-v0", "-f", "logs"]
+    for command in (
+        [*([*own, "train"] if by == "sb3_maddpg" else zoo), *words],
+        [*own, "enjoy", *enjoy],
+        [sys.executable, "-c", f"{hook}from rl_zoo3.enjoy import enjoy; enjoy()", *enjoy],
+        plot,
+    ):
+        env = {**os.environ, "MPLBACKEND": "Agg"}
+        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, (command, done.stderr)
+        assert command is plot or "train" in command or command[:2] == zoo or "3 Episodes" in done.stdout
 
 
 def test_the_single_file_does_the_update_of_the_package():

@@ -55,6 +55,13 @@ DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command"}
 NEED_NO_TEST = {"sb3_maddpg.__main__", "sb3_maddpg.callbacks", "quad_swarm.figures.colours"}
 # Modules that are tested through what is built on them
 TESTED_WITH = {
+    "sb3_maddpg.cli.algorithms": "sb3_maddpg.cli.experiment",
+    "sb3_maddpg.cli.environments": "sb3_maddpg.cli.experiment",
+    "sb3_maddpg.cli.models": "sb3_maddpg.cli.main",
+    "sb3_maddpg.cli.offered": "sb3_maddpg.cli.experiment",
+    "sb3_maddpg.cli.runs": "sb3_maddpg.cli.training",
+    "sb3_maddpg.cli.show": "sb3_maddpg.cli.experiment",
+    "sb3_maddpg.cli.study": "sb3_maddpg.cli.search",
     "sb3_maddpg.common.action_noise": "sb3_maddpg.common.actions",
     "sb3_maddpg.common.arguments": "sb3_maddpg.maddpg.maddpg",
     "sb3_maddpg.common.layout": "sb3_maddpg.relational.policy",

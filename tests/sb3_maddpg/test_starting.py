@@ -11,10 +11,10 @@ import pytest
 SLOW = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nimport time\ntime.sleep(60)\n"
 
 
-@pytest.mark.parametrize("words", [["-m", "sb3_maddpg", "pretrained"], ["sb3-maddpg", "pretrained"]])
+@pytest.mark.parametrize("words", [["-m", "sb3_maddpg", "train"], ["sb3-maddpg", "train"]])
 def test_ctrl_c_during_the_imports_is_one_line(words, tmp_path):
     (tmp_path / "torch.py").write_text(SLOW)
-    (tmp_path / "sb3-maddpg").write_text("from sb3_maddpg.cli.commands import main\nmain()\n")
+    (tmp_path / "sb3-maddpg").write_text("from sb3_maddpg.cli.main import main\nmain()\n")
     if words[0] != "-m":
         words = [str(tmp_path / words[0]), *words[1:]]
     done = subprocess.run(
@@ -26,7 +26,7 @@ def test_ctrl_c_during_the_imports_is_one_line(words, tmp_path):
 
 def test_other_programs_keep_their_keyboard_interrupt(tmp_path):
     (tmp_path / "torch.py").write_text(SLOW)
-    program = "try:\n    import sb3_maddpg\nexcept KeyboardInterrupt:\n    print('as usual')\n"
+    program = "try:\n    from sb3_maddpg import MADDPG\nexcept KeyboardInterrupt:\n    print('as usual')\n"
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True
     )
@@ -36,7 +36,7 @@ def test_other_programs_keep_their_keyboard_interrupt(tmp_path):
 def test_background_jobs_keep_ignoring_it(tmp_path):
     (tmp_path / "torch.py").write_text(SLOW.replace("time.sleep(60)", "print('goes on', flush=True)\nos._exit(0)"))
     done = subprocess.run(
-        [sys.executable, "-m", "sb3_maddpg", "pretrained"],
+        [sys.executable, "-m", "sb3_maddpg", "train"],
         cwd=tmp_path,
         env=environment(tmp_path),
         capture_output=True,

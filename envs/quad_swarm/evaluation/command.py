@@ -21,6 +21,7 @@ from quad_swarm.evaluation.provenance import provenance
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_csv, write_rows, write_text
 from quad_swarm.jobs import ENGINES
 from quad_swarm.jobs.journal import default_folder
+from quad_swarm.parsing import Parser
 from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
 from quad_swarm.task.rules import RULES
@@ -252,17 +253,16 @@ def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace)
         if args.debug:
             raise
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        return 1
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="sb3-maddpg evaluate",
+    parser = Parser(
+        "sb3-maddpg evaluate",
         description="Fly the same held-out episodes with several policies and compare them. Without options, this "
         "prints the paper's table: four policies in all scenarios.",
         epilog=f"example:\n{EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_policy_arguments(parser, required=False)
     parser.add_argument(

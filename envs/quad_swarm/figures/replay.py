@@ -25,6 +25,7 @@ from quad_swarm.evaluation.provenance import plant_name
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_text
 from quad_swarm.figures.colours import COLOURS
 from quad_swarm.geometry import length
+from quad_swarm.parsing import Parser
 from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.scenarios import SCENARIOS
@@ -138,11 +139,10 @@ def _colliding(flight: Flight) -> list[list[int]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="sb3-maddpg replay",
+    parser = Parser(
+        "sb3-maddpg replay",
         description="Fly a held-out episode with several policies and write a web page that replays it.",
         epilog=f"example:\n{EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_policy_arguments(parser)
     parser.add_argument("--scenario", default="symmetric_swap", help=f"one of {', '.join(SCENARIOS)} (%(default)s)")

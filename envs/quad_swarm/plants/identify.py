@@ -6,7 +6,6 @@ writes a vehicle file, which worlds accept as ``quadrotor``.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import sys
@@ -18,6 +17,7 @@ import numpy as np
 import yaml
 
 from quad_swarm.errors import needs_extra
+from quad_swarm.parsing import Parser
 from quad_swarm.plants.base import make_plant, simulated_vehicles
 from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams
 
@@ -107,7 +107,7 @@ def identify(plant: str) -> Identification:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    parser = argparse.ArgumentParser(prog="sb3-maddpg identify", description=__doc__)
+    parser = Parser("sb3-maddpg identify", description=__doc__)
     parser.add_argument("--plant", required=True, help=f"one of {', '.join(simulated_vehicles())}")
     parser.add_argument(
         "--gym-packages",

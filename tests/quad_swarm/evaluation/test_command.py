@@ -53,7 +53,7 @@ def test_values_of_repeated_options_come_together(capsys):
         ["random", "none"], ["random", "full"], ["random_swap", "none"], ["random_swap", "full"]
     ]  # fmt: skip
     assert "preset: paper with radius=0.2 goal_radius=0.4;" in printed[7]
-    assert main([*arguments, "--world", "radius=0.2", "--world", "radius=0.1"]) == 2
+    assert main([*arguments, "--world", "radius=0.2", "--world", "radius=0.1"]) == 1
     assert "'radius' is given twice" in capsys.readouterr().err
 
 
@@ -215,7 +215,7 @@ def test_a_dash_writes_a_file_to_the_standard_output_alone(option, tmp_path, mon
     else:
         assert printed.out.endswith("\\end{tabular}\n")
         assert "wrote" not in printed.out
-    assert main([*FEW, option, "-", "--json" if option != "--json" else "--csv", "-"]) == 2
+    assert main([*FEW, option, "-", "--json" if option != "--json" else "--csv", "-"]) == 1
     assert "are both -: one would overwrite the other" in capsys.readouterr().err
 
 
@@ -225,7 +225,7 @@ def test_figures_without_their_packages_fail_before_the_flights(missing, tmp_pat
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     monkeypatch.setattr("quad_swarm.evaluation.command.evaluate", lambda *_: pytest.fail("it flew"))
-    assert main([*FEW, "--plot", str(tmp_path / "plots"), "--json", str(tmp_path / "a.json")]) == 2
+    assert main([*FEW, "--plot", str(tmp_path / "plots"), "--json", str(tmp_path / "a.json")]) == 1
     error = capsys.readouterr().err
     assert "--plot needs the extra 'plot': in the clone, pip install -e '.[plot]'" in error
     assert missing in error
@@ -237,7 +237,7 @@ def test_a_missing_simulator_is_told_before_the_flights(tmp_path, monkeypatch, c
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(remote, "_servers", {})
     monkeypatch.setattr("quad_swarm.evaluation.command.evaluate", lambda *_: pytest.fail("it flew"))
-    assert main([*FEW, "--plant", "crazyflow"]) == 2
+    assert main([*FEW, "--plant", "crazyflow"]) == 1
     error = capsys.readouterr().err
     assert "needs the extra 'plants': in the clone, pip install -e '.[plants]' (no crazyflow here)" in error
     assert error.count("\n") == 1
@@ -272,7 +272,7 @@ def test_a_missing_simulator_is_told_before_the_flights(tmp_path, monkeypatch, c
     ],
 )
 def test_errors_are_one_line_with_the_remedy(arguments, message, capsys):
-    assert main(arguments) == 2
+    assert main(arguments) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -281,18 +281,18 @@ def test_errors_are_one_line_with_the_remedy(arguments, message, capsys):
 def test_the_nearest_model_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("maddpg_swarm.zip").touch()
-    assert main(["--policy", "maddpg_swrm.zip@0.5"]) == 2
+    assert main(["--policy", "maddpg_swrm.zip@0.5"]) == 1
     assert "Did you mean 'maddpg_swarm.zip'?" in capsys.readouterr().err
 
 
 def test_a_damaged_model_is_named(tmp_path, capsys):
     broken = tmp_path / "model.zip"
     broken.write_bytes(b"PK\x03\x04 and no more")
-    assert main(["--policy", str(broken), "--scenario", "random", "--episodes", "1"]) == 2
+    assert main(["--policy", str(broken), "--scenario", "random", "--episodes", "1"]) == 1
     error = capsys.readouterr().err
     assert str(broken) in error
     assert "Is the file complete" in error
-    assert main(["--policy", str(broken), "--algo", "quad_swarm:Nothing"]) == 2
+    assert main(["--policy", str(broken), "--algo", "quad_swarm:Nothing"]) == 1
     assert "not an importable module:Class" in capsys.readouterr().err
 
 
@@ -315,7 +315,7 @@ def test_models_fly_in_the_world_that_they_were_trained_in(capsys):
     assert main(["--policy", dense, *flags, "--preset", "paper"]) == 0
     assert "note: quad-swarm-dense was trained in 'dense', but this is 'paper'" in capsys.readouterr().err
     paper = str(pretrained_folder("quad-swarm-paper") / "model.zip")
-    assert main(["--policy", dense, paper, *flags]) == 2
+    assert main(["--policy", dense, paper, *flags]) == 1
     assert "choose one of these with --preset" in capsys.readouterr().err
 
 

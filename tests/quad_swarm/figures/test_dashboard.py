@@ -13,7 +13,7 @@ from quad_swarm.figures import dashboard
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG, DashboardCallback, pretrained
-from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.main import main
 from sb3_maddpg.common.callbacks import hyperparameters
 from sb3_maddpg.hub.pretrained import pretrained_folder
 from sb3_maddpg.team.toys import OwnBit

@@ -80,9 +80,9 @@ def test_a_pair_that_only_comes_close_is_not_marked_with_the_one_that_collides()
 
 def test_mistakes_are_told_in_one_line(tmp_path, capsys):
     out = ["--out", str(tmp_path / "replay.html")]
-    assert main(["--policy", "full", "--scenario", "symetric_swap", *out]) == 2
+    assert main(["--policy", "full", "--scenario", "symetric_swap", *out]) == 1
     assert "symmetric_swap" in capsys.readouterr().err
-    assert main(["--policy", "full", "--episode", "-1", *out]) == 2
+    assert main(["--policy", "full", "--episode", "-1", *out]) == 1
     assert "count from 0" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sb3_maddpg.cli.bench import timed
-from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.main import main
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +45,7 @@ def test_bench_says_where_the_time_goes(capsys):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["-n", "0"], "--n-timesteps=0: choose 1 or more"),
+        (["-n", "0"], "argument -n/--n-timesteps: 0: choose 1 or more"),
         (["--json", "folder"], "folder: Is a directory"),
         (["--json", "file/bench.json"], "file"),
     ],
@@ -53,7 +53,7 @@ def test_bench_says_where_the_time_goes(capsys):
 def test_bench_finds_out_before_the_work_that_it_cannot_be_done(capsys, argv, message):
     Path("folder").mkdir()
     Path("file").touch()
-    assert main(["bench", "--env", "OwnBit-v0", *argv]) == 2
+    assert main(["bench", "--env", "OwnBit-v0", *argv]) == (2 if "-n" in argv else 1)
     shown = capsys.readouterr()
     assert f"error: {message}" in shown.err
     assert shown.err.count("\n") == 1

@@ -7,7 +7,8 @@ import torch
 import yaml
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
-from sb3_maddpg.cli.literals import BoundedLoader, StoreValues, format_literal, parse_literal, parse_value
+from sb3_maddpg.cli.literals import BoundedLoader, format_literal, parse_literal, parse_value
+from sb3_maddpg.cli.options import StoreValues
 
 
 @pytest.mark.parametrize(

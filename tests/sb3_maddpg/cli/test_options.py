@@ -1,21 +1,12 @@
 """What all commands share: their options, and the check of files that they are going to write."""
 
-import argparse
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from sb3_maddpg.cli.options import check_writable, common_options, import_packages, nearest_options
-
-
-def test_what_is_not_common_is_left_to_others():
-    options, rest = common_options().parse_known_args(["--env", "OwnBit-v0", "--seed", "1", "--gym-packages", "a", "b"])
-    assert (options.algo, options.env, options.gym_packages) == ("maddpg", "OwnBit-v0", ["a", "b"])
-    assert rest == ["--seed", "1"]
-    options, rest = common_options().parse_known_args(["--al", "matd3"])
-    assert (options.algo, rest) == ("maddpg", ["--al", "matd3"]), "options are not abbreviated"
+from sb3_maddpg.cli.options import check_writable, import_packages
 
 
 @pytest.mark.parametrize("name", ["../..", "", ".json", "a b", "\0", "json."])
@@ -45,22 +36,6 @@ def test_a_module_that_lacks_another_says_so(tmp_path, monkeypatch):
     message = r"^--gym-packages needy: .* \(ModuleNotFoundError: No module named 'jsom'\): repair it, or install what"
     with pytest.raises(ImportError, match=message):
         import_packages(["needy"])
-
-
-def test_the_nearest_option_and_choice_are_named(capsys):
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--policy", choices=["full", "none"])
-    for words, hint in (
-        (["--polcy", "none"], "--polcy none; did you mean '--policy'?"),
-        (["--policy", "ful"], "; did you mean 'full'?"),
-        (["--xyz"], "unrecognized arguments: --xyz\n"),
-    ):
-        with nearest_options(), pytest.raises(SystemExit):
-            parser.parse_args(words)
-        assert hint in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        parser.parse_args(["--polcy", "none"])
-    assert "did you mean" not in capsys.readouterr().err, "only inside"
 
 
 def test_a_file_that_can_be_written_is_left_as_it_is(tmp_path):

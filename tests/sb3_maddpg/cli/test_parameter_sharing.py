@@ -10,10 +10,11 @@ from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_maddpg.cli.commands import latest_model, main
+from sb3_maddpg.cli.main import main
+from sb3_maddpg.cli.overview import load_environments
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, SharedPolicy, shares_parameters
 from sb3_maddpg.cli.pettingzoo_ids import register
-from sb3_maddpg.cli.zoo import register as register_all
+from sb3_maddpg.cli.runs import latest_model
 from sb3_maddpg.matd3.matd3 import MATD3
 
 SPREAD, TAG, SWARM = "mpe2/simple_spread_v3", "mpe2/simple_tag_v3", "quad_swarm/parallel_env"
@@ -54,7 +55,7 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
 
 
 def test_only_algorithms_for_single_agents_on_pettingzoo_share_a_policy():
-    register_all()
+    load_environments()
     assert shares_parameters(PPO, SPREAD)
     assert not shares_parameters(MATD3, SPREAD)
     assert not shares_parameters(PPO, "OwnBit-v0")
@@ -198,7 +199,7 @@ def test_an_algorithm_for_single_agents_is_trained_and_watched(capsys, algo, env
         assert found["timesteps"][0] == 120  # agents' steps
         assert found["results"].shape[1] == n_agents  # an episode of all agents
     capsys.readouterr()
-    assert main(["enjoy", *argv, "-n", "60", "--no-render"]) == 2
+    assert main(["enjoy", *argv, "-n", "60", "--no-render"]) == 1
     assert "holds pickled values" in capsys.readouterr().err
     assert main(["enjoy", *argv, "-n", "60", "--no-render", "--trust"]) == 0
     assert "Mean episode length: " in capsys.readouterr().out

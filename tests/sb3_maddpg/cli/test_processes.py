@@ -88,7 +88,6 @@ def test_a_child_imports_nothing_from_the_current_folder_but_from_pythonpath(ver
 
 @pytest.mark.parametrize("words", [["--vec-env", "subproc", "-params", "n_envs:2"], ["--seeds", "0", "--jobs", "1"]])
 def test_processes_of_a_training_import_only_what_the_user_named(words, tmp_path):
-    pytest.importorskip("rl_zoo3")
     pytest.importorskip("mpe2")
     lay_traps(tmp_path)
     (tmp_path / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")

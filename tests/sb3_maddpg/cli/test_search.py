@@ -17,11 +17,10 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 from processes import children, descendants
 
-from sb3_maddpg.cli import zoo
-from sb3_maddpg.cli.commands import main
-from sb3_maddpg.cli.search import bring_back, enlist, kept_search, open_storage, sign, tell_best
+from sb3_maddpg.cli import study as study_module
+from sb3_maddpg.cli.main import main
+from sb3_maddpg.cli.search import kept_search, mark_owner, open_storage, register_worker, retry_lost_trials, tell_best
 
-pytest.importorskip("rl_zoo3")
 RECIPE = {"n_timesteps": 400, "policy": "MlpPolicy", "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
 COMMAND = [sys.executable, "-m", "sb3_maddpg", "train", "-optimize", "--env", "OwnBit-v0", "--conf-file", "recipe.yml"]
 COMMAND += ["--n-evaluations", "2", "--n-eval-envs", "1", "--n-startup-trials", "2"]  # without a seed, as documented
@@ -128,7 +127,7 @@ def test_workers_of_a_command_share_its_trials_whatever_dies(engine, tmp_path, m
         assert process.poll() is None, process.stdout.read()
         assert time.monotonic() < end
         time.sleep(0.05)
-    workers = [pid for pid in descendants(process.pid) if b"-optimize" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    workers = [pid for pid in descendants(process.pid) if b"tune" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     assert len(workers) == 2
     if engine == "local":
         process.kill()
@@ -152,21 +151,21 @@ def test_several_workers_need_a_study_to_share(capsys, monkeypatch):
     assert main(["tune", "--env", "OwnBit-v0", "--jobs", "2"]) == 2
     assert "--jobs and --engine ray need --storage and --study-name" in capsys.readouterr().err
     called = []
-    monkeypatch.setattr(zoo, "_call", lambda function, name, argv: called.append(name))
+    monkeypatch.setattr(study_module.Search, "run", lambda search: called.append(search))
     assert main(["tune", "--env", "OwnBit-v0", "--jobs", "1"]) == 0
-    assert called == ["tune"]
+    assert len(called) == 1, "one worker needs no one to share with"
 
 
 def test_a_worker_that_a_cluster_restarts_elsewhere_repeats_its_trial(study, monkeypatch):
     monkeypatch.setenv("SB3_MADDPG_WORKER", "a")
     mine, others = begin(study, "else 1 2 a"), begin(study, "else 1 2 b")
-    assert bring_back(study) == 1
+    assert retry_lost_trials(study) == 1
     states = {trial.number: trial.state for trial in study.trials}
     assert states[mine.number] == TrialState.FAIL
     assert states[others.number] == TrialState.RUNNING
     signed = study.ask()
-    sign(signed)
-    assert bring_back(study) == 0, "this process runs"
+    mark_owner(signed)
+    assert retry_lost_trials(study) == 0, "this process runs"
 
 
 @pytest.fixture
@@ -190,14 +189,14 @@ def test_trials_of_processes_that_are_gone_come_back_with_their_parameters(study
     another_process_has_its_number = begin(study, f"{host} {os.getpid()} 1")
     elsewhere, older, odd = (begin(study, text) for text in (f"else {gone.pid} 1", None, "?"))
     mine = study.ask()
-    sign(mine)
+    mark_owner(mine)
     expected = 2 if Path("/proc/self/stat").exists() else 1
-    assert bring_back(study) == expected
+    assert retry_lost_trials(study) == expected
     states = {trial.number: trial.state for trial in study.trials}
     assert states[killed.number] == TrialState.FAIL
     assert (states[another_process_has_its_number.number] == TrialState.FAIL) == (expected == 2)
     assert {states[trial.number] for trial in (elsewhere, older, odd, mine)} == {TrialState.RUNNING}
-    assert bring_back(study) == 0, "once is enough"
+    assert retry_lost_trials(study) == 0, "once is enough"
     again = study.ask()
     assert again.suggest_float("x", 0, 1) == killed.params["x"]
 
@@ -207,9 +206,9 @@ def test_a_trial_whose_process_was_killed_before_it_signed_comes_back(study, ali
     """Only if no worker is left that may be about to sign it."""
     study.set_user_attr(f"worker {socket.gethostname()} {2**22 + 1} 1", True)
     if alive:
-        enlist(study)
+        register_worker(study)
     unsigned = study.ask()
-    assert bring_back(study) == 1 - alive
+    assert retry_lost_trials(study) == 1 - alive
     assert (study.trials[unsigned.number].state == TrialState.RUNNING) == alive
 
 
@@ -231,7 +230,7 @@ def test_a_file_that_is_no_journal_is_named_and_left_alone(text, words, tmp_path
     monkeypatch.chdir(tmp_path)
     Path("notes.log").write_text(text)
     argv = ["tune", "--env", "OwnBit-v0", "-n", "100", "--n-trials", "1", "--storage", "notes.log"]
-    assert main([*argv, *words]) == 2
+    assert main([*argv, *words]) == 1
     assert "notes.log is not a journal of Optuna" in capsys.readouterr().err
     assert Path("notes.log").read_text() == text
 
@@ -304,7 +303,7 @@ def test_a_disk_that_is_full_from_the_start_is_told(tmp_path, monkeypatch, capsy
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(JournalFileBackend, "append_logs", full)
-    assert main(["tune", "--env", "OwnBit-v0", "-n", "100", "--n-trials", "1"]) == 2
+    assert main(["tune", "--env", "OwnBit-v0", "-n", "100", "--n-trials", "1"]) == 1
     assert "No space left on device: free space, then repeat the command to continue." in capsys.readouterr().err
 
 
@@ -327,7 +326,7 @@ def test_edited_types_in_a_journal_are_told_in_one_line(tmp_path, monkeypatch, c
     assert old in text
     Path("t.log").write_text(text.replace(old, new))
     for words in (["-optimize", "--n-trials", "1"], ["--trial-id", "1"]):
-        assert main(["train", "--env", "OwnBit-v0", *words, "--storage", "t.log", "--study-name", "s"]) == 2
+        assert main(["train", "--env", "OwnBit-v0", *words, "--storage", "t.log", "--study-name", "s"]) == 1
         (told,) = capsys.readouterr().err.strip().splitlines()
         assert told.startswith("error: --storage ")
         assert "t.log is damaged" in told or "t.log is not a journal" in told
@@ -349,7 +348,7 @@ def test_the_trial_of_someone_else_names_no_code(tmp_path, monkeypatch, capsys, 
     choices = {key: optuna.distributions.CategoricalDistribution([value]) for key, value in params.items()}
     study.add_trial(optuna.trial.create_trial(value=1.0, params=params, distributions=choices))
     argv = ["train", "--env", "OwnBit-v0", "--trial-id", "0", "--storage", "t.log", "--study-name", "s"]
-    assert main(argv) == 2
+    assert main(argv) == 1
     assert told in capsys.readouterr().err
 
 
@@ -369,7 +368,7 @@ def test_a_full_disk_during_a_search_is_told_and_the_search_goes_on_later(tmp_pa
 
     with monkeypatch.context() as patched:
         patched.setattr(JournalFileBackend, "append_logs", full)
-        assert main(words) == 2
+        assert main(words) == 1
     error = capsys.readouterr().err
     assert "No space left on device: free space, then repeat the command to continue" in error
     assert "Should not reach" not in error

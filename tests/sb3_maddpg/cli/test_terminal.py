@@ -15,7 +15,6 @@ import yaml
 
 from sb3_maddpg.cli.terminal import tell
 
-pytest.importorskip("rl_zoo3")
 RECIPE = {"n_timesteps": 10**7, "policy": "MlpPolicy", "learning_starts": 50, "buffer_size": 500, "batch_size": 16}
 TRAIN = [sys.executable, "-m", "sb3_maddpg", "train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1"]
 

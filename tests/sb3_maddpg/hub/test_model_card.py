@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_maddpg import IDDPG, MADDPG, SafeVecNormalize, TeamEnv
-from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.main import main
 from sb3_maddpg.files.model_files import refuse_pickled
 from sb3_maddpg.hub import model_card as hub
 from sb3_maddpg.hub.pretrained import pretrained_folder
@@ -123,7 +123,7 @@ def test_a_hub_that_cannot_be_reached_is_one_line(api, model, tmp_path, monkeypa
     with pytest.raises(OSError, match=message):
         hub.publish(model, "me/a-model")
     model.save(tmp_path / "model.zip")
-    assert main(["publish", str(tmp_path / "model.zip"), "me/a-model"]) == 2
+    assert main(["publish", str(tmp_path / "model.zip"), "me/a-model"]) == 1
     assert re.match(f"error: {message}.*--out DIR.*\n$", capsys.readouterr().err)
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_maddpg import IDDPG, MADDPG
-from sb3_maddpg.cli.commands import main
+from sb3_maddpg.cli.main import main
 from sb3_maddpg.iddpg.iddpg import IndependentPolicy
 from sb3_maddpg.team.pettingzoo import TeamEnv
 from sb3_maddpg.team.toys import OwnBit

@@ -1,8 +1,10 @@
 """The command ``sb3-maddpg``: what it hands on, and what it does itself."""
 
-import ast
+import contextlib
 import json
-from graphlib import TopologicalSorter
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,9 +14,9 @@ import sb3_maddpg
 from quad_swarm.task.rules import RULES
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
-from sb3_maddpg.cli import commands
-from sb3_maddpg.cli.commands import COMMANDS, examples, main
-from sb3_maddpg.cli.overview import ALGORITHMS, packaged_recipes
+from sb3_maddpg.cli.algorithms import ALGORITHMS
+from sb3_maddpg.cli.main import COMMANDS, build_parser, main
+from sb3_maddpg.cli.overview import packaged_recipes
 from sb3_maddpg.files import registry
 from sb3_maddpg.hub.pretrained import pretrained_folder, pretrained_models
 
@@ -30,25 +32,57 @@ def test_every_command_helps_with_an_example(name, capsys):
         main([name, "--help"])
     assert stopped.value.code == 0
     shown = capsys.readouterr().out
-    assert "usage:" in shown
-    assert examples(name).splitlines()[0].strip() in shown
     assert f"usage: sb3-maddpg {name}" in shown
+    assert f"  sb3-maddpg {name}" in shown.partition("examples:")[2]
     assert not any(word in COMMANDS[name].examples for word in ("Swarm", "swarm"))
 
 
-def test_the_help_names_what_is_installed(capsys):
-    for argv in (["--help"], ["train", "--help"], ["tune", "--help"]):
+def test_the_full_help_names_what_is_installed(capsys):
+    for argv in ([], ["train"], ["tune"]):
         with pytest.raises(SystemExit):
-            main(argv)
+            main([*argv, "--help-all"])
         shown = capsys.readouterr().out
         known = (*ALGORITHMS, *pretrained_models(), *packaged_recipes(), "QuadSwarm-v0")
         assert all(name in shown for name in known)
-        assert argv == ["--help"] or "--resume" in shown
+        assert not argv or "--resume" in shown
     for command in ("evaluate", "replay"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         shown = capsys.readouterr().out
         assert all(f"pretrained:{name}" in shown for name in pretrained_models())
+
+
+def test_the_short_help_shows_the_frequent_options_and_the_full_one_all(capsys):
+    shown = {}
+    for command in ("train", "tune"):
+        for option in ("--help", "--help-all"):
+            with pytest.raises(SystemExit):
+                main([command, option])
+            shown[command, option] = capsys.readouterr().out
+    assert len(shown["train", "--help"].splitlines()) < 50
+    for rare, command in (("--save-freq", "train"), ("--pruner", "train"), ("--engine", "tune")):
+        assert rare not in shown[command, "--help"]
+        assert rare in shown[command, "--help-all"]
+    assert "--pruner" in shown["tune", "--help"]
+    options = {one for action in build_parser()[1]["train"]._actions for one in action.option_strings}
+    assert all(option in shown["train", "--help-all"] for option in options)
+
+
+def test_the_help_loads_neither_pytorch_nor_an_environment(tmp_path):
+    code = "import sys; from sb3_maddpg.cli.main import main\ntry: main(sys.argv[1:])\nexcept SystemExit: pass\n"
+    code += "print(sorted({'torch', 'gymnasium', 'stable_baselines3', 'casadi', 'quad_swarm'} & set(sys.modules)))"
+    for argv in (["--help"], ["train", "--help"], ["--version"], ["train", "--nonsense"]):
+        done = subprocess.run([sys.executable, "-c", code, *argv], capture_output=True, text=True, cwd=tmp_path)
+        assert done.stdout.splitlines()[-1] == "[]", done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("columns", [80, 100, 200])
+def test_help_fits_the_terminal(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit):
+        main(["train", "--help-all"])
+    options = capsys.readouterr().out.partition("examples:")[0]
+    assert max(map(len, options.splitlines())) <= columns
 
 
 def test_help_names_own_rules_and_scenarios(capsys):
@@ -80,8 +114,8 @@ def test_help_names_own_rules_and_scenarios(capsys):
     ],
 )
 def test_the_nearest_of_what_is_mistyped_is_named(argv, nearest, capsys):
-    with pytest.raises(SystemExit):
-        main(argv)
+    with contextlib.suppress(SystemExit):  # of a package's parser
+        assert main(argv) == 2
     error = capsys.readouterr().err
     assert f"did you mean '{nearest}'?" in error
     assert f"sb3-maddpg {argv[0]}: error" in error or argv == ["evalute"]
@@ -98,7 +132,7 @@ def test_the_nearest_of_what_is_mistyped_is_named(argv, nearest, capsys):
 )
 def test_the_nearest_file_or_module_is_named(argv, message, capsys):
     Path("my_recipes.yml").touch()
-    assert main(argv) == 2
+    assert main(argv) == (2 if "--env" in argv and "--conf-file" not in argv else 1)
     assert message in capsys.readouterr().err
 
 
@@ -119,7 +153,7 @@ def test_pretrained_models_are_listed_shown_and_copied(capsys):
     copy = ["pretrained", "quad-swarm-paper", "--out", "models"]
     assert main(copy) == 0
     assert MADDPG.load("models/quad-swarm-paper/model.zip").env_spec["id"] == "QuadSwarm-v0"
-    assert main(copy) == 2  # nothing is overwritten
+    assert main(copy) == 1  # nothing is overwritten
     assert "models/quad-swarm-paper" in capsys.readouterr().err
     assert main(["pretrained", "quad-swarm-papr"]) == 2
     assert "did you mean 'quad-swarm-paper'" in capsys.readouterr().err
@@ -137,21 +171,11 @@ def test_a_pretrained_model_is_evaluated_and_replayed_by_its_name(capsys):
     assert "CartPole-v1" in capsys.readouterr().err
 
 
-def test_modules_of_the_command_line_import_each_other_in_one_direction():
-    imported = {}
-    for path in Path(commands.__file__).parent.glob("*.py"):
-        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
-        names = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
-        imported[path.stem] = {name.split(".")[2] for name in names if name.startswith("sb3_maddpg.cli.")}
-    order = list(TopologicalSorter(imported).static_order())
-    assert order.index("options") < order.index("experiment") < order.index("zoo") < order.index("commands")
-
-
 def test_ctrl_c_ends_any_command_with_one_line(monkeypatch, capsys):
-    def interrupted(argv: list[str]) -> int:
+    def interrupted(*_) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(COMMANDS, "bench", COMMANDS["bench"]._replace(run=interrupted))
+    monkeypatch.setattr("sb3_maddpg.cli.bench.bench", interrupted)
     assert main(["bench"]) == 130
     assert capsys.readouterr().err == "Interrupted.\n"
     with pytest.raises(KeyboardInterrupt):
@@ -159,9 +183,7 @@ def test_ctrl_c_ends_any_command_with_one_line(monkeypatch, capsys):
 
 
 def test_the_version_is_told(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main(["--version"])
-    assert stopped.value.code == 0
+    assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"sb3-maddpg {sb3_maddpg.__version__}\n"
     assert quad_swarm.__version__ == sb3_maddpg.__version__
 
@@ -170,10 +192,10 @@ def test_the_version_is_told(capsys):
     ("group", "argv"),
     [
         ("environments", ["train", "--env", "OwnBit-v0"]),
-        ("environments", ["--help"]),
+        ("environments", ["--help-all"]),
         ("models", ["pretrained"]),
         ("evaluators", ["evaluate", "--env", "Broken-v0"]),
-        ("replays", ["--help"]),
+        ("replays", ["replay", "--env", "Broken-v0", "--help"]),
         ("allowed_in_files", ["evaluate", "--policy", "pretrained:quad-swarm-flight"]),
     ],
 )
@@ -189,8 +211,38 @@ def test_a_package_that_cannot_be_loaded_is_named(group, argv, code, tmp_path, m
     monkeypatch.chdir(tmp_path / "elsewhere")
     registry._load_entry_points.cache_clear()
     try:
-        assert main(argv) == 2
+        assert main(argv) == 1
     finally:
         registry._load_entry_points.cache_clear()
     (told,) = capsys.readouterr().err.strip().splitlines()
     assert f"their-package is installed, but its entry point sb3_maddpg.{group}: Broken-v0" in told
+
+
+def test_quiet_commands_print_results_and_errors_only(capsys):
+    train = ["train", "--env", "OwnBit-v0", "-n", "600", "--eval-freq", "200", "--quiet"]
+    assert main([*train, "--progress"]) == 0
+    assert capsys.readouterr().out == ""
+    assert list(Path("logs").rglob("OwnBit-v0.zip"))
+    assert main([*train, "-params", "estimater:1"]) == 2
+    assert "did you mean 'estimator'" in capsys.readouterr().err
+    assert main(["pretrained", "--quiet"]) == 0
+    assert "quad-swarm-paper" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("sb3-maddpg tr", {"train "}),
+        ("sb3-maddpg train --tens", {"--tensorboard-log "}),
+        ("sb3-maddpg train --vec-env ", {"dummy", "subproc"}),
+        ("sb3-maddpg convert --lean ", {"actor", "critic"}),
+    ],
+)
+def test_words_are_completed(line, expected, tmp_path):
+    """As the shell functions of argcomplete ask for it."""
+    pytest.importorskip("argcomplete")
+    env = {**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
+    env |= {"_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "words")}
+    done = subprocess.run([sys.executable, "-m", "sb3_maddpg"], env=env, capture_output=True, text=True)
+    assert expected <= set((tmp_path / "words").read_text().split("\n")), done.stderr

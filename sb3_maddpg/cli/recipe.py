@@ -1,12 +1,12 @@
-"""Checks of command-line options and recipes before training starts."""
+"""Recipes: the files of hyperparameters, and their checks before anything runs."""
 
-import argparse
 import importlib
 import inspect
 import math
+import runpy
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,9 +23,6 @@ from pydantic import (
     create_model,
     field_validator,
 )
-from rl_zoo3.utils import ALGOS, get_class_by_name
-from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -33,39 +30,24 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_maddpg.cli import pettingzoo_ids
+from sb3_maddpg.cli.algorithms import algorithm
 from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
-from sb3_maddpg.cli.options import did_you_mean, files_beside
+from sb3_maddpg.cli.options import MOST_COPIES, files_beside
 from sb3_maddpg.cli.overview import packaged_recipes
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.team import pettingzoo as parallel
-from sb3_maddpg.utils import arguments_of, shown, suggest, told
+from sb3_maddpg.utils import arguments_of, did_you_mean, shown, suggest, told
 from sb3_maddpg.validation import Arguments, NormalizationArguments, validated_as
 
 # Arguments of the algorithm that come from the command line
 COMMAND_LINE = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
 # Arguments of the policy that the algorithm passes
 OF_ALGORITHM = {"observation_space", "action_space", "lr_schedule"}
-# Arguments that rl_zoo3 turns into schedules
+# Arguments that become schedules
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
-# Maximum number of parallel environments
-MOST_COPIES = 10_000
 SIMPLE = (int, float, bool, str, type(None))
 # Keys of a recipe that hold a dict, or text with one
 DICTS = ("env_kwargs", "eval_env_kwargs", "monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_kwargs")
-
-
-def at_least(low: int, otherwise: int | None = None) -> AfterValidator:
-    """
-    :param low: the lowest value
-    :param otherwise: a lower value that is also allowed, because it has a special meaning
-    :return: a validator
-    """
-
-    def check(value: int) -> int:
-        if value < low and value != otherwise:
-            raise ValueError(f"choose {low} or more" + ("" if otherwise is None else f", or {otherwise}"))
-        return value
-
-    return AfterValidator(check)
 
 
 def at_most(high: int) -> AfterValidator:
@@ -76,65 +58,10 @@ def at_most(high: int) -> AfterValidator:
 
     def check(value: int) -> int:
         if value > high:
-            raise ValueError(f"choose {high} or less")
+            raise InvalidArgumentError(f"choose {high} or less")
         return value
 
     return AfterValidator(check)
-
-
-def _storage(storage: str | None) -> str | None:
-    """Check a storage of Optuna, which is a journal file or a database."""
-    if storage is not None and not storage.endswith(".log"):
-        try:
-            make_url(storage).get_dialect()
-        except ArgumentError:
-            raise ValueError("name a file FILE.log, or the URL of a database such as sqlite:///FILE.db") from None
-    return storage
-
-
-One = Annotated[int, at_least(1)]
-OneOrDefault = Annotated[int, at_least(1, otherwise=-1)]
-
-
-class LengthOption(Arguments):
-    """Option for the length of ``enjoy``, ``record`` and ``bench``."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    n_timesteps: One
-
-
-class TrainingOptions(Arguments):
-    """Numeric options of rl_zoo3's ``train``, and the storage. -1 means the default, or none."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    n_timesteps: OneOrDefault = -1
-    num_threads: OneOrDefault = -1
-    eval_freq: OneOrDefault = -1
-    save_freq: OneOrDefault = -1
-    log_interval: Annotated[int, at_least(-2)] = -1
-    eval_episodes: One = 1
-    n_eval_envs: Annotated[One, at_most(MOST_COPIES)] = 1
-    n_trials: One = 1
-    max_total_trials: One | None = None
-    n_startup_trials: Annotated[int, at_least(0)] = 0
-    n_evaluations: One | None = None
-    n_jobs: OneOrDefault = 1
-    trial_id: Annotated[int, at_least(0)] | None = None
-    verbose: Annotated[int, at_least(0)] = 0
-    storage: Annotated[str | None, AfterValidator(_storage)] = None
-
-
-def check_options(args: argparse.Namespace, options: type[Arguments] = TrainingOptions) -> None:
-    """
-    Check options of the command line.
-
-    :param args: options with rl_zoo3's names
-    :param options: class of the options to check
-    :raises ValueError: if an option is invalid; the message names the option, its value and what is allowed
-    """
-    validated_as(options, vars(args), lambda name: f"--{name.replace('_', '-')}")
 
 
 def _number(value: Any) -> Any:
@@ -144,7 +71,7 @@ def _number(value: Any) -> Any:
     try:
         return float(value)
     except ValueError:
-        raise ValueError("write a number") from None
+        raise InvalidArgumentError("write a number") from None
 
 
 def _schedule(value: Any) -> Any:
@@ -156,7 +83,7 @@ def _schedule(value: Any) -> Any:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError("write a finite number, or lin_NUMBER for one that decreases linearly to zero")
+        raise InvalidArgumentError("write a finite number, or lin_NUMBER for one that decreases linearly to zero")
     return number if text == value else value
 
 
@@ -174,7 +101,7 @@ def _normalization(given: dict[str, Any]) -> dict[str, Any]:
 
 def _noise_type(name: str) -> str:
     if not any(kind in name for kind in ("normal", "ornstein-uhlenbeck")):
-        raise ValueError("choose normal or ornstein-uhlenbeck")
+        raise InvalidArgumentError("choose normal or ornstein-uhlenbeck")
     return name
 
 
@@ -187,8 +114,8 @@ Normalization = bool | Annotated[dict[str, Any], BeforeValidator(_literal), Afte
 Named = str | dict[str, Any] | list[str | dict[str, Any]] | None
 
 
-class ZooKeys(Arguments):
-    """Keys of a recipe that rl_zoo3 reads itself. All other keys are arguments of the algorithm."""
+class Recipe(Arguments):
+    """Keys of a recipe that the command line reads itself. All other keys are arguments of the algorithm."""
 
     model_config = ConfigDict(extra="allow", protected_namespaces=())
 
@@ -211,12 +138,12 @@ class ZooKeys(Arguments):
     @classmethod
     def _with_noise_type(cls, noise_std: float | None, info: ValidationInfo) -> float | None:
         if noise_std is None and info.data.get("noise_type") is not None:
-            raise ValueError("noise_type needs a standard deviation, write a number")
+            raise InvalidArgumentError("noise_type needs a standard deviation, write a number")
         return noise_std
 
 
 class ShownKeys(Arguments):
-    """Keys of the settings of a run that rl_zoo3 reads in order to show it."""
+    """Keys of the settings of a run that showing it needs."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -236,63 +163,85 @@ class MonitorArguments(Arguments):
     override_existing: bool = True
 
 
-def read_recipe(path: str, algo: str, env_id: str) -> None:
+def recipe_path(name: str | None, algo: str, env_id: str) -> str:
     """
-    Check that a YAML file has a recipe for the environment.
-
-    :param path: path of the file
+    :param name: value of ``--conf-file``: a YAML file, a packaged recipe, or a module; None for the default
     :param algo: name of the algorithm
     :param env_id: Gymnasium id
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if the file has no valid recipe for the environment
+    :return: path of the file, or the module
+    :raises InvalidArgumentError: if there is no default for both
     """
-    if not path.endswith((".yml", ".yaml")):  # a module, which Python reads
-        if not all(part.isidentifier() for part in path.split(".")):
-            raise ValueError(f"--conf-file {path!r} is neither a YAML file nor a module.")
-        if not path.endswith(".py"):
-            _check_recipes(_recipes_of_module(path), path, algo, env_id)
-        return
-    if not Path(path).is_file():
+    packaged = packaged_recipes()
+    if name is not None:
+        return name if Path(name).is_file() else str(packaged.get(name, name))
+    path = packaged.get(f"{algo}.yml")
+    if path is not None and not {env_id, "default"}.isdisjoint(yaml.safe_load(path.read_text())):
+        return str(path)
+    raise InvalidArgumentError(f"There is no packaged recipe of {algo} for {env_id}: pass --conf-file FILE.")
+
+
+def read_recipe(path: str, algo: str, env_id: str) -> dict[str, Any]:
+    """
+    Read the recipe of an environment.
+
+    :param path: see ``recipe_path``
+    :param algo: name of the algorithm
+    :param env_id: Gymnasium id
+    :return: the recipe as it is written
+    :raises FileNotFoundError: if there is no such file
+    :raises InvalidArgumentError: if the file has no valid recipe for the environment
+    """
+    if not path.endswith((".yml", ".yaml")):
+        recipes = _recipes_of_code(path)
+    elif not Path(path).is_file():
         hint = did_you_mean(path, [*files_beside(path, "*.y*ml"), *packaged_recipes()])
         raise FileNotFoundError(f"There is no recipe {path}: --conf-file must name a YAML file.{hint}")
-    try:
-        with Path(path).open() as file:
-            recipes = yaml.load(file, BoundedLoader)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        raise ValueError(
-            f"{path}{where}: this is not valid YAML ({getattr(error, 'problem', None) or error})."
-        ) from None
-    _check_recipes(recipes, path, algo, env_id)
+    else:
+        try:
+            with Path(path).open() as file:
+                recipes = yaml.load(file, BoundedLoader)
+        except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+            mark = getattr(error, "problem_mark", None)
+            where = f", line {mark.line + 1}" if mark else ""
+            raise InvalidArgumentError(
+                f"{path}{where}: this is not valid YAML ({getattr(error, 'problem', None) or error})."
+            ) from None
+    return _checked_recipes(recipes, path, algo, env_id)
 
 
-def _recipes_of_module(name: str) -> Any:
+def _recipes_of_code(name: str) -> Any:
+    """:return: the recipes in a Python file or a module"""
+    is_file = name.endswith(".py")
+    if not is_file and not all(part.isidentifier() for part in name.split(".")):
+        raise InvalidArgumentError(f"--conf-file {name!r} is neither a YAML file nor a module.")
     try:
-        module = importlib.import_module(name)
+        found = runpy.run_path(name) if is_file else vars(importlib.import_module(name))
     except (Exception, SystemExit) as error:  # from foreign code
-        raise ValueError(
+        raise InvalidArgumentError(
             f"--conf-file {name} cannot be imported ({told(error)}): name a YAML file or a module with `hyperparams`."
         ) from error
-    if not hasattr(module, "hyperparams"):
-        raise ValueError(f"--conf-file {name}: the module has no `hyperparams`, a dict of recipes by environment.")
-    return module.hyperparams
+    if "hyperparams" not in found:
+        raise InvalidArgumentError(
+            f"--conf-file {name}: the module has no `hyperparams`, a dict of recipes by environment."
+        )
+    return found["hyperparams"]
 
 
-def _check_recipes(recipes: Any, path: str, algo: str, env_id: str) -> None:
+def _checked_recipes(recipes: Any, path: str, algo: str, env_id: str) -> dict[str, Any]:
     form = f"Write `{env_id}:` and the keys of its recipe, indented, below it."
     if not isinstance(recipes, dict):
-        raise ValueError(f"{path} holds {_kind(recipes)} instead of recipes by environment. {form}")
+        raise InvalidArgumentError(f"{path} holds {_kind(recipes)} instead of recipes by environment. {form}")
     name = env_id if env_id in recipes else "default"
     if name not in recipes:
-        raise ValueError(
+        raise InvalidArgumentError(
             f"{path} has no recipe for {env_id} and no `default`. {form}{did_you_mean(env_id, map(str, recipes))}"
         )
     if not isinstance(recipes[name], dict):
-        raise ValueError(f"{path}: the recipe {name} is {_kind(recipes[name])}. {form}")
+        raise InvalidArgumentError(f"{path}: the recipe {name} is {_kind(recipes[name])}. {form}")
     for key in recipes[name]:
         if not isinstance(key, str):
-            raise ValueError(suggest(f"key in the recipe for {algo}", str(key), set(ZooKeys.model_fields)))
+            raise InvalidArgumentError(suggest(f"key in the recipe for {algo}", str(key), set(Recipe.model_fields)))
+    return dict(recipes[name])
 
 
 def _kind(value: Any) -> str:
@@ -310,23 +259,25 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
     :raises ValueError: if a key is unknown or a value is invalid; the message says what is allowed
     """
     check_keys(algo, hyperparams)
-    fields = {key: hint for key, hint in _hints(ALGOS[algo]).items() if key in hyperparams}
+    fields = {key: hint for key, hint in _hints(algorithm(algo)).items() if key in hyperparams}
     fields |= {key: Schedule for key in SCHEDULES if key in hyperparams}
     dicts = ("policy_kwargs", "replay_buffer_kwargs")
     fields |= {key: KeywordArguments | None for key in dicts if key in hyperparams}
     definitions: Any = {key: (hint, ...) for key, hint in fields.items()}
-    model = create_model("Recipe", __base__=ZooKeys, **definitions)
+    model = create_model(f"{algo} recipe", __base__=Recipe, **definitions)
     checked = validated_as(model, hyperparams, lambda name: f"{source}: {name}")
     found = {key: checked[key] for key in hyperparams}
     check_policy_kwargs(algo, found)
     if found.get("noise_std") is not None and "noise_type" not in found:
-        raise ValueError(f"{source}: noise_std={found['noise_std']} needs noise_type: normal or ornstein-uhlenbeck.")
+        raise InvalidArgumentError(
+            f"{source}: noise_std={found['noise_std']} needs noise_type: normal or ornstein-uhlenbeck."
+        )
     validated_as(MonitorArguments, found.get("monitor_kwargs") or {}, lambda name: f"{source}: monitor_kwargs: {name}")
     for key in ("env_wrapper", "vec_env_wrapper", "callback"):
         for name, arguments in _classes(found.get(key)):
             _check_call(key, name, arguments)
-    if isinstance(policy := found["policy"], str) and "." in policy:  # which rl_zoo3 imports
-        _class_named("policy", policy, "sb3_maddpg.MADDPGPolicy")
+    if isinstance(policy := found["policy"], str) and "." in policy:
+        found["policy"] = _class_named("policy", policy, "sb3_maddpg.MADDPGPolicy")
     if isinstance(buffer := found.get("replay_buffer_class"), str):
         found["replay_buffer_class"] = _replay_buffer(buffer)
     return found
@@ -334,11 +285,11 @@ def check_recipe(algo: str, hyperparams: Mapping[str, Any], source: str) -> dict
 
 def check_shown(settings: Mapping[str, Any], source: str) -> dict[str, Any]:
     """
-    Check the settings of a run that rl_zoo3 reads in order to show it.
+    Check the settings of a run that showing it needs.
 
     :param settings: settings of the run
     :param source: the file, for error messages
-    :return: those that are set, as rl_zoo3 expects them
+    :return: those that are set
     :raises ValueError: if a value is invalid
     """
     checked = validated_as(ShownKeys, settings, lambda name: f"{source}: {name}")
@@ -346,10 +297,6 @@ def check_shown(settings: Mapping[str, Any], source: str) -> dict[str, Any]:
     for key in ("env_wrapper", "vec_env_wrapper"):
         for name, arguments in _classes(found.get(key)):
             _check_call(key, name, arguments, source)
-    if found.get("normalize"):
-        found["normalize_kwargs"] = found["normalize"]
-    if isinstance(buffer := settings.get("replay_buffer_class"), str):
-        found["replay_buffer_class"] = buffer
     return found
 
 
@@ -383,10 +330,10 @@ def check_keys(algo: str, hyperparams: Mapping[str, Any]) -> None:
     :param hyperparams: the recipe
     :raises ValueError: if a key is unknown; the message suggests the closest known one
     """
-    known = set(ZooKeys.model_fields) | (arguments_of(ALGOS[algo]) - COMMAND_LINE)
+    known = set(Recipe.model_fields) | (arguments_of(algorithm(algo)) - COMMAND_LINE)
     for key in hyperparams:
         if key not in known:
-            raise ValueError(suggest(f"key in the recipe for {algo}", str(key), known))
+            raise InvalidArgumentError(suggest(f"key in the recipe for {algo}", str(key), known))
     check_policy_kwargs(algo, hyperparams)
 
 
@@ -404,17 +351,17 @@ def check_policy_kwargs(algo: str, hyperparams: Mapping[str, Any]) -> None:
         known = arguments_of(policy) - OF_ALGORITHM
         for key in policy_kwargs:
             if key not in known:
-                raise ValueError(suggest(f"key in policy_kwargs for {algo}", str(key), known))
+                raise InvalidArgumentError(suggest(f"key in policy_kwargs for {algo}", str(key), known))
 
 
 def policy_class(algo: str, name: str | type[BasePolicy]) -> type[BasePolicy] | None:
     """
     :param algo: name of the algorithm
     :param name: name of the policy in the recipe
-    :return: the policy class, or None for a dotted path, which rl_zoo3 imports later, or an invalid name
+    :return: the policy class, or None for an invalid name
     """
     if isinstance(name, str):
-        return ALGOS[algo].policy_aliases.get(name)
+        return algorithm(algo).policy_aliases.get(name)
     return name if isinstance(name, type) else None
 
 
@@ -431,12 +378,17 @@ def _replay_buffer(name: str) -> type[ReplayBuffer]:
 def _class_named(key: str, name: str, example: str) -> Any:
     """:return: what a dotted path in a recipe names"""
     try:
-        return get_class_by_name(name)
+        return _import(name)
     except (Exception, SystemExit) as error:  # from foreign code
-        raise ValueError(
+        raise InvalidArgumentError(
             f"{key}: {name} in the recipe cannot be imported ({told(error)}). Use the dotted path of a class, such as "
             f"{example}. {_OF_WHICH}"
         ) from error
+
+
+def _import(name: str) -> Any:
+    module, _, attribute = name.rpartition(".")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def names_of_classes(value: Any) -> list[str]:
@@ -460,15 +412,19 @@ def _check_call(key: str, name: str, arguments: Any, source: str = "the recipe")
     """Check that a class of a recipe exists and can be called with its arguments."""
     where = f"{key}: {name} in {source}"
     try:
-        found = get_class_by_name(name)
+        found = _import(name)
     except (Exception, SystemExit) as error:  # from foreign code
-        raise ValueError(f"{where} cannot be imported ({told(error)}). {_OF_WHICH}") from error
+        raise InvalidArgumentError(f"{where} cannot be imported ({told(error)}). {_OF_WHICH}") from error
     if not callable(found):
-        raise ValueError(f"{where} is not a class. Use the dotted path of one.")
+        raise InvalidArgumentError(f"{where} is not a class. Use the dotted path of one.")
     if key == "callback" and not (isinstance(found, type) and issubclass(found, BaseCallback)):
-        raise ValueError(f"{where} is no subclass of Stable-Baselines3's BaseCallback. Use the dotted path of one.")
+        raise InvalidArgumentError(
+            f"{where} is no subclass of Stable-Baselines3's BaseCallback. Use the dotted path of one."
+        )
     if not isinstance(arguments, dict):
-        raise ValueError(f"{where} has {_kind(arguments)} instead of arguments: write `{name}: {{ARGUMENT: VALUE}}`.")
+        raise InvalidArgumentError(
+            f"{where} has {_kind(arguments)} instead of arguments: write `{name}: {{ARGUMENT: VALUE}}`."
+        )
     try:
         signature = inspect.signature(found)
     except (TypeError, ValueError):  # compiled code may have none
@@ -478,7 +434,7 @@ def _check_call(key: str, name: str, arguments: Any, source: str = "the recipe")
         given = signature.bind_partial(*positional, **arguments).arguments
     except TypeError as error:
         names = ", ".join([*signature.parameters][len(positional) :]) or "none"
-        raise ValueError(f"{where}: {error}. Its arguments are: {names}.") from error
+        raise InvalidArgumentError(f"{where}: {error}. Its arguments are: {names}.") from error
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     missing = [
         parameter.name
@@ -487,7 +443,50 @@ def _check_call(key: str, name: str, arguments: Any, source: str = "the recipe")
     ]
     if missing:
         form = ", ".join(f"{one}: VALUE" for one in missing)
-        raise ValueError(f"{where} needs {' and '.join(missing)}: write `{name}: {{{form}}}`.")
+        raise InvalidArgumentError(f"{where} needs {' and '.join(missing)}: write `{name}: {{{form}}}`.")
+
+
+def wrapper_of(key: str, value: Any) -> Callable[[Any], Any] | None:
+    """
+    :param key: ``env_wrapper`` or ``vec_env_wrapper``
+    :param value: its value in a recipe that was checked
+    :return: a function that applies the wrappers, None without any
+    """
+    wrappers = [(_import(name), arguments) for name, arguments in _classes(value)]
+    if not wrappers:
+        return None
+
+    def wrapped(env: Any) -> Any:
+        try:
+            for wrapper, arguments in wrappers:
+                env = wrapper(env, **arguments)
+        except Exception as error:  # from foreign code
+            raise InvalidEnvironmentError(
+                f"{key}: {shown(value)} cannot wrap the environment ({told(error)})."
+            ) from error
+        needed = VecEnv if key == "vec_env_wrapper" else gymnasium.Env
+        if not isinstance(env, needed):
+            raise InvalidEnvironmentError(
+                f"{key}: {shown(value)} returned {shown(env)}: it must return a {needed.__module__}.{needed.__name__} "
+                "around the environment."
+            )
+        return env
+
+    return wrapped
+
+
+def callbacks_of(value: Any) -> list[BaseCallback]:
+    """
+    :param value: ``callback`` in a recipe that was checked
+    :return: new callbacks
+    :raises InvalidArgumentError: if one cannot be created
+    """
+    try:
+        return [_import(name)(**arguments) for name, arguments in _classes(value)]
+    except Exception as error:  # from foreign code
+        raise InvalidArgumentError(
+            f"callback: {shown(value)} in the recipe cannot be created ({told(error)}): repair it, or leave it out."
+        ) from error
 
 
 def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
@@ -501,7 +500,7 @@ def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
     known = _env_arguments(env_id)
     for key in env_kwargs:
         if known is not None and key not in known:
-            raise ValueError(suggest(f"argument of {env_id}", key, known))
+            raise InvalidArgumentError(suggest(f"argument of {env_id}", key, known))
 
 
 def _env_arguments(env_id: str) -> set[str] | None:

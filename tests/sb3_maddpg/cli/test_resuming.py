@@ -1,7 +1,6 @@
 """Runs of the command line that are killed and resumed end as if nothing had happened."""
 
 import csv
-import json
 import os
 import shutil
 import signal
@@ -16,10 +15,10 @@ import pytest
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_maddpg.cli.command_files import write_command
-from sb3_maddpg.cli.commands import main
+from sb3_maddpg import MADDPG
+from sb3_maddpg.cli.main import main
+from sb3_maddpg.cli.safety import RunLoader
 
-pytest.importorskip("rl_zoo3")
 SWARM = {
     "n_timesteps": 2400,
     "n_envs": 4,
@@ -89,13 +88,13 @@ def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tm
     process.kill()
     process.wait()
     last = checkpoints(parts)[-1].name
-    process = start(["--resume"], parts)
+    process = start(["--resume", "--tensorboard-log", "tb"], parts)
     wait_for(process, 1, parts, last)
     process.send_signal(signal.SIGTERM)
     output = process.communicate()[0]
     assert process.returncode == -signal.SIGTERM, output
     assert "Ended by SIGTERM at step" in output
-    process = start(["--resume"], parts)
+    process = start(["--resume", "--tensorboard-log", "tb"], parts)
     output = process.communicate()[0]
     assert process.returncode == 0, output
     assert "Resuming logs/maddpg/" in output
@@ -137,7 +136,7 @@ def test_resuming_a_run_that_trains_does_not_touch_it(tmp_path):
     wait_for(process, 1, tmp_path)
     second = start(["--resume"], tmp_path)
     output = second.communicate()[0]
-    assert second.returncode == 2, output
+    assert second.returncode == 1, output
     assert f"checkpoints is in use by process {process.pid}" in output
     process.send_signal(signal.SIGINT)
     output = process.communicate()[0]
@@ -152,15 +151,14 @@ def test_what_cannot_be_resumed_is_said(tmp_path, monkeypatch, capsys):
     for argv, message in (
         (["--resume"], "no run in logs has checkpoints"),
         (["--resume", "nowhere"], "nowhere is not the folder of a run with checkpoints"),
-        (["--resume", "nowhere", "--seed", "3"], "leave out --seed 3"),
         (["--env", "OwnBit-v0", "-f", ""], "--log-folder is empty"),
         (["--env", "OwnBit-v0", "--checkpoint-every", "-5"], "--checkpoint-every -5: pass a number of steps, or 0"),
     ):
         assert main(["train", *argv]) == 2
         assert message in capsys.readouterr().err
-    Path("run").mkdir()
-    Path("run/command.json").write_text(json.dumps({"argv": [], "every": None}))
-    assert main(["train", "--resume", "run"]) == 2
+    Path("run/OwnBit-v0").mkdir(parents=True)
+    Path("run/OwnBit-v0/args.yml").write_text("env: OwnBit-v0\n")
+    assert main(["train", "--resume", "run"]) == 1
     assert "run has no complete checkpoint" in capsys.readouterr().err
 
 
@@ -169,7 +167,7 @@ def test_checkpoints_can_be_switched_off(tmp_path, monkeypatch):
     Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**OWN, "n_timesteps": 300}}))
     argv = ["train", "--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--verbose", "0"]
     assert main([*argv, "--checkpoint-every", "0"]) == 0
-    assert not list(Path("logs").rglob("command.json"))
+    assert not list(Path("logs").rglob("checkpoints"))
 
 
 def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
@@ -188,7 +186,7 @@ def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
     assert not checkpoints(tmp_path)
 
 
-def test_a_recipe_with_another_number_of_environments_is_refused_until_it_is_as_before(tmp_path, monkeypatch, capsys):
+def test_another_number_of_environments_is_refused_until_it_is_as_before(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     recipe = OWN | {"train_freq": 3, "n_envs": 2}
     Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": recipe}))
@@ -205,13 +203,22 @@ def test_a_recipe_with_another_number_of_environments_is_refused_until_it_is_as_
     before = episodes()[1:15]
     for n_envs in (1, 3):
         Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": recipe | {"n_envs": n_envs}}))
-        assert main(["train", "--resume"]) == 2
-        error = capsys.readouterr().err
-        assert f"has n_envs=2, but the recipe or env has n_envs={n_envs} now: set it to 2 to resume this run" in error
-        assert error.count("\n") == 1
-    Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": recipe}))
-    assert main(["train", "--resume"]) == 0
+        for words in (["-params", f"n_envs:{n_envs}"], ["--conf-file", "r.yml"]):
+            assert main(["train", "--resume", *words]) != 0
+            error = capsys.readouterr().err
+            assert f"has n_envs=2, but the recipe or env has n_envs={n_envs} now: set it to 2 to resume" in error
+            assert error.count("\n") == 1
+    assert main(["train", "--resume"]) == 0, "the recipe of the run's folder is as it was"
     assert episodes()[1:15] == before
+
+
+def test_options_beside_resume_replace_those_of_the_run(killed, tmp_path, monkeypatch):
+    monkeypatch.chdir(shutil.copytree(killed, tmp_path / "copy"))
+    assert main(["train", "--resume", "-n", "1500", "--save-replay-buffer"]) == 0
+    (run,) = Path("logs/maddpg").glob("*_1")
+    assert MADDPG.load(run / "OwnBit-v0.zip").num_timesteps == 1500
+    assert (run / "replay_buffer.pkl").exists()
+    assert yaml.safe_load((run / "OwnBit-v0/args.yml").read_text())["checkpoint_every"] == 300
 
 
 @pytest.fixture(scope="module")
@@ -227,67 +234,71 @@ def killed(tmp_path_factory) -> Path:
     return folder
 
 
+def change(name: str, **values) -> None:
+    (path,) = Path("logs").rglob(name)
+    path.write_text(yaml.safe_dump({**yaml.load(path.read_text(), RunLoader), **values}))
+
+
+CHECKPOINTS = "stable_baselines3.common.callbacks.CheckpointCallback"
+
+
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("name", "values", "told"),
     [
-        (["-params", "callback:[{os.mkdir: {path: caught}}]"], "callback names 'os.mkdir'"),
-        (["-params", "policy:lurking.Policy"], "policy names 'lurking.Policy'"),
-        (["-params", "replay_buffer_class:lurking.Buffer"], "replay_buffer_class names 'lurking.Buffer'"),
-        (["-params", "env_wrapper:lurking.Wrapper"], "env_wrapper names 'lurking.Wrapper'"),
-        (["--gym-packages", "lurking"], "command.json imports 'lurking'"),
-        (["--gym-pack=lurking"], "command.json imports 'lurking'"),
-        (["--gym-packages", "lurking", "--gym-pack", "sys"], "command.json imports 'lurking'"),
-        (["--env", "lurking"], "command.json imports 'lurking'"),
-        (["--conf-file", "lurking"], "with lurking may run any code"),
-        (["--conf", "lurking.py"], "with lurking.py may run any code"),
-        (["--conf-file", "evil.yml"], "callback names 'lurking.Callback'"),
-        (["-optimize"], "may run any code"),
-        (["-optimize", "--sampler", "auto"], "has the option '--sampler'"),
+        ("config.yml", {"callback": [{"os.mkdir": {"path": "caught"}}]}, "callback names 'os.mkdir'"),
+        ("config.yml", {"policy": "lurking.Policy"}, "policy names 'lurking.Policy'"),
+        ("config.yml", {"replay_buffer_class": "lurking.Buffer"}, "replay_buffer_class names 'lurking.Buffer'"),
+        ("config.yml", {"env_wrapper": "lurking.Wrapper"}, "env_wrapper names 'lurking.Wrapper'"),
         (
-            [
-                "-params",
-                "callback:[{stable_baselines3.common.callbacks.CheckpointCallback: "
-                "{save_freq: 9, save_path: ../victim}}]",
-            ],
+            "config.yml",
+            {"callback": [{CHECKPOINTS: {"save_freq": 9, "save_path": "../victim"}}]},
             "save_path is '../victim', which may be a path outside",
         ),
-        (["-params", "monitor_kwargs:{info_keywords: [a/b]}"], "info_keywords is 'a/b'"),
-        (["--track"], "has the option '--track'"),
+        ("config.yml", {"monitor_kwargs": {"info_keywords": ["a/b"]}}, "info_keywords is 'a/b'"),
+        ("args.yml", {"gym_packages": ["lurking"]}, "args.yml imports 'lurking'"),
+        ("args.yml", {"gym_packages": ["gymnasium", "lurking"]}, "args.yml imports 'lurking'"),
+        ("args.yml", {"env": "lurking"}, "args.yml imports 'lurking'"),
+        ("args.yml", {"tensorboard_log": "/victim"}, "--tensorboard-log is '/victim', outside"),
+        ("args.yml", {"tensorboard_log": "../tb"}, "--tensorboard-log is '../tb', outside"),
+        ("args.yml", {"algo": "ppo"}, "algo is 'ppo'"),
+        ("args.yml", {"n_timesteps": "many"}, "args.yml: argument -n/--n-timesteps: 'many' is no integer"),
+        ("args.yml", {"vec_env": "--track"}, "invalid choice: '--track'"),
     ],
 )
-def test_the_command_of_someone_elses_run_runs_no_code(killed, monkeypatch, capsys, words, told):
-    monkeypatch.chdir(killed)
+def test_the_folder_of_someone_elses_run_runs_no_code(killed, tmp_path, monkeypatch, capsys, name, values, told):
+    folder = shutil.copytree(killed, tmp_path / "copy")
+    monkeypatch.chdir(folder)
     monkeypatch.delitem(sys.modules, "lurking", raising=False)  # a module of this name is imported by other tests
     monkeypatch.syspath_prepend("")  # as `python -m` does
-    (killed / "lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
-    (killed / "evil.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"callback": "lurking.Callback"}}))
-    (path,) = killed.rglob("command.json")
-    own = path.read_text()
-    command = json.loads(own)
-    try:
-        path.write_text(json.dumps({**command, "argv": [*command["argv"], *words]}))
-        assert main(["train", "--resume"]) == 2
-        assert told in (error := capsys.readouterr().err)
-        assert "pass --trust" in error
-        assert not (killed / "caught").exists()
-    finally:
-        path.write_text(own)
+    (folder / "lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
+    change(name, **values)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["train", "--resume"]) == 1
+    assert told in (error := capsys.readouterr().err)
+    assert error.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_someone_elses_run_is_resumed_if_its_command_runs_no_code(killed, tmp_path, capsys, monkeypatch):
+def test_options_that_only_begin_a_run_are_not_taken_from_its_folder(killed, tmp_path, monkeypatch):
+    folder = shutil.copytree(killed, tmp_path / "copy")
+    monkeypatch.chdir(folder)
+    (folder / "lurking.py").write_text("from pathlib import Path\nPath('caught').touch()\n")
+    further = {"conf_file": "lurking", "track": True, "optimize_hyperparameters": True, "log_folder": "/victim"}
+    change("args.yml", **further, storage="victim.log", hyperparams={"callback": "os.system"}, n_timesteps=1200)
+    assert main(["train", "--resume"]) == 0
+    assert not (folder / "caught").exists()
+    assert not (folder / "victim.log").exists()
+
+
+def test_someone_elses_run_is_resumed_if_it_runs_no_code(killed, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(shutil.copytree(killed, tmp_path / "copy"))
-    (path,) = Path("logs").rglob("command.json")
-    argv = json.loads(path.read_text())["argv"]
-    words = ["-params", "n_timesteps:700", "policy:sb3_maddpg.MADDPGPolicy"]
-    path.write_text(json.dumps({"argv": [*argv, *words], "every": 300}))
+    change("config.yml", n_timesteps=1200, policy="sb3_maddpg.MADDPGPolicy")
     assert main(["train", "--resume"]) == 0
     assert "Resuming logs" in capsys.readouterr().out
 
     monkeypatch.chdir(shutil.copytree(killed, tmp_path / "trusted"))
-    checkpoints = "stable_baselines3.common.callbacks.CheckpointCallback"
-    words = ["-params", "n_timesteps:700", f"callback:[{{{checkpoints}: {{save_freq: 50, save_path: caught}}}}]"]
-    path.write_text(json.dumps({"argv": [*argv, *words], "every": 300}))
-    assert main(["train", "--resume"]) == 2
+    change("config.yml", callback=[{CHECKPOINTS: {"save_freq": 50, "save_path": "caught"}}])
+    assert main(["train", "--resume"]) == 1
     assert not Path("caught").exists()
     assert "may be a path outside" in capsys.readouterr().err
     assert main(["train", "--resume", "--trust"]) == 2
@@ -295,40 +306,32 @@ def test_someone_elses_run_is_resumed_if_its_command_runs_no_code(killed, tmp_pa
     assert "resume with the same ones" in error
 
 
-def test_a_packaged_recipe_is_not_replaced_by_a_file_of_the_present_folder(killed, tmp_path, monkeypatch):
-    folder = shutil.copytree(killed, tmp_path / "copy")
-    (run,) = folder.glob("logs/maddpg/*")
-    monkeypatch.chdir(folder)
-    words = ["--env", "OwnBit-v0", "--conf-file", "maddpg.yml", "-n", "700", "--eval-freq", "-1", "--verbose", "0"]
-    write_command(run, words, 300)
-    monkeypatch.chdir(tmp_path)
-    Path("maddpg.yml").write_text(yaml.safe_dump({"default": OWN | {"callback": [{"os.mkdir": {"path": "caught"}}]}}))
-    assert main(["train", "--resume", str(run)]) == 0
-    assert not Path("caught").exists()
-
-
-def test_a_run_in_an_environment_of_the_present_folder_is_resumed_from_any_folder(tmp_path):
+def test_what_a_run_imports_and_writes_elsewhere_is_named_again(tmp_path):
     pytest.importorskip("mpe2")
-    project, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
-    project.mkdir()
-    elsewhere.mkdir()
-    (project / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
-    (project / "my_callbacks.py").write_text(
+    (tmp_path / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
+    (tmp_path / "my_callbacks.py").write_text(
         "from stable_baselines3.common.callbacks import CallbackList\nclass Own(CallbackList):\n"
         "    def __init__(self):\n        super().__init__([])\n"
     )
     recipe = {**OWN, "n_timesteps": 3000, "callback": "my_callbacks.Own"}
-    (project / "r.yml").write_text(yaml.safe_dump({"default": recipe}))
+    (tmp_path / "r.yml").write_text(yaml.safe_dump({"default": recipe}))
     argv = ["--env", "my_team/parallel_env", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "200"]
-    process = start([*argv, "--gym-packages", "my_callbacks", "--verbose", "0"], project)
-    for folder, words in (
-        (project, ["--resume"]),
-        (elsewhere, ["--resume", "../project/logs/maddpg/my_team-parallel_env_1"]),
+    named = ["--gym-packages", "my_callbacks", "--tensorboard-log", "tb"]
+    process = start([*argv, *named, "--verbose", "0"], tmp_path)
+    wait_for(process, 1, tmp_path)
+    process.kill()
+    process.wait()
+    for words, missing in (
+        (["--resume"], "imports 'my_callbacks'"),
+        (["--resume", *named[:2]], "imports 'my_team'"),
+        (["--resume", *named[:2], "--env", argv[1]], "--tensorboard-log is 'tb', outside"),
     ):
-        wait_for(process, 1, project, (checkpoints(project) or [Path()])[-1].name)
-        process.kill()
-        process.wait()
-        process = start(words, folder)
+        process = start(words, tmp_path)
+        output = process.communicate()[0]
+        assert process.returncode == 1
+        assert missing in output
+        assert "pass --trust" in output
+    process = start(["--resume", *named, "--env", argv[1]], tmp_path)
     output = process.communicate()[0]
     assert process.returncode == 0, output
-    assert "Resuming ../project/logs/maddpg" in output
+    assert "Resuming logs/maddpg" in output
