@@ -32,19 +32,9 @@ from quad_swarm.evaluation.rows import write_rows
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
 from sb3_maddpg.checkpoints import checkpoints
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
+from studies.commit_points import POINTS, interrupt
 
 SWARMS, EVERY = 8, 400
-POINTS = (
-    "opened rows",
-    "written rows",
-    "begin",
-    *(f"{done} {name}" for name in ("arrays.npz", "model.zip", "state.json") for done in ("written", "synced")),
-    "opened manifest",
-    "manifest",
-    "folder synced",
-    "renamed",
-    "committed",
-)
 DAMAGED = 5
 _FAULT = "STUDIES_KILLS_FAULT"  # the point at which a child kills itself
 _FULL = "STUDIES_KILLS_FULL"  # the point at which its disk is full
@@ -98,7 +88,7 @@ def child(folder: Path, steps: int) -> None:
             full = None  # the disk is full only once
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    checkpoints.fault = fault
+    interrupt(fault)
     print(train(folder, steps), flush=True)
 
 

@@ -60,8 +60,6 @@ from sb3_maddpg.vec_env.states import (
 _FORMAT = 2
 _PREFIX, _UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
 _SEGMENTS = "segments"
-# Called with the name of each step of writing; tests replace it by a function that kills the process
-fault: Callable[[str], None] = lambda point: None  # noqa: E731
 _BLOCK = 2**25  # bytes of a replay buffer to write at once
 # Minimum time between checkpoints (s), and maximum fraction of the time that they may take
 _SECONDS, _SHARE = 30.0, 0.015
@@ -364,7 +362,6 @@ class _Writer(threading.Thread):
         unfinished = _unfinished(path)
         try:
             with unfinished.open("xb") as file:
-                fault("opened rows")
                 for end, parts in self.segment.content():
                     with self._progress:
                         self._copied = end
@@ -372,7 +369,6 @@ class _Writer(threading.Thread):
                     for part in parts:
                         found.update(part)
                         file.write(part)
-                fault("written rows")
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(unfinished, path)
@@ -934,23 +930,16 @@ def _commit(target: Path, write: Callable[[Path], None]) -> Path:
     """Write a folder atomically."""
     unfinished = _unfinished(target)
     unfinished.mkdir(parents=True)
-    fault("begin")
     write(unfinished)
     sums = {}
     for path in sorted(unfinished.iterdir()):
-        fault(f"written {path.name}")
         _sync(path)
         sums[path.name] = _sha256(path)
-        fault(f"synced {path.name}")
     _write_synced(unfinished / _MANIFEST, json.dumps(sums).encode())
-    fault("manifest")
     sync_folder(unfinished)
-    fault("folder synced")
     shutil.rmtree(target, ignore_errors=True)
     os.rename(unfinished, target)
-    fault("renamed")
     sync_folder(target.parent)
-    fault("committed")
     return target
 
 
@@ -996,7 +985,6 @@ def _sha256(path: Path) -> str:
 
 def _write_synced(path: Path, content: bytes) -> None:
     with path.open("wb") as file:
-        fault("opened manifest")
         file.write(content)
         file.flush()
         os.fsync(file.fileno())

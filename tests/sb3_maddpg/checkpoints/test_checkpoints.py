@@ -37,6 +37,7 @@ from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.utils import sources_of
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 from sb3_maddpg.vec_env.states import Replayable
+from studies.commit_points import POINTS, interrupt
 
 SETTINGS = {"learning_starts": 60, "batch_size": 16, "seed": 0}
 SWARM = {"preset": "flight", "n_robots": 3, "max_steps": 20}
@@ -110,7 +111,7 @@ def go_on(name: str, folder: Path, others: list[BaseCallback] = []) -> MADDPG:  
 
 
 def kill_at(monkeypatch, point: str, times: int) -> None:
-    """Kill when a fault point is reached for so many times."""
+    """Kill when a point of writing is reached for so many times."""
     left = [times]
 
     def fault(name: str) -> None:
@@ -119,7 +120,7 @@ def kill_at(monkeypatch, point: str, times: int) -> None:
             left[0] = -1
             raise Killed
 
-    monkeypatch.setattr(checkpoints, "fault", fault)
+    interrupt(fault, monkeypatch.setattr)
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -170,12 +171,6 @@ def test_a_signal_ends_the_run_after_the_rollout_and_a_second_one_at_once(steps,
     assert model.num_timesteps == ended_at
     path = newest(tmp_path)
     assert (path.name if path else None) == ("checkpoint-000000000150" if len(steps) == 1 else None)
-
-
-POINTS = [
-    "opened rows", "written rows", "begin", "written arrays.npz", "synced model.zip", "written state.json",
-    "opened manifest", "manifest", "folder synced", "renamed", "committed",
-]  # fmt: skip
 
 
 @pytest.mark.parametrize("point", POINTS)
@@ -431,15 +426,15 @@ def test_a_full_disk_keeps_the_last_checkpoint(tmp_path, monkeypatch, number, to
         if point == "written model.zip" and len(list(tmp_path.glob("checkpoint-*"))) > 2:
             raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(checkpoints, "fault", full)
-    with pytest.warns(UserWarning, match=told):
-        model = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
+    with monkeypatch.context() as patched:
+        interrupt(full, patched.setattr)
+        with pytest.warns(UserWarning, match=told):
+            model = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])
     assert digest(model) == expected, "the training goes on"
     assert not list(tmp_path.glob("*.unfinished"))
     states = [json.loads((path / "state.json").read_text()) for path in tmp_path.glob("checkpoint-*")]
     needed = {one["name"] for state in states for one in state["segments"]}
     assert {path.name for path in (tmp_path / "segments").iterdir()} == needed
-    monkeypatch.setattr(checkpoints, "fault", lambda point: None)
     assert digest(go_on("replayed", tmp_path)) == expected
 
 
