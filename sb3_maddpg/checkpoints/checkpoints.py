@@ -33,6 +33,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch as th
+from filelock import FileLock, Timeout, UnixFileLock
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
@@ -493,28 +494,24 @@ def newest(folder: str | os.PathLike[str]) -> Path | None:
 @contextmanager
 def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
     """
-    Lock a folder of checkpoints for this process. The lock ends with the process, however that ends. On Windows, this
-    does nothing.
+    Lock a folder of checkpoints for this process. The lock ends with the process, however that ends.
 
     :param folder: folder of the checkpoints
     :raises ValueError: if another process holds the lock
     """
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
+    file, holder = path / "lock", ""
+    with suppress(OSError):
+        holder = file.read_text(errors="replace").strip()  # earlier versions of filelock truncate the file
+    lock = FileLock(file, thread_local=False)
     try:
-        import fcntl
-    except ImportError:  # on Windows
-        yield
-        return
-    with (path / "lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            raise TeamError(f"{path} is in use by {file.read().strip() or 'another process'}.") from None
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {platform.node()}")
-        file.flush()
+        held = lock.acquire(blocking=False)
+    except Timeout:
+        raise TeamError(f"{path} is in use by {holder or 'another process'}.") from None
+    with held:
+        if isinstance(lock, UnixFileLock):  # on Windows, nobody can write into a locked file
+            file.write_text(f"process {os.getpid()} on {platform.node()}")
         yield
 
 
