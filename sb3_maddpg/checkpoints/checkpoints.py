@@ -34,12 +34,26 @@ from typing import Any, cast
 import numpy as np
 import torch as th
 from filelock import FileLock, Timeout, UnixFileLock
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    CheckpointCallback,
+    ConvertCallback,
+    EvalCallback,
+    EventCallback,
+    EveryNTimesteps,
+    LogEveryNTimesteps,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.common.buffers import TeamReplayBuffer
+from sb3_maddpg.common.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError, InvalidFileError, NoStateError, TeamError
 from sb3_maddpg.files.model_files import as_damage, check_not_compressed
@@ -107,6 +121,13 @@ class RunCheckpoint(BaseCallback):
         self._segments: list[dict[str, Any]] = []
         # Callbacks with their values at the start of training
         self._at_start: list[tuple[BaseCallback, dict[str, Any]]] = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """:return: nothing: what it counts begins anew in every process"""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """:param state: see ``state_dict``"""
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -203,7 +224,7 @@ class RunCheckpoint(BaseCallback):
         started = time.monotonic()
         self.saved_at = model.num_timesteps
         kept, (first, end) = self._kept_segments(buffer), self._new_rows(buffer)
-        state = _state_of(model, _callbacks(self._root()), self._at_start)
+        state = _state_of(model, _callbacks(self._root()), self._at_start, self.every)
         self.inexact = state["inexact"]
         self._writer = _Writer(self.folder, model, _Segment(buffer, first, end), kept, state, self.keep)
         self._writer.start()
@@ -534,12 +555,16 @@ def digest(model: TeamAlgorithm) -> str:
 
 
 def _state_of(
-    model: TeamAlgorithm, callbacks: list[BaseCallback], at_start: Sequence[tuple[BaseCallback, dict[str, Any]]]
+    model: TeamAlgorithm,
+    callbacks: list[BaseCallback],
+    at_start: Sequence[tuple[BaseCallback, dict[str, Any]]],
+    every: int | None,
 ) -> dict[str, Any]:
     """
     :param model: the model
     :param callbacks: all callbacks
     :param at_start: callbacks with their values at the start of training
+    :param every: number of steps between checkpoints, None for checkpoints by time
     :return: the state of everything that is not in the model's file
     """
     buffer = model.replay_buffer
@@ -554,13 +579,13 @@ def _state_of(
             reason, evaluation = _env_state_or_reason(other)
             inexact = inexact or reason
         began = next((values for known, values in at_start if known is one), None)
-        values = {"values": _values(one), "at_start": began}
+        values = {"values": {**_values(one), **_told(one)}, "at_start": began}
         states.append({"class": type(one).__name__, **values, "eval_env": evaluation})
     return {
         "format": _FORMAT,
         "fingerprint": fingerprint(model.env),
         "inexact": inexact,
-        "every": next(one.every for one in callbacks if isinstance(one, RunCheckpoint)),
+        "every": every,
         "counters": counters,
         "buffer_arrays": {name: one for name, one in arrays.items() if name not in in_segments},
         "last": {name: getattr(model, name) for name in _LAST},
@@ -602,7 +627,7 @@ def _restore(model: TeamAlgorithm, callbacks: list[BaseCallback], state: dict[st
             f"The run had the callbacks {written}, but now they are {names}: resume with the same ones."
         )
     for one, saved in zip(callbacks, states, strict=True):
-        set_plain_values(one, _values_to_restore(one, saved["values"], saved.get("at_start")))
+        _restore_callback(one, saved["values"], saved.get("at_start"))
         if saved["eval_env"] is not None:
             load_vec_env_state(one.eval_env, saved["eval_env"])  # type: ignore[attr-defined]
     for name in _LOGGED:
@@ -611,9 +636,81 @@ def _restore(model: TeamAlgorithm, callbacks: list[BaseCallback], state: dict[st
     _set_random_state(state["random"])
 
 
+# What training changes in callbacks whose arguments it does not change, beside the number of their calls
+_KEPT: dict[type[BaseCallback], tuple[str, ...]] = {
+    CheckpointCallback: (),
+    ConvertCallback: (),
+    CurriculumCallback: ("successes",),
+    DashboardCallback: (),
+    EvalCallback: (
+        "best_mean_reward",
+        "last_mean_reward",
+        "evaluations_results",
+        "evaluations_timesteps",
+        "evaluations_length",
+        "evaluations_successes",
+    ),
+    EventCallback: (),
+    EveryNTimesteps: ("last_time_trigger",),
+    LogEveryNTimesteps: ("last_time_trigger",),
+    MetricsCallback: (),
+    ProgressBarCallback: (),
+    StopTrainingOnMaxEpisodes: ("n_episodes",),
+    StopTrainingOnNoModelImprovement: ("last_best_mean_reward", "no_improvement_evals"),
+    StopTrainingOnRewardThreshold: (),
+}
+_CALLS, _TOLD = "n_calls", "state_dict"
+
+
+def _tells_state(callback: BaseCallback) -> bool:
+    """:return: whether a callback decides itself what checkpoints hold of it"""
+    return all(callable(getattr(type(callback), name, None)) for name in (_TOLD, "load_state_dict"))
+
+
 def _values(callback: BaseCallback) -> dict[str, Any]:
-    """:return: the values of a callback that checkpoints hold"""
-    return {"n_calls": callback.n_calls} if isinstance(callback, RunCheckpoint) else plain_values(callback)
+    """:return: the values of a callback that checkpoints hold, except what it tells itself"""
+    if _tells_state(callback):
+        return {_CALLS: callback.n_calls}
+    names = _KEPT.get(type(callback))
+    if names is None:  # an own callback, or a subclass, of which nobody has said what to keep
+        return plain_values(callback)
+    return plain_entries({name: getattr(callback, name) for name in (_CALLS, *names)})
+
+
+def _told(callback: BaseCallback) -> dict[str, Any]:
+    """
+    :param callback: a callback
+    :return: what it tells of its state, under a name that no attribute has; nothing if that is empty
+    :raises ValueError: if that cannot be written
+    """
+    told: Any = callback.state_dict() if _tells_state(callback) else {}  # type: ignore[attr-defined]
+    name = f"{type(callback).__name__}.state_dict()"
+    if not isinstance(told, dict):
+        raise InvalidArgumentError(f"{name} returned {shown(told)}: it must return a dict of plain values and arrays.")
+    encode(told, name, {})
+    return {_TOLD: told} if told else {}
+
+
+def _restore_callback(callback: BaseCallback, values: dict[str, Any], at_start: dict[str, Any] | None) -> None:
+    """
+    :param callback: a callback of the resumed run
+    :param values: its values in the checkpoint
+    :param at_start: its values at the start of the run, None if the checkpoint does not hold them
+    :raises ValueError: if the values do not fit the callback
+    """
+    names = _KEPT.get(type(callback))
+    if _TOLD in values:
+        if not _tells_state(callback):
+            raise InvalidArgumentError(
+                f"The run's {type(callback).__name__} had state_dict() and load_state_dict(), but now it has not: "
+                "resume with the same one."
+            )
+        set_plain_values(callback, {_CALLS: values[_CALLS]})
+        callback.load_state_dict(values[_TOLD])  # type: ignore[attr-defined]
+    elif names is not None:
+        set_plain_values(callback, {name: values[name] for name in (_CALLS, *names) if name in values})
+    else:
+        set_plain_values(callback, _values_to_restore(callback, values, at_start))
 
 
 def _values_to_restore(
@@ -627,7 +724,7 @@ def _values_to_restore(
     :param at_start: its values at the start of the run, None if the checkpoint does not hold them
     :return: all values if its arguments are those of the run; otherwise those that had changed since the start
     """
-    present, arguments = _values(callback), arguments_of(type(callback))
+    present, arguments = plain_values(callback), arguments_of(type(callback))
     differ = {
         name: value for name, value in present.items() if at_start and not _equal(value, at_start.get(name, value))
     }

@@ -13,26 +13,35 @@ import sys
 import textwrap
 import time
 import warnings
+from copy import deepcopy
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common import callbacks as sb3_callbacks
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
+    CheckpointCallback,
     EvalCallback,
+    EventCallback,
+    EveryNTimesteps,
+    LogEveryNTimesteps,
+    ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
 )
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from quad_swarm import QuadSwarmParallelEnv
-from sb3_maddpg import MADDPG, CurriculumCallback, PrioritizedTeamReplayBuffer, SafeVecNormalize, TeamEnv
+from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer, SafeVecNormalize, TeamEnv
 from sb3_maddpg.checkpoints import checkpoints
 from sb3_maddpg.checkpoints.checkpoints import RunCheckpoint, digest, locked, newest, resume
+from sb3_maddpg.common.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
 from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.utils import sources_of
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
@@ -291,6 +300,112 @@ def test_an_argument_that_the_training_changed_is_restored_and_another_value_is_
     assert (decays.rate, decays.factor) == (after, 3.0)
     with pytest.warns(UserWarning, match=r"Decays: rate=2\.0 has no effect. The run began with 1\.0, .*: 0\.80"):
         assert resumed(2.0).rate == after
+
+
+class Best(BaseCallback):
+    """A callback of somebody else's that keeps its state in objects, and tells it."""
+
+    def __init__(self, limit: int = 9):
+        super().__init__()
+        self.limit, self.seen, self.loaded = limit, {3, 1}, False
+
+    def _on_step(self) -> bool:
+        self.seen.add(int(self.num_timesteps))
+        self.limit += 1
+        return True
+
+    def state_dict(self) -> dict:
+        return {"seen": np.array(sorted(self.seen)), "note": ["x", None, 0.5]}
+
+    def load_state_dict(self, state: dict) -> None:
+        if state["note"] != ["x", None, 0.5]:
+            raise ValueError("no note")
+        self.seen, self.loaded = set(state["seen"].tolist()), True
+
+
+def test_a_callback_that_tells_its_state_decides_what_is_kept(tmp_path):
+    make("replayed").learn(250, callback=[first := Best(), RunCheckpoint(tmp_path, EVERY, keep=1)])
+    assert first.limit > 200
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    steps = model.num_timesteps
+    model.learn(1, callback=[best := Best(), callback], reset_num_timesteps=False)
+    assert best.loaded
+    assert best.seen == {3, 1, *range(1, steps + 11)}, "it went on for one episode"
+    assert (best.n_calls, best.limit) == (steps + 10, 19), "only what it tells is kept, and its calls"
+
+    class Silent(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+    Silent.__name__ = "Best"
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    with pytest.raises(ValueError, match=r"The run's Best had state_dict\(\) and load_state_dict\(\), but now"):
+        model.learn(1, callback=[Silent(), callback], reset_num_timesteps=False)
+    edit(tmp_path, lambda state: state["callbacks"][0]["values"]["state_dict"].update(note=1))
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    with pytest.raises(ValueError, match="no note"):
+        model.learn(1, callback=[Best(), callback], reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("told", [[1], {"seen": {1, 2}}, {"model": object()}])
+def test_a_state_that_cannot_be_written_is_refused_by_name(told, tmp_path, monkeypatch):
+    monkeypatch.setattr(Best, "state_dict", lambda self: told)
+    with pytest.raises(ValueError, match=r"Best\.state_dict\(\)"):
+        make("replayed").learn(250, callback=[Best(), RunCheckpoint(tmp_path, EVERY)])
+
+
+def test_a_callback_that_tells_its_state_reads_the_attributes_in_earlier_checkpoints(tmp_path):
+    make("replayed").learn(250, callback=[Best(), RunCheckpoint(tmp_path, EVERY, keep=1)])
+    before = {"n_calls": 200, "num_timesteps": 200, "verbose": 0, "limit": 209, "loaded": False}
+    edit(tmp_path, lambda state: state["callbacks"][0].update(values=before, at_start={**before, "limit": 9}))
+    model, callback = resume(tmp_path, Replayable(OwnBit()))
+    model.learn(1, callback=[best := Best(), callback], reset_num_timesteps=False)
+    assert (best.n_calls, best.limit, best.loaded) == (210, 219, False)
+
+
+# What begins anew in every process, or with every evaluation
+OBJECTS = {"eval_env", "callback", "callback_on_new_best", "model", "parent", "pbar"}
+PASSING = {"model", "parent", "locals", "globals", "num_timesteps", "pbar", "_is_success_buffer"}
+PASSING |= {"_total_max_episodes", "n_levels"}  # follow from arguments and the environment
+
+
+def test_the_table_of_callbacks_holds_all_that_training_changes_in_them(tmp_path):
+    env = DummyVecEnv([lambda: Monitor(curriculum())])
+    evaluation = EvalCallback(
+        env,
+        StopTrainingOnRewardThreshold(1e9),
+        StopTrainingOnNoModelImprovement(100),
+        eval_freq=90,
+        log_path=str(tmp_path),
+        verbose=0,
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        bar = ProgressBarCallback()
+    given = [
+        evaluation,
+        EveryNTimesteps(90, CheckpointCallback(1, str(tmp_path / "models"))),
+        LogEveryNTimesteps(70),
+        StopTrainingOnMaxEpisodes(10**6),
+        EventCallback(MetricsCallback()),
+        DashboardCallback(),
+        CurriculumCallback(1.0, 50),
+        bar,
+    ]
+    every = [one for callback in given for one in checkpoints._callbacks(callback)]
+    assert {type(one) for one in every} == set(checkpoints._KEPT), "each is tried here"
+    known = {one for one in vars(sb3_callbacks).values() if isinstance(one, type) and issubclass(one, BaseCallback)}
+    assert known - set(checkpoints._KEPT) == {BaseCallback, CallbackList}
+    before = [deepcopy({k: v for k, v in vars(callback).items() if k not in OBJECTS}) for callback in every]
+    make("one swarm").learn(250, callback=given)
+    changed = set()
+    for callback, values in zip(every, before, strict=True):
+        kept = {"n_calls", *checkpoints._KEPT[type(callback)]}
+        differ = {name for name, value in vars(callback).items() if name not in OBJECTS and value != values.get(name)}
+        assert differ <= kept | PASSING, type(callback)
+        changed |= {(type(callback), name) for name in differ & kept}
+    assert (StopTrainingOnMaxEpisodes, "n_episodes") in changed
+    assert (EvalCallback, "best_mean_reward") in changed
 
 
 def test_the_window_of_a_curriculum_is_the_one_passed_now(tmp_path):
