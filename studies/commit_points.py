@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sb3_maddpg.checkpoints import checkpoints
+from sb3_maddpg.checkpoints import commit
+from sb3_maddpg.checkpoints.writer import Segment, Writer
 
 # In the order in which they are reached
 POINTS = (
@@ -29,15 +30,15 @@ def interrupt(fault: Callable[[str], None], replace: Callable[[Any, str, Any], N
     :param fault: function of the point's name, which may raise an error or kill the process
     :param replace: what replaces a function of a module or class, e.g. pytest's ``monkeypatch.setattr``
     """
-    content, write = checkpoints._Segment.content, checkpoints._Writer._write
-    sync, write_synced, sync_folder = checkpoints._sync, checkpoints._write_synced, checkpoints.sync_folder
+    content, write = Segment.content, Writer._write
+    sync, write_synced, sync_folder = commit._sync, commit._write_synced, commit.sync_folder
 
-    def contents(segment: checkpoints._Segment) -> Iterator[tuple[int, list[bytes]]]:
+    def contents(segment: Segment) -> Iterator[tuple[int, list[bytes]]]:
         fault("opened rows")
         yield from content(segment)
         fault("written rows")
 
-    def begin(writer: checkpoints._Writer, path: Path) -> None:
+    def begin(writer: Writer, path: Path) -> None:
         fault("begin")
         write(writer, path)
 
@@ -53,15 +54,14 @@ def interrupt(fault: Callable[[str], None], replace: Callable[[Any, str, Any], N
         fault("manifest")
 
     def folder_synced(path: Path) -> None:
-        unfinished = path.name.endswith(checkpoints._UNFINISHED)
-        if not (unfinished or path.name == checkpoints._SEGMENTS):
+        unfinished = path.name.endswith(commit.UNFINISHED)
+        if not unfinished:
             fault("renamed")
         sync_folder(path)
-        if path.name != checkpoints._SEGMENTS:
-            fault("folder synced" if unfinished else "committed")
+        fault("folder synced" if unfinished else "committed")
 
-    replace(checkpoints._Segment, "content", contents)
-    replace(checkpoints._Writer, "_write", begin)
-    replace(checkpoints, "_sync", synced)
-    replace(checkpoints, "_write_synced", manifest)
-    replace(checkpoints, "sync_folder", folder_synced)
+    replace(Segment, "content", contents)
+    replace(Writer, "_write", begin)
+    replace(commit, "_sync", synced)
+    replace(commit, "_write_synced", manifest)
+    replace(commit, "sync_folder", folder_synced)

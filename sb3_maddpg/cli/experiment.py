@@ -29,7 +29,9 @@ from stable_baselines3.common.utils import LinearSchedule, configure_logger, saf
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.utils.tensorboard import SummaryWriter
 
-from sb3_maddpg.checkpoints.checkpoints import RunCheckpoint, locked, resume
+from sb3_maddpg.checkpoints.callback import RunCheckpoint
+from sb3_maddpg.checkpoints.commit import locked
+from sb3_maddpg.checkpoints.resume import resume
 from sb3_maddpg.cli.command_files import latest_run_number, write_command
 from sb3_maddpg.cli.interrupts import noticed_interrupts
 from sb3_maddpg.cli.literals import format_literal, parse_literal

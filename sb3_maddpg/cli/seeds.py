@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_maddpg.checkpoints.checkpoints import locked, newest
+from sb3_maddpg.checkpoints.commit import locked, newest
 from sb3_maddpg.cli.command_files import COMMAND_FILE, read_command, resumable, write_command
 from sb3_maddpg.cli.experiment import CHECKPOINTS
 from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all

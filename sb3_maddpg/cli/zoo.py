@@ -27,7 +27,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
-from sb3_maddpg.checkpoints.checkpoints import newest
+from sb3_maddpg.checkpoints.commit import newest
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.command_files import COMMAND_FILE, latest_run_number, read_command, recipe_of, resumable
 from sb3_maddpg.cli.experiment import CHECKPOINTS, Checkpoints, TeamExperimentManager
