@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 import quad_swarm  # noqa: F401 - registers the environment
 from quad_swarm.evaluation.rows import read_rows, write_rows
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
-from sb3_maddpg.checkpoints.checkpoints import RunCheckpoint
+from sb3_maddpg.checkpoints.callback import RunCheckpoint
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 
 FILE = Path(__file__).parents[1] / "zoo_configs" / "quad_swarm_flight.yml"

@@ -30,21 +30,11 @@ from tqdm import tqdm
 import quad_swarm  # noqa: F401 - registers the environment
 from quad_swarm.evaluation.rows import write_rows
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer
-from sb3_maddpg.checkpoints import checkpoints
+from sb3_maddpg.checkpoints import RunCheckpoint, digest, locked, newest, resume
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
+from studies.commit_points import POINTS, interrupt
 
 SWARMS, EVERY = 8, 400
-POINTS = (
-    "opened rows",
-    "written rows",
-    "begin",
-    *(f"{done} {name}" for name in ("arrays.npz", "model.zip", "state.json") for done in ("written", "synced")),
-    "opened manifest",
-    "manifest",
-    "folder synced",
-    "renamed",
-    "committed",
-)
 DAMAGED = 5
 _FAULT = "STUDIES_KILLS_FAULT"  # the point at which a child kills itself
 _FULL = "STUDIES_KILLS_FULL"  # the point at which its disk is full
@@ -64,8 +54,8 @@ def train(folder: Path, steps: int) -> str:
         observation="state+approach+memory+plan+told+mask+critic",
     )
     env = VecMonitor(GymnasiumVecEnv(envs))
-    with checkpoints.locked(folder):
-        found = checkpoints.resume(folder, env)
+    with locked(folder):
+        found = resume(folder, env)
         if found is not None:
             model, callback = found
         else:
@@ -81,9 +71,9 @@ def train(folder: Path, steps: int) -> str:
                 replay_buffer_class=PrioritizedTeamReplayBuffer,
                 seed=0,
             )
-            callback = checkpoints.RunCheckpoint(folder, EVERY)
+            callback = RunCheckpoint(folder, EVERY)
         model.learn(steps - model.num_timesteps, [callback], reset_num_timesteps=found is None)
-    return checkpoints.digest(model)
+    return digest(model)
 
 
 def child(folder: Path, steps: int) -> None:
@@ -98,7 +88,7 @@ def child(folder: Path, steps: int) -> None:
             full = None  # the disk is full only once
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    checkpoints.fault = fault
+    interrupt(fault)
     print(train(folder, steps), flush=True)
 
 
@@ -117,7 +107,7 @@ def start(folder: Path, steps: int, fault: str = "", full: str = "") -> subproce
 
 def newest_step(folder: Path) -> int:
     """Return the step of the newest complete checkpoint, 0 without one."""
-    path = checkpoints.newest(folder)
+    path = newest(folder)
     return int(path.name.rpartition("-")[2]) if path else 0
 
 
@@ -157,16 +147,16 @@ def kill(folder: Path, steps: int, fault: str = "", seconds: float = 0.0, full: 
 
 def damage(folder: Path, kind: str, rng: random.Random) -> dict[str, Any]:
     """Truncate a file of the newest checkpoint, or flip one of its bits."""
-    newest = checkpoints.newest(folder)
-    assert newest is not None
-    path = rng.choice(sorted(newest.iterdir()))
+    last = newest(folder)
+    assert last is not None
+    path = rng.choice(sorted(last.iterdir()))
     content = bytearray(path.read_bytes())
     if kind == "truncated":
         content = content[: rng.randrange(len(content))]
     else:
         content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
     path.write_bytes(content)
-    before, kept = int(newest.name.rpartition("-")[2]), newest_step(folder)
+    before, kept = int(last.name.rpartition("-")[2]), newest_step(folder)
     return {"kill": f"{kind}: {path.name}", "from_step": before, "kept_step": kept, "done": None, "leftovers": 0}
 
 

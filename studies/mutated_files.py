@@ -40,8 +40,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
 from quad_swarm.evaluation.rows import write_rows
-from sb3_maddpg import MADDPG, MATD3, PrioritizedTeamReplayBuffer, SafeVecNormalize
-from sb3_maddpg.checkpoints import checkpoints
+from sb3_maddpg import MADDPG, MATD3, PrioritizedTeamReplayBuffer, SafeVecNormalize, checkpoints
+from sb3_maddpg.checkpoints.commit import sha256
 from sb3_maddpg.cli.safety import RunLoader
 from sb3_maddpg.team.toys import FollowTarget, OwnBit
 from sb3_maddpg.vec_env.states import Replayable
@@ -247,7 +247,7 @@ def files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
         def load(path: Path) -> None:
             content = path.read_bytes()
             (found / name).write_bytes(content)
-            sums = {one.name: checkpoints._sha256(one) for one in found.iterdir() if one.name != "manifest.json"}
+            sums = {one.name: sha256(one) for one in found.iterdir() if one.name != "manifest.json"}
             if name != "manifest.json":  # as after deliberate damage
                 (found / "manifest.json").write_text(json.dumps(sums))
             again = checkpoints.resume(folder / "run", env)
@@ -339,7 +339,7 @@ def used_files(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
         assert found is not None
         content = path.read_bytes()
         (found / ("arrays.npz" if content[:2] == b"PK" else "state.json")).write_bytes(content)
-        sums = {one.name: checkpoints._sha256(one) for one in found.iterdir() if one.name != "manifest.json"}
+        sums = {one.name: sha256(one) for one in found.iterdir() if one.name != "manifest.json"}
         (found / "manifest.json").write_text(json.dumps(sums))
         again = checkpoints.resume(run, env())
         if again is None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import gymnasium
 
-from sb3_maddpg.checkpoints.checkpoints import newest
+from sb3_maddpg.checkpoints.commit import newest
 from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.algorithms import ALGORITHMS
 from sb3_maddpg.cli.experiment import given_recipe

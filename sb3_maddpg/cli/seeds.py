@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from sb3_maddpg.checkpoints.checkpoints import locked, newest
+from sb3_maddpg.checkpoints.commit import locked, newest
 from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all, without_processes
 from sb3_maddpg.cli.resuming import parsed
 from sb3_maddpg.cli.runs import CHECKPOINTS

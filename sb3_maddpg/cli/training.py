@@ -34,7 +34,7 @@ try:
 except ImportError as error:
     raise ImportError(f"{error}. This needs the extra 'zoo': in the clone, pip install -e '.[zoo]'.") from error
 
-from sb3_maddpg.checkpoints.checkpoints import RunCheckpoint, locked, resume
+from sb3_maddpg.checkpoints import RunCheckpoint, locked, resume
 from sb3_maddpg.cli.environments import STATISTICS, is_stochastic
 from sb3_maddpg.cli.experiment import Experiment, begin, given_recipe, merged
 from sb3_maddpg.cli.options import ENGINES

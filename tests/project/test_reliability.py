@@ -14,7 +14,7 @@ from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 from studies import command_lines, random_worlds, solver_faults
-from studies.kills import POINTS
+from studies.commit_points import POINTS
 from studies.swarm.protocol import condition
 
 ROOT = Path(__file__).parents[2]

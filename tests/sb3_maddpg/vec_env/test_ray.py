@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import quad_swarm  # noqa: F401 - registers QuadSwarm-v0
 from sb3_maddpg import MADDPG
-from sb3_maddpg.checkpoints.checkpoints import digest
+from sb3_maddpg.checkpoints.state import digest
 from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.vec_env.ray import RayVecEnv
 from sb3_maddpg.vec_env.states import Replayable

@@ -1,4 +1,4 @@
-"""States of environments and of what wraps them. That runs go on from them is in test_checkpoints.py."""
+"""States of environments and of what wraps them. That runs go on from them is in checkpoints/test_resume.py."""
 
 import json
 
