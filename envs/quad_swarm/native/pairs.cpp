@@ -1,5 +1,5 @@
-// Computations for every pair of robots in every step. pairs.py and steps.py document them. Their NumPy versions give bit-identical
-// results, so the order of operations must not change.
+// Computations for every pair of robots in every step. pairs.py and steps.py document them, table.py declares their
+// parameters. Their NumPy versions give bit-identical results, so the order of operations must not change.
 //
 // All arrays are contiguous. A trajectory is a row of 3 N numbers, stage by stage. Pairs are ordered by the robot, then
 // by the other.
@@ -59,7 +59,7 @@ inline void steady(const double* pos, const double* vel, const std::vector<doubl
     for (int i = 0; i < 3; i++) to[k + i] = vel[i] * times[k + i] + pos[i];
 }
 
-// The record of `STATISTICS` in steps.py
+// The record of `STATISTICS` in table.py
 struct Statistics {
   Integer steps, steps_counted, requests, possible_requests, peak_requests, plans_used, plan_ages, requests_flown;
   Integer planner_failures;

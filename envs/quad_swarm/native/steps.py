@@ -10,20 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quad_swarm.native import pairs
-from quad_swarm.native.build import addresses
-
-# Record of what is counted of an episode, see `quad_swarm.task.episode_statistics`; pairs.cpp has the same
-STATISTICS = np.dtype(
-    [
-        *((name, np.int64) for name in ("steps", "steps_counted", "requests", "possible_requests", "peak_requests")),
-        *((name, np.int64) for name in ("plans_used", "plan_ages", "requests_flown", "planner_failures")),
-        *((name, np.float64) for name in ("path_length", "min_separation", "min_separation_continuous")),
-        ("solve_seconds", np.float64),
-        *((name, np.bool_) for name in ("at_goals", "reached", "arrived")),
-        *((name, np.bool_) for name in ("collided", "collided_at_steps", "collided_continuous")),
-    ],
-    align=True,
-)
+from quad_swarm.native.table import STATISTICS as STATISTICS
 
 
 class Measured(NamedTuple):
@@ -64,18 +51,14 @@ def measure(
     n_swarms, n = goals.shape[:2]
     shape = (n_swarms, n, n - 1) if others is None else others.shape
     empty = np.empty if others is not None else _swarms_last
-    if (library := pairs.compiled()) is not None:
-        positions, goals = np.ascontiguousarray(positions, np.float64), np.ascontiguousarray(goals, np.float64)
-        others = None if others is None else np.ascontiguousarray(others, np.int64)
-        measured = Measured(
-            *(np.empty(n_swarms), np.empty(n_swarms)),
-            *(empty(shape), empty(shape), empty(shape, bool), empty(shape, bool)),
-            *(np.empty((n_swarms, n)), np.empty((n_swarms, n), dtype=bool)),
+    if (functions := pairs.compiled()) is not None:
+        function = functions.measure_all if others is None else functions.measure
+        measured = function(
+            m=shape[2], contact=contact, goal_radius=goal_radius, positions=positions, goals=goals, others=others
         )
-        library.quad_swarm_measure(
-            len(positions) - 1, *shape, contact, goal_radius, *addresses(positions, goals, others, *measured)
-        )
-        return measured
+        if others is None:
+            measured = (*measured[:2], *(one.transpose(2, 0, 1) for one in measured[2:6]), *measured[6:])
+        return Measured(*measured)
     between = positions[:, :, :, None] - positions[:, :, None]
     start, change = between[:-1], np.diff(between, axis=0)
     along = -_einsum(start, change) / np.maximum(_einsum(change, change), 1e-12)
@@ -128,10 +111,6 @@ class Step(NamedTuple):
     least_during: np.ndarray
 
 
-# Types of the fields
-_OF_STEP = tuple(map(np.dtype, (np.int64, *[np.bool_] * 4, *[np.int64] * 4, *[np.float64] * 3)))
-
-
 def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> None:
     """Add a step to the statistics of E swarms.
 
@@ -140,11 +119,8 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     :param failed: smallest status of a plan without a successful solve
     :param seconds: time of the planner for all swarms (s)
     """
-    if (library := pairs.compiled()) is not None:
-        arrays = [
-            None if one is None else np.ascontiguousarray(one, kind) for one, kind in zip(step, _OF_STEP, strict=True)
-        ]
-        library.quad_swarm_count(*step.source.shape, failed, seconds, *addresses(*arrays, statistics))
+    if (functions := pairs.compiled()) is not None:
+        functions.count(failed=failed, seconds=seconds, statistics=statistics, **step._asdict())
         return
     s, used = statistics, step.source != 0
     counted = ~(s["reached"] | s["collided"])
