@@ -12,7 +12,7 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.evaluation.policies import RequestPolicy, make_policy, name_of, policy_of
-from quad_swarm.geometry import length
+from quad_swarm.geometry import closest_approach, length
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, requests_of
 from quad_swarm.task.rules import parse_rule
@@ -239,9 +239,8 @@ class Flight:
     def closest_approach(self) -> tuple[np.ndarray, np.ndarray]:
         """Distance (m) and time (s) of the closest approach at constant velocities from each step on, without a time
         limit, both (T + 1, n, n - 1)."""
-        closing = -(self.relative_pos * self.relative_vel).sum(axis=-1)
-        time = np.maximum(closing / np.maximum((self.relative_vel**2).sum(axis=-1), 1e-12), 0.0)
-        return length(self.relative_pos + time[..., None] * self.relative_vel), time
+        nearest, time = closest_approach(self.relative_pos, self.relative_vel)
+        return length(nearest), time
 
     @cached_property
     def arrival(self) -> int | None:

@@ -33,6 +33,16 @@ inline double squared_distance(const double* a, const double* b) {
   return einsum(difference, difference);
 }
 
+// Move `position` to where it is at the closest approach of straight motion, until a time at most, and return when that
+// is. geometry.py explains it.
+template <class Product>
+inline double approach(double* position, const double* velocity, double until, Product product) {
+  const double speed2 = std::max(product(velocity, velocity), 1e-12);
+  const double time = std::min(std::max(-product(position, velocity) / speed2, 0.0), until);
+  for (int i = 0; i < 3; i++) position[i] += time * velocity[i];
+  return time;
+}
+
 // Return the smallest squared distance of two robots that move in straight lines between consecutive positions, which
 // are `stride` numbers apart.
 double closest(const double* a, const double* b, Integer n_parts, Integer stride) {
@@ -40,14 +50,13 @@ double closest(const double* a, const double* b, Integer n_parts, Integer stride
   double start[3], end[3];
   for (int i = 0; i < 3; i++) start[i] = a[i] - b[i];
   for (Integer part = 1; part <= n_parts; part++) {
-    double change[3], point[3];
+    double change[3];
     for (int i = 0; i < 3; i++) {
       end[i] = a[part * stride + i] - b[part * stride + i];
       change[i] = end[i] - start[i];
     }
-    const double along = clipped(-einsum(start, change) / std::max(einsum(change, change), 1e-12));
-    for (int i = 0; i < 3; i++) point[i] = start[i] + along * change[i];
-    least = std::min(least, einsum(point, point));
+    approach(start, change, 1.0, einsum);
+    least = std::min(least, einsum(start, start));
     std::copy(end, end + 3, start);
   }
   return least;
@@ -193,8 +202,7 @@ EXPORT void quad_swarm_keep_right(Integer n_robots, Integer n_others, Integer n_
       vel[i] = velocity - state[3 + i];
     }
     const double speed = std::hypot(vel[0], vel[1]);
-    const double time = -dot(pos, vel) / std::max(dot(vel, vel), 1e-9);
-    const double grown = width * clipped(time / fade) * clipped(speed / slow);
+    const double grown = width * (approach(pos, vel, fade, dot) / fade) * clipped(speed / slow);
     const double shift[2] = {grown * (vel[1] / std::max(speed, 1e-9)), grown * (-vel[0] / std::max(speed, 1e-9))};
     for (Integer k = 0; k < n_stages; k++) {
       row[3 * k] += shift[0];
@@ -228,9 +236,7 @@ EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_
         }
         error[other] = nullptr;
         if (other == robot || dot(apart, apart) > limit * limit) continue;
-        const double time =
-            std::min(std::max(-dot(apart, along) / std::max(dot(along, along), 1e-12), 0.0), look_ahead);
-        for (int i = 0; i < 3; i++) apart[i] += time * along[i];
+        approach(apart, along, look_ahead, dot);
         near.emplace_back(dot(apart, apart), other);
       }
       if (static_cast<Integer>(near.size()) > n_places) {

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_swarm.geometry import length
+from quad_swarm.geometry import closest_approach, dot, length
 from quad_swarm.native.table import compiled
 
 
@@ -217,8 +217,8 @@ def keep_right(
     pos = others[:, :, 0] - dt * velocity - x[:, None, :3]
     vel = velocity - x[:, None, 3:6]
     speed = np.hypot(vel[..., 0], vel[..., 1])
-    time = -(pos * vel).sum(axis=-1) / np.maximum((vel * vel).sum(axis=-1), 1e-9)
-    grown = width * known * np.clip(time / fade, 0.0, 1.0) * np.clip(speed / slow, 0.0, 1.0)
+    _, time = closest_approach(pos, vel, fade)
+    grown = width * known * (time / fade) * np.clip(speed / slow, 0.0, 1.0)
     left = np.stack([vel[..., 1], -vel[..., 0], np.zeros_like(speed)], axis=-1) / np.maximum(speed, 1e-9)[..., None]
     return others + (grown[..., None] * left)[:, :, None], np.repeat(grown[..., None], others.shape[2], axis=2)
 
@@ -261,11 +261,10 @@ def neighbours(
         seen = (*where[:2], others[where])
         apart[seen] -= errors[where][:, :3]
         along[seen] -= errors[where][:, 3:]
-    within = _dot(apart, apart) <= limit * limit
+    within = dot(apart, apart) <= limit * limit
     within[:, numbers, numbers] = False
-    time = np.minimum(np.maximum(-_dot(apart, along) / np.maximum(_dot(along, along), 1e-12), 0.0), look_ahead)
-    apart = apart + time[..., None] * along
-    nearest = np.argsort(np.where(within, _dot(apart, apart), np.inf), axis=-1, kind="stable")[..., :m]
+    apart, _ = closest_approach(apart, along, look_ahead)
+    nearest = np.argsort(np.where(within, dot(apart, apart), np.inf), axis=-1, kind="stable")[..., :m]
     near = np.zeros(within.shape, dtype=bool)
     np.put_along_axis(near, nearest, np.take_along_axis(within, nearest, axis=-1), axis=-1)
 
@@ -284,10 +283,6 @@ def neighbours(
     seen &= present[np.arange(n_swarms)[:, None, None], others]
     reverse = np.where(present & seen.any(axis=-1), seen.argmax(axis=-1), -1)
     return others, present, reverse
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def advance(trajectory: np.ndarray) -> np.ndarray:

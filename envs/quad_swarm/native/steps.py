@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quad_swarm.geometry import closest_approach
 from quad_swarm.native import pairs
 from quad_swarm.native.table import STATISTICS as STATISTICS
 
@@ -61,8 +62,7 @@ def measure(
         return Measured(*measured)
     between = positions[:, :, :, None] - positions[:, :, None]
     start, change = between[:-1], np.diff(between, axis=0)
-    along = -_einsum(start, change) / np.maximum(_einsum(change, change), 1e-12)
-    closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
+    closest, _ = closest_approach(start, change, 1.0, _einsum)
     after, during = np.sqrt(_einsum(between[-1], between[-1])), np.sqrt(_einsum(closest, closest).min(axis=0))
     own = np.arange(n)
     after[:, own, own] = during[:, own, own] = np.inf

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_swarm.geometry import length
+from quad_swarm.geometry import closest_approach, length
 from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
@@ -168,7 +168,5 @@ class View:
         :param look_ahead: latest time to consider (s)
         :return: distance (m) and time from now (s), both (E, n, n - 1)
         """
-        closing = -(self.pos * self.vel).sum(axis=-1)
-        speed2 = (self.vel**2).sum(axis=-1)
-        time = np.clip(closing / np.maximum(speed2, 1e-12), 0.0, look_ahead)
-        return length(self.pos + time[..., None] * self.vel), time
+        nearest, time = closest_approach(self.pos, self.vel, look_ahead)
+        return length(nearest), time
