@@ -30,10 +30,10 @@ _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 # Limit of lengths and coordinates (m), far beyond any flight and small enough for precise squares
-FARTHEST = 1e4
-Length = Annotated[float, pydantic.Field(ge=0, le=FARTHEST)]
-PositiveLength = Annotated[float, pydantic.Field(gt=0, le=FARTHEST)]
-Coordinate = Annotated[float, pydantic.Field(ge=-FARTHEST, le=FARTHEST)]
+LARGEST_LENGTH = 1e4
+Length = Annotated[float, pydantic.Field(ge=0, le=LARGEST_LENGTH)]
+PositiveLength = Annotated[float, pydantic.Field(gt=0, le=LARGEST_LENGTH)]
+Coordinate = Annotated[float, pydantic.Field(ge=-LARGEST_LENGTH, le=LARGEST_LENGTH)]
 
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
@@ -244,18 +244,18 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         errors = errors[:1]
     if place and isinstance(place[0], int):  # a positional argument
         place = (_names(owner)[place[0]], *place[1:])
-    told = " or ".join(dict.fromkeys(_told(each["msg"]) for each in errors))
+    problem = " or ".join(dict.fromkeys(_readable(each["msg"]) for each in errors))
     name = ".".join((*path, *(str(part) for part in place)))
     if errors[0]["type"] == "value_error" and not isinstance(value, (tuple, list)):
         return ValueError(
-            told if told.endswith(("?", ".")) else f"{told}."
+            problem if problem.endswith(("?", ".")) else f"{problem}."
         )  # from `__post_init__`, which names the conflicting fields
     if errors[0]["type"] == "missing":  # in a tuple
-        name, told = name.rpartition(".")[0], "it has too few entries"
-    return ValueError(f"{name}={shown(value)}: {told}.")
+        name, problem = name.rpartition(".")[0], "it has too few entries"
+    return ValueError(f"{name}={shown(value)}: {problem}.")
 
 
-def _told(message: str) -> str:
+def _readable(message: str) -> str:
     message = message.removeprefix("Value error, ").replace("Input should", "it must", 1)
     return message.replace("dictionary", "mapping").replace(" or an instance of", ", not a plain value, or a")
 

@@ -30,7 +30,7 @@ from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.scenarios import SCENARIOS
 
 # Number of steps to show after all robots have arrived
-_LINGER = 10
+_EXTRA_STEPS = 10
 # Decimals of metres and radians, which are finer than a pixel; plans need fewer
 _DIGITS, _PLAN_DIGITS = 3, 2
 # Every such stage of a plan is drawn
@@ -81,7 +81,7 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
     (m); arrival, collision: first steps after which all robots had arrived, and two collided, or None; colliding:
     (step, robot, robot) for each pair that collides in a step.
     """
-    end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _LINGER, len(flight.requests))
+    end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _EXTRA_STEPS, len(flight.requests))
     others = other_indices(flight.n_robots)
     name, detail = _plain_name(policy)
     return {

@@ -15,7 +15,7 @@ from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_o
 from quad_swarm.states import as_other_state, generator_of, generator_state, like
 from quad_swarm.task.request_task import make_task, requests_of
 from quad_swarm.validation import checked_arguments
-from quad_swarm.world.neighbours import spread
+from quad_swarm.world.neighbours import slots_to_robots
 
 
 class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
@@ -181,7 +181,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         bits = checked_bits(action, (self._n_bits,), self.config.n_others, self.task.n_bits)[None]
         if self.render_mode is not None:
             neighbours = self.task.swarm.neighbours
-            self._requests = spread(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
+            self._requests = slots_to_robots(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
         outcome = self.task.act(bits)
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = info_of(self.task.info(outcome), 0)

@@ -269,15 +269,15 @@ def neighbours(
     np.put_along_axis(near, nearest, np.take_along_axis(within, nearest, axis=-1), axis=-1)
 
     stays = present & np.take_along_axis(near, others, axis=-1)
-    swarms, robots, places = np.nonzero(stays)
-    near[swarms, robots, others[swarms, robots, places]] = False  # the remaining ones are new
+    swarms, robots, slots = np.nonzero(stays)
+    near[swarms, robots, others[swarms, robots, slots]] = False  # the remaining ones are new
     others = np.where(stays, others, numbers[:, None])
     free = np.argsort(stays, axis=-1, kind="stable")  # free slots first
     swarms, robots, come = np.nonzero(near)
-    places = free[swarms, robots, (near.cumsum(axis=-1) - 1)[swarms, robots, come]]
-    others[swarms, robots, places] = come
+    slots = free[swarms, robots, (near.cumsum(axis=-1) - 1)[swarms, robots, come]]
+    others[swarms, robots, slots] = come
     present = stays.copy()
-    present[swarms, robots, places] = True
+    present[swarms, robots, slots] = True
 
     seen = others[np.arange(n_swarms)[:, None, None], others] == numbers[:, None, None]
     seen &= present[np.arange(n_swarms)[:, None, None], others]

@@ -17,22 +17,22 @@ from quad_swarm.native.table import STATISTICS as STATISTICS
 class Measured(NamedTuple):
     """What is measured of one step of E swarms.
 
-    :param least: smallest distance of all pairs after the step, (E,) (m)
-    :param least_during: smallest distance of all pairs during the step, (E,) (m)
-    :param apart: distance of each robot to each of its ``others`` after the step, infinity for none, (E, n, m) (m)
-    :param apart_during: smallest distance to each of them during the step, (E, n, m) (m)
-    :param colliding: where ``apart`` is less than the distance of contact, (E, n, m) bool
-    :param colliding_during: where ``apart_during`` is less, (E, n, m) bool
+    :param min_separation: smallest distance of all pairs after the step, (E,) (m)
+    :param min_separation_continuous: smallest distance of all pairs during the step, (E,) (m)
+    :param separation: distance of each robot to each of its ``others`` after the step, infinity for none, (E, n, m) (m)
+    :param separation_continuous: smallest distance to each of them during the step, (E, n, m) (m)
+    :param colliding: where ``separation`` is less than the distance of contact, (E, n, m) bool
+    :param colliding_continuous: where ``separation_continuous`` is less, (E, n, m) bool
     :param moved: distance between the positions before and after the step, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     """
 
-    least: np.ndarray
-    least_during: np.ndarray
-    apart: np.ndarray
-    apart_during: np.ndarray
+    min_separation: np.ndarray
+    min_separation_continuous: np.ndarray
+    separation: np.ndarray
+    separation_continuous: np.ndarray
     colliding: np.ndarray
-    colliding_during: np.ndarray
+    colliding_continuous: np.ndarray
     moved: np.ndarray
     at_goal: np.ndarray
 
@@ -66,21 +66,21 @@ def measure(
     after, during = np.sqrt(_einsum(between[-1], between[-1])), np.sqrt(_einsum(closest, closest).min(axis=0))
     own = np.arange(n)
     after[:, own, own] = during[:, own, own] = np.inf
-    apart, apart_during = empty(shape), empty(shape)
+    separation, separation_continuous = empty(shape), empty(shape)
     if others is None:
-        apart[...] = after[:, ~np.eye(n, dtype=bool)].reshape(shape)
-        apart_during[...] = during[:, ~np.eye(n, dtype=bool)].reshape(shape)
+        separation[...] = after[:, ~np.eye(n, dtype=bool)].reshape(shape)
+        separation_continuous[...] = during[:, ~np.eye(n, dtype=bool)].reshape(shape)
     else:
-        apart, apart_during = (np.take_along_axis(one, others, axis=2) for one in (after, during))
+        separation, separation_continuous = (np.take_along_axis(one, others, axis=2) for one in (after, during))
     moved, to_goal = positions[-1] - positions[0], positions[-1] - goals
     return Measured(
         *(after.min(axis=(1, 2)), during.min(axis=(1, 2))),
-        *(apart, apart_during, apart < contact, apart_during < contact),
+        *(separation, separation_continuous, separation < contact, separation_continuous < contact),
         *(np.sqrt(_einsum(moved, moved)), _einsum(to_goal, to_goal) <= goal_radius * goal_radius),
     )
 
 
-class Step(NamedTuple):
+class Counted(NamedTuple):
     """What is counted of one step of E swarms, with the names of `quad_swarm.world.swarm.StepReport`.
 
     :param n_requests: number of requests, (E,) int64
@@ -88,13 +88,13 @@ class Step(NamedTuple):
     :param collision: whether two robots collided after the step, (E,) bool
     :param collision_continuous: whether two robots collided during the step, (E,) bool
     :param at_goal: (E, n) bool
-    :param source: origin of the believed trajectories, 0 without a plan, (E, n, m) int64
-    :param age: ages of the believed plans, (E, n, m) int64
-    :param status: status of the plans, (E, n) int64
+    :param belief_source: origin of the believed trajectories, 0 without a plan, (E, n, m) int64
+    :param plan_age: ages of the believed plans, (E, n, m) int64
+    :param plan_status: status of the plans, (E, n) int64
     :param others: indices of the others, -1 for an empty slot, (E, n, m) int64; None without empty slots
     :param moved: mean distance that a robot flew, (E,) (m)
-    :param least: smallest distance of two robots after the step, (E,) (m)
-    :param least_during: smallest distance during the step, (E,) (m)
+    :param min_separation: smallest distance of two robots after the step, (E,) (m)
+    :param min_separation_continuous: smallest distance during the step, (E,) (m)
     """
 
     n_requests: np.ndarray
@@ -102,16 +102,16 @@ class Step(NamedTuple):
     collision: np.ndarray
     collision_continuous: np.ndarray
     at_goal: np.ndarray
-    source: np.ndarray
-    age: np.ndarray
-    status: np.ndarray
+    belief_source: np.ndarray
+    plan_age: np.ndarray
+    plan_status: np.ndarray
     others: np.ndarray | None
     moved: np.ndarray
-    least: np.ndarray
-    least_during: np.ndarray
+    min_separation: np.ndarray
+    min_separation_continuous: np.ndarray
 
 
-def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> None:
+def count(statistics: np.ndarray, step: Counted, failed: int, seconds: float) -> None:
     """Add a step to the statistics of E swarms.
 
     :param statistics: the statistics, changed in place, (E,) `STATISTICS`
@@ -122,7 +122,7 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     if (functions := pairs.compiled()) is not None:
         functions.count(failed=failed, seconds=seconds, statistics=statistics, **step._asdict())
         return
-    s, used = statistics, step.source != 0
+    s, used = statistics, step.belief_source != 0
     counted = ~(s["reached"] | s["collided"])
     requests = counted * step.n_requests
     possible = used[:1].size if step.others is None else (step.others >= 0).sum(axis=(1, 2))
@@ -132,7 +132,7 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     s["possible_requests"] += counted * possible
     s["peak_requests"] = np.maximum(s["peak_requests"], requests)
     s["plans_used"] += counted * used.sum(axis=(1, 2))
-    s["plan_ages"] += counted * (used * step.age).sum(axis=(1, 2))
+    s["plan_ages"] += counted * (used * step.plan_age).sum(axis=(1, 2))
     s["requests_flown"] += step.n_requests
     s["path_length"] += counted * step.moved
     s["collided"] |= step.collided
@@ -141,9 +141,9 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     s["at_goals"] = step.at_goal.all(axis=1)
     s["arrived"] |= s["at_goals"] & ~s["collided"]
     s["reached"] |= s["at_goals"]
-    s["min_separation"] = np.minimum(s["min_separation"], step.least)
-    s["min_separation_continuous"] = np.minimum(s["min_separation_continuous"], step.least_during)
-    s["planner_failures"] += (step.status >= failed).sum(axis=1)
+    s["min_separation"] = np.minimum(s["min_separation"], step.min_separation)
+    s["min_separation_continuous"] = np.minimum(s["min_separation_continuous"], step.min_separation_continuous)
+    s["planner_failures"] += (step.plan_status >= failed).sum(axis=1)
     s["solve_seconds"] += seconds / max(len(s), 1)
 
 
