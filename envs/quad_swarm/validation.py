@@ -13,7 +13,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import numpy as np
 import pydantic
@@ -24,6 +24,7 @@ from pydantic_core import ArgsKwargs
 from quad_swarm.errors import shown, unknown_name
 
 T = TypeVar("T")
+R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
 _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -112,6 +113,39 @@ def checked_arguments(function: F) -> F:
             raise explained(error, function) from None
 
     return wrapper  # type: ignore[return-value]
+
+
+def with_fields(cls: type[Any]) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Decorate a function with a parameter ``options``, so that it takes the fields of a dataclass instead: by the same
+    names, in the same order and with the same defaults, converted and checked like those of `checked_arguments`.
+
+    :param cls: the dataclass
+    """
+    types = get_type_hints(cls, include_extras=True)
+    fields = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=field.default, annotation=types[field.name]
+        )
+        for field in dataclasses.fields(cls)
+    ]
+
+    def decorate(function: Callable[..., R]) -> Callable[..., R]:
+        parameters: list[inspect.Parameter] = []
+        for one in inspect.signature(function, eval_str=True).parameters.values():
+            parameters += fields if one.name == "options" else [one]
+
+        @functools.wraps(function)
+        def flat(*args: Any, **kwargs: Any) -> R:
+            given = signature.bind(*args, **kwargs).arguments
+            options = cls(**{one.name: given.pop(one.name) for one in fields if one.name in given})
+            return function(**given, options=options)
+
+        signature = inspect.Signature(parameters)
+        flat.__signature__ = signature  # type: ignore[attr-defined]
+        flat.__annotations__ = {one.name: one.annotation for one in parameters if one.annotation is not one.empty}
+        return checked_arguments(flat)
+
+    return decorate
 
 
 def replaced(config: T, changes: Mapping[str, Any], *path: str) -> T:
