@@ -12,16 +12,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.native.pairs import advance, resample
+from quad_swarm.native.pairs import resample
 from quad_swarm.native.steps import measure
 from quad_swarm.planner import Planner, Plans, PlanStatus, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.states import MOST_STEPS, like
-from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, of_others, other_indices, resampled
+from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, of_others, other_indices, resampled
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig, points
+from quad_swarm.world.radio import RadioChannel
 from quad_swarm.world.realisation import Realisation
 
 # Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
@@ -105,9 +106,7 @@ class Swarm:
         differ = config.radio.is_random or config.sensing.others
         self.beliefs_seen_by_others = Beliefs(*beliefs) if differ else self.beliefs
         self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
-        # Planned positions of the last steps, oldest first, which late answers contain
-        late = config.radio.delay + config.radio.jitter
-        self._earlier = [self.plans[..., POSITION].copy() for _ in range(late)]
+        self._radio = RadioChannel(config.radio.delay, config.radio.jitter, self.plans[..., POSITION])
         self._u = np.zeros((n_swarms, n, 4))  # current inputs
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
@@ -209,8 +208,7 @@ class Swarm:
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
         for mine, fresh in zip(self._plans, hover, strict=True):
             mine[swarm * n : (swarm + 1) * n] = fresh
-        for plans in self._earlier:
-            plans[swarm] = self.plans[swarm, ..., POSITION]
+        self._radio.reset(swarm, self.plans[swarm, ..., POSITION])
         self._u[swarm] = 0.0
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
@@ -228,7 +226,7 @@ class Swarm:
         for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
             beliefs.keep(swarms)
         self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
-        self._earlier = [plans[swarms] for plans in self._earlier]
+        self._radio.keep(swarms)
 
     def part(self, swarms: np.ndarray) -> Swarm:
         """Return a copy of the given swarms (mask), which shares the planner and the random number generators."""
@@ -238,7 +236,7 @@ class Swarm:
             part.beliefs if self.beliefs_seen_by_others is self.beliefs else copy(self.beliefs_seen_by_others)
         )
         part.neighbours, part.disturbances = copy(self.neighbours), copy(self.disturbances)
-        part._plant = self._plant.fork()
+        part._radio, part._plant = copy(self._radio), self._plant.fork()
         part.keep(swarms)
         return part
 
@@ -263,7 +261,7 @@ class Swarm:
             "goal": self.goal.copy(),
             "input": self._u.copy(),
             "plans": {name: field.copy() for name, field in self._plans._asdict().items()},
-            "earlier": [plans.copy() for plans in self._earlier],
+            "earlier": self._radio.state_dict(),
             "beliefs": self.beliefs.state_dict(),
             "presumed_beliefs": seen_by_others,
             "chance": self.disturbances.state_dict(),
@@ -286,13 +284,7 @@ class Swarm:
                 for name, one in self._plans._asdict().items()
             }
         )
-        if len(state["earlier"]) != len(self._earlier):
-            raise ValueError(
-                f"The state has {len(state['earlier'])} earlier plans, but this world has {len(self._earlier)}."
-            )
-        self._earlier = [
-            like(mine, one, "earlier plans") for mine, one in zip(self._earlier, state["earlier"], strict=True)
-        ]
+        self._radio.load_state_dict(state["earlier"])
         self.beliefs.load_state_dict(state["beliefs"])
         if self.beliefs_seen_by_others is not self.beliefs:
             self.beliefs_seen_by_others.load_state_dict(state["presumed_beliefs"])
@@ -331,24 +323,14 @@ class Swarm:
 
     def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the beliefs after the answers have arrived, see `Beliefs.update`."""
-        radio, others = self.config.radio, self.neighbours.others
-        trajectories = advance(self.planned_positions())
-        if self._earlier:
-            self._earlier = [*map(advance, self._earlier), trajectories]  # advanced to the current step
-            trajectories = self._earlier[-1 - radio.delay]
-        age = 1 + radio.delay
+        others = self.neighbours.others
+        self._radio.send(self.planned_positions())
         if self.beliefs_seen_by_others is not self.beliefs:
-            sent = answered(requests, trajectories, others)
-            self.beliefs_seen_by_others.receive(requests, *self._seen_by_all(), sent, age)
+            sent = self._radio.answers(requests, others)
+            self.beliefs_seen_by_others.receive(requests, *self._seen_by_all(), *sent)
         arriving, lateness = self.disturbances.arrivals(requests, others)
-        received, ages = answered(arriving, trajectories, others), age
-        if lateness is not None:
-            late = lateness[arriving]
-            for k in range(1, radio.jitter + 1):
-                received[late == k] = answered(arriving, self._earlier[-1 - radio.delay - k], others)[late == k]
-            ages = age + late
-        self._earlier = self._earlier[1:]
-        return self.beliefs.update(arriving, *self.observe(), received, ages)
+        received = self._radio.answers(arriving, others, lateness)
+        return self.beliefs.update(arriving, *self.observe(), *received)
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""
