@@ -6,24 +6,22 @@ If the neighbourhood is limited, axes of length n - 1 have fewer entries, one pe
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quad_swarm.native.pairs import resample
 from quad_swarm.native.steps import measure
-from quad_swarm.planner import Planner, Plans, PlanStatus, Problems, make_planner
+from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.states import MOST_STEPS, like
 from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, of_others, other_indices, resampled
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig, points
 from quad_swarm.world.radio import RadioChannel
 from quad_swarm.world.realisation import Realisation
+from quad_swarm.world.swarm_state import SwarmState
 
 # Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
 # keeps less than half of it from the robot. In "flight-hard", plans are up to 0.15 m off, less than a fifth
@@ -75,7 +73,7 @@ class StepReport(NamedTuple):
     solve_seconds: float
 
 
-class Swarm:
+class Swarm(SwarmState):
     """State, plans and beliefs of E independent swarms, which share one planner call.
 
     :ivar state: true states, (E, n, 9)
@@ -83,8 +81,6 @@ class Swarm:
     :ivar neighbours: which others each robot perceives
     :ivar disturbances: realisation of the disturbances
     :ivar beliefs: beliefs of each robot about the others
-    :ivar beliefs_seen_by_others: beliefs of each robot as the others see them, who assume that all their answers
-        arrived
 
     :param config: the world
     :param n_swarms: number of swarms E
@@ -97,23 +93,34 @@ class Swarm:
         self.planner.checks = False
         n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
         self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
-        self.state = np.zeros((n_swarms, n, 9))
-        self.goal = np.zeros((n_swarms, n, 3))
-        self.neighbours = Neighbours(n_swarms, n, config.neighbourhood)
-        self.disturbances = Realisation(config, n_swarms)
+        state = np.zeros((n_swarms, n, 9))
+        plans = Plans.hover(state.reshape(-1, 9), horizon)
+        plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
         beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others, _MISFIT * config.planner.separation)
-        self.beliefs = Beliefs(*beliefs)
         differ = config.radio.is_random or config.sensing.others
-        self.beliefs_seen_by_others = Beliefs(*beliefs) if differ else self.beliefs
-        self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
-        self._radio = RadioChannel(config.radio.delay, config.radio.jitter, self.plans[..., POSITION])
-        self._u = np.zeros((n_swarms, n, 4))  # current inputs
+        super().__init__(
+            state=state,
+            goal=np.zeros((n_swarms, n, 3)),
+            _u=np.zeros((n_swarms, n, 4)),
+            _plans=plans,
+            _radio=RadioChannel(config.radio.delay, config.radio.jitter, plans_of_robots[..., POSITION]),
+            beliefs=Beliefs(*beliefs),
+            _other_beliefs=Beliefs(*beliefs) if differ else None,
+            disturbances=Realisation(config, n_swarms),
+            neighbours=Neighbours(n_swarms, n, config.neighbourhood),
+        )
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
             number = np.zeros((n, n), dtype=int)
             number[self._pairs] = np.arange(len(self._pairs[0]))
             # Index of the pair of each robot and each of its others
             self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
+
+    @property
+    def beliefs_seen_by_others(self) -> Beliefs:
+        """Beliefs of each robot as the others see them, who assume that all their answers arrived: its own if they
+        always arrive and everybody observes the same."""
+        return self.beliefs if self._other_beliefs is None else self._other_beliefs
 
     @property
     def n_swarms(self) -> int:
@@ -219,24 +226,13 @@ class Swarm:
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
-        self.state, self.goal, self._u = self.state[swarms], self.goal[swarms], self._u[swarms]
-        self.neighbours.keep(swarms)
-        self.disturbances.keep(swarms)
+        super().keep(swarms)
         self._plant.keep(swarms)
-        for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
-            beliefs.keep(swarms)
-        self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
-        self._radio.keep(swarms)
 
     def part(self, swarms: np.ndarray) -> Swarm:
         """Return a copy of the given swarms (mask), which shares the planner and the random number generators."""
-        part = copy(self)
-        part.beliefs = copy(self.beliefs)
-        part.beliefs_seen_by_others = (
-            part.beliefs if self.beliefs_seen_by_others is self.beliefs else copy(self.beliefs_seen_by_others)
-        )
-        part.neighbours, part.disturbances = copy(self.neighbours), copy(self.disturbances)
-        part._radio, part._plant = copy(self._radio), self._plant.fork()
+        part = self.copied()
+        part._plant = self._plant.fork()
         part.keep(swarms)
         return part
 
@@ -253,44 +249,7 @@ class Swarm:
         """
         if self.config.plant != MODEL:
             raise ValueError(f"plant={self.config.plant!r} does not provide its state: only plant={MODEL!r} does.")
-        seen_by_others = (
-            None if self.beliefs_seen_by_others is self.beliefs else self.beliefs_seen_by_others.state_dict()
-        )
-        return {
-            "state": self.state.copy(),
-            "goal": self.goal.copy(),
-            "input": self._u.copy(),
-            "plans": {name: field.copy() for name, field in self._plans._asdict().items()},
-            "earlier": self._radio.state_dict(),
-            "beliefs": self.beliefs.state_dict(),
-            "presumed_beliefs": seen_by_others,
-            "chance": self.disturbances.state_dict(),
-            "neighbours": self.neighbours.state_dict(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state from `state_dict` of swarms in the same world, bit for bit.
-
-        :raises ValueError: if the state belongs to other swarms
-        """
-        self.state = like(self.state, state["state"], "state")
-        self.goal = like(self.goal, state["goal"], "goal")
-        self._u = like(self._u, state["input"], "input")
-        plans = state["plans"]
-        limits = {"age": (0, MOST_STEPS), "iterations": (0, MOST_STEPS), "status": (min(PlanStatus), max(PlanStatus))}
-        self._plans = Plans(
-            **{
-                name: like(one, plans[name], f"plans.{name}", *limits.get(name, ()))
-                for name, one in self._plans._asdict().items()
-            }
-        )
-        self._radio.load_state_dict(state["earlier"])
-        self.beliefs.load_state_dict(state["beliefs"])
-        if self.beliefs_seen_by_others is not self.beliefs:
-            self.beliefs_seen_by_others.load_state_dict(state["presumed_beliefs"])
-        self.disturbances.load_state_dict(state["chance"])
-        if self.neighbours.limited:
-            self.neighbours.load_state_dict(state["neighbours"])
+        return super().state_dict()
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let all robots make requests, plan and fly for one step.
@@ -325,9 +284,9 @@ class Swarm:
         """Return the beliefs after the answers have arrived, see `Beliefs.update`."""
         others = self.neighbours.others
         self._radio.send(self.planned_positions())
-        if self.beliefs_seen_by_others is not self.beliefs:
+        if self._other_beliefs is not None:
             sent = self._radio.answers(requests, others)
-            self.beliefs_seen_by_others.receive(requests, *self._seen_by_all(), *sent)
+            self._other_beliefs.receive(requests, *self._seen_by_all(), *sent)
         arriving, lateness = self.disturbances.arrivals(requests, others)
         received = self._radio.answers(arriving, others, lateness)
         return self.beliefs.update(arriving, *self.observe(), *received)
