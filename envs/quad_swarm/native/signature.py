@@ -144,6 +144,10 @@ class Compiled:
         self._sizes = [letter for letter in signature.sizes if letter not in told and letter not in constants]
         returned = {one.name for one in self._outputs if not one.optional}
         self._names = [*self._sizes, *(name for name in signature.parameters if name not in returned)]
+        # Arrays of lengths that nothing else depends on, so that each new length is not a new shape
+        inside = {axis[0] for one in signature.arrays for axis in one.axes[one.direction != "out" :]}
+        fixed = {*signature.sizes, *constants, *inside, ""}
+        self._any_length = [one for one in self._inputs if one.axes[0][0].lstrip("*") not in fixed]
         # What follows from shapes that have been checked: sizes, and the shapes of what is returned
         self._checked: dict[Any, tuple] = {}
         self.call = self._make_call()
@@ -153,10 +157,18 @@ class Compiled:
 
         Whatever it does not know, shapes or arrays that are not contiguous, is left to `_call`.
         """
-        shapes = [_unless_none(one, one.name, f"{one.name}.shape") for one in self._inputs]
-        types = [
+        shapes = [
+            _unless_none(one, one.name, f"{one.name}.shape" + ("[1:]" if one in self._any_length else ""))
+            for one in self._inputs
+        ]
+        fitting = [
             (f"{one.name} is None or " if one.optional else "") + f"{one.name}.dtype is {one.name}_type"
             for one in self._inputs
+        ]
+        fitting += [
+            (f"{one.name} is None or " if one.optional else "") + f"len({one.name}) == len({first.name})"
+            for first in self._any_length[:1]
+            for one in self._any_length
         ]
         allocated = [
             f"{one.name}_ = empty({one.name}_, {one.name}_type)" + (f" if {one.name} else None" if one.optional else "")
@@ -179,7 +191,7 @@ class Compiled:
         source = f"""def call(*, {", ".join(self._names)}):
     try:
         {"".join(f"{one}, " for one in (*sizes, *outputs))} = checked[{", ".join((*self._sizes, *shapes))},]
-        if not ({" and ".join(f"({one})" for one in types)}):
+        if not ({" and ".join(f"({one})" for one in fitting)}):
             raise KeyError
         {"; ".join(allocated) or "pass"}
         arguments = ({", ".join(arguments)},)
@@ -207,7 +219,7 @@ class Compiled:
             if array is not None or not parameter.optional:
                 array = _fitting(parameter, array, sizes)
             arrays[parameter.name] = array
-            key.append(None if array is None else array.shape)
+            key.append(None if array is None else array.shape[parameter in self._any_length :])
         sizes |= {letter[1:]: math.prod(axes) for letter, axes in sizes.items() if letter.startswith("*")}
         shapes = [parameter.shape(sizes) for parameter in self._outputs]
         passed = [sizes[letter] for letter in self.signature.sizes]

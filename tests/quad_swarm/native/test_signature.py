@@ -2,13 +2,14 @@
 
 import ctypes
 import subprocess
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from quad_swarm.native import build
-from quad_swarm.native.signature import Signature
+from quad_swarm.native import build, table
+from quad_swarm.native.signature import Compiled, Signature
 
 # Adds `more` and the weight of its row, if there are weights, to each number, and counts the rows in place
 CODE = """
@@ -139,3 +140,38 @@ def test_shapes_are_forgotten_when_there_are_many(library, monkeypatch):
     add = SIGNATURE.of(library)
     for rows in (1, 2, 3, 4, 5, 1):
         assert add(**arguments(numbers=np.ones((rows, 4)))).sums.tolist() == [[2.0] * 3] * rows
+
+
+def test_each_new_length_is_not_a_new_shape():
+    """The number of answers differs from step to step."""
+    source = Path(table.__file__).with_name(table.SOURCE).read_text(encoding="utf-8")
+    compiled = Compiled(
+        table.TABLE["receive"], ctypes.CDLL(str(build.build("pairs", table.SOURCE, {table.SOURCE: source}))), {}
+    )
+
+    def receive(answers: int, ages: np.ndarray | None) -> np.ndarray:
+        pos, plans = np.zeros((6, 3)), np.zeros((6, 5, 3))
+        return compiled.call(
+            age=1,
+            dt=0.1,
+            misfit=np.inf,
+            arriving=np.arange(6) < answers,
+            received=np.ones((answers, 5, 3)),
+            ages=ages,
+            pos=pos,
+            vel=pos,
+            remembers=np.zeros(6, dtype=bool),
+            known_age=np.full(6, 4),
+            known=plans,
+            remembered=None,
+            believed=True,
+            source=True,
+        )[1]
+
+    for answers in (3, 1, 6, 2):
+        assert receive(answers, None)[:, 0, 0].tolist() == [1.0] * answers + [0.0] * (6 - answers)
+        assert receive(answers, np.ones(answers, dtype=np.int64))[:, 0, 0].sum() == answers
+    assert len(compiled._checked) == 2
+    for ages in (np.ones(2, dtype=np.int64), np.array(1)):
+        with pytest.raises(ValueError, match=r"ages has shape \(.*\); it must be \(3,\)"):
+            receive(3, ages)
