@@ -1,8 +1,17 @@
-"""Lengths of vectors."""
+"""Lengths of vectors, and the closest approach of straight motion."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+
+_STILL = 1e-12  # squared speed below which nothing moves (m^2/s^2); pairs.cpp has the same
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Dot products, (..., 3) and (..., 3) -> (...)."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def length(vectors: np.ndarray) -> np.ndarray:
@@ -12,3 +21,23 @@ def length(vectors: np.ndarray) -> np.ndarray:
     """
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     return np.sqrt(x * x + y * y + z * z)
+
+
+def closest_approach(
+    position: np.ndarray,
+    velocity: np.ndarray,
+    until: float = np.inf,
+    product: Callable[[np.ndarray, np.ndarray], np.ndarray] = dot,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the closest approach of two points that move in straight lines.
+
+    :param position: relative position now, (..., 3) (m)
+    :param velocity: relative velocity, (..., 3) (m/s)
+    :param until: latest time to consider (s)
+    :param product: dot products, for results that depend on the order of its operations
+    :return: relative position at the closest approach, (..., 3) (m), and the time until then, 0 if it is over, (...)
+        (s)
+    """
+    closing = -(product(position, velocity) + 0.0)  # at rest, the sign of zero is always the same
+    time = np.clip(closing / np.maximum(product(velocity, velocity), _STILL), 0.0, until)
+    return position + time[..., None] * velocity, time

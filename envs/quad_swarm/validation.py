@@ -13,7 +13,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import numpy as np
 import pydantic
@@ -24,16 +24,17 @@ from pydantic_core import ArgsKwargs
 from quad_swarm.errors import shown, unknown_name
 
 T = TypeVar("T")
+R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
 _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 # Limit of lengths and coordinates (m), far beyond any flight and small enough for precise squares
-FARTHEST = 1e4
-Length = Annotated[float, pydantic.Field(ge=0, le=FARTHEST)]
-PositiveLength = Annotated[float, pydantic.Field(gt=0, le=FARTHEST)]
-Coordinate = Annotated[float, pydantic.Field(ge=-FARTHEST, le=FARTHEST)]
+LARGEST_LENGTH = 1e4
+Length = Annotated[float, pydantic.Field(ge=0, le=LARGEST_LENGTH)]
+PositiveLength = Annotated[float, pydantic.Field(gt=0, le=LARGEST_LENGTH)]
+Coordinate = Annotated[float, pydantic.Field(ge=-LARGEST_LENGTH, le=LARGEST_LENGTH)]
 
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
@@ -112,6 +113,39 @@ def checked_arguments(function: F) -> F:
             raise explained(error, function) from None
 
     return wrapper  # type: ignore[return-value]
+
+
+def with_fields(cls: type[Any]) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Decorate a function with a parameter ``options``, so that it takes the fields of a dataclass instead: by the same
+    names, in the same order and with the same defaults, converted and checked like those of `checked_arguments`.
+
+    :param cls: the dataclass
+    """
+    types = get_type_hints(cls, include_extras=True)
+    fields = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.POSITIONAL_OR_KEYWORD, default=field.default, annotation=types[field.name]
+        )
+        for field in dataclasses.fields(cls)
+    ]
+
+    def decorate(function: Callable[..., R]) -> Callable[..., R]:
+        parameters: list[inspect.Parameter] = []
+        for one in inspect.signature(function, eval_str=True).parameters.values():
+            parameters += fields if one.name == "options" else [one]
+
+        @functools.wraps(function)
+        def flat(*args: Any, **kwargs: Any) -> R:
+            given = signature.bind(*args, **kwargs).arguments
+            options = cls(**{one.name: given.pop(one.name) for one in fields if one.name in given})
+            return function(**given, options=options)
+
+        signature = inspect.Signature(parameters)
+        flat.__signature__ = signature  # type: ignore[attr-defined]
+        flat.__annotations__ = {one.name: one.annotation for one in parameters if one.annotation is not one.empty}
+        return checked_arguments(flat)
+
+    return decorate
 
 
 def replaced(config: T, changes: Mapping[str, Any], *path: str) -> T:
@@ -244,18 +278,18 @@ def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueE
         errors = errors[:1]
     if place and isinstance(place[0], int):  # a positional argument
         place = (_names(owner)[place[0]], *place[1:])
-    told = " or ".join(dict.fromkeys(_told(each["msg"]) for each in errors))
+    problem = " or ".join(dict.fromkeys(_readable(each["msg"]) for each in errors))
     name = ".".join((*path, *(str(part) for part in place)))
     if errors[0]["type"] == "value_error" and not isinstance(value, (tuple, list)):
         return ValueError(
-            told if told.endswith(("?", ".")) else f"{told}."
+            problem if problem.endswith(("?", ".")) else f"{problem}."
         )  # from `__post_init__`, which names the conflicting fields
     if errors[0]["type"] == "missing":  # in a tuple
-        name, told = name.rpartition(".")[0], "it has too few entries"
-    return ValueError(f"{name}={shown(value)}: {told}.")
+        name, problem = name.rpartition(".")[0], "it has too few entries"
+    return ValueError(f"{name}={shown(value)}: {problem}.")
 
 
-def _told(message: str) -> str:
+def _readable(message: str) -> str:
     message = message.removeprefix("Value error, ").replace("Input should", "it must", 1)
     return message.replace("dictionary", "mapping").replace(" or an instance of", ", not a plain value, or a")
 

@@ -78,7 +78,7 @@ class DelayCheckedSwarm(Swarm):
     def _announced(self) -> np.ndarray:
         """Return the positions that robots broadcast, from now on, by the steps' clock, (E, n, 2, stages + 1, 3)."""
         pos = self._x[..., POSITION]
-        start = self.chance.start
+        start = self.disturbances.start
         return pos if start is None else resampled(pos, -np.repeat(start[..., None], 2, 2) / self.config.substeps)
 
     def _receive(self, requests: np.ndarray) -> np.ndarray:
@@ -88,10 +88,10 @@ class DelayCheckedSwarm(Swarm):
             (E, n, n - 1, 2, stages + 1, 3)
         """
         self._sent = [advance(sent) for sent in self._sent]
-        arriving, _ = self.chance.arrivals(requests, self.neighbours.others)
+        arriving, _ = self.disturbances.arrivals(requests, self.neighbours.others)
         newest = self._sent[0][:, self.neighbours.others]
         self._known = np.where(arriving[..., None, None, None], newest, advance(self._known))
-        start = self.chance.start
+        start = self.disturbances.start
         if start is None:
             return self._known
         return resampled(
@@ -119,7 +119,7 @@ class DelayCheckedSwarm(Swarm):
         self._plan(self._pending == 0, known)
 
         self._sent = [*self._sent[1:], self._announced()]
-        x, start = self.estimate(), self.chance.start
+        x, start = self.estimate(), self.disturbances.start
         if start is not None:
             x = self.planner.model.ahead(x, self._u, start / self.config.substeps * self.config.planner.dt)
         inputs = self._inputs[:, :, COMMITTED].copy()

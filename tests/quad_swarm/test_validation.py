@@ -1,5 +1,6 @@
 """How a wrong value is told: in one line, with its name, also where it was given by position."""
 
+import inspect
 import math
 import re
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from pydantic import PositiveInt
 
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.task.request_task import make_task
-from quad_swarm.validation import Range, checked, checked_arguments, read_yaml, replaced
+from quad_swarm.validation import Range, checked, checked_arguments, read_yaml, replaced, with_fields
 from quad_swarm.world.presets import make_config
 
 
@@ -122,3 +123,28 @@ def test_truth_values_are_no_numbers_among_arguments():
         with pytest.raises(ValueError, match=f"{name}='True': it must be a valid"):
             make_task(**arguments)
     assert make_task(n_robots=2, end_at_arrival=True, max_steps=100).end_at_arrival
+
+
+@dataclass(frozen=True)
+class Options:
+    size: PositiveInt = 1
+    name: str = "x"
+
+
+def test_fields_of_a_dataclass_become_arguments():
+    @with_fields(Options)
+    def described(first: int, options: Options, last: bool = False) -> tuple:
+        """Return all."""
+        return first, options, last
+
+    assert described.__doc__ == "Return all."
+    assert str(inspect.signature(described)).startswith("(first: int, size: ")
+    assert described(1) == (1, Options(), False)
+    assert described("2", "3", last="true") == (2, Options(3), True)
+    assert described(first=2, name="y") == (2, Options(name="y"), False)
+    with pytest.raises(ValueError, match=r"size=0: it must be greater than 0"):
+        described(1, size=0)
+    with pytest.raises(ValueError, match=r"Unknown argument 'sise'.*Did you mean 'size'"):
+        described(1, sise=0)
+    with pytest.raises(ValueError, match="first"):
+        described(name="y")

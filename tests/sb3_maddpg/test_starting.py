@@ -13,7 +13,7 @@ SLOW = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nimport time\ntim
 
 @pytest.mark.parametrize("words", [["-m", "sb3_maddpg", "train"], ["sb3-maddpg", "train"]])
 def test_ctrl_c_during_the_imports_is_one_line(words, tmp_path):
-    (tmp_path / "torch.py").write_text(SLOW)
+    trap(tmp_path, SLOW)
     (tmp_path / "sb3-maddpg").write_text("from sb3_maddpg.cli.main import main\nmain()\n")
     if words[0] != "-m":
         words = [str(tmp_path / words[0]), *words[1:]]
@@ -25,7 +25,7 @@ def test_ctrl_c_during_the_imports_is_one_line(words, tmp_path):
 
 
 def test_other_programs_keep_their_keyboard_interrupt(tmp_path):
-    (tmp_path / "torch.py").write_text(SLOW)
+    trap(tmp_path, SLOW)
     program = "try:\n    from sb3_maddpg import MADDPG\nexcept KeyboardInterrupt:\n    print('as usual')\n"
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True
@@ -34,7 +34,7 @@ def test_other_programs_keep_their_keyboard_interrupt(tmp_path):
 
 
 def test_background_jobs_keep_ignoring_it(tmp_path):
-    (tmp_path / "torch.py").write_text(SLOW.replace("time.sleep(60)", "print('goes on', flush=True)\nos._exit(0)"))
+    trap(tmp_path, SLOW.replace("time.sleep(60)", "print('goes on', flush=True)\nos._exit(0)"))
     done = subprocess.run(
         [sys.executable, "-m", "sb3_maddpg", "train"],
         cwd=tmp_path,
@@ -46,5 +46,11 @@ def test_background_jobs_keep_ignoring_it(tmp_path):
     assert done.stdout == "goes on\n", done.stderr
 
 
+def trap(folder: Path, code: str) -> None:
+    """Not in the current folder, from which a command imports nothing."""
+    (folder / "path").mkdir()
+    (folder / "path/torch.py").write_text(code)
+
+
 def environment(folder: Path) -> dict[str, str]:
-    return {"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "HOME": str(folder)}
+    return {"PYTHONPATH": str(folder / "path"), "PATH": "/usr/bin:/bin", "HOME": str(folder)}

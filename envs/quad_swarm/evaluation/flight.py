@@ -12,14 +12,14 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.evaluation.policies import RequestPolicy, make_policy, name_of, policy_of
-from quad_swarm.geometry import length
+from quad_swarm.geometry import closest_approach, length
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, requests_of
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.doubts import too_short, warn
-from quad_swarm.world.neighbours import spread
+from quad_swarm.world.neighbours import slots_to_robots
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -122,7 +122,7 @@ def begin(
     return policy, task, [np.random.default_rng([seed, 1]) for seed in episodes]
 
 
-class Step(NamedTuple):
+class FlownStep(NamedTuple):
     """One step of a batch of episodes.
 
     :param episodes: indices of the running episodes, (E,)
@@ -142,7 +142,7 @@ class Step(NamedTuple):
 
 def fly_steps(
     policy: RequestPolicy, task: RequestTask, rngs: Sequence[np.random.Generator], linger: int | None = None
-) -> Iterator[Step]:
+) -> Iterator[FlownStep]:
     """Fly all episodes of a task and yield their steps. Finished episodes leave the batch after their last step.
 
     :param policy: see `begin`
@@ -163,7 +163,7 @@ def fly_steps(
         if linger is not None:
             over |= since_arrival > linger
         others = outcome.report.others
-        yield Step(episodes, spread(requests, others), spread(announced, others), outcome, over)
+        yield FlownStep(episodes, slots_to_robots(requests, others), slots_to_robots(announced, others), outcome, over)
         if over.any():
             task.keep(~over)
             episodes, since_arrival = episodes[~over], since_arrival[~over]
@@ -239,9 +239,8 @@ class Flight:
     def closest_approach(self) -> tuple[np.ndarray, np.ndarray]:
         """Distance (m) and time (s) of the closest approach at constant velocities from each step on, without a time
         limit, both (T + 1, n, n - 1)."""
-        closing = -(self.relative_pos * self.relative_vel).sum(axis=-1)
-        time = np.maximum(closing / np.maximum((self.relative_vel**2).sum(axis=-1), 1e-12), 0.0)
-        return length(self.relative_pos + time[..., None] * self.relative_vel), time
+        nearest, time = closest_approach(self.relative_pos, self.relative_vel)
+        return length(nearest), time
 
     @cached_property
     def arrival(self) -> int | None:
@@ -282,7 +281,7 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     def recorded(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
         neighbours = task.swarm.neighbours
         asked = neighbours.perceived(rule(View(task.swarm, other_rngs)))
-        other_requests.append(spread(asked, neighbours.numbers())[0])
+        other_requests.append(slots_to_robots(asked, neighbours.numbers())[0])
         return policy(task, rngs)
 
     closest: list[float] = []

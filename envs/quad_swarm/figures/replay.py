@@ -24,14 +24,14 @@ from quad_swarm.evaluation.policies import is_model, short_name
 from quad_swarm.evaluation.provenance import plant_name
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_text
 from quad_swarm.figures.colours import COLOURS
-from quad_swarm.geometry import length
+from quad_swarm.geometry import closest_approach, length
 from quad_swarm.parsing import Parser
 from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.scenarios import SCENARIOS
 
 # Number of steps to show after all robots have arrived
-_LINGER = 10
+_EXTRA_STEPS = 10
 # Decimals of metres and radians, which are finer than a pixel; plans need fewer
 _DIGITS, _PLAN_DIGITS = 3, 2
 # Every such stage of a plan is drawn
@@ -82,7 +82,7 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
     (m); arrival, collision: first steps after which all robots had arrived, and two collided, or None; colliding:
     (step, robot, robot) for each pair that collides in a step.
     """
-    end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _LINGER, len(flight.requests))
+    end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _EXTRA_STEPS, len(flight.requests))
     others = other_indices(flight.n_robots)
     name, detail = _plain_name(policy)
     return {
@@ -125,9 +125,7 @@ def _colliding(flight: Flight) -> list[list[int]]:
     """
     before, after = flight.relative_pos[:-1], flight.relative_pos[1:]
     if flight.config.continuous_collisions:
-        move = after - before
-        share = -(before * move).sum(axis=-1) / np.maximum((move**2).sum(axis=-1), 1e-12)
-        after = before + np.clip(share, 0, 1)[..., None] * move
+        after, _ = closest_approach(before, after - before, 1.0)
     apart = length(after)
     closest, least = apart == apart.min(axis=(1, 2), keepdims=True), flight.min_separation[1:, None, None]
     limit = 2 * flight.config.radius - flight.config.collision_tolerance

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from pydantic import PositiveInt
 
 from quad_swarm.errors import unknown_name
 from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, checked_seed, need_reset
 from quad_swarm.states import as_other_state, generator_of, generator_state, like
-from quad_swarm.task.request_task import make_task, requests_of
-from quad_swarm.validation import checked_arguments
-from quad_swarm.world.neighbours import spread
+from quad_swarm.task.options import TaskOptions
+from quad_swarm.task.request_task import requests_of, task_of
+from quad_swarm.validation import with_fields
+from quad_swarm.world.neighbours import slots_to_robots
 
 
 class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
@@ -89,48 +88,9 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
     reset_options = ("starts", "goals")
 
-    @checked_arguments
-    def __init__(
-        self,
-        preset: str = "paper",
-        scenario: str | Mapping[str, float] = "mixed",
-        n_robots: int | None = None,
-        max_steps: PositiveInt | None = None,
-        observation: str = "paper",
-        scale_observation: bool = False,
-        continuous_collisions: bool | None = None,
-        end_at_arrival: bool = False,
-        memory: float | None = None,
-        reward: Mapping[str, Any] | None = None,
-        planner: Mapping[str, Any] | None = None,
-        noise: Mapping[str, Any] | None = None,
-        radio: Mapping[str, Any] | None = None,
-        space: Mapping[str, Any] | None = None,
-        world: Mapping[str, Any] | None = None,
-        solver: str = "auto",
-        announcements: bool = False,
-        render_mode: str | None = None,
-    ):
-        self.task = make_task(
-            n_swarms=1,
-            preset=preset,
-            scenario=scenario,
-            n_robots=n_robots,
-            max_steps=max_steps,
-            observation=observation,
-            scale_observation=scale_observation,
-            continuous_collisions=continuous_collisions,
-            end_at_arrival=end_at_arrival,
-            memory=memory,
-            reward=reward,
-            planner=planner,
-            noise=noise,
-            radio=radio,
-            space=space,
-            world=world,
-            solver=solver,
-            announcements=announcements,
-        )
+    @with_fields(TaskOptions)
+    def __init__(self, options: TaskOptions, render_mode: str | None = None):
+        self.task = task_of(options)
         n = self.n_agents
         self.observation_space = spaces.Box(-np.inf, np.inf, (n, self.task.observation_size), np.float32)
         self._n_bits = n * self.config.n_others * self.task.n_bits
@@ -181,7 +141,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         bits = checked_bits(action, (self._n_bits,), self.config.n_others, self.task.n_bits)[None]
         if self.render_mode is not None:
             neighbours = self.task.swarm.neighbours
-            self._requests = spread(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
+            self._requests = slots_to_robots(requests_of(self.task.sent(bits), neighbours)[0], neighbours.numbers_in(0))
         outcome = self.task.act(bits)
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         info = info_of(self.task.info(outcome), 0)

@@ -22,12 +22,12 @@ from multiprocessing.context import SpawnContext
 from types import TracebackType
 from typing import Any
 
-# Number of attempts before a piece, or the machine, is considered the cause of the processes' deaths
+# Number of attempts before a task, or the machine, is considered the cause of the processes' deaths
 _ATTEMPTS = 3
 
 
 @dataclass
-class _Piece:
+class _Task:
     function: Callable[[], Any]
     future: Future[Any] = field(default_factory=Future)
     attempts: int = 0
@@ -36,14 +36,14 @@ class _Piece:
 @dataclass
 class _Worker:
     process: multiprocessing.process.BaseProcess
-    piece: _Piece | None = None
+    task: _Task | None = None
 
 
 class Pool(Executor):
     """Executor like `concurrent.futures.ProcessPoolExecutor`, but tolerant of dying processes.
 
-    If a process dies, a new process repeats its piece, so a piece must be a pure function of its arguments. All
-    processes end with their parent, however that ends. An exception in the ``with`` block stops running pieces.
+    If a process dies, a new process repeats its task, so a task must be a pure function of its arguments. All
+    processes end with their parent, however that ends. An exception in the ``with`` block stops running tasks.
 
     Each process has its own pipe and shares no lock, so it cannot leave anything locked.
 
@@ -58,7 +58,7 @@ class Pool(Executor):
         self._jobs, self._modules = jobs, tuple(modules)
         # Spawned, not forked, because numerical libraries have threads
         self._context: SpawnContext = multiprocessing.get_context("spawn")
-        self._waiting: deque[_Piece] = deque()
+        self._waiting: deque[_Task] = deque()
         self._workers: dict[Connection, _Worker] = {}
         self._closing = self._stopping = False
         self._lock = threading.Lock()
@@ -68,21 +68,21 @@ class Pool(Executor):
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `concurrent.futures.Executor.submit`.
 
-        The future raises ValueError if the piece's processes died repeatedly.
+        The future raises ValueError if the task's processes died repeatedly.
         """
-        piece = _Piece(partial(function, *args, **kwargs))
+        task = _Task(partial(function, *args, **kwargs))
         with self._lock:
             if self._closing:
                 raise RuntimeError("This pool is closed.")
-            self._waiting.append(piece)
+            self._waiting.append(task)
             if self._manager is None:
                 self._manager = threading.Thread(target=self._manage, daemon=True)
                 self._manager.start()
         self._wake.send(None)
-        return piece.future
+        return task.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See `concurrent.futures.Executor.shutdown`. ``cancel_futures`` also stops running pieces."""
+        """See `concurrent.futures.Executor.shutdown`. ``cancel_futures`` also stops running tasks."""
         with self._lock:
             self._closing, self._stopping = True, self._stopping or cancel_futures
         with contextlib.suppress(OSError):  # the pool has already ended
@@ -97,44 +97,44 @@ class Pool(Executor):
         return None
 
     def _manage(self) -> None:
-        """Distribute pieces and collect results until the pool is closed and no piece is left."""
+        """Distribute tasks and collect results until the pool is closed and no task is left."""
         while True:
             with self._lock:
                 stopping, closing = self._stopping, self._closing
             if not stopping:
-                self._give_out()
-            busy = any(worker.piece for worker in self._workers.values())
+                self._dispatch()
+            busy = any(worker.task for worker in self._workers.values())
             if stopping or (closing and not busy and not self._waiting):
                 break
             for ready in wait([self._woken, *self._workers]):
                 if ready is self._woken:
                     self._woken.recv()
                 else:
-                    self._take_in(ready)  # type: ignore[arg-type]  # a Connection like the one above
+                    self._receive(ready)  # type: ignore[arg-type]  # a Connection like the one above
         self._end()
 
-    def _give_out(self) -> None:
+    def _dispatch(self) -> None:
         while self._waiting:
-            idle = next((connection for connection, worker in self._workers.items() if worker.piece is None), None)
+            idle = next((connection for connection, worker in self._workers.items() if worker.task is None), None)
             if idle is None and len(self._workers) == self._jobs:
                 return
-            piece = self._waiting.popleft()
-            if not piece.attempts and not piece.future.set_running_or_notify_cancel():
+            task = self._waiting.popleft()
+            if not task.attempts and not task.future.set_running_or_notify_cancel():
                 continue
             try:
-                text = pickle.dumps(piece.function)
+                text = pickle.dumps(task.function)
             except Exception as error:  # whatever pickle raises
-                piece.future.set_exception(error)
+                task.future.set_exception(error)
                 continue
-            connection = idle or self._hire()
-            self._workers[connection].piece = piece
-            piece.attempts += 1
+            connection = idle or self._start_worker()
+            self._workers[connection].task = task
+            task.attempts += 1
             try:
                 connection.send_bytes(text)
             except OSError:
-                self._bury(connection)
+                self._remove_worker(connection)
 
-    def _hire(self) -> Connection:
+    def _start_worker(self) -> Connection:
         mine, theirs = self._context.Pipe()
         # One thread per process, so that processes do not compete for cores
         os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -145,49 +145,49 @@ class Pool(Executor):
         self._workers[mine] = _Worker(process)
         return mine
 
-    def _take_in(self, connection: Connection) -> None:
+    def _receive(self, connection: Connection) -> None:
         worker = self._workers[connection]
         try:
             result = connection.recv_bytes()
         except (OSError, EOFError):
-            self._bury(connection)
+            self._remove_worker(connection)
             return
-        piece, worker.piece = worker.piece, None
-        assert piece is not None
+        task, worker.task = worker.task, None
+        assert task is not None
         try:
             value, error, trace = pickle.loads(result)
         except Exception as unreadable:  # whatever the value's class raises
             value, error, trace = None, unreadable, "as it was read"
         if error is None:
-            piece.future.set_result(value)
+            task.future.set_result(value)
         else:
             error.__cause__ = RuntimeError(f"in a process of the pool:\n{trace}")
-            piece.future.set_exception(error)
+            task.future.set_exception(error)
 
-    def _bury(self, connection: Connection) -> None:
-        """Remove a dead process and requeue its piece, unless it has had all its attempts."""
+    def _remove_worker(self, connection: Connection) -> None:
+        """Remove a dead process and requeue its task, unless it has had all its attempts."""
         worker = self._workers.pop(connection)
         connection.close()
         worker.process.join()
-        if worker.piece is None:
+        if worker.task is None:
             return
-        if worker.piece.attempts < _ATTEMPTS:
-            self._waiting.appendleft(worker.piece)
+        if worker.task.attempts < _ATTEMPTS:
+            self._waiting.appendleft(worker.task)
         else:
             message = f"{_ATTEMPTS} processes died in the same piece of work. If memory is short, use fewer --jobs."
-            worker.piece.future.set_exception(ValueError(message))
+            worker.task.future.set_exception(ValueError(message))
 
     def _end(self) -> None:
         for connection, worker in self._workers.items():
             connection.close()  # this ends an idle process
-            if worker.piece is not None:
+            if worker.task is not None:
                 worker.process.kill()
-                worker.piece.future.set_exception(RuntimeError("The pool was stopped."))
+                worker.task.future.set_exception(RuntimeError("The pool was stopped."))
         for worker in self._workers.values():
             worker.process.join()
-        for piece in self._waiting:
-            if piece.attempts or not piece.future.cancel():
-                piece.future.set_exception(RuntimeError("The pool was stopped."))
+        for task in self._waiting:
+            if task.attempts or not task.future.cancel():
+                task.future.set_exception(RuntimeError("The pool was stopped."))
         self._workers.clear()
         self._waiting.clear()
 
@@ -215,19 +215,19 @@ def _without_current_folder() -> Iterator[None]:
 
 
 def _work(connection: Connection, modules: Sequence[str]) -> None:
-    """Run pieces until the pipe is closed."""
+    """Run tasks until the pipe is closed."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this one
     for module in modules:
         importlib.import_module(module)
     while True:
         try:
-            piece = connection.recv_bytes()
+            task = connection.recv_bytes()
         except EOFError:
             return
         value, error, trace = None, None, ""
         try:
-            value = pickle.loads(piece)()
+            value = pickle.loads(task)()
         except Exception as raised:  # passed on to the caller
             error, trace = raised, traceback.format_exc()
         try:

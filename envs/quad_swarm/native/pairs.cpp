@@ -1,5 +1,5 @@
-// Computations for every pair of robots in every step. pairs.py and steps.py document them. Their NumPy versions give bit-identical
-// results, so the order of operations must not change.
+// Computations for every pair of robots in every step. pairs.py and steps.py document them, table.py declares their
+// parameters. Their NumPy versions give bit-identical results, so the order of operations must not change.
 //
 // All arrays are contiguous. A trajectory is a row of 3 N numbers, stage by stage. Pairs are ordered by the robot, then
 // by the other.
@@ -33,6 +33,16 @@ inline double squared_distance(const double* a, const double* b) {
   return einsum(difference, difference);
 }
 
+// Move `position` to where it is at the closest approach of straight motion, until a time at most, and return when that
+// is. geometry.py explains it.
+template <class Product>
+inline double approach(double* position, const double* velocity, double until, Product product) {
+  const double speed2 = std::max(product(velocity, velocity), 1e-12);
+  const double time = std::min(std::max(-product(position, velocity) / speed2, 0.0), until);
+  for (int i = 0; i < 3; i++) position[i] += time * velocity[i];
+  return time;
+}
+
 // Return the smallest squared distance of two robots that move in straight lines between consecutive positions, which
 // are `stride` numbers apart.
 double closest(const double* a, const double* b, Integer n_parts, Integer stride) {
@@ -40,14 +50,13 @@ double closest(const double* a, const double* b, Integer n_parts, Integer stride
   double start[3], end[3];
   for (int i = 0; i < 3; i++) start[i] = a[i] - b[i];
   for (Integer part = 1; part <= n_parts; part++) {
-    double change[3], point[3];
+    double change[3];
     for (int i = 0; i < 3; i++) {
       end[i] = a[part * stride + i] - b[part * stride + i];
       change[i] = end[i] - start[i];
     }
-    const double along = clipped(-einsum(start, change) / std::max(einsum(change, change), 1e-12));
-    for (int i = 0; i < 3; i++) point[i] = start[i] + along * change[i];
-    least = std::min(least, einsum(point, point));
+    approach(start, change, 1.0, einsum);
+    least = std::min(least, einsum(start, start));
     std::copy(end, end + 3, start);
   }
   return least;
@@ -59,7 +68,7 @@ inline void steady(const double* pos, const double* vel, const std::vector<doubl
     for (int i = 0; i < 3; i++) to[k + i] = vel[i] * times[k + i] + pos[i];
 }
 
-// The record of `STATISTICS` in steps.py
+// The record of `STATISTICS` in table.py
 struct Statistics {
   Integer steps, steps_counted, requests, possible_requests, peak_requests, plans_used, plan_ages, requests_flown;
   Integer planner_failures;
@@ -193,8 +202,7 @@ EXPORT void quad_swarm_keep_right(Integer n_robots, Integer n_others, Integer n_
       vel[i] = velocity - state[3 + i];
     }
     const double speed = std::hypot(vel[0], vel[1]);
-    const double time = -dot(pos, vel) / std::max(dot(vel, vel), 1e-9);
-    const double grown = width * clipped(time / fade) * clipped(speed / slow);
+    const double grown = width * (approach(pos, vel, fade, dot) / fade) * clipped(speed / slow);
     const double shift[2] = {grown * (vel[1] / std::max(speed, 1e-9)), grown * (-vel[0] / std::max(speed, 1e-9))};
     for (Integer k = 0; k < n_stages; k++) {
       row[3 * k] += shift[0];
@@ -205,7 +213,7 @@ EXPORT void quad_swarm_keep_right(Integer n_robots, Integer n_others, Integer n_
 }
 
 // `errors` null: robots observe each other without errors.
-EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_places, double limit, double look_ahead,
+EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_slots, double limit, double look_ahead,
                                   const double* pos, const double* vel, const double* errors, Integer* others,
                                   Flag* present, Integer* reverse) {
   std::vector<std::pair<double, Integer>> near;
@@ -213,10 +221,10 @@ EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_
   std::vector<const double*> error(n_robots, nullptr);  // of each other that is in a slot
   for (Integer swarm = 0; swarm < n_swarms; swarm++) {
     const double *swarm_pos = pos + 3 * n_robots * swarm, *swarm_vel = vel + 3 * n_robots * swarm;
-    const Integer first = n_places * n_robots * swarm;
+    const Integer first = n_slots * n_robots * swarm;
     for (Integer robot = 0; robot < n_robots; robot++) {
       near.clear();
-      for (Integer k = first + n_places * robot; errors && k < first + n_places * (robot + 1); k++)
+      for (Integer k = first + n_slots * robot; errors && k < first + n_slots * (robot + 1); k++)
         if (present[k]) error[others[k]] = errors + 6 * k;
       for (Integer other = 0; other < n_robots; other++) {
         double apart[3], along[3];
@@ -228,73 +236,72 @@ EXPORT void quad_swarm_neighbours(Integer n_swarms, Integer n_robots, Integer n_
         }
         error[other] = nullptr;
         if (other == robot || dot(apart, apart) > limit * limit) continue;
-        const double time =
-            std::min(std::max(-dot(apart, along) / std::max(dot(along, along), 1e-12), 0.0), look_ahead);
-        for (int i = 0; i < 3; i++) apart[i] += time * along[i];
+        approach(apart, along, look_ahead, dot);
         near.emplace_back(dot(apart, apart), other);
       }
-      if (static_cast<Integer>(near.size()) > n_places) {
-        std::nth_element(near.begin(), near.begin() + n_places, near.end());
-        near.resize(n_places);
+      if (static_cast<Integer>(near.size()) > n_slots) {
+        std::nth_element(near.begin(), near.begin() + n_slots, near.end());
+        near.resize(n_slots);
       }
       std::fill(comes.begin(), comes.end(), 0);
       for (const auto& one : near) comes[one.second] = 1;
-      Integer* who = others + first + n_places * robot;
-      Flag* taken = present + first + n_places * robot;
-      for (Integer place = 0; place < n_places; place++) {
-        taken[place] = taken[place] && comes[who[place]];
-        if (taken[place])
-          comes[who[place]] = 0;
+      Integer* who = others + first + n_slots * robot;
+      Flag* taken = present + first + n_slots * robot;
+      for (Integer slot = 0; slot < n_slots; slot++) {
+        taken[slot] = taken[slot] && comes[who[slot]];
+        if (taken[slot])
+          comes[who[slot]] = 0;
         else
-          who[place] = robot;
+          who[slot] = robot;
       }
-      Integer place = 0;
+      Integer slot = 0;
       for (Integer other = 0; other < n_robots; other++) {
         if (!comes[other]) continue;
-        while (taken[place]) place++;
-        who[place] = other;
-        taken[place] = 1;
+        while (taken[slot]) slot++;
+        who[slot] = other;
+        taken[slot] = 1;
       }
     }
     for (Integer robot = 0; robot < n_robots; robot++) {
-      for (Integer k = first + n_places * robot; k < first + n_places * (robot + 1); k++) {
-        const Integer* theirs = others + first + n_places * others[k];
-        const Integer* found = std::find(theirs, theirs + n_places, robot);
-        reverse[k] = present[k] && found != theirs + n_places ? found - theirs : -1;
+      for (Integer k = first + n_slots * robot; k < first + n_slots * (robot + 1); k++) {
+        const Integer* theirs = others + first + n_slots * others[k];
+        const Integer* found = std::find(theirs, theirs + n_slots, robot);
+        reverse[k] = present[k] && found != theirs + n_slots ? found - theirs : -1;
       }
     }
   }
 }
 
 // Without `others`, the swarms' results for pairs lie next to each other.
-EXPORT void quad_swarm_measure(Integer n_parts, Integer n_swarms, Integer n_robots, Integer n_places, double contact,
+EXPORT void quad_swarm_measure(Integer n_parts, Integer n_swarms, Integer n_robots, Integer n_slots, double contact,
                                double goal_radius, const double* positions, const double* goals, const Integer* others,
-                               double* least, double* least_during, double* apart, double* apart_during, Flag* colliding,
-                               Flag* colliding_during, double* moved, Flag* at_goal) {
+                               double* min_separation, double* min_separation_continuous, double* separation,
+                               double* separation_continuous, Flag* colliding, Flag* colliding_continuous,
+                               double* moved, Flag* at_goal) {
   const double infinity = std::numeric_limits<double>::infinity();
   const Integer stride = 3 * n_robots * n_swarms, last = stride * n_parts;
   std::vector<double> after(n_robots * n_robots, infinity), during(n_robots * n_robots, infinity);
   for (Integer swarm = 0; swarm < n_swarms; swarm++) {
     const double* pos = positions + 3 * n_robots * swarm;
-    least[swarm] = least_during[swarm] = infinity;
+    min_separation[swarm] = min_separation_continuous[swarm] = infinity;
     for (Integer robot = 0; robot < n_robots; robot++) {
       for (Integer other = robot + 1; other < n_robots; other++) {
         const Integer one = n_robots * robot + other, two = n_robots * other + robot;
         after[one] = after[two] = std::sqrt(squared_distance(pos + last + 3 * robot, pos + last + 3 * other));
         during[one] = during[two] = std::sqrt(closest(pos + 3 * robot, pos + 3 * other, n_parts, stride));
-        least[swarm] = std::min(least[swarm], after[one]);
-        least_during[swarm] = std::min(least_during[swarm], during[one]);
+        min_separation[swarm] = std::min(min_separation[swarm], after[one]);
+        min_separation_continuous[swarm] = std::min(min_separation_continuous[swarm], during[one]);
       }
     }
     for (Integer robot = 0; robot < n_robots; robot++) {
-      for (Integer place = 0; place < n_places; place++) {
-        const Integer pair = n_places * robot + place, pairs = n_places * n_robots;
-        const Integer other = others ? others[pairs * swarm + pair] : place + (place >= robot);
+      for (Integer slot = 0; slot < n_slots; slot++) {
+        const Integer pair = n_slots * robot + slot, pairs = n_slots * n_robots;
+        const Integer other = others ? others[pairs * swarm + pair] : slot + (slot >= robot);
         const Integer k = others ? pairs * swarm + pair : n_swarms * pair + swarm;
-        apart[k] = after[n_robots * robot + other];
-        apart_during[k] = during[n_robots * robot + other];
-        colliding[k] = apart[k] < contact;
-        colliding_during[k] = apart_during[k] < contact;
+        separation[k] = after[n_robots * robot + other];
+        separation_continuous[k] = during[n_robots * robot + other];
+        colliding[k] = separation[k] < contact;
+        colliding_continuous[k] = separation_continuous[k] < contact;
       }
       const Integer number = n_robots * swarm + robot;
       const double* now = pos + last + 3 * robot;
@@ -304,19 +311,20 @@ EXPORT void quad_swarm_measure(Integer n_parts, Integer n_swarms, Integer n_robo
   }
 }
 
-EXPORT void quad_swarm_count(Integer n_swarms, Integer n_robots, Integer n_places, Integer failed, double seconds,
+EXPORT void quad_swarm_count(Integer n_swarms, Integer n_robots, Integer n_slots, Integer failed, double seconds,
                              const Integer* n_requests, const Flag* collided, const Flag* collision,
-                             const Flag* collision_continuous, const Flag* at_goal, const Integer* source,
-                             const Integer* age, const Integer* status, const Integer* others, const double* moved,
-                             const double* least, const double* least_during, Statistics* statistics) {
-  const Integer n_pairs = n_robots * n_places;
+                             const Flag* collision_continuous, const Flag* at_goal, const Integer* belief_source,
+                             const Integer* plan_age, const Integer* plan_status, const Integer* others,
+                             const double* moved, const double* min_separation,
+                             const double* min_separation_continuous, Statistics* statistics) {
+  const Integer n_pairs = n_robots * n_slots;
   for (Integer swarm = 0; swarm < n_swarms; swarm++) {
     Statistics& sum = statistics[swarm];
     if (!sum.reached && !sum.collided) {
       Integer used = 0, ages = 0, possible = others ? 0 : n_pairs;
       for (Integer pair = n_pairs * swarm; pair < n_pairs * (swarm + 1); pair++) {
-        used += source[pair] != 0;
-        ages += source[pair] != 0 ? age[pair] : 0;
+        used += belief_source[pair] != 0;
+        ages += belief_source[pair] != 0 ? plan_age[pair] : 0;
         possible += others && others[pair] >= 0;
       }
       sum.steps_counted++;
@@ -335,12 +343,12 @@ EXPORT void quad_swarm_count(Integer n_swarms, Integer n_robots, Integer n_place
     sum.at_goals = 1;
     for (Integer robot = n_robots * swarm; robot < n_robots * (swarm + 1); robot++) {
       sum.at_goals &= at_goal[robot];
-      sum.planner_failures += status[robot] >= failed;
+      sum.planner_failures += plan_status[robot] >= failed;
     }
     sum.arrived |= sum.at_goals && !sum.collided;
     sum.reached |= sum.at_goals;
-    sum.min_separation = std::min(sum.min_separation, least[swarm]);
-    sum.min_separation_continuous = std::min(sum.min_separation_continuous, least_during[swarm]);
+    sum.min_separation = std::min(sum.min_separation, min_separation[swarm]);
+    sum.min_separation_continuous = std::min(sum.min_separation_continuous, min_separation_continuous[swarm]);
     sum.solve_seconds += seconds / static_cast<double>(n_swarms);
   }
 }

@@ -6,45 +6,14 @@ the number of stages of a plan.
 
 from __future__ import annotations
 
-import ctypes
 import functools
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from quad_swarm.geometry import length
-from quad_swarm.native.build import BuildError, addresses, build, load
-
-_SOURCE = "pairs.cpp"
-_INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-_OF_BELIEVE = (np.float64, np.float64, np.float64, np.bool_)  # types of the arrays of a function
-_OF_RECEIVE = (np.bool_, np.float64, np.int64, np.float64, np.float64, np.bool_, np.int64, np.float64)
-_FUNCTIONS = {
-    "quad_swarm_remember": [_INTEGER, _INTEGER, _REAL, *[_ARRAY] * 7],
-    "quad_swarm_believe": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 6],
-    "quad_swarm_receive": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 12],
-    "quad_swarm_approach": [_INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 9],
-    "quad_swarm_resample": [_INTEGER, _INTEGER, _INTEGER, _ARRAY, _ARRAY],
-    "quad_swarm_keep_right": [_INTEGER, _INTEGER, _INTEGER, *[_REAL] * 4, *[_ARRAY] * 4],
-    "quad_swarm_neighbours": [_INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 6],
-    "quad_swarm_measure": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, _REAL, _REAL, *[_ARRAY] * 11],
-    "quad_swarm_count": [_INTEGER, _INTEGER, _INTEGER, _INTEGER, _REAL, *[_ARRAY] * 13],
-}
-
-
-@functools.cache
-def compiled() -> ctypes.CDLL | None:
-    """Return the compiled functions, None if they cannot be compiled, of which the planner warns."""
-    try:
-        text = (Path(__file__).parent / _SOURCE).read_text(encoding="utf-8")
-        library = load(str(build("pairs", _SOURCE, {_SOURCE: text})), *_FUNCTIONS)
-    except BuildError:
-        return None
-    for name, types in _FUNCTIONS.items():
-        getattr(library, name).argtypes = types
-    return library
+from quad_swarm.geometry import closest_approach, dot, length
+from quad_swarm.native.table import compiled
 
 
 def remember(
@@ -59,19 +28,11 @@ def remember(
     :return: positions from now on, whose last segment continues in a straight line, ages, errors (m), and which plans
         are believed, bool
     """
-    n_stages = remembered.shape[-2] - 1
-    if (library := compiled()) is None:
-        later, age = advance(remembered), age + 1
-        error = length(later[..., 0, :] - pos)
-        return later, age, error, (age < n_stages) & (error <= memory)
-    remembered, pos = np.ascontiguousarray(remembered, np.float64), np.ascontiguousarray(pos, np.float64)
-    age = np.ascontiguousarray(age, np.int64)
-    later, next_age = np.empty_like(remembered), np.empty_like(age)
-    error, remembers = np.empty(age.shape), np.empty(age.shape, dtype=bool)
-    library.quad_swarm_remember(
-        age.size, n_stages, memory, *addresses(pos, remembered, age, later, next_age, error, remembers)
-    )
-    return later, next_age, error, remembers
+    if (functions := compiled()) is not None:
+        return functions.remember(memory=memory, pos=pos, remembered=remembered, age=age)
+    later, age = advance(remembered), age + 1
+    error = length(later[..., 0, :] - pos)
+    return later, age, error, (age < remembered.shape[-2] - 1) & (error <= memory)
 
 
 def believe(
@@ -93,16 +54,10 @@ def believe(
     :return: positions, (pairs, stages, 3) (m)
     """
     chosen = _first(remembered.shape[-2] - 1) if stages is None else np.array(stages, dtype=np.int64)
-    if (library := compiled()) is None:
-        steady = pos[..., None, :] + (dt * (chosen + 1))[:, None] * vel[..., None, :]
-        return np.where(remembers[..., None, None], remembered.take(chosen + 1, axis=-2), steady)
-    kinds = zip((pos, vel, remembered, remembers), _OF_BELIEVE, strict=True)
-    arrays: list[np.ndarray] = [np.ascontiguousarray(array, kind) for array, kind in kinds]
-    believed = np.empty((*pos.shape[:-1], len(chosen), 3))
-    library.quad_swarm_believe(
-        remembers.size, remembered.shape[-2] - 1, len(chosen), dt, *addresses(chosen, *arrays, believed)
-    )
-    return believed
+    if (functions := compiled()) is not None:
+        return functions.believe(dt=dt, chosen=chosen, pos=pos, vel=vel, remembered=remembered, remembers=remembers)
+    steady = pos[..., None, :] + (dt * (chosen + 1))[:, None] * vel[..., None, :]
+    return np.where(remembers[..., None, None], remembered.take(chosen + 1, axis=-2), steady)
 
 
 class Known(NamedTuple):
@@ -145,20 +100,23 @@ def receive(
     ages = age if isinstance(age, np.ndarray) else None
     if memory:
         _check_in_place("known.remembered", known.remembered)
-    if (library := compiled()) is not None:
-        arrays = [arriving, received if len(received) else None, None if ages is None or not len(ages) else ages]
-        arrays = [
-            None if one is None else np.ascontiguousarray(one, kind)
-            for one, kind in zip((*arrays, *known), _OF_RECEIVE, strict=True)
-        ]
-        next_age = np.empty(arriving.shape, dtype=np.int64)
-        believed = np.empty((*arriving.shape, received.shape[-2] - 1, 3)) if predicts else None
-        source = np.empty(arriving.shape, dtype=np.int64) if predicts else None
-        library.quad_swarm_receive(
-            *(arriving.size, received.shape[-2] - 1, 0 if ages is not None else age, dt, misfit),
-            *addresses(*arrays, known.remembered if memory else None, next_age, believed, source),
+    if (functions := compiled()) is not None:
+        return functions.receive(
+            age=0 if ages is not None else age,
+            dt=dt,
+            misfit=misfit,
+            arriving=arriving,
+            received=received if len(received) else None,
+            ages=ages if ages is not None and len(ages) else None,
+            pos=known.pos,
+            vel=known.vel,
+            remembers=known.remembers,
+            known_age=known.age,
+            known=known.remembered,
+            remembered=known.remembered if memory else None,
+            believed=predicts,
+            source=predicts,
         )
-        return next_age, believed, source
     if ages is not None:
         newer = ages <= known.age[arriving]
         arriving, received, age = arriving.copy(), received[newer], ages[newer]
@@ -208,19 +166,13 @@ def approach(
     :return: the smallest distance (m), the first stage at which it is reached, counting from 0, and the distance at the
         last stage (m), each (E, n, n - 1)
     """
-    n_stages = plan.shape[-2]
-    if (library := compiled()) is None:
-        expected = believe(pos, vel, remembered, remembers, dt) - own[:, :, None, None]
-        distances = length(plan[:, :, None] - expected)
-        return distances.min(axis=-1), distances.argmin(axis=-1), distances[..., -1]
-    arrays = [np.ascontiguousarray(array, np.float64) for array in (own, plan, pos, vel, remembered)]
-    arrays.append(np.ascontiguousarray(remembers, np.bool_))
-    least, last = np.empty(remembers.shape), np.empty(remembers.shape)
-    nearest = np.empty(remembers.shape, dtype=np.int64)
-    n_others = remembers.shape[-1]
-    n_robots = remembers.size // max(n_others, 1)
-    library.quad_swarm_approach(n_robots, n_others, n_stages, dt, *addresses(*arrays, least, nearest, last))
-    return least, nearest, last
+    if (functions := compiled()) is not None:
+        return functions.approach(
+            dt=dt, own=own, plan=plan, pos=pos, vel=vel, remembered=remembered, remembers=remembers
+        )
+    expected = believe(pos, vel, remembered, remembers, dt) - own[:, :, None, None]
+    distances = length(plan[:, :, None] - expected)
+    return distances.min(axis=-1), distances.argmin(axis=-1), distances[..., -1]
 
 
 def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
@@ -232,15 +184,13 @@ def resample(trajectories: np.ndarray, later: np.ndarray) -> None:
     :raises ValueError: if the trajectories cannot be written into
     """
     _check_in_place("trajectories", trajectories)
-    if (library := compiled()) is None:
-        pieces = np.diff(trajectories, axis=-2)
-        pieces *= later[..., None, None, None]
-        trajectories[..., :-1, :] += pieces
-        trajectories[..., -1, :] += pieces[..., -1, :]
+    if (functions := compiled()) is not None:
+        functions.resample(later=later, trajectories=trajectories)
         return
-    n_rows, n_stages = trajectories.shape[2:4]
-    later = np.ascontiguousarray(later, np.float64)
-    library.quad_swarm_resample(later.size, n_rows, n_stages, *addresses(later, trajectories))
+    pieces = np.diff(trajectories, axis=-2)
+    pieces *= later[..., None, None, None]
+    trajectories[..., :-1, :] += pieces
+    trajectories[..., -1, :] += pieces[..., -1, :]
 
 
 def keep_right(
@@ -257,18 +207,18 @@ def keep_right(
     :param slow: closing speed below which the effect is reduced (m/s)
     :return: shifted positions of the others, (B, m, N, 3) (m), and additional clearances, (B, m, N) (m)
     """
-    if (library := compiled()) is not None:
-        others = np.array(others, dtype=float, order="C")
-        clearance = np.zeros(others.shape[:-1])
-        x, known = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(known, np.bool_)
-        library.quad_swarm_keep_right(*others.shape[:3], width, dt, fade, slow, *addresses(x, known, others, clearance))
+    if (functions := compiled()) is not None:
+        others, clearance = np.array(others, order="C"), np.zeros(others.shape[:-1])
+        functions.keep_right(
+            width=width, dt=dt, fade=fade, slow=slow, x=x, known=known, others=others, clearance=clearance
+        )
         return others, clearance
     velocity = (others[:, :, 1] - others[:, :, 0]) / dt
     pos = others[:, :, 0] - dt * velocity - x[:, None, :3]
     vel = velocity - x[:, None, 3:6]
     speed = np.hypot(vel[..., 0], vel[..., 1])
-    time = -(pos * vel).sum(axis=-1) / np.maximum((vel * vel).sum(axis=-1), 1e-9)
-    grown = width * known * np.clip(time / fade, 0.0, 1.0) * np.clip(speed / slow, 0.0, 1.0)
+    _, time = closest_approach(pos, vel, fade)
+    grown = width * known * (time / fade) * np.clip(speed / slow, 0.0, 1.0)
     left = np.stack([vel[..., 1], -vel[..., 0], np.zeros_like(speed)], axis=-1) / np.maximum(speed, 1e-9)[..., None]
     return others + (grown[..., None] * left)[:, :, None], np.repeat(grown[..., None], others.shape[2], axis=2)
 
@@ -297,13 +247,10 @@ def neighbours(
     :return: the new ``others`` and ``present``, and the slot of the robot at each of its neighbours, -1 without one,
         (E, n, m)
     """
-    if (library := compiled()) is not None:
-        others, present = np.array(others, np.int64, order="C"), np.array(present, np.bool_, order="C")
-        pos, vel = np.ascontiguousarray(pos, np.float64), np.ascontiguousarray(vel, np.float64)
-        reverse = np.empty_like(others)
-        errors = None if errors is None else np.ascontiguousarray(errors, np.float64)
-        library.quad_swarm_neighbours(
-            *others.shape, limit, look_ahead, *addresses(pos, vel, errors, others, present, reverse)
+    if (functions := compiled()) is not None:
+        others, present = np.array(others, order="C"), np.array(present, order="C")
+        reverse = functions.neighbours(
+            limit=limit, look_ahead=look_ahead, pos=pos, vel=vel, errors=errors, others=others, present=present
         )
         return others, present, reverse
     n_swarms, n, m = others.shape
@@ -314,33 +261,28 @@ def neighbours(
         seen = (*where[:2], others[where])
         apart[seen] -= errors[where][:, :3]
         along[seen] -= errors[where][:, 3:]
-    within = _dot(apart, apart) <= limit * limit
+    within = dot(apart, apart) <= limit * limit
     within[:, numbers, numbers] = False
-    time = np.minimum(np.maximum(-_dot(apart, along) / np.maximum(_dot(along, along), 1e-12), 0.0), look_ahead)
-    apart = apart + time[..., None] * along
-    nearest = np.argsort(np.where(within, _dot(apart, apart), np.inf), axis=-1, kind="stable")[..., :m]
+    apart, _ = closest_approach(apart, along, look_ahead)
+    nearest = np.argsort(np.where(within, dot(apart, apart), np.inf), axis=-1, kind="stable")[..., :m]
     near = np.zeros(within.shape, dtype=bool)
     np.put_along_axis(near, nearest, np.take_along_axis(within, nearest, axis=-1), axis=-1)
 
     stays = present & np.take_along_axis(near, others, axis=-1)
-    swarms, robots, places = np.nonzero(stays)
-    near[swarms, robots, others[swarms, robots, places]] = False  # the remaining ones are new
+    swarms, robots, slots = np.nonzero(stays)
+    near[swarms, robots, others[swarms, robots, slots]] = False  # the remaining ones are new
     others = np.where(stays, others, numbers[:, None])
     free = np.argsort(stays, axis=-1, kind="stable")  # free slots first
     swarms, robots, come = np.nonzero(near)
-    places = free[swarms, robots, (near.cumsum(axis=-1) - 1)[swarms, robots, come]]
-    others[swarms, robots, places] = come
+    slots = free[swarms, robots, (near.cumsum(axis=-1) - 1)[swarms, robots, come]]
+    others[swarms, robots, slots] = come
     present = stays.copy()
-    present[swarms, robots, places] = True
+    present[swarms, robots, slots] = True
 
     seen = others[np.arange(n_swarms)[:, None, None], others] == numbers[:, None, None]
     seen &= present[np.arange(n_swarms)[:, None, None], others]
     reverse = np.where(present & seen.any(axis=-1), seen.argmax(axis=-1), -1)
     return others, present, reverse
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def advance(trajectory: np.ndarray) -> np.ndarray:

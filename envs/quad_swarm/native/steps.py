@@ -9,42 +9,30 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quad_swarm.geometry import closest_approach
 from quad_swarm.native import pairs
-from quad_swarm.native.build import addresses
-
-# Record of what is counted of an episode, see `quad_swarm.task.episode_statistics`; pairs.cpp has the same
-STATISTICS = np.dtype(
-    [
-        *((name, np.int64) for name in ("steps", "steps_counted", "requests", "possible_requests", "peak_requests")),
-        *((name, np.int64) for name in ("plans_used", "plan_ages", "requests_flown", "planner_failures")),
-        *((name, np.float64) for name in ("path_length", "min_separation", "min_separation_continuous")),
-        ("solve_seconds", np.float64),
-        *((name, np.bool_) for name in ("at_goals", "reached", "arrived")),
-        *((name, np.bool_) for name in ("collided", "collided_at_steps", "collided_continuous")),
-    ],
-    align=True,
-)
+from quad_swarm.native.table import STATISTICS as STATISTICS
 
 
 class Measured(NamedTuple):
     """What is measured of one step of E swarms.
 
-    :param least: smallest distance of all pairs after the step, (E,) (m)
-    :param least_during: smallest distance of all pairs during the step, (E,) (m)
-    :param apart: distance of each robot to each of its ``others`` after the step, infinity for none, (E, n, m) (m)
-    :param apart_during: smallest distance to each of them during the step, (E, n, m) (m)
-    :param colliding: where ``apart`` is less than the distance of contact, (E, n, m) bool
-    :param colliding_during: where ``apart_during`` is less, (E, n, m) bool
+    :param min_separation: smallest distance of all pairs after the step, (E,) (m)
+    :param min_separation_continuous: smallest distance of all pairs during the step, (E,) (m)
+    :param separation: distance of each robot to each of its ``others`` after the step, infinity for none, (E, n, m) (m)
+    :param separation_continuous: smallest distance to each of them during the step, (E, n, m) (m)
+    :param colliding: where ``separation`` is less than the distance of contact, (E, n, m) bool
+    :param colliding_continuous: where ``separation_continuous`` is less, (E, n, m) bool
     :param moved: distance between the positions before and after the step, (E, n) (m)
     :param at_goal: whether each robot is within the goal radius, (E, n) bool
     """
 
-    least: np.ndarray
-    least_during: np.ndarray
-    apart: np.ndarray
-    apart_during: np.ndarray
+    min_separation: np.ndarray
+    min_separation_continuous: np.ndarray
+    separation: np.ndarray
+    separation_continuous: np.ndarray
     colliding: np.ndarray
-    colliding_during: np.ndarray
+    colliding_continuous: np.ndarray
     moved: np.ndarray
     at_goal: np.ndarray
 
@@ -64,40 +52,35 @@ def measure(
     n_swarms, n = goals.shape[:2]
     shape = (n_swarms, n, n - 1) if others is None else others.shape
     empty = np.empty if others is not None else _swarms_last
-    if (library := pairs.compiled()) is not None:
-        positions, goals = np.ascontiguousarray(positions, np.float64), np.ascontiguousarray(goals, np.float64)
-        others = None if others is None else np.ascontiguousarray(others, np.int64)
-        measured = Measured(
-            *(np.empty(n_swarms), np.empty(n_swarms)),
-            *(empty(shape), empty(shape), empty(shape, bool), empty(shape, bool)),
-            *(np.empty((n_swarms, n)), np.empty((n_swarms, n), dtype=bool)),
+    if (functions := pairs.compiled()) is not None:
+        function = functions.measure_all if others is None else functions.measure
+        measured = function(
+            m=shape[2], contact=contact, goal_radius=goal_radius, positions=positions, goals=goals, others=others
         )
-        library.quad_swarm_measure(
-            len(positions) - 1, *shape, contact, goal_radius, *addresses(positions, goals, others, *measured)
-        )
-        return measured
+        if others is None:
+            measured = (*measured[:2], *(one.transpose(2, 0, 1) for one in measured[2:6]), *measured[6:])
+        return Measured(*measured)
     between = positions[:, :, :, None] - positions[:, :, None]
     start, change = between[:-1], np.diff(between, axis=0)
-    along = -_einsum(start, change) / np.maximum(_einsum(change, change), 1e-12)
-    closest = start + np.clip(along, 0.0, 1.0)[..., None] * change
+    closest, _ = closest_approach(start, change, 1.0, _einsum)
     after, during = np.sqrt(_einsum(between[-1], between[-1])), np.sqrt(_einsum(closest, closest).min(axis=0))
     own = np.arange(n)
     after[:, own, own] = during[:, own, own] = np.inf
-    apart, apart_during = empty(shape), empty(shape)
+    separation, separation_continuous = empty(shape), empty(shape)
     if others is None:
-        apart[...] = after[:, ~np.eye(n, dtype=bool)].reshape(shape)
-        apart_during[...] = during[:, ~np.eye(n, dtype=bool)].reshape(shape)
+        separation[...] = after[:, ~np.eye(n, dtype=bool)].reshape(shape)
+        separation_continuous[...] = during[:, ~np.eye(n, dtype=bool)].reshape(shape)
     else:
-        apart, apart_during = (np.take_along_axis(one, others, axis=2) for one in (after, during))
+        separation, separation_continuous = (np.take_along_axis(one, others, axis=2) for one in (after, during))
     moved, to_goal = positions[-1] - positions[0], positions[-1] - goals
     return Measured(
         *(after.min(axis=(1, 2)), during.min(axis=(1, 2))),
-        *(apart, apart_during, apart < contact, apart_during < contact),
+        *(separation, separation_continuous, separation < contact, separation_continuous < contact),
         *(np.sqrt(_einsum(moved, moved)), _einsum(to_goal, to_goal) <= goal_radius * goal_radius),
     )
 
 
-class Step(NamedTuple):
+class Counted(NamedTuple):
     """What is counted of one step of E swarms, with the names of `quad_swarm.world.swarm.StepReport`.
 
     :param n_requests: number of requests, (E,) int64
@@ -105,13 +88,13 @@ class Step(NamedTuple):
     :param collision: whether two robots collided after the step, (E,) bool
     :param collision_continuous: whether two robots collided during the step, (E,) bool
     :param at_goal: (E, n) bool
-    :param source: origin of the believed trajectories, 0 without a plan, (E, n, m) int64
-    :param age: ages of the believed plans, (E, n, m) int64
-    :param status: status of the plans, (E, n) int64
+    :param belief_source: origin of the believed trajectories, 0 without a plan, (E, n, m) int64
+    :param plan_age: ages of the believed plans, (E, n, m) int64
+    :param plan_status: status of the plans, (E, n) int64
     :param others: indices of the others, -1 for an empty slot, (E, n, m) int64; None without empty slots
     :param moved: mean distance that a robot flew, (E,) (m)
-    :param least: smallest distance of two robots after the step, (E,) (m)
-    :param least_during: smallest distance during the step, (E,) (m)
+    :param min_separation: smallest distance of two robots after the step, (E,) (m)
+    :param min_separation_continuous: smallest distance during the step, (E,) (m)
     """
 
     n_requests: np.ndarray
@@ -119,20 +102,16 @@ class Step(NamedTuple):
     collision: np.ndarray
     collision_continuous: np.ndarray
     at_goal: np.ndarray
-    source: np.ndarray
-    age: np.ndarray
-    status: np.ndarray
+    belief_source: np.ndarray
+    plan_age: np.ndarray
+    plan_status: np.ndarray
     others: np.ndarray | None
     moved: np.ndarray
-    least: np.ndarray
-    least_during: np.ndarray
+    min_separation: np.ndarray
+    min_separation_continuous: np.ndarray
 
 
-# Types of the fields
-_OF_STEP = tuple(map(np.dtype, (np.int64, *[np.bool_] * 4, *[np.int64] * 4, *[np.float64] * 3)))
-
-
-def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> None:
+def count(statistics: np.ndarray, step: Counted, failed: int, seconds: float) -> None:
     """Add a step to the statistics of E swarms.
 
     :param statistics: the statistics, changed in place, (E,) `STATISTICS`
@@ -140,13 +119,10 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     :param failed: smallest status of a plan without a successful solve
     :param seconds: time of the planner for all swarms (s)
     """
-    if (library := pairs.compiled()) is not None:
-        arrays = [
-            None if one is None else np.ascontiguousarray(one, kind) for one, kind in zip(step, _OF_STEP, strict=True)
-        ]
-        library.quad_swarm_count(*step.source.shape, failed, seconds, *addresses(*arrays, statistics))
+    if (functions := pairs.compiled()) is not None:
+        functions.count(failed=failed, seconds=seconds, statistics=statistics, **step._asdict())
         return
-    s, used = statistics, step.source != 0
+    s, used = statistics, step.belief_source != 0
     counted = ~(s["reached"] | s["collided"])
     requests = counted * step.n_requests
     possible = used[:1].size if step.others is None else (step.others >= 0).sum(axis=(1, 2))
@@ -156,7 +132,7 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     s["possible_requests"] += counted * possible
     s["peak_requests"] = np.maximum(s["peak_requests"], requests)
     s["plans_used"] += counted * used.sum(axis=(1, 2))
-    s["plan_ages"] += counted * (used * step.age).sum(axis=(1, 2))
+    s["plan_ages"] += counted * (used * step.plan_age).sum(axis=(1, 2))
     s["requests_flown"] += step.n_requests
     s["path_length"] += counted * step.moved
     s["collided"] |= step.collided
@@ -165,9 +141,9 @@ def count(statistics: np.ndarray, step: Step, failed: int, seconds: float) -> No
     s["at_goals"] = step.at_goal.all(axis=1)
     s["arrived"] |= s["at_goals"] & ~s["collided"]
     s["reached"] |= s["at_goals"]
-    s["min_separation"] = np.minimum(s["min_separation"], step.least)
-    s["min_separation_continuous"] = np.minimum(s["min_separation_continuous"], step.least_during)
-    s["planner_failures"] += (step.status >= failed).sum(axis=1)
+    s["min_separation"] = np.minimum(s["min_separation"], step.min_separation)
+    s["min_separation_continuous"] = np.minimum(s["min_separation_continuous"], step.min_separation_continuous)
+    s["planner_failures"] += (step.plan_status >= failed).sum(axis=1)
     s["solve_seconds"] += seconds / max(len(s), 1)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from quad_swarm.native.steps import STATISTICS, Step, count
+from quad_swarm.native.steps import STATISTICS, Counted, count
 from quad_swarm.planner import PlanStatus
 from quad_swarm.states import like
 from quad_swarm.world.messages import REQUEST_BYTES, plan_bytes
@@ -119,19 +119,19 @@ class EpisodeStatistics:
         :param n_requests: number of requests in the step, (E,)
         :param collided: whether two robots collided in the step, in the sense that ends episodes, (E,) bool
         """
-        step = Step(
+        step = Counted(
             n_requests=n_requests,
             collided=collided,
             collision=report.collision,
             collision_continuous=report.collision_continuous,
             at_goal=report.at_goal,
-            source=report.belief_source,
-            age=report.plan_age,
-            status=report.plan_status,
+            belief_source=report.belief_source,
+            plan_age=report.plan_age,
+            plan_status=report.plan_status,
             others=None if report.changed is None else report.others,  # then there may be empty slots
             moved=report.moved.sum(axis=1) / report.moved.shape[1],
-            least=report.min_separation,
-            least_during=report.min_separation_continuous,
+            min_separation=report.min_separation,
+            min_separation_continuous=report.min_separation_continuous,
         )
         count(self._records, step, _SHIFTED, report.solve_seconds)
 

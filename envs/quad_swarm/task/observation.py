@@ -219,14 +219,15 @@ def _plan(pair: PairView) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
-def _told(pair: PairView) -> np.ndarray:
+def _known_by_other(pair: PairView) -> np.ndarray:
     """Return features of the other's knowledge of this robot: whether it believes a plan, and that plan's error."""
     view, stages = pair.view, _stages(pair.horizon)
-    told = view.presumed(stages)
-    off = view.plan[:, :, None, stages] - (told.believed - view.own_pos[:, :, None, None])
+    theirs = view.seen_by_others(stages)
+    off = view.plan[:, :, None, stages] - (theirs.believed - view.own_pos[:, :, None, None])
     parts = (
         np.stack(
-            [told.remembers.astype(float), np.minimum(told.age / pair.horizon, 1.0), np.exp(2 - told.age)], axis=-1
+            [theirs.remembers.astype(float), np.minimum(theirs.age / pair.horizon, 1.0), np.exp(2 - theirs.age)],
+            axis=-1,
         ),
         np.tanh(length(off) / 0.1),
         np.clip(2 * _flat(pair.turn(off[..., 1:, :]), 3), -2, 2),
@@ -268,7 +269,7 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
     "side": _side,
     "memory": _memory,
     "plan": _plan,
-    "told": _told,
+    "told": _known_by_other,
     "mask": _mask,
     "critic": _critic,
 }

@@ -12,7 +12,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from quad_swarm.task.episode_statistics import EpisodeStatistics
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
-from quad_swarm.validation import checked, checked_arguments, replaced
+from quad_swarm.task.options import TaskOptions
+from quad_swarm.validation import checked, replaced, with_fields
 from quad_swarm.world.beliefs import other_indices, reverse_indices
 from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import Neighbours
@@ -328,41 +329,39 @@ class RequestTask:
         return {"is_success": self.statistics.success, "metrics": self.statistics.metrics()}
 
 
-@checked_arguments
-def make_task(
-    n_swarms: PositiveInt = 1,
-    preset: str = "paper",
-    scenario: str | Mapping[str, float] = "mixed",
-    n_robots: int | None = None,
-    max_steps: PositiveInt | None = None,
-    observation: str = "paper",
-    scale_observation: bool = False,
-    continuous_collisions: bool | None = None,
-    end_at_arrival: bool = False,
-    memory: float | None = None,
-    reward: Mapping[str, Any] | None = None,
-    planner: Mapping[str, Any] | None = None,
-    noise: Mapping[str, Any] | None = None,
-    radio: Mapping[str, Any] | None = None,
-    space: Mapping[str, Any] | None = None,
-    world: Mapping[str, Any] | None = None,
-    solver: str = "auto",
-    announcements: bool = False,
-) -> RequestTask:
+@with_fields(TaskOptions)
+def make_task(n_swarms: PositiveInt = 1, *, options: TaskOptions) -> RequestTask:
     """Create the task of an environment. The other arguments are those of `QuadSwarmEnv`.
 
     :param n_swarms: number of swarms E
     :raises ValueError: if a value is invalid; the message names it and the remedy
     """
+    return task_of(options, n_swarms)
+
+
+def task_of(options: TaskOptions, n_swarms: int = 1) -> RequestTask:
+    """Create the task of an environment.
+
+    :param options: its arguments, of the right types
+    :param n_swarms: number of swarms E
+    :raises ValueError: if a value is invalid; the message names it and the remedy
+    """
     config = make_config(
-        preset, world, n_robots=n_robots, memory=memory, planner=planner, noise=noise, radio=radio, space=space
+        options.preset,
+        options.world,
+        **{name: getattr(options, name) for name in ("n_robots", "memory", "planner", "noise", "radio", "space")},
     )
-    sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
-    for sentence in too_short(config, max_steps) if max_steps is not None else ():
+    sampler = ScenarioSampler(options.scenario, config.n_robots, config.space, config)
+    for sentence in too_short(config, options.max_steps) if options.max_steps is not None else ():
         warn(sentence)
-    weights = replaced(RewardConfig(), reward or {}, "reward")
-    swarm = Swarm(config, n_swarms, solver)
-    seen = make_observation(config, observation, scale_observation)
+    weights = replaced(RewardConfig(), options.reward or {}, "reward")
     return RequestTask(
-        swarm, sampler, weights, max_steps, seen, continuous_collisions, end_at_arrival, announcements=announcements
+        Swarm(config, n_swarms, options.solver),
+        sampler,
+        weights,
+        options.max_steps,
+        make_observation(config, options.observation, options.scale_observation),
+        options.continuous_collisions,
+        options.end_at_arrival,
+        announcements=options.announcements,
     )

@@ -56,11 +56,11 @@ def event(drift: float) -> Rule:
 
 def push(distance: float) -> Rule:
     """Event-triggered by the sender: a robot's plan is sent if it deviates, anywhere over the horizon, by more than
-    ``distance`` (m) from what the sender presumes that the receiver predicts."""
+    ``distance`` (m) from what, as far as the sender knows, the receiver predicts."""
 
     def rule(view: View) -> np.ndarray:
-        presumed = view.presumed(range(view.horizon)).believed
-        off = length(view.plan[:, :, None] + view.own_pos[:, :, None, None] - presumed).max(axis=-1)
+        believed = view.seen_by_others(range(view.horizon)).believed
+        off = length(view.plan[:, :, None] + view.own_pos[:, :, None, None] - believed).max(axis=-1)
         return view.of_the_other(off > distance)
 
     return rule

@@ -12,15 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_swarm.geometry import length
+from quad_swarm.geometry import closest_approach, length
 from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
 from quad_swarm.world.swarm import Swarm
 
 
-class Presumed(NamedTuple):
-    """How each of the others predicts a robot, as presumed by that robot.
+class SeenByOthers(NamedTuple):
+    """How each of the others predicts a robot, as far as that robot knows.
 
     :param believed: predicted positions at the given stages, (E, n, n - 1, stages, 3), world frame (m)
     :param remembers: whether the prediction is a plan, otherwise a constant velocity, (E, n, n - 1) bool
@@ -109,21 +109,21 @@ class View:
         """
         return self.prediction.believed(stages) - self.own_pos[:, :, None, None]
 
-    def presumed(self, stages: Sequence[int]) -> Presumed:
-        """Return how each of the others predicts this robot without a request, as presumed by this robot. It knows the
+    def seen_by_others(self, stages: Sequence[int]) -> SeenByOthers:
+        """Return how each of the others predicts this robot without a request, as far as this robot knows. It knows the
         plans that it sent and assumes that all of them arrived.
 
         :param stages: indices among the next N steps, counting from 0
         """
-        presumed = self._swarm.presume()
+        predictions = self._swarm.predictions_seen_by_others()
         # Others that do not perceive this robot have no plan of it: they predict a constant velocity
         times = self._swarm.config.planner.dt * (np.array(stages) + 1)
         steady = self.own_pos[:, :, None] + times[:, None] * self.own_vel[:, :, None]
-        return Presumed(
-            self.of_the_other(presumed.believed(stages), steady[:, :, None]),
-            self.of_the_other(presumed.remembers),
-            self.of_the_other(presumed.age, self.horizon),
-            self.of_the_other(presumed.error),
+        return SeenByOthers(
+            self.of_the_other(predictions.believed(stages), steady[:, :, None]),
+            self.of_the_other(predictions.remembers),
+            self.of_the_other(predictions.age, self.horizon),
+            self.of_the_other(predictions.error),
         )
 
     def of_the_other(self, field: np.ndarray, otherwise: np.ndarray | float = 0) -> np.ndarray:
@@ -168,7 +168,5 @@ class View:
         :param look_ahead: latest time to consider (s)
         :return: distance (m) and time from now (s), both (E, n, n - 1)
         """
-        closing = -(self.pos * self.vel).sum(axis=-1)
-        speed2 = (self.vel**2).sum(axis=-1)
-        time = np.clip(closing / np.maximum(speed2, 1e-12), 0.0, look_ahead)
-        return length(self.pos + time[..., None] * self.vel), time
+        nearest, time = closest_approach(self.pos, self.vel, look_ahead)
+        return length(nearest), time

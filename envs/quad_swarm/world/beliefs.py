@@ -81,8 +81,8 @@ def answered(arriving: np.ndarray, trajectories: np.ndarray, others: np.ndarray)
     :param others: see `other_indices` or `Neighbours.others`
     :return: received trajectories in the order of the true entries of ``arriving``, (number of answers, K, 3)
     """
-    swarms, robots, places = np.nonzero(arriving)
-    senders = others[robots, places] if others.ndim == 2 else others[swarms, robots, places]
+    swarms, robots, slots = np.nonzero(arriving)
+    senders = others[robots, slots] if others.ndim == 2 else others[swarms, robots, slots]
     return trajectories[swarms, senders]
 
 
@@ -184,10 +184,10 @@ class Beliefs:
         self._age[swarms] = self.horizon
         self._known = None
 
-    def forget_others(self, places: np.ndarray) -> None:
+    def forget_others(self, slots: np.ndarray) -> None:
         """Forget the plans received from some of the others, (E, n, n - 1) bool."""
-        self._age[places] = self.horizon
-        self._remembered[places] = 0.0
+        self._age[slots] = self.horizon
+        self._remembered[slots] = 0.0
         self._known = None
 
     def keep(self, swarms: np.ndarray) -> None:

@@ -324,7 +324,7 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
             )
 
 
-_told: set[str] = set()
+_warned: set[str] = set()
 
 
 def warn(sentence: str) -> None:
@@ -337,7 +337,7 @@ def warn(sentence: str) -> None:
         if issubclass(DoubtfulWorld, category) and message is None and module is None
     )
     if next(actions, "default") in usual:
-        if sentence in _told:
+        if sentence in _warned:
             return
-        _told.add(sentence)
+        _warned.add(sentence)
     warnings.warn_explicit(f"{sentence}.", DoubtfulWorld, "quad_swarm", 0)

@@ -11,7 +11,7 @@ from quad_swarm.errors import shown
 _HEADER = struct.Struct("<BBI")  # sender, receiver, step
 REQUEST_BYTES = _HEADER.size
 _MILLIMETRES = 1e-3
-_FARTHEST = np.iinfo(np.int16).max * _MILLIMETRES
+_RANGE_OF_MESSAGES = np.iinfo(np.int16).max * _MILLIMETRES
 
 
 def pack_plan(sender: int, receiver: int, step: int, positions: np.ndarray) -> bytes:
@@ -33,9 +33,9 @@ def pack_plan(sender: int, receiver: int, step: int, positions: np.ndarray) -> b
             f"positions have shape {positions.shape} and type {positions.dtype}: a plan holds positions at stages "
             "0..N, (N + 1, 3)."
         )
-    if not (np.abs(positions) <= _FARTHEST).all():
+    if not (np.abs(positions) <= _RANGE_OF_MESSAGES).all():
         farthest = float(np.abs(positions).max())
-        raise ValueError(f"A plan reaches {farthest} m: messages hold coordinates of up to {_FARTHEST:.1f} m.")
+        raise ValueError(f"A plan reaches {farthest} m: messages hold coordinates of up to {_RANGE_OF_MESSAGES:.1f} m.")
     packed = np.rint(positions / _MILLIMETRES).astype("<i2").tobytes()
     return _HEADER.pack(sender, receiver, step) + packed
 

@@ -1,6 +1,6 @@
 """Perception of other robots: all others or, in large swarms, only the nearest others within a range.
 
-A robot has m slots (places) for the others that it perceives: m = n - 1, or fewer if its neighbourhood is limited.
+A robot has m slots for the others that it perceives: m = n - 1, or fewer if its neighbourhood is limited.
 Array axes that are documented as the n - 1 others of a robot list these m slots.
 """
 
@@ -36,7 +36,7 @@ class Neighbourhood:
     range: PositiveLength | None = None
     look_ahead: Annotated[float, Field(ge=0, le=1e3)] = 0.0
 
-    def places(self, n_robots: int) -> int:
+    def slots(self, n_robots: int) -> int:
         """Return the number of slots of a robot.
 
         :param n_robots: number of robots n per swarm
@@ -48,7 +48,7 @@ class Neighbourhood:
 
         :param n_robots: number of robots n per swarm
         """
-        return self.range is not None or self.places(n_robots) < n_robots - 1
+        return self.range is not None or self.slots(n_robots) < n_robots - 1
 
 
 class Neighbours:
@@ -74,13 +74,13 @@ class Neighbours:
         self._n_robots, self._look_ahead = n_robots, limit.look_ahead
         self._range = np.inf if limit.range is None else limit.range
         if limit.limits(n_robots):
-            self.others, self.present = self._empty(n_swarms, limit.places(n_robots))
+            self.others, self.present = self._empty(n_swarms, limit.slots(n_robots))
             self.reverse = np.full(self.others.shape, -1)
         else:
             self.others, self.reverse = other_indices(n_robots), reverse_indices(n_robots)
 
-    def _empty(self, n_swarms: int, n_places: int) -> tuple[np.ndarray, np.ndarray]:
-        shape = (n_swarms, self._n_robots, n_places)
+    def _empty(self, n_swarms: int, n_slots: int) -> tuple[np.ndarray, np.ndarray]:
+        shape = (n_swarms, self._n_robots, n_slots)
         own = np.arange(self._n_robots)[:, None]
         return np.broadcast_to(own, shape).astype(np.int64), np.zeros(shape, dtype=bool)
 
@@ -141,12 +141,12 @@ class Neighbours:
             self.present = like(self.present, state["present"], "presence of neighbours")
             self.reverse = like(self.reverse, state["reverse"], "slots at neighbours", -1, self.others.shape[-1] - 1)
 
-    def perceived(self, places: np.ndarray) -> np.ndarray:
+    def perceived(self, slots: np.ndarray) -> np.ndarray:
         """Return a mask without empty slots.
 
-        :param places: mask of slots, (E, n, m) bool
+        :param slots: mask of slots, (E, n, m) bool
         """
-        return places if self.present is None else places & self.present
+        return slots if self.present is None else slots & self.present
 
     def of_the_other(self, field: np.ndarray, otherwise: Any = 0) -> np.ndarray:
         """Swap the roles in values that robots have about others: return the values that the others have about the
@@ -173,18 +173,18 @@ class Neighbours:
         return numbers if self.present is None else numbers[swarm]
 
 
-def spread(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+def slots_to_robots(slots: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """Convert a mask of slots to a mask of all others in ascending order, which is False for others without a slot.
 
-    :param places: mask of slots, (..., n, m) bool
+    :param slots: mask of slots, (..., n, m) bool
     :param numbers: indices of the robots in the slots, see `Neighbours.numbers`
     :return: mask of all others, (..., n, n - 1) bool
     """
-    n = places.shape[-2]
+    n = slots.shape[-2]
     if numbers is other_indices(n):
-        return places
-    all_others = np.zeros((*places.shape[:-1], n - 1), dtype=bool)
-    where = np.nonzero(places & (numbers >= 0))
+        return slots
+    all_others = np.zeros((*slots.shape[:-1], n - 1), dtype=bool)
+    where = np.nonzero(slots & (numbers >= 0))
     other = numbers[where]
     column = (*where[:-1], other - (other > where[-2]))
     all_others[column] = True

@@ -18,7 +18,7 @@ from quad_swarm.planner import PlannerConfig
 from quad_swarm.planner.problem import check_vehicle
 from quad_swarm.plants.base import MODEL, parse_plant
 from quad_swarm.quadrotor import QuadrotorParams
-from quad_swarm.validation import FARTHEST, Length, PositiveLength, checked, replaced
+from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, checked, replaced
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.doubts import doubts, far_goals, short_horizon, warn
@@ -215,7 +215,7 @@ class SwarmConfig:
     @property
     def n_others(self) -> int:
         """Maximum number of others that a robot perceives."""
-        return self.neighbourhood.places(self.n_robots)
+        return self.neighbourhood.slots(self.n_robots)
 
     @property
     def is_limited(self) -> bool:
@@ -308,7 +308,7 @@ def _with_followers(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any
     room = changes.get("space", {})
     if isinstance(room, Mapping) and "spacing" not in room and base.space.spacing < planner.separation:
         spacing = planner.separation + (base.space.spacing - base.planner.separation)
-        room = {**room, "spacing": min(round(spacing, 6), FARTHEST)}
+        room = {**room, "spacing": min(round(spacing, 6), LARGEST_LENGTH)}
     space = replaced(base.space, room) if isinstance(room, Mapping) else room
     if isinstance(given, Mapping):
         given = {**_workspace(base, space), **given}
@@ -342,7 +342,7 @@ def _edges(space: ScenarioSpace, sign: int) -> tuple[float, float, float]:
 def points(name: str, values: Any, count: int) -> np.ndarray:
     """Convert points to an array, (count, 3) (m).
 
-    :raises ValueError: if the points have another shape, are not numbers, or are farther away than `FARTHEST`
+    :raises ValueError: if the points have another shape, are not numbers, or are farther away than `LARGEST_LENGTH`
     """
     try:
         array = np.asarray(values, dtype=float)
@@ -350,13 +350,14 @@ def points(name: str, values: Any, count: int) -> np.ndarray:
             not np.ma.is_masked(values)
             and not np.iscomplexobj(values)
             and array.shape == (count, 3)
-            and bool((np.abs(array) <= FARTHEST).all())
+            and bool((np.abs(array) <= LARGEST_LENGTH).all())
         )
     except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:
         raise ValueError(
-            f"{name} must be {count} finite points, shape ({count}, 3), within {FARTHEST:.0f} m; got {shown(values)}."
+            f"{name} must be {count} finite points, shape ({count}, 3), within {LARGEST_LENGTH:.0f} m; got "
+            f"{shown(values)}."
         )
     return array
 

@@ -90,13 +90,13 @@ class Realisation:
         if config.sensing.others:
             self._observer[swarm] = self._observer_scale * rng.normal(size=self._observer.shape[1:])
 
-    def meet(self, places: np.ndarray) -> None:
+    def draw_for_new_neighbours(self, slots: np.ndarray) -> None:
         """Draw new observation errors and link states for slots with new robots.
 
-        :param places: whether the slot has a new robot, (E, n, n - 1) bool
+        :param slots: whether the slot has a new robot, (E, n, n - 1) bool
         """
-        for swarm in np.flatnonzero(places.any(axis=(1, 2))):
-            where, rng = places[swarm], self._rngs[swarm]
+        for swarm in np.flatnonzero(slots.any(axis=(1, 2))):
+            where, rng = slots[swarm], self._rngs[swarm]
             count = int(where.sum())
             if self.config.radio.bursts:
                 self._down[swarm, where] = rng.random(count) < self.config.radio.bursts

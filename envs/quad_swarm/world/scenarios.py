@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.validation import FARTHEST, Length, PositiveLength, Range, checked
+from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, Range, checked
 
 if TYPE_CHECKING:
     from quad_swarm.world.presets import SwarmConfig
@@ -58,10 +58,10 @@ class ScenarioSpace:
         for name in ("circle_radius", "sector_radius"):
             if getattr(self, name)[0] < 0:
                 raise ValueError(f"space.{name}={getattr(self, name)}: a radius must not be negative")
-        most = FARTHEST - max(self.circle_radius[1], -self.heights[0], self.heights[1])
+        most = LARGEST_LENGTH - max(self.circle_radius[1], -self.heights[0], self.heights[1])
         if self.circle_jitter > most:
             raise ValueError(
-                f"space.circle_jitter={self.circle_jitter}: starts must stay within {FARTHEST:.0f} m, so with "
+                f"space.circle_jitter={self.circle_jitter}: starts must stay within {LARGEST_LENGTH:.0f} m, so with "
                 f"space.circle_radius={self.circle_radius} and space.heights={self.heights} it must be at most {most:g}"
             )
 

@@ -6,29 +6,28 @@ If the neighbourhood is limited, axes of length n - 1 have fewer entries, one pe
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.native.pairs import advance, resample
+from quad_swarm.native.pairs import resample
 from quad_swarm.native.steps import measure
-from quad_swarm.planner import Planner, Plans, PlanStatus, Problems, make_planner
+from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.states import MOST_STEPS, like
-from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, answered, of_others, other_indices, resampled
+from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, of_others, other_indices, resampled
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig, points
+from quad_swarm.world.radio import RadioChannel
 from quad_swarm.world.realisation import Realisation
+from quad_swarm.world.swarm_state import SwarmState
 
 # Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
 # keeps less than half of it from the robot. In "flight-hard", plans are up to 0.15 m off, less than a fifth
 _MISFIT = 0.5
 # Distance (in separations) at which an empty slot shows a robot, far beyond all plans
-_NOBODY = 30.0
+_EMPTY_SLOT = 30.0
 
 
 class StepReport(NamedTuple):
@@ -74,15 +73,14 @@ class StepReport(NamedTuple):
     solve_seconds: float
 
 
-class Swarm:
+class Swarm(SwarmState):
     """State, plans and beliefs of E independent swarms, which share one planner call.
 
     :ivar state: true states, (E, n, 9)
     :ivar goal: goals, (E, n, 3), world frame (m)
     :ivar neighbours: which others each robot perceives
-    :ivar chance: realisation of the disturbances
+    :ivar disturbances: realisation of the disturbances
     :ivar beliefs: beliefs of each robot about the others
-    :ivar presumed_beliefs: beliefs of each robot as the others presume them, assuming that all their answers arrived
 
     :param config: the world
     :param n_swarms: number of swarms E
@@ -95,25 +93,34 @@ class Swarm:
         self.planner.checks = False
         n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
         self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
-        self.state = np.zeros((n_swarms, n, 9))
-        self.goal = np.zeros((n_swarms, n, 3))
-        self.neighbours = Neighbours(n_swarms, n, config.neighbourhood)
-        self.chance = Realisation(config, n_swarms)
+        state = np.zeros((n_swarms, n, 9))
+        plans = Plans.hover(state.reshape(-1, 9), horizon)
+        plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
         beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others, _MISFIT * config.planner.separation)
-        self.beliefs = Beliefs(*beliefs)
         differ = config.radio.is_random or config.sensing.others
-        self.presumed_beliefs = Beliefs(*beliefs) if differ else self.beliefs
-        self._plans = Plans.hover(self.state.reshape(-1, 9), horizon)
-        # Planned positions of the last steps, oldest first, which late answers contain
-        late = config.radio.delay + config.radio.jitter
-        self._earlier = [self.plans[..., POSITION].copy() for _ in range(late)]
-        self._u = np.zeros((n_swarms, n, 4))  # current inputs
+        super().__init__(
+            state=state,
+            goal=np.zeros((n_swarms, n, 3)),
+            _u=np.zeros((n_swarms, n, 4)),
+            _plans=plans,
+            _radio=RadioChannel(config.radio.delay, config.radio.jitter, plans_of_robots[..., POSITION]),
+            beliefs=Beliefs(*beliefs),
+            _other_beliefs=Beliefs(*beliefs) if differ else None,
+            disturbances=Realisation(config, n_swarms),
+            neighbours=Neighbours(n_swarms, n, config.neighbourhood),
+        )
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
             number = np.zeros((n, n), dtype=int)
             number[self._pairs] = np.arange(len(self._pairs[0]))
             # Index of the pair of each robot and each of its others
             self._pair_of = np.take_along_axis(number + number.T, other_indices(n), axis=1)
+
+    @property
+    def beliefs_seen_by_others(self) -> Beliefs:
+        """Beliefs of each robot as the others see them, who assume that all their answers arrived: its own if they
+        always arrive and everybody observes the same."""
+        return self.beliefs if self._other_beliefs is None else self._other_beliefs
 
     @property
     def n_swarms(self) -> int:
@@ -135,12 +142,12 @@ class Swarm:
         return self._estimate().copy()
 
     def _estimate(self) -> np.ndarray:
-        return self.chance.estimate(self.state)
+        return self.disturbances.estimate(self.state)
 
     def observe(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (m) and velocities (m/s) of the others as each robot observes them, (E, n, n - 1, 3) each,
         world frame."""
-        return self.chance.observe(*self._seen_by_all())
+        return self.disturbances.observe(*self._seen_by_all())
 
     def _seen_by_all(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the same as `observe`, but without the additional errors of the observers."""
@@ -148,12 +155,13 @@ class Swarm:
         seen = of_others(estimate, neighbours.others)
         pos, vel = seen[..., POSITION], seen[..., VELOCITY]
         if neighbours.present is not None:
-            pos[..., 0] += np.where(neighbours.present, 0.0, _NOBODY * self.config.planner.separation)
+            pos[..., 0] += np.where(neighbours.present, 0.0, _EMPTY_SLOT * self.config.planner.separation)
         return pos, vel
 
-    def presume(self) -> Prediction:
-        """Return each robot's predictions without requests, as the others presume them."""
-        return self.presumed_beliefs.predict(*self._seen_by_all())
+    def predictions_seen_by_others(self) -> Prediction:
+        """Return each robot's predictions without requests, as the others see them: they assume that all their answers
+        arrived."""
+        return self.beliefs_seen_by_others.predict(*self._seen_by_all())
 
     @property
     def plans(self) -> np.ndarray:
@@ -164,7 +172,7 @@ class Swarm:
         """Planned positions at the start of the last step and of the N steps after it, (E, n, N + 1, 3) (m). With clock
         skew, `plans` start when the robot's input takes effect and are resampled here."""
         plans = self.plans[..., POSITION]
-        start = self.chance.start
+        start = self.disturbances.start
         return plans if start is None else resampled(plans, -start / self.config.substeps)
 
     def planned_separation(self, steps: int, others: np.ndarray) -> np.ndarray:
@@ -202,38 +210,28 @@ class Swarm:
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
-        for beliefs in {self.beliefs, self.presumed_beliefs}:
+        for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
             beliefs.forget(np.array([swarm]))
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
         for mine, fresh in zip(self._plans, hover, strict=True):
             mine[swarm * n : (swarm + 1) * n] = fresh
-        for plans in self._earlier:
-            plans[swarm] = self.plans[swarm, ..., POSITION]
+        self._radio.reset(swarm, self.plans[swarm, ..., POSITION])
         self._u[swarm] = 0.0
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
-            self.chance.reset(swarm, noise_seed)
+            self.disturbances.reset(swarm, noise_seed)
         if self.neighbours.limited:
             estimate = self._estimate()[swarm]
             self.neighbours.reset(swarm, estimate[:, POSITION], estimate[:, VELOCITY])
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
-        self.state, self.goal, self._u = self.state[swarms], self.goal[swarms], self._u[swarms]
-        self.neighbours.keep(swarms)
-        self.chance.keep(swarms)
+        super().keep(swarms)
         self._plant.keep(swarms)
-        for beliefs in {self.beliefs, self.presumed_beliefs}:
-            beliefs.keep(swarms)
-        self._plans = Plans(*(field[np.repeat(swarms, self.config.n_robots)] for field in self._plans))
-        self._earlier = [plans[swarms] for plans in self._earlier]
 
     def part(self, swarms: np.ndarray) -> Swarm:
         """Return a copy of the given swarms (mask), which shares the planner and the random number generators."""
-        part = copy(self)
-        part.beliefs = copy(self.beliefs)
-        part.presumed_beliefs = part.beliefs if self.presumed_beliefs is self.beliefs else copy(self.presumed_beliefs)
-        part.neighbours, part.chance = copy(self.neighbours), copy(self.chance)
+        part = self.copied()
         part._plant = self._plant.fork()
         part.keep(swarms)
         return part
@@ -241,7 +239,7 @@ class Swarm:
     def fork(self) -> Swarm:
         """Return an independent copy of all swarms, with the same future disturbances."""
         fork = self.part(np.ones(self.n_swarms, dtype=bool))
-        fork.chance = self.chance.fork()
+        fork.disturbances = self.disturbances.fork()
         return fork
 
     def state_dict(self) -> dict[str, Any]:
@@ -251,48 +249,7 @@ class Swarm:
         """
         if self.config.plant != MODEL:
             raise ValueError(f"plant={self.config.plant!r} does not provide its state: only plant={MODEL!r} does.")
-        presumed = None if self.presumed_beliefs is self.beliefs else self.presumed_beliefs.state_dict()
-        return {
-            "state": self.state.copy(),
-            "goal": self.goal.copy(),
-            "input": self._u.copy(),
-            "plans": {name: field.copy() for name, field in self._plans._asdict().items()},
-            "earlier": [plans.copy() for plans in self._earlier],
-            "beliefs": self.beliefs.state_dict(),
-            "presumed_beliefs": presumed,
-            "chance": self.chance.state_dict(),
-            "neighbours": self.neighbours.state_dict(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state from `state_dict` of swarms in the same world, bit for bit.
-
-        :raises ValueError: if the state belongs to other swarms
-        """
-        self.state = like(self.state, state["state"], "state")
-        self.goal = like(self.goal, state["goal"], "goal")
-        self._u = like(self._u, state["input"], "input")
-        plans = state["plans"]
-        limits = {"age": (0, MOST_STEPS), "iterations": (0, MOST_STEPS), "status": (min(PlanStatus), max(PlanStatus))}
-        self._plans = Plans(
-            **{
-                name: like(one, plans[name], f"plans.{name}", *limits.get(name, ()))
-                for name, one in self._plans._asdict().items()
-            }
-        )
-        if len(state["earlier"]) != len(self._earlier):
-            raise ValueError(
-                f"The state has {len(state['earlier'])} earlier plans, but this world has {len(self._earlier)}."
-            )
-        self._earlier = [
-            like(mine, one, "earlier plans") for mine, one in zip(self._earlier, state["earlier"], strict=True)
-        ]
-        self.beliefs.load_state_dict(state["beliefs"])
-        if self.presumed_beliefs is not self.beliefs:
-            self.presumed_beliefs.load_state_dict(state["presumed_beliefs"])
-        self.chance.load_state_dict(state["chance"])
-        if self.neighbours.limited:
-            self.neighbours.load_state_dict(state["neighbours"])
+        return super().state_dict()
 
     def step(self, requests: np.ndarray) -> StepReport:
         """Let all robots make requests, plan and fly for one step.
@@ -314,37 +271,29 @@ class Swarm:
         :return: whether another robot, or none, is in the slot now, (E, n, m) bool
         """
         estimate = self._estimate()
-        changed = self.neighbours.update(estimate[..., POSITION], estimate[..., VELOCITY], self.chance.observer_errors)
+        changed = self.neighbours.update(
+            estimate[..., POSITION], estimate[..., VELOCITY], self.disturbances.observer_errors
+        )
         if changed.any():
-            for beliefs in {self.beliefs, self.presumed_beliefs}:
+            for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
                 beliefs.forget_others(changed)
-            self.chance.meet(self.neighbours.perceived(changed))
+            self.disturbances.draw_for_new_neighbours(self.neighbours.perceived(changed))
         return changed
 
     def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the beliefs after the answers have arrived, see `Beliefs.update`."""
-        radio, others = self.config.radio, self.neighbours.others
-        trajectories = advance(self.planned_positions())
-        if self._earlier:
-            self._earlier = [*map(advance, self._earlier), trajectories]  # advanced to the current step
-            trajectories = self._earlier[-1 - radio.delay]
-        age = 1 + radio.delay
-        if self.presumed_beliefs is not self.beliefs:
-            presumed = answered(requests, trajectories, others)
-            self.presumed_beliefs.receive(requests, *self._seen_by_all(), presumed, age)
-        arriving, lateness = self.chance.arrivals(requests, others)
-        received, ages = answered(arriving, trajectories, others), age
-        if lateness is not None:
-            late = lateness[arriving]
-            for k in range(1, radio.jitter + 1):
-                received[late == k] = answered(arriving, self._earlier[-1 - radio.delay - k], others)[late == k]
-            ages = age + late
-        self._earlier = self._earlier[1:]
-        return self.beliefs.update(arriving, *self.observe(), received, ages)
+        others = self.neighbours.others
+        self._radio.send(self.planned_positions())
+        if self._other_beliefs is not None:
+            sent = self._radio.answers(requests, others)
+            self._other_beliefs.receive(requests, *self._seen_by_all(), *sent)
+        arriving, lateness = self.disturbances.arrivals(requests, others)
+        received = self._radio.answers(arriving, others, lateness)
+        return self.beliefs.update(arriving, *self.observe(), *received)
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""
-        x, start = self._estimate(), self.chance.start
+        x, start = self._estimate(), self.disturbances.start
         if start is not None:
             later = start / self.config.substeps
             x = self.planner.model.ahead(x, self._u, later * self.config.planner.dt)
@@ -358,15 +307,16 @@ class Swarm:
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""
-        chance, before, planned = self.chance, self._u, self._plans.u[:, 0].reshape(self._u.shape)
+        disturbances, start = self.disturbances, self.disturbances.start
+        before, planned = self._u, self._plans.u[:, 0].reshape(self._u.shape)
         positions = np.empty((self.config.substeps + 1, *self.pos.shape))
         positions[0] = self.pos
         for k in range(self.config.substeps):
-            self._u = planned if chance.start is None else np.where((chance.start <= k)[..., None], planned, before)
-            self.state = self._plant.step(self.state, self._u, chance.air, chance.factors)
+            self._u = planned if start is None else np.where((start <= k)[..., None], planned, before)
+            self.state = self._plant.step(self.state, self._u, disturbances.air, disturbances.factors)
             positions[k + 1] = self.pos
         if self.config.is_random:
-            kicks = chance.advance()
+            kicks = disturbances.advance()
             if kicks is not None:
                 self.state = self.state + kicks
                 positions[-1] = self.pos
@@ -379,14 +329,14 @@ class Swarm:
         measured = measure(positions, self.goal, contact, self.config.goal_radius, others)
         shape = self.state.shape[:2]
         return StepReport(
-            min_separation=measured.least,
-            min_separation_continuous=measured.least_during,
+            min_separation=measured.min_separation,
+            min_separation_continuous=measured.min_separation_continuous,
             others=self.neighbours.numbers(),
-            separation=measured.apart,
+            separation=measured.separation,
             colliding=measured.colliding,
-            colliding_continuous=measured.colliding_during,
-            collision=measured.least < contact,
-            collision_continuous=measured.least_during < contact,
+            colliding_continuous=measured.colliding_continuous,
+            collision=measured.min_separation < contact,
+            collision_continuous=measured.min_separation_continuous < contact,
             changed=None,
             moved=measured.moved,
             at_goal=measured.at_goal,

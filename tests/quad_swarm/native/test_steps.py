@@ -6,20 +6,20 @@ import pytest
 from quad_swarm.native import pairs, steps
 
 
-def random_step(rng: np.random.Generator, shape: tuple[int, ...], empty: bool) -> steps.Step:
+def random_step(rng: np.random.Generator, shape: tuple[int, ...], empty: bool) -> steps.Counted:
     """What is counted of a step, in which there may be empty slots."""
     n_swarms, n, _ = shape
-    return steps.Step(
+    return steps.Counted(
         rng.integers(0, 9, n_swarms),
         *(rng.random((3, n_swarms)) < 0.2),
         at_goal=rng.random((n_swarms, n)) < 0.8,
-        source=rng.integers(0, 3, shape),
-        age=rng.integers(0, 9, shape),
-        status=rng.integers(0, 4, (n_swarms, n)),
+        belief_source=rng.integers(0, 3, shape),
+        plan_age=rng.integers(0, 9, shape),
+        plan_status=rng.integers(0, 4, (n_swarms, n)),
         others=rng.integers(-1, n, shape) if empty else None,
         moved=rng.random(n_swarms),
-        least=rng.random(n_swarms),
-        least_during=rng.random(n_swarms),
+        min_separation=rng.random(n_swarms),
+        min_separation_continuous=rng.random(n_swarms),
     )
 
 
@@ -31,8 +31,8 @@ def everything(n_swarms: int, n: int, order: str = "C") -> list[np.ndarray]:
     found = []
     for k in range(6):
         step = random_step(rng, (n_swarms, n, n - 1), empty=bool(k % 2))
-        before = steps.Step(*(None if one is None else np.array(one, order=order) for one in step))
-        given = steps.Step(*(None if one is None else np.array(one, order=order) for one in step))
+        before = steps.Counted(*(None if one is None else np.array(one, order=order) for one in step))
+        given = steps.Counted(*(None if one is None else np.array(one, order=order) for one in step))
         steps.count(statistics, given, failed=2, seconds=0.1)
         assert all(one is None or np.array_equal(one, other) for one, other in zip(given, before, strict=True))
         path = np.array(rng.normal(size=(2 + k, n_swarms, n, 3)).cumsum(axis=0), order=order)
@@ -61,9 +61,9 @@ def test_contact_and_arrival_are_measured(either):
     after = np.array([[[2.0, 0, 0], [0, 0.4, 0]]])
     goals = np.array([[[2.0, 0, 0.9], [5, 0, 0]]])
     measured = steps.measure(np.array([before, after]), goals, contact=0.5, goal_radius=1.0)
-    assert measured.apart[0, 0, 0] == measured.least[0] == pytest.approx(np.hypot(2, 0.4))
-    assert measured.apart_during[0, 0, 0] == measured.least_during[0] == pytest.approx(0.4)
+    assert measured.separation[0, 0, 0] == measured.min_separation[0] == pytest.approx(np.hypot(2, 0.4))
+    assert measured.separation_continuous[0, 0, 0] == measured.min_separation_continuous[0] == pytest.approx(0.4)
     assert not measured.colliding.any()
-    assert measured.colliding_during.all()
+    assert measured.colliding_continuous.all()
     assert measured.moved.tolist() == [[2.0, 2.0]]
     assert measured.at_goal.tolist() == [[True, False]]

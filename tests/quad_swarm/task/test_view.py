@@ -94,8 +94,8 @@ def test_a_robot_knows_whom_it_answered_but_not_whether_the_answer_arrived(loss)
     view = View(swarm)
     horizon = swarm.config.planner.horizon
     assert view.age[0, 0, 0] == 2 if loss == 0 else view.age[0, 0, 0] >= horizon
-    told = view.presumed(range(horizon))
+    told = view.seen_by_others(range(horizon))
     assert told.age[0, 1, 0] == 2, "robot 1 takes its answer to have arrived"
     assert (told.age[0, 0] >= horizon).all(), "nobody asked robot 0"
-    assert view.presumed([0, 3]).believed.shape[-2] == 2
-    assert np.array_equal(view.presumed([3]).believed[..., 0, :], told.believed[..., 3, :])
+    assert view.seen_by_others([0, 3]).believed.shape[-2] == 2
+    assert np.array_equal(view.seen_by_others([3]).believed[..., 0, :], told.believed[..., 3, :])

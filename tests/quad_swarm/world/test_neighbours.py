@@ -8,7 +8,7 @@ from quad_swarm.task.request_task import make_task
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import BeliefSource, other_indices, reverse_indices
-from quad_swarm.world.neighbours import Neighbourhood, Neighbours, spread
+from quad_swarm.world.neighbours import Neighbourhood, Neighbours, slots_to_robots
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -151,11 +151,11 @@ def test_errors_of_an_observer_stay_with_the_one_that_is_observed():
     swarm = make_swarm(FEW, n_swarms=40)
     rng, drawn, kept, anew = np.random.default_rng(0), [], [], []
     for _ in range(40):
-        before, numbers = swarm.chance._observer.copy(), swarm.neighbours.numbers()
+        before, numbers = swarm.disturbances._observer.copy(), swarm.neighbours.numbers()
         changed = swarm.step(asked(swarm, rng)).changed
         came = changed & swarm.neighbours.present
-        drawn.append(swarm.chance._observer[came, 0])
-        jump = np.abs(swarm.chance._observer - before)[..., 0]
+        drawn.append(swarm.disturbances._observer[came, 0])
+        jump = np.abs(swarm.disturbances._observer - before)[..., 0]
         kept.append(jump[~changed & (numbers >= 0)])
         anew.append(jump[came])
     kept, anew, drawn = map(np.concatenate, (kept, anew, drawn))
@@ -219,11 +219,11 @@ def test_who_does_not_perceive_a_robot_is_taken_to_expect_a_constant_velocity():
     swarm = placed((0, 0), (1.2, 0), (1.9, 0), neighbourhood={"max_others": 1}, planner={"separation": 0.6})
     assert swarm.neighbours.numbers()[0].tolist() == [[1], [2], [1]]  # no robot perceives robot 0
     swarm.state[0, 0, 3:6] = [0.1, 0.2, 0.3]
-    presumed = View(swarm).presumed([0, 4])
+    seen = View(swarm).seen_by_others([0, 4])
     step = swarm.config.planner.dt * np.array([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(presumed.believed[0, 0, 0], swarm.pos[0, 0] + [step, 5 * step])
-    assert not presumed.remembers[0, 0, 0]
-    assert presumed.age[0, 0, 0] >= swarm.config.planner.horizon
+    np.testing.assert_allclose(seen.believed[0, 0, 0], swarm.pos[0, 0] + [step, 5 * step])
+    assert not seen.remembers[0, 0, 0]
+    assert seen.age[0, 0, 0] >= swarm.config.planner.horizon
 
 
 def test_robots_that_do_not_perceive_each_other_collide_all_the_same():
@@ -302,10 +302,10 @@ def test_a_swarm_does_not_depend_on_its_company():
 
 def test_spread_names_robots_by_their_numbers():
     numbers = np.array([[[2, -1], [-1, 0], [1, 0]]])
-    places = np.array([[[True, True], [False, True], [False, True]]])
-    assert spread(places, numbers)[0].tolist() == [[False, True], [True, False], [True, False]]
+    slots = np.array([[[True, True], [False, True], [False, True]]])
+    assert slots_to_robots(slots, numbers)[0].tolist() == [[False, True], [True, False], [True, False]]
     plain = np.random.default_rng(0).random((2, 4, 3)) < 0.5
-    assert spread(plain, other_indices(4)) is plain
+    assert slots_to_robots(plain, other_indices(4)) is plain
 
 
 def nearest_as_observed(swarm: Swarm, m: int) -> list[set[int]]:
@@ -339,7 +339,7 @@ def test_neighbours_are_chosen_by_what_robots_observe(sensing, way, monkeypatch)
         assert [set(row) for row in swarm.neighbours.numbers_in(0).tolist()] == expected
     by_truth = 0
     for _ in range(20):
-        swarm.chance.advance()  # errors change, robots stay
+        swarm.disturbances.advance()  # errors change, robots stay
         expected = nearest_as_observed(swarm, 3)
         swarm._look_around()
         assert [set(row) for row in swarm.neighbours.numbers_in(0).tolist()] == expected

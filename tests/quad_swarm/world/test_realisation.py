@@ -153,7 +153,7 @@ def test_a_late_answer_holds_the_plan_of_its_time():
 
 def test_robots_act_on_a_plan_when_their_clock_says_so():
     swarm = make_swarm(8, substeps=4, clock_skew=0.8, noise={"wind": 1e-12})
-    start = swarm.chance.start
+    start = swarm.disturbances.start
     assert start is not None
     assert set(np.unique(start)) == {0, 1, 2, 3}
     # A robot that knows when its input will act plans from where it will be then: the plan holds without a model error.

@@ -149,14 +149,14 @@ def test_a_robot_knows_what_the_others_believe_of_it():
     swarm, rng = make_swarm(2), np.random.default_rng(0)
     for _ in range(8):
         swarm.step(rng.random((2, 4, 3)) < 0.3)
-    presumed = View(swarm).presumed(range(swarm.config.planner.horizon))
+    seen = View(swarm).seen_by_others(range(swarm.config.planner.horizon))
     prediction = swarm.beliefs.predict(*swarm.observe())
     believed = (prediction.believed(), prediction.remembers, prediction.age, prediction.error)
-    assert 0 < presumed.remembers.mean() < 1
+    assert 0 < seen.remembers.mean() < 1
     for i, m in np.ndindex(4, 3):
         j = swarm.neighbours.others[i, m]
         mine = swarm.neighbours.others[j].tolist().index(i)
-        for field, of_other in zip(presumed, believed, strict=True):
+        for field, of_other in zip(seen, believed, strict=True):
             assert np.array_equal(field[:, i, m], of_other[:, j, mine])
 
 
@@ -165,10 +165,10 @@ def test_a_robot_takes_its_answers_to_have_arrived():
     for _ in range(5):
         swarm.step(all_ask(swarm))
     view = View(swarm)
-    assert view.presumed([0]).remembers.all()
+    assert view.seen_by_others([0]).remembers.all()
     assert not view.prediction.remembers.any()
     swarm.reset(0, swarm.pos[0], swarm.goal[0])
-    assert not View(swarm).presumed([0]).remembers.any()
+    assert not View(swarm).seen_by_others([0]).remembers.any()
 
 
 def test_late_answers_are_older_plans():

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.native.build import addresses, build, load
+from quad_swarm.native.build import build, load
+from quad_swarm.native.signature import Signature
 from quad_swarm.planner.base import Solution
 from quad_swarm.planner.problem import OptimalControlProblem, Problems
 from quad_swarm.planner.rti.codegen import formulas, generate_model
@@ -17,8 +18,27 @@ from quad_swarm.quadrotor import N_INPUTS, N_STATES
 
 # Precision of the iteration -> type in C++
 PRECISIONS = {"float32": "float", "float64": "double"}
-_FUNCTION = "quad_swarm_rti"
 _SOURCES = Path(__file__).parent
+
+# B problems of N stages with m others
+SIGNATURE = Signature(
+    "quad_swarm_rti",
+    "B",
+    x=f"B {N_STATES} f8",
+    goal="B 3 f8",
+    others="B m N 3 f8",
+    clearance="B m N f8 optional",
+    u_guess=f"B N {N_INPUTS} f8",
+    x_plan=f"B N+1 {N_STATES} f8 out",
+    u_plan=f"B N {N_INPUTS} f8 out",
+    success="B bool out",
+    iterations="B i8 out",
+    sqp_iterations="int",
+    extra_iterations="int",
+    max_iterations="int",
+    tolerance="real",
+    result=Solution,
+)
 
 
 class RtiSolver:
@@ -63,7 +83,7 @@ class RtiSolver:
         self.precision = precision
         self.max_iterations = max_iterations
         self.tolerance = tolerance
-        self._kernel: Any = None
+        self._kernel: Callable[..., Any] | None = None
         _generated(problem)  # raises if the method cannot solve it
 
     def compile(self) -> None:
@@ -71,38 +91,31 @@ class RtiSolver:
 
         :raises BuildError: if it cannot be compiled
         """
+        self._compiled()
+
+    def _compiled(self) -> Callable[..., Any]:
         if self._kernel is None:
-            library = build_kernel(_generated(self.problem), self.precision)
-            self._kernel = getattr(load(str(library), _FUNCTION), _FUNCTION)
-            self._kernel.argtypes = [ctypes.c_int64, *[ctypes.c_void_p] * 9, *[ctypes.c_int64] * 3, ctypes.c_double]
+            library = load(str(build_kernel(_generated(self.problem), self.precision)), SIGNATURE.name)
+            self._kernel = SIGNATURE.of(library, N=self.problem.config.horizon, m=self.problem.n_others)
+        return self._kernel
 
     def solve(self, problems: Problems, x_guess: np.ndarray, u_guess: np.ndarray) -> Solution:
-        """See `Solver.solve`."""
-        self.compile()
-        count, horizon, n_others = problems.x.shape[0], self.problem.config.horizon, self.problem.n_others
+        """See `Solver.solve`.
+
+        :raises ValueError: if an array has another shape than the problem's
+        """
         clearance = problems.clearance
-        arguments = (
-            _array("x", problems.x, (count, N_STATES)),
-            _array("goal", problems.goal, (count, 3)),
-            _array("others", problems.others, (count, n_others, horizon, 3)),
-            None if clearance is None else _array("clearance", clearance, (count, n_others, horizon)),
-            _array("u_guess", u_guess, (count, horizon, N_INPUTS)),
+        return self._compiled()(
+            x=np.asarray(problems.x, float),
+            goal=np.asarray(problems.goal, float),
+            others=np.asarray(problems.others, float),
+            clearance=None if clearance is None else np.asarray(clearance, float),
+            u_guess=np.asarray(u_guess, float),
+            sqp_iterations=self.sqp_iterations,
+            extra_iterations=self.extra_iterations,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
         )
-        solution = Solution(
-            x=np.empty((count, horizon + 1, N_STATES)),
-            u=np.empty((count, horizon, N_INPUTS)),
-            success=np.empty(count, dtype=bool),
-            iterations=np.empty(count, dtype=np.int64),
-        )
-        self._kernel(
-            count,
-            *addresses(*arguments, *solution),
-            self.sqp_iterations,
-            self.extra_iterations,
-            self.max_iterations,
-            self.tolerance,
-        )
-        return solution
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"_kernel": None}  # loaded on demand in another process
@@ -130,11 +143,3 @@ def _generated(problem: OptimalControlProblem) -> str:
             _models.pop(next(iter(_models)))
         _models[key] = generate_model(problem)
     return _models[key]
-
-
-def _array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Convert an array for the kernel and check its shape, which the kernel does not."""
-    array = np.ascontiguousarray(array, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}; this solver takes {shape}.")
-    return array

@@ -1,0 +1,65 @@
+"""Plans that travel: which of the last steps an answer contains, and how old it is."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.radio import RadioChannel
+
+N = 4  # stages
+OTHERS = other_indices(3)
+
+
+def plans_of(step: int) -> np.ndarray:
+    """What two swarms of three robots plan in a step: robot 10 E + n moves along x by its number, from `step` on."""
+    speed = np.array([[0.0, 1, 2], [10, 11, 12]])[..., None, None]
+    return (step + np.arange(N + 1))[:, None] * speed * [1.0, 0, 0] + [0, step, 0]
+
+
+def channel(delay: int, jitter: int = 0) -> RadioChannel:
+    radio = RadioChannel(delay, jitter, plans_of(0))
+    for step in range(8):
+        radio.send(plans_of(step))
+    return radio  # at the beginning of step 8
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_answers_take_a_step_and_the_delay(delay):
+    arriving = np.zeros((2, 3, 2), dtype=bool)
+    arriving[0, 1, 1] = arriving[1, 0, 0] = True  # robot 2 to 1, and in the other swarm robot 1 to 0
+    received, age = channel(delay).answers(arriving, OTHERS)
+    assert age == 1 + delay
+    made = 8 - age
+    assert received[:, 0].tolist() == [[8 * 2, made, 0], [8 * 11, made, 0]], "now, as planned then"
+
+
+def test_some_answers_are_later():
+    radio, arriving = channel(1, jitter=2), np.ones((2, 3, 2), dtype=bool)
+    lateness = np.random.default_rng(0).integers(0, 3, arriving.shape)
+    received, ages = radio.answers(arriving, OTHERS, lateness)
+    assert np.array_equal(ages, 2 + lateness.ravel())
+    assert np.array_equal(received[:, 0, 1], 8 - ages)
+    none, ages = radio.answers(~arriving, OTHERS, lateness)
+    assert none.shape == (0, N + 1, 3)
+    assert ages.shape == (0,)
+
+
+def test_one_swarm_starts_again_and_others_leave():
+    radio, arriving = channel(2), np.ones((2, 3, 2), dtype=bool)
+    radio.reset(1, plans_of(100)[1])
+    radio.keep(np.array([False, True]))
+    radio.send(plans_of(8)[1:])
+    received, _ = radio.answers(arriving[:1], OTHERS)
+    assert (received[:, 0, 1] == 100).all()
+
+
+def test_it_goes_on_from_its_state():
+    radio, arriving = channel(1, jitter=1), np.ones((2, 3, 2), dtype=bool)
+    other = RadioChannel(1, 1, plans_of(0))
+    other.load_state_dict(radio.state_dict())
+    for one in (radio, other):
+        one.send(plans_of(8))
+    lateness = np.ones(arriving.shape, dtype=int)
+    assert np.array_equal(radio.answers(arriving, OTHERS, lateness)[0], other.answers(arriving, OTHERS, lateness)[0])
+    with pytest.raises(ValueError, match="The state has 2 earlier plans, but this world has 3"):
+        RadioChannel(3, 0, plans_of(0)).load_state_dict(radio.state_dict())
