@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from sb3_maddpg.common.env_checker import check_team_env
     from sb3_maddpg.common.policies import MADDPGPolicy
     from sb3_maddpg.files.registry import allow_in_files
+    from sb3_maddpg.files.trust import untrusted
     from sb3_maddpg.hub.pretrained import pretrained
     from sb3_maddpg.iddpg.iddpg import IDDPG
     from sb3_maddpg.images.cnn_policy import CnnPolicy
@@ -45,6 +46,7 @@ _MODULES = {
     "allow_in_files": "files.registry",
     "check_team_env": "common.env_checker",
     "pretrained": "hub.pretrained",
+    "untrusted": "files.trust",
 }
 
 __all__ = [
@@ -66,6 +68,7 @@ __all__ = [
     "allow_in_files",
     "check_team_env",
     "pretrained",
+    "untrusted",
 ]
 
 

@@ -235,7 +235,7 @@ def attributes(
     :raises ValueError: if a value is pickled and not trusted, cannot be decoded, or would replace a method
     """
     check_size(data, path)
-    pickled = _pickled(data) - set(given)
+    pickled = pickled_values(data) - set(given)
     if pickled and not trusted(trust):
         raise UntrustedFileError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), which may run any code when they are loaded. "
@@ -278,8 +278,11 @@ def _is_method(cls: type, name: str) -> bool:
     return isinstance(defined, (property, classmethod, staticmethod)) or inspect.isroutine(defined)
 
 
-def _pickled(data: dict[str, Any]) -> set[str]:
-    """:return: the names of values that Stable-Baselines3 would unpickle"""
+def pickled_values(data: dict[str, Any]) -> set[str]:
+    """
+    :param data: member ``data`` of a model file, as JSON
+    :return: the names of values that Stable-Baselines3 would unpickle
+    """
     return {key for key, value in data.items() if isinstance(value, dict) and _PICKLED in value}
 
 
@@ -293,7 +296,7 @@ def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[
     """
     with _opened(path) as file, zipfile.ZipFile(file) as archive:
         data = json.loads(archive.read("data")) if "data" in archive.namelist() else {}
-    if pickled := _pickled(data) - set(given):
+    if pickled := pickled_values(data) - set(given):
         raise UntrustedFileError(
             f"{path} holds pickled values ({', '.join(sorted(pickled))}), as the files of most algorithms do. They may "
             "run any code when they are loaded: if you trust their author, pass --trust."

@@ -95,6 +95,15 @@ def name_in_files(cls: type) -> str | None:
     return path if _of_libraries().get(path) is cls else None
 
 
+def knows(name: str) -> bool:
+    """
+    :param name: name of a class in a file
+    :return: whether a class has this name
+    """
+    _load_entry_points()
+    return name in _of_libraries() or name in _allowed
+
+
 def class_in_files(name: Any) -> type:
     """
     :param name: name of a class in a file
