@@ -260,7 +260,7 @@ def attempt(words: list[str]) -> tuple[str, str]:
         return "raw error", traceback.format_exc()[-600:]
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-    lines = [line for line in err.getvalue().splitlines() if line.startswith("error:")]
+    lines = [line for line in err.getvalue().splitlines() if line.startswith("error:") or ": error: " in line]
     told = err.getvalue()
     if status == 0:
         return "accepted", ""

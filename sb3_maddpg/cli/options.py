@@ -198,7 +198,14 @@ def showing_options(parser: Parser, records: bool = False) -> None:
     task_options(parser)
     add, rare = parser.add_argument, parser.rare
     add("-f", "--folder", default="logs", metavar="DIR", help="folder of the runs (default %(default)s)")
-    add("-n", "--n-timesteps", type=_ONE, default=1000, metavar="N", help="number of steps (default %(default)s)")
+    add(
+        "-n",
+        "--n-timesteps",
+        type=integer(1, high=2**63 - 1),
+        default=1000,
+        metavar="N",
+        help="number of steps (default %(default)s)",
+    )
     add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the newest, -1: no folder of its own")
     add("--env-kwargs", **_PAIRS, help="arguments of the environment, merged over those of the training")
     add("--seed", type=int, default=0, help="random seed (default %(default)s)")
