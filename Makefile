@@ -14,7 +14,7 @@ TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan 
 POLICIES ?= none full distance:4 "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
 PEERS := agilerl benchmarl xuance
 
-.PHONY: help install train test lint docs page bench bench-peers check-peers results results-quick clean
+.PHONY: help install train test quick test-all lint docs page bench bench-peers check-peers results results-quick clean
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
@@ -33,8 +33,14 @@ train: install  ## train MADDPG on the swarm, then print the table of policies (
 	$(BIN)/sb3-maddpg evaluate --policy $(POLICIES) latest:$(LOGS) --scenario all \
 		--episodes $(EPISODES) --jobs $(JOBS) --json $(LOGS)/table.json --plot $(LOGS)/plots
 
-test: install lint docs  ## every check: ruff, mypy, the site, pytest
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+test: install  ## ruff, mypy, the site, and the tests that do not take long, side by side
+	$(MAKE) --no-print-directory --jobs 3 --output-sync=target quick lint docs
+
+quick: install
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
+
+test-all: install  ## the tests that take long: kills, simulators, other engines, releases, studies
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow
 
 lint: install  ## ruff, mypy and spelling
 	$(BIN)/ruff check .

@@ -54,6 +54,8 @@ def run(args: argparse.Namespace, words: list[str], example: str, user_errors: t
         )
     main = load_offer(offer)
     words = [model_path(word, args.algo, env_id) for word in words]
+    if getattr(args, "debug", False) and group != "identifiers":  # which has no such option
+        words.append("--debug")
     return _call(offer, main, [*words, *_loader(args.algo, words)], user_errors)
 
 

@@ -182,6 +182,14 @@ def test_ctrl_c_ends_any_command_with_one_line(monkeypatch, capsys):
         main(["bench", "--debug"])
 
 
+def test_debug_reaches_the_commands_of_packages(capsys):
+    for argv in (["evaluate", "--policy", "nope.zip", "--debug"], ["evaluate", "--debug", "--policy", "nope.zip"]):
+        with pytest.raises((ValueError, OSError), match="nope"):
+            main(argv)
+        assert main([word for word in argv if word != "--debug"]) == 1
+        assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_the_version_is_told(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"sb3-maddpg {sb3_maddpg.__version__}\n"
