@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import sys
 
 import pytest
 
@@ -11,6 +12,28 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+_OF_PETTINGZOO = "sb3_maddpg.team.pettingzoo:make"
+_REGISTRIES = (("quad_swarm.task.rules", "RULES"), ("quad_swarm.world.scenarios", "SCENARIOS"))
+
+
+@pytest.fixture(autouse=True)
+def _registries():
+    """What a test registers is gone after it, so that tests may run in any order."""
+    registries = [getattr(sys.modules[module], name) for module, name in _REGISTRIES if module in sys.modules]
+    before = [dict(registry) for registry in registries]
+    import gymnasium
+
+    ids = set(gymnasium.registry)
+    yield
+    for registry, entries in zip(registries, before, strict=True):
+        if registry.keys() != entries.keys():
+            registry.clear()
+            registry.update(entries)
+    for env_id in set(gymnasium.registry) - ids:
+        if gymnasium.registry[env_id].entry_point == _OF_PETTINGZOO:  # registered again where it is needed
+            del gymnasium.registry[env_id]
 
 
 @pytest.fixture(scope="session")
