@@ -57,6 +57,7 @@ def short_trainings(monkeypatch, tmp_path):
         registry.update(entries)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if examples(page)])
 def test_examples_run(page, short_trainings):
     namespace = {"__name__": "__main__"}

@@ -20,6 +20,7 @@ WORDS = {"rl_zoo3_train.py": ["--algo", "masac", "--env", "OwnBit-v0", "--conf-f
 RECIPE = "OwnBit-v0: {n_timesteps: 300, policy: MlpPolicy, learning_starts: 50, batch_size: 16, buffer_size: 500}\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
 def test_runs_in_its_short_form(name, tmp_path):
     (tmp_path / "r.yml").write_text(RECIPE)
@@ -30,6 +31,7 @@ def test_runs_in_its_short_form(name, tmp_path):
     assert f"]({name})" in (EXAMPLES / "README.md").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["sb3_maddpg", "rl_zoo3"])
 def test_both_zoos_show_and_plot_the_runs_of_each_other(by, tmp_path):
     """Folders, files and options are the same."""

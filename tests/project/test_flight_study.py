@@ -185,6 +185,7 @@ def test_full_communication_is_flown_once(flown, tmp_path):
     assert not flown
 
 
+@pytest.mark.slow
 def test_conditions_fill_their_tables(tmp_path: Path):
     parts = {part: list(flight_world.jobs(part)) for part in ("world", "delays", "delay_check")}
     rows = [flight_world.fly(job, 3) for jobs in parts.values() for job in (jobs[0], jobs[-1])]
@@ -197,6 +198,7 @@ def test_conditions_fill_their_tables(tmp_path: Path):
     assert report.worlds_table(rows, "plants") == "Not flown yet."
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 2])
 def test_plans_that_passed_the_delay_check_never_come_near_each_other(delay):
     config = make_config("flight", CALM | {"n_robots": 6, "radio": {"loss": 0, "delay": delay, "jitter": 0}})
@@ -276,6 +278,7 @@ def test_the_headline_table_has_five_rows_and_gives_seeds_as_ranges():
     assert lines[4] == ["1 to 3 of 12,000 [0.00, 0.05] %", "6 of 12,000 [0.03, 0.10] %", "1.00% to 4.50%", "2,000 |"]
 
 
+@pytest.mark.slow
 def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown(tmp_path, monkeypatch):
     monkeypatch.setattr(fly_flight, "DATA", tmp_path)
     with pytest.raises(ValueError, match="holds no safe rule"):

@@ -860,6 +860,7 @@ def files(tmp_path_factory):
         os.environ["CXX"] = before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("area", AREAS)
 def test_malformed_input_is_refused_in_one_line_or_works(area, files):
     cases = cases_of(area, files)

@@ -86,6 +86,7 @@ def installed(wheel, tmp_path_factory) -> Path:
     return python.parent
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_file_of_the_packages(wheel):
     expected = {
         f"{packed}/{path.relative_to(ROOT / source).as_posix()}"
@@ -111,6 +112,7 @@ def test_the_description_is_the_readme(wheel):
     assert description.strip() == (ROOT / "README.md").read_text(encoding="utf-8").strip()
 
 
+@pytest.mark.slow
 def test_the_packages_come_from_the_wheel(installed, tmp_path):
     code = "import sb3_maddpg, quad_swarm; print(sb3_maddpg.__file__, quad_swarm.__file__)"
     for path in run(installed / "python", "-c", code, cwd=tmp_path).split():
@@ -119,6 +121,7 @@ def test_the_packages_come_from_the_wheel(installed, tmp_path):
     assert run(installed / "python", "-c", code, cwd=tmp_path).split() == ["None"] * 4, "extras are not there"
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_readme_run_without_extras(installed, tmp_path):
     blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
     code = "\n".join(block for block in blocks if "mpe2" not in block)  # an extra
@@ -127,6 +130,7 @@ def test_the_examples_of_the_readme_run_without_extras(installed, tmp_path):
     assert "PairPolicy" in run(installed / "python", "readme.py", cwd=tmp_path)
 
 
+@pytest.mark.slow
 def test_the_command_works_without_extras(installed, tmp_path):
     command = installed / "sb3-maddpg"
     shown = run(command, "--help-all", cwd=tmp_path)

@@ -25,6 +25,7 @@ def study(name: str, *words: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=500)
 
 
+@pytest.mark.slow
 def test_five_kills_change_nothing(tmp_path):
     done = study("kills", "--no-faults", "--kills", "5", "--steps", "4800", "--json", str(tmp_path / "kills.json"))
     assert done.returncode == 0, done.stdout + done.stderr
@@ -35,6 +36,7 @@ def test_five_kills_change_nothing(tmp_path):
     assert all(row["kept_step"] >= row["from_step"] for row in rows)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 def test_killed_workers_change_no_table(tmp_path):
     done = study("killed_workers", "--what", "evaluation", "--kills", "4", "--json", str(tmp_path / "workers.json"))
@@ -44,6 +46,7 @@ def test_killed_workers_change_no_table(tmp_path):
     assert (row["same"], row["orphans"], row["pieces_left"]) == (True, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_many_episodes_do_not_grow_the_process(tmp_path):
     done = study("soak", "--episodes", "3000", "--json", str(tmp_path / "soak.json"))
@@ -53,6 +56,7 @@ def test_many_episodes_do_not_grow_the_process(tmp_path):
     assert (row["files_grown"], row["threads_grown"]) == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", ["1"])
 def test_damaged_files_are_refused_or_harmless(tmp_path, seed):
     counts = ("--count", "250", "--used", "120")
@@ -64,6 +68,7 @@ def test_damaged_files_are_refused_or_harmless(tmp_path, seed):
     assert len({row["file"] for row in rows}) == 17
 
 
+@pytest.mark.slow
 def test_wrong_commands_are_refused_in_one_line_or_harmless(tmp_path):
     kinds = [one.__name__ for one in command_lines.KINDS]
     done = study("command_lines", "--count", "250", "--seed", "3", "--json", str(tmp_path / "commands.json"))
@@ -101,6 +106,7 @@ def test_without_faults_it_is_the_evaluation():
 WORLDS = [random_worlds.draw_world(0, number) for number in range(20)]
 
 
+@pytest.mark.slow
 def test_random_worlds_fly_or_are_refused_when_they_are_created():
     outcomes = [random_worlds.attempt(world, number, steps=6) for number, world in enumerate(WORLDS)]
     assert [told for outcome, told in outcomes if outcome == "wrong"] == []

@@ -37,6 +37,7 @@ def test_hopeless_is_what_collides_clearly_more_often():
     assert not protocol.hopeless(Comparison(800, 1, 0))
 
 
+@pytest.mark.slow
 def test_stages_fly_every_episode_once_and_stop_where_there_is_no_hope(monkeypatch):
     monkeypatch.setattr(protocol, "STAGES", (10, 30, 60))
     full, all_60 = protocol.fly_validation(["full", "cpa:0.7:1.5"], "paper", "random", 60).values()
@@ -49,6 +50,7 @@ def test_stages_fly_every_episode_once_and_stop_where_there_is_no_hope(monkeypat
     assert (len(figures), safe) == (10, False)
 
 
+@pytest.mark.slow
 def test_teams_of_another_size_need_fewer_episodes_and_fly_full_communication_only_as_far(monkeypatch):
     monkeypatch.setattr(protocol, "STAGES", (5, 10, 20))
     monkeypatch.setattr(protocol, "OF_TEAM", protocol.Standard(0.3, 10))
@@ -59,6 +61,7 @@ def test_teams_of_another_size_need_fewer_episodes_and_fly_full_communication_on
     assert (len(figures), len(rival), safe) == (20, 20, False), "a preset's own team has a standard of its own"
 
 
+@pytest.mark.slow
 def test_rules_are_tuned_for_each_size_of_the_team(tmp_path, monkeypatch):
     table = tmp_path / "team_rules.json"
     words = ["tune_rules.py", "--preset", "dense", "--scenario", "random", "--family", "random", "--quick"]
@@ -134,6 +137,7 @@ def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
     assert page.teams_table(rows).splitlines()[2].startswith("| 6 | `full` | - | 1/4000, "), "not flown yet"
 
 
+@pytest.mark.slow
 def test_flights_of_teams_fill_their_table(monkeypatch):
     monkeypatch.setattr(fly_tests, "TEAMS", (4, 6))  # flown in seconds
     rows = [row for job in fly_tests.teams(4) for row in fly_tests.compare(job)]
@@ -181,6 +185,7 @@ def test_a_table_is_read_again_when_it_has_changed(tmp_path):
     assert protocol.known_rows(path) == [{"a": 1}, {"a": 2}]
 
 
+@pytest.mark.slow
 def test_rows_of_an_earlier_rule_do_not_stay(tmp_path, monkeypatch):
     monkeypatch.setattr(fly_tests, "QUICK", 1)
     for rule in ("none", "full"):
@@ -208,6 +213,7 @@ def test_interventions_change_the_steps_that_they_should():
     assert {tuple(map(int, place)) for place in np.argwhere(third)} == {(0, 1), (0, 3), (2, 1), (2, 3)}
 
 
+@pytest.mark.slow
 def test_thresholds_are_kept_by_scenario_and_written_into_the_model_only_when_asked(tmp_path, monkeypatch):
     path, table = tmp_path / "model.zip", tmp_path / "thresholds.json"
     path.write_bytes((pretrained_folder("quad-swarm-paper") / "model.zip").read_bytes())
@@ -243,6 +249,7 @@ def test_a_threshold_needs_a_reserve():
     assert Comparison(12000, 25, 0).as_safe(), "though it would do without"
 
 
+@pytest.mark.slow
 def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
     table = tmp_path / "ppo.json"
     words = ["ppo.py", "--price", "0.05", "--steps", "2048", "--episodes", "3", "--models", str(tmp_path)]
@@ -274,6 +281,7 @@ def test_forks_differ_by_the_request_that_is_turned_round_and_by_nothing_else(mo
     assert 0 < (gains != 0).mean() < 1
 
 
+@pytest.mark.slow
 def test_a_regression_on_forks_is_trained_and_flown(tmp_path, monkeypatch):
     table = tmp_path / "counterfactual.json"
     words = [

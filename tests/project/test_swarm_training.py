@@ -34,6 +34,7 @@ def evaluate_rows(tmp_path, *arguments: str) -> list[dict]:
     return json.loads(target.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
 def test_learns_in_several_environments_and_is_judged_by_its_own_observation(vec_env_cls, tmp_path):
     # With its module's name, so that fresh processes know the id too.

@@ -27,6 +27,7 @@ def change_what_is_private(swarm: Swarm, robot: int, rng: np.random.Generator) -
     swarm.goal[0, robot] += rng.normal(size=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("solver", "n_seeds"), [("rti", 12), ("fatrop", 2)])
 def test_plans_depend_on_those_that_were_asked_alone(solver, n_seeds):
     told = unasked = 0

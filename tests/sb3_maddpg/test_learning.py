@@ -31,22 +31,26 @@ def learned(task: type[TeamTask], steps: int = 1000, algorithm: type[MADDPG] = M
     return task().play(model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", BINARY_TASKS)
 def test_expected_solves_every_binary_task(task):
     # With some seeds one of eight answers of OneOfBits stays wrong, see docs/learning_checks.md
     assert learned(task, 2500 if task is PricedBit else 1000) > (0.84 if task is OneOfBits else 0.97)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", sorted(set(ESTIMATORS) - {"expected"}))
 def test_the_other_estimators_solve_a_task_without_interplay_of_bits(estimator):
     assert learned(OwnBit, estimator=estimator) > 0.85
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_every_estimator_solves_a_task_of_categories(estimator):
     assert learned(OwnCategory, estimator=estimator) > 0.97
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["straight_through", "score"])
 def test_only_expected_finds_bits_that_pay_together_or_not_at_all(estimator):
     """The others stay with no bit at all, because none pays by itself."""
@@ -54,22 +58,26 @@ def test_only_expected_finds_bits_that_pay_together_or_not_at_all(estimator):
     assert learned(AllBits, estimator=estimator) == pytest.approx(none)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [MADDPG, MATD3])
 @pytest.mark.parametrize("task", [OwnBit, OwnCategory, AllBits])
 def test_one_value_for_the_team_is_enough_for_cooperative_tasks(task, algorithm):
     assert learned(task, 2500, algorithm, policy_kwargs={"share_critic": "team"}) > 0.97
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [OwnBit, OwnCategory])
 def test_shared_networks_solve_tasks_with_equal_agents(task):
     assert learned(task, policy_kwargs=SHARED) > 0.97
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [OtherBit, OwnCategory, FollowTarget])
 def test_twin_delayed_learners_solve_them_too(task):
     assert learned(task, algorithm=MATD3) > 0.97
 
 
+@pytest.mark.slow
 def test_a_known_price_leads_to_the_same_policy():
     class KnownPrice(PricedBit):
         action_cost = PricedBit.price
@@ -77,6 +85,7 @@ def test_a_known_price_leads_to_the_same_policy():
     assert learned(KnownPrice, 1500, learning_starts=800, use_action_cost=True, policy_kwargs=SHARED) > 0.97
 
 
+@pytest.mark.slow
 def test_continuous_actions():
     assert learned(FollowTarget, action_noise=NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))) > 0.99
 

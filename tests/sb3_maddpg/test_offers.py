@@ -148,6 +148,7 @@ def test_classes_of_a_package_are_known(value, install):
     assert typed_json.decode({"$": "class", "name": "their_package.Known"}, "buffer").__name__ == "Known"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("value", "code", "problem"),
     [

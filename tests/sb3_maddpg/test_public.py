@@ -30,6 +30,7 @@ def test_what_is_not_there_is_an_attribute_error():
         sb3_maddpg.MADDGP  # noqa: B018
 
 
+@pytest.mark.slow
 def test_importing_the_package_loads_no_pytorch():
     code = "import sys, sb3_maddpg; print('torch' in sys.modules); sb3_maddpg.MADDPG; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -40,6 +40,7 @@ def test_a_score_pays_the_prices_up_to_it():
     np.testing.assert_allclose(_price_up_to(scores, PRICES), np.interp(scores, fine, integral), rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_scores_say_up_to_which_price_a_bit_is_worth_setting():
     kwargs = {"learning_rate": 3e-3, "learning_starts": 200, "train_freq": 1, "batch_size": 64, "gamma": 0.0}
     model = MADDPG("MlpPolicy", Gains(), threshold_price=PRICES, policy_regularization=0.0, seed=0, **kwargs)

@@ -25,6 +25,7 @@ KEYS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_writes_table_json_and_figures(tmp_path, capsys):
     target = tmp_path / "new" / "table.json"
     arguments = ["--policy", "none", "full", "--scenario", "random", "random_swap", "--episodes", "2"]
@@ -67,6 +68,7 @@ def test_the_table_is_printed_even_if_a_file_cannot_be_written(tmp_path, capsys)
     assert (tmp_path / "full.json").is_symlink()
 
 
+@pytest.mark.slow
 def test_the_table_names_models_shortly_where_that_tells_them_apart(capsys, tmp_path):
     path = str(pretrained_folder("quad-swarm-paper") / "model.zip")
     flags = ["--scenario", "random", "--episodes", "1"]
@@ -123,6 +125,7 @@ def test_the_table_goes_into_latex_and_csv(tmp_path, capsys):
     assert all(f"wrote {tmp_path / name}" in printed for name in ("a.csv", "a.tex"))
 
 
+@pytest.mark.slow
 def test_without_policies_it_is_the_papers_table(capsys):
     assert main(["--episodes", "1", "--max-steps", "3"]) == 0
     lines = [line.split()[:2] for line in capsys.readouterr().out.splitlines()[2:18]]
@@ -169,6 +172,7 @@ def test_files_say_what_was_flown(tmp_path, capsys):
     assert seen[0]["planner"] == {"separation": pytest.approx(0.62)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plant", ["crazyflow", "rotorpy:hummingbird"])
 def test_files_and_the_table_name_the_simulator(plant, tmp_path, capsys):
     pytest.importorskip("mujoco", reason="the extra `plants` is not installed")
@@ -243,6 +247,7 @@ def test_a_missing_simulator_is_told_before_the_flights(tmp_path, monkeypatch, c
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -34,6 +34,7 @@ def condition(policy: str, max_steps: int = 25) -> Condition:
     return Condition(policy, "asymmetric_swap", make_config("paper"), max_steps)
 
 
+@pytest.mark.slow
 def test_result_does_not_depend_on_the_number_of_processes():
     conditions = [condition("random:0.3"), condition("cpa:0.7:1.5")]
     one, two = (evaluate(conditions, episodes=30, seed=1, jobs=jobs) for jobs in (1, 2))
@@ -111,6 +112,7 @@ def killed_once(condition: Condition, episodes: range) -> list[dict[str, float]]
     return run_episodes(condition, episodes)
 
 
+@pytest.mark.slow
 def test_pieces_of_a_worker_that_died_are_flown_again(tmp_path, monkeypatch):
     monkeypatch.setenv("MARKER", str(tmp_path / "died"))
     monkeypatch.setattr(evaluation, "_CHUNK", 5)
@@ -240,6 +242,7 @@ def test_pieces_are_told_apart_by_all_that_they_depend_on(tmp_path, monkeypatch)
     assert evaluation._key(one, episodes) == keys[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM])
 def test_workers_end_with_their_parent(kind):
@@ -283,6 +286,7 @@ def busy(pid: int) -> bool:
     return int(fields[11]) > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_what_users_register_flies_in_every_process(jobs, monkeypatch):
     """Also what is no function of their own modules, such as a built-in one with other arguments."""
@@ -322,6 +326,7 @@ def test_a_policy_that_cannot_be_sent_to_processes_is_named():
         evaluate(conditions, 1, jobs=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_simulator_that_dies_costs_its_piece_only(jobs, tmp_path, monkeypatch):
     monkeypatch.setitem(SIMULATORS, "mortal", Simulator(foreign.Mortal, ("iris", "typhoon")))
@@ -333,6 +338,7 @@ def test_a_simulator_that_dies_costs_its_piece_only(jobs, tmp_path, monkeypatch)
     assert [row["path_length"] for row in rows] == pytest.approx([1.0] * 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_simulator_that_always_dies_is_told_in_one_line(jobs, tmp_path, monkeypatch):
     monkeypatch.setitem(SIMULATORS, "doomed", Simulator(foreign.Mortal, ("iris", "typhoon")))

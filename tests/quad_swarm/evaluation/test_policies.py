@@ -79,6 +79,7 @@ def relational(tmp_path_factory) -> str:
     return path
 
 
+@pytest.mark.slow
 def test_a_model_decides_alike_where_everybody_happens_to_be_near(relational):
     flights = [
         fly(Condition(relational, "random_swap", make_config("flight", n_robots=8, world={"neighbourhood": limit})), 1)
@@ -111,6 +112,7 @@ def test_a_model_flies_more_robots_than_it_was_trained_with_and_asks_its_neighbo
     assert len(replay_page([one], seed=1)) > 1e5
 
 
+@pytest.mark.slow
 def test_a_model_that_announces_flies_as_in_its_environment(tmp_path):
     kwargs = {"preset": "flight", "n_robots": 3, "observation": "state+approach+mask", "announcements": True}
     env = gym.make("QuadSwarm-v0", scenario="symmetric_swap", **kwargs)

@@ -24,6 +24,7 @@ def events(folder) -> EventAccumulator:
     return EventAccumulator(str(file)).Reload()
 
 
+@pytest.mark.slow
 def test_the_zoo_logs_pictures_hyperparameters_and_the_swarms_layout(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     recipe = {"n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 20, "train_freq": 10, "batch_size": 16}

@@ -133,6 +133,7 @@ def test_refuses_senseless_actions(action, message):
         env.step(action)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

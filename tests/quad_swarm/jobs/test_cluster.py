@@ -73,6 +73,7 @@ def untimed(flown):
     return {key: [{**row, "solve_seconds": 0.0} for row in rows] for key, rows in flown.items()}
 
 
+@pytest.mark.slow
 def test_functions_of_scripts_are_worked_off_too():
     names: dict = {"__name__": "__main__"}
     exec("def shifted(x):\n    return x + offset\n\noffset = 3", names)  # as in a script
@@ -80,6 +81,7 @@ def test_functions_of_scripts_are_worked_off_too():
         assert list(executor.map(names["shifted"], range(3))) == [3, 4, 5]
 
 
+@pytest.mark.slow
 def test_flights_are_those_of_this_process():
     conditions = [Condition(policy, "symmetric_swap", make_config("flight", n_robots=3)) for policy in ("none", "full")]
     with Cluster(2) as executor:
@@ -87,6 +89,7 @@ def test_flights_are_those_of_this_process():
     assert untimed(there) == untimed(fly_all(conditions, 300))
 
 
+@pytest.mark.slow
 def test_errors_are_the_callers():
     with Cluster(2) as executor:
         assert list(executor.map(square, range(5))) == [0, 1, 4, 9, 16]
@@ -97,12 +100,14 @@ def test_errors_are_the_callers():
             executor.submit(fail_oddly).result(timeout=60)
 
 
+@pytest.mark.slow
 def test_a_piece_whose_process_dies_is_begun_again(tmp_path):
     with Cluster(2) as executor:
         assert executor.submit(die_once, str(tmp_path / "died")).result(timeout=60) == "alive"
         assert (tmp_path / "died").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
 def test_processes_may_be_killed_at_random(tmp_path):
     over = threading.Event()
@@ -151,6 +156,7 @@ def test_results_of_other_code_are_refused_in_any_case(monkeypatch):
             executor.submit(square, 2).result(timeout=60)
 
 
+@pytest.mark.slow
 def test_a_module_or_model_that_is_another_there_is_noticed(tmp_path, monkeypatch):
     """The processes of the cluster import other modules of the same name, and read another file."""
     for folder, text in (("here", "A = 1"), ("there", "A = 2")):
@@ -241,6 +247,7 @@ def test_a_cluster_by_its_port_gets_the_users_token(tmp_path):
         shutil.rmtree(folder, ignore_errors=True)
 
 
+@pytest.mark.slow
 def test_without_an_address_a_cluster_starts_here(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # of another cluster, as in any job of Ray
     ray.shutdown()
@@ -252,6 +259,7 @@ def test_without_an_address_a_cluster_starts_here(monkeypatch):
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 * 2**20)
 
 
+@pytest.mark.slow
 def test_an_address_where_nobody_answers(monkeypatch):
     # "auto" must not find the clusters of tests that run at the same time
     monkeypatch.setattr("ray._private.services._find_address_from_flag", lambda flag: set())

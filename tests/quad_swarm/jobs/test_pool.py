@@ -102,6 +102,7 @@ def test_errors_are_the_callers():
         assert pool.submit(square, 2).result() == 4, "the process lives on"
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_costs_its_piece_only(tmp_path):
     with Pool(2) as pool:
         others = [pool.submit(square, x) for x in range(8)]
@@ -114,6 +115,7 @@ def test_a_process_that_dies_costs_its_piece_only(tmp_path):
         assert pool.submit(square, 3).result() == 9
 
 
+@pytest.mark.slow
 @linux
 def test_processes_may_be_killed_at_any_moment():
     rng, over = random.Random(0), threading.Event()
@@ -162,6 +164,7 @@ def test_an_exception_stops_what_runs():
     assert not workers()
 
 
+@pytest.mark.slow
 @linux
 def test_ctrl_c_reaches_the_parent_alone():
     script = "import time\nfrom quad_swarm.jobs import Pool\nif __name__ == '__main__':\n"

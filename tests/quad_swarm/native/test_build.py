@@ -71,6 +71,7 @@ def solve(precision: str = "float32", solver: RtiSolver | None = None):
     return solver.solve(problems, np.zeros((21, 4, 9)), np.zeros((21, 3, 4)))
 
 
+@pytest.mark.slow
 def test_compiles_once_for_each_problem(cache):
     first = solve()
     (library,) = libraries(cache)
@@ -101,6 +102,7 @@ def test_the_cache_is_where_the_user_wants_it(monkeypatch, tmp_path):
     assert build_module.cache_directory() == tmp_path / "local" / "quad_swarm"
 
 
+@pytest.mark.slow
 def test_processes_may_build_at_once(cache):
     with multiprocessing.get_context("spawn").Pool(3) as pool:
         results = pool.map(solve, ["float32"] * 3, chunksize=1)
@@ -109,6 +111,7 @@ def test_processes_may_build_at_once(cache):
     assert len(libraries(cache)) == 1
 
 
+@pytest.mark.slow
 def test_travels_to_another_process(filled):
     solver = RtiSolver(OptimalControlProblem(CONFIG, QUADROTOR, 2), sqp_iterations=3)
     expected = solve(solver=solver)
@@ -137,6 +140,7 @@ def test_a_fork_solves_the_same(filled):
     assert subprocess.run([sys.executable, "-c", FORK], timeout=120).returncode == 42
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_every_build_gives_the_same_bits(precision, filled, monkeypatch):
     expected = solve(precision)
@@ -312,6 +316,7 @@ int main() {
 """
 
 
+@pytest.mark.slow
 def test_sanitizers_find_nothing(tmp_path):
     solved = run_harness(tmp_path, SANITIZED, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     assert int(solved) > 70  # of 144 problems a quarter are absurd
@@ -394,6 +399,7 @@ def test_the_cache_s_path_is_absolute(name, value, expected, monkeypatch, tmp_pa
     assert build_module.cache_directory() == tmp_path / expected
 
 
+@pytest.mark.slow
 def test_a_cache_in_the_current_folder_works(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("QUAD_SWARM_CACHE", ".")
@@ -414,6 +420,7 @@ def test_a_compiler_of_c_is_named_as_the_cause(cache, tmp_path, monkeypatch):
         build_module.load(str(library))
 
 
+@pytest.mark.slow
 def test_temporary_files_of_the_compiler_are_in_the_cache(cache, monkeypatch, tmp_path):
     seen = []
     run = subprocess.run

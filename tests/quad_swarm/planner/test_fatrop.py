@@ -46,6 +46,7 @@ def test_what_is_no_state_fails_without_a_solve(value):
     assert (solution.success[0], solution.iterations[0]) == (False, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["attitude=1.5", "pos=1e3", "vel=1e3"])
 def test_every_solve_ends(noise):
     name, value = noise.split("=")

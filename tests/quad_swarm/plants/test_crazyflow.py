@@ -10,6 +10,7 @@ from quad_swarm.quadrotor import QuadrotorParams
 pytest.importorskip("mujoco", reason="the extra `plants` is not installed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["cf21B_500", "hb_x500"])
 def test_hovers_tilts_and_climbs_as_commanded(vehicle):
     check_hovers_tilts_and_climbs(f"crazyflow:{vehicle}", climb=0.5)
@@ -40,5 +41,6 @@ def test_refuses_sub_steps_between_its_own():
         make_plant("crazyflow", QuadrotorParams(), 0.003, 1, 2)
 
 
+@pytest.mark.slow
 def test_swarms_fly_in_it_and_full_communication_keeps_them_apart():
     check_full_communication_keeps_apart("crazyflow", "crazyflie21", episodes=10)

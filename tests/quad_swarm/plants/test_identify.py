@@ -24,6 +24,7 @@ def test_our_own_model_is_found_again():
     assert max(found[1:]) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "vehicle"), [("crazyflow:cf21B_500", "crazyflie21"), ("rotorpy:hummingbird", "hummingbird")]
 )

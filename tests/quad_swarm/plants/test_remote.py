@@ -35,6 +35,7 @@ def test_what_the_simulator_refuses_arrives_as_it_is():
         make(0.005001)
 
 
+@pytest.mark.slow
 @needs_crazyflow
 def test_all_plants_share_one_process_until_it_dies():
     first, second = make(), make()

@@ -7,11 +7,13 @@ from flown_plants import check_full_communication_keeps_apart, check_hovers_tilt
 pytest.importorskip("torchdiffeq", reason="the extra `plants` is not installed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["crazyflie", "hummingbird"])
 def test_hovers_tilts_and_climbs_as_commanded(vehicle):
     check_hovers_tilts_and_climbs(f"rotorpy:{vehicle}", climb=0.45)
 
 
+@pytest.mark.slow
 def test_wind_drags_the_rotors():
     plant, start = placed("rotorpy:hummingbird")
     state = fly(plant, start, np.zeros((2, 3, 4)), 100, air=1.0)
@@ -42,5 +44,6 @@ def test_a_swarm_that_begins_anew_has_forgotten_the_last_episode():
     assert np.array_equal(fly(plant, start, u, 10), first)
 
 
+@pytest.mark.slow
 def test_swarms_fly_in_it_and_full_communication_keeps_them_apart():
     check_full_communication_keeps_apart("rotorpy:hummingbird", "hummingbird", episodes=5)

@@ -78,6 +78,7 @@ def test_curriculum_opens_scenarios_one_by_one():
         ScenarioSampler("mixed", 4, SPACE).set_level(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SCENARIOS, "mixed", "curriculum"])
 def test_says_how_many_fit(name):
     with pytest.raises(DoesNotFit, match=r"300 robots .* do not fit .* about \d+ do"):
@@ -123,6 +124,7 @@ def test_senseless_weights_are_refused(weights, message):
         ScenarioSampler(weights, 4, SPACE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "n_robots"), [("paper", 14), ("paper", 16), ("dense", 16), ("flight", 16)])
 def test_robots_that_fit_at_construction_fit_at_every_reset(preset, n_robots):
     config = make_config(preset, n_robots=n_robots)
@@ -132,6 +134,7 @@ def test_robots_that_fit_at_construction_fit_at_every_reset(preset, n_robots):
         assert min(spacing(starts), spacing(goals)) >= config.space.spacing
 
 
+@pytest.mark.slow
 @given(
     name=st.sampled_from([*SCENARIOS, "mixed"]),
     n_robots=st.integers(2, 40),
@@ -154,6 +157,7 @@ def test_a_room_is_refused_at_construction_or_never(name, n_robots, gap, half_wi
         assert min(spacing(starts), spacing(goals)) >= gap
 
 
+@pytest.mark.slow
 def test_draws_that_succeed_at_once_are_as_they_were():
     space = PRESETS["paper"].space
     sampler = ScenarioSampler("symmetric_swap", 16, space)
@@ -169,6 +173,7 @@ def test_draws_that_succeed_at_once_are_as_they_were():
     assert 5 < same < 20, "the others were drawn again"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_robots", [18, 20, 40, 300])
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_the_number_and_the_room_that_are_named_fit(name, n_robots):

@@ -55,6 +55,7 @@ def test_a_signal_ends_the_run_after_the_rollout_and_a_second_one_at_once(steps,
     assert (path.name if path else None) == ("checkpoint-000000000150" if len(steps) == 1 else None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bare", ["first", "now"])
 def test_a_list_of_one_callback_is_the_same_as_the_callback(bare, tmp_path):
     checkpoint = RunCheckpoint(tmp_path, EVERY)
@@ -91,6 +92,7 @@ def test_checkpoints_take_no_more_than_their_share(seconds, expected, tmp_path, 
     assert len(steps) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "told"),
     [

@@ -14,6 +14,7 @@ from sb3_maddpg.checkpoints.state import digest
 from studies.commit_points import POINTS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("point", POINTS)
 def test_a_kill_at_any_moment_of_a_commit_loses_nothing_but_that_checkpoint(point, tmp_path, monkeypatch):
     expected = digest(make("replayed").learn(STEPS))
@@ -74,6 +75,7 @@ def test_a_checkpoint_names_files_in_its_folder_only(where, name, tmp_path):
         assert newest(tmp_path) is None
 
 
+@pytest.mark.slow
 def test_two_processes_do_not_write_into_one_folder(tmp_path):
     program = textwrap.dedent("""
         import sys

@@ -21,6 +21,7 @@ from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.vec_env.states import Replayable
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_a_resumed_run_ends_as_the_uninterrupted_one(name, tmp_path, monkeypatch):
     monkeypatch.setattr(writer, "_BLOCK", 5000)  # several blocks in each segment
@@ -35,6 +36,7 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(name, tmp_path, monkeypatch
     assert digest(go_on(name, tmp_path / "b")) == expected
 
 
+@pytest.mark.slow
 def test_a_run_that_a_callback_ended_goes_on_with_another_argument(tmp_path):
     ended = make("replayed").learn(STEPS, callback=[RunCheckpoint(tmp_path, 50), StopTrainingOnMaxEpisodes(25)])
     assert ended.num_timesteps == 250
@@ -46,6 +48,7 @@ def test_a_run_that_a_callback_ended_goes_on_with_another_argument(tmp_path):
     assert (model.num_timesteps, stop.n_episodes) == (500, 50), "also after a second resumption"
 
 
+@pytest.mark.slow
 def test_what_tells_no_state_goes_on_with_new_episodes_and_says_so(tmp_path):
     for env in (lambda: DummyVecEnv([OwnBit]), lambda: SubprocVecEnv([OwnBit])):
         model = MADDPG("MlpPolicy", env(), buffer_size=300, train_freq=5, **SETTINGS)

@@ -41,6 +41,7 @@ def evaluated(folder: Path) -> list[BaseCallback]:
     return [RunCheckpoint(folder / "checkpoints", EVERY), evaluation]
 
 
+@pytest.mark.slow
 def test_without_the_checkpoint_s_state_a_run_ends_otherwise(tmp_path, monkeypatch):
     expected = digest(make("replayed").learn(STEPS))
     kill_at(monkeypatch, "committed", 3)
@@ -50,6 +51,7 @@ def test_without_the_checkpoint_s_state_a_run_ends_otherwise(tmp_path, monkeypat
     assert digest(go_on("replayed", tmp_path)) != expected
 
 
+@pytest.mark.slow
 def test_callbacks_go_on_where_they_were(tmp_path, monkeypatch):
     (whole := tmp_path / "whole").mkdir()
     make("replayed").learn(STEPS, callback=evaluated(whole))
@@ -64,6 +66,7 @@ def test_callbacks_go_on_where_they_were(tmp_path, monkeypatch):
             assert np.array_equal(one[name], two[name])
 
 
+@pytest.mark.slow
 def test_a_curriculum_goes_on_where_it_was(tmp_path, monkeypatch):
     def learn(folder: Path) -> MADDPG:
         return make("one swarm").learn(STEPS, callback=[RunCheckpoint(folder, EVERY), CurriculumCallback(0.1, 3)])

@@ -13,6 +13,7 @@ from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.vec_env.states import Replayable
 
 
+@pytest.mark.slow
 def test_only_new_transitions_are_written(tmp_path):
     make("replayed", buffer_size=500).learn(400, callback=[RunCheckpoint(tmp_path, EVERY)])
     sizes = [path.stat().st_size for path in sorted((tmp_path / "segments").iterdir())]
@@ -23,6 +24,7 @@ def test_only_new_transitions_are_written(tmp_path):
     assert len(list((tmp_path / "ring" / "segments").iterdir())) <= 4, "what the ring has overwritten is removed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["swarms", "memory", "replayed"])
 def test_a_slow_disk_does_not_change_a_checkpoint(name, tmp_path, monkeypatch):
     """The training overwrites all rows of the buffer while the thread writes."""
@@ -44,6 +46,7 @@ def test_a_slow_disk_does_not_change_a_checkpoint(name, tmp_path, monkeypatch):
     assert digest(go_on(name, tmp_path)) == expected
 
 
+@pytest.mark.slow
 def test_observations_are_written_once(tmp_path):
     model = make("swarms")
     model.learn(STEPS, callback=[RunCheckpoint(tmp_path, EVERY)])

@@ -281,6 +281,7 @@ def test_evaluation_that_cannot_be_is_refused(arena, capsys, argv, message):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algo", ["maddpg", "ppo"])
 def test_the_packaged_recipes_train_the_swarm(algo, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -293,6 +294,7 @@ def test_the_packaged_recipes_train_the_swarm(algo, tmp_path, monkeypatch, capsy
     assert "eval_env_kwargs={'preset': 'paper', 'scenario': 'mixed', 'scale_observation': True}" in out
 
 
+@pytest.mark.slow
 def test_as_a_command(tmp_path):
     command = [sys.executable, "-m", "sb3_maddpg"]
     shown = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
@@ -302,6 +304,7 @@ def test_as_a_command(tmp_path):
     assert MADDPG.load(tmp_path / "logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip").num_timesteps == 600
 
 
+@pytest.mark.slow
 def test_the_script_finds_environments_in_the_present_folder(tmp_path):
     (tmp_path / "pack").mkdir()
     (tmp_path / "pack" / "spread.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")
@@ -311,6 +314,7 @@ def test_the_script_finds_environments_in_the_present_folder(tmp_path):
     assert (tmp_path / "logs" / "maddpg" / "pack-spread_1" / "pack-spread.zip").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("missing", "words", "message"),
     [

@@ -159,6 +159,7 @@ def test_pretrained_models_are_listed_shown_and_copied(capsys):
     assert "did you mean 'quad-swarm-paper'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_pretrained_model_is_evaluated_and_replayed_by_its_name(capsys):
     flown = ["--policy", "pretrained:quad-swarm-paper@0.5"]
     argv = ["evaluate", *flown, "--scenario", "random", "--episodes", "2", "--json", "table.json"]

@@ -1,12 +1,14 @@
 """What there is to name on the command line."""
 
 import gymnasium
+import pytest
 import yaml
 
 from sb3_maddpg.cli.overview import ALGORITHMS, environments, overview, packaged_recipes
 from sb3_maddpg.hub.pretrained import pretrained_models
 
 
+@pytest.mark.slow
 def test_everything_that_is_registered_is_named(monkeypatch):
     monkeypatch.setitem(
         gymnasium.registry, "Mine-v0", gymnasium.envs.registration.EnvSpec("Mine-v0", entry_point="mine:Mine")

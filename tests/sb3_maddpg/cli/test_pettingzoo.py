@@ -36,6 +36,7 @@ def in_logs(tmp_path, monkeypatch):
     gymnasium.registry.update(known)
 
 
+@pytest.mark.slow
 def test_a_pettingzoo_module_is_trained_watched_and_recorded(in_logs, capsys):
     wrapped = {"continuous_actions": True, "state": True, "wrappers": [{"supersuit.frame_stack_v2": {"stack_size": 2}}]}
     recipe = {"n_timesteps": 120, "learning_starts": 40, "train_freq": 10, "n_envs": 2, "policy": "MlpPolicy"}
@@ -89,6 +90,7 @@ def test_the_packaged_recipes_are_for_environments_that_are_there(in_logs, algo)
         assert recipe["env_kwargs"] == {"continuous_actions": True}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "discrete"), [(MADDPG, True), (MATD3, False), (MATD3, True)])
 def test_the_packaged_recipes_train_both_kinds_of_actions(in_logs, capsys, algorithm, discrete):
     algo = ["--algo", algorithm.__name__.lower(), *SPREAD]

@@ -22,6 +22,7 @@ class Command:
         return self.words, "starts" if self.words else "nothing to do"
 
 
+@pytest.mark.slow
 def test_runs_all_and_returns_the_status_of_one_that_failed(tmp_path, capsys):
     jobs = [
         Command("first", tmp_path / "1.log", ["pretrained"]),
@@ -40,6 +41,7 @@ def test_runs_all_and_returns_the_status_of_one_that_failed(tmp_path, capsys):
     assert not jobs[2].output.exists()
 
 
+@pytest.mark.slow
 def test_commands_get_their_environment(tmp_path):
     words = ["evaluate", "--policy", "none", "--episodes", "1"]
     job = Command("one", tmp_path / "1.log", words, {"QUAD_SWARM_CACHE": str(tmp_path / "cache")})
@@ -70,6 +72,7 @@ def lay_traps(folder: Path) -> None:
         (folder / f"{name}.py").write_text(TRAP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [(3, 10), (3, 11)])
 def test_a_child_imports_nothing_from_the_current_folder_but_from_pythonpath(version, tmp_path, monkeypatch):
     if version > sys.version_info[:2]:
@@ -86,6 +89,7 @@ def test_a_child_imports_nothing_from_the_current_folder_but_from_pythonpath(ver
     assert not list(tmp_path.glob("*.caught")), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["--vec-env", "subproc", "-params", "n_envs:2"], ["--seeds", "0", "--jobs", "1"]])
 def test_processes_of_a_training_import_only_what_the_user_named(words, tmp_path):
     pytest.importorskip("mpe2")

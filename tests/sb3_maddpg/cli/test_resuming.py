@@ -73,6 +73,7 @@ def results(folder: Path, env_id: str) -> dict:
     return found | {tag: [(one.step, one.value) for one in events.Scalars(tag)] for tag in tags}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", RECIPES)
 def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
@@ -111,6 +112,7 @@ def test_killed_and_resumed_twice_a_run_ends_as_the_uninterrupted_one(env_id, tm
     assert not any("checkpoint" in name or "before" in name for name in found["files"])
 
 
+@pytest.mark.slow
 def test_a_copied_run_writes_into_the_copy_only(tmp_path):
     (tmp_path / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3}}))
     argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--checkpoint-every", "300", "--verbose", "0"]
@@ -129,6 +131,7 @@ def test_a_copied_run_writes_into_the_copy_only(tmp_path):
         assert curves["timesteps"].tolist() == list(range(250, 6001, 250))
 
 
+@pytest.mark.slow
 def test_resuming_a_run_that_trains_does_not_touch_it(tmp_path):
     (tmp_path / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3, "n_timesteps": 100_000}}))
     argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "300"]
@@ -170,6 +173,7 @@ def test_checkpoints_can_be_switched_off(tmp_path, monkeypatch):
     assert not list(Path("logs").rglob("checkpoints"))
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
     (tmp_path / "r.yml").write_text(yaml.safe_dump({"OwnBit-v0": OWN | {"train_freq": 3}}))
     argv = ["--env", "OwnBit-v0", "--conf-file", "r.yml", "--eval-freq", "-1", "--checkpoint-every", "300"]
@@ -186,6 +190,7 @@ def test_an_interrupted_run_keeps_its_checkpoints(tmp_path):
     assert not checkpoints(tmp_path)
 
 
+@pytest.mark.slow
 def test_another_number_of_environments_is_refused_until_it_is_as_before(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     recipe = OWN | {"train_freq": 3, "n_envs": 2}
@@ -212,6 +217,7 @@ def test_another_number_of_environments_is_refused_until_it_is_as_before(tmp_pat
     assert episodes()[1:15] == before
 
 
+@pytest.mark.slow
 def test_options_beside_resume_replace_those_of_the_run(killed, tmp_path, monkeypatch):
     monkeypatch.chdir(shutil.copytree(killed, tmp_path / "copy"))
     assert main(["train", "--resume", "-n", "1500", "--save-replay-buffer"]) == 0
@@ -242,6 +248,7 @@ def change(name: str, **values) -> None:
 CHECKPOINTS = "stable_baselines3.common.callbacks.CheckpointCallback"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "values", "told"),
     [
@@ -279,6 +286,7 @@ def test_the_folder_of_someone_elses_run_runs_no_code(killed, tmp_path, monkeypa
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_options_that_only_begin_a_run_are_not_taken_from_its_folder(killed, tmp_path, monkeypatch):
     folder = shutil.copytree(killed, tmp_path / "copy")
     monkeypatch.chdir(folder)
@@ -290,6 +298,7 @@ def test_options_that_only_begin_a_run_are_not_taken_from_its_folder(killed, tmp
     assert not (folder / "victim.log").exists()
 
 
+@pytest.mark.slow
 def test_someone_elses_run_is_resumed_if_it_runs_no_code(killed, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(shutil.copytree(killed, tmp_path / "copy"))
     change("config.yml", n_timesteps=1200, policy="sb3_maddpg.MADDPGPolicy")
@@ -306,6 +315,7 @@ def test_someone_elses_run_is_resumed_if_it_runs_no_code(killed, tmp_path, capsy
     assert "resume with the same ones" in error
 
 
+@pytest.mark.slow
 def test_what_a_run_imports_and_writes_elsewhere_is_named_again(tmp_path):
     pytest.importorskip("mpe2")
     (tmp_path / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")

@@ -51,6 +51,7 @@ def kill_within_a_trial(process: subprocess.Popen, finished: int) -> None:
     process.communicate()
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_after_kills(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--n-trials", "4"]
@@ -69,6 +70,7 @@ def test_a_search_goes_on_after_kills(tmp_path, monkeypatch):
     assert Path("logs/maddpg/OwnBit-v0_best.yml").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_is_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     process = start("--n-trials", "50")
@@ -85,6 +87,7 @@ def test_an_interrupted_search_is_kept(tmp_path, monkeypatch):
     assert Path("logs/maddpg/OwnBit-v0_best.yml").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("named", [True, False])
 def test_a_search_interrupted_in_its_first_trial_says_how_to_continue(named, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -106,6 +109,7 @@ def test_a_search_interrupted_in_its_first_trial_says_how_to_continue(named, tmp
     assert trial.state is TrialState.FAIL
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("engine", ["local", "ray"])
 def test_workers_of_a_command_share_its_trials_whatever_dies(engine, tmp_path, monkeypatch):
@@ -352,6 +356,7 @@ def test_the_trial_of_someone_else_names_no_code(tmp_path, monkeypatch, capsys, 
     assert told in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_full_disk_during_a_search_is_told_and_the_search_goes_on_later(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("recipe.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "n_timesteps": 60}}))

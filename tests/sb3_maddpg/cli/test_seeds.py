@@ -69,6 +69,7 @@ def wait_for_checkpoints(folder: Path, process: subprocess.Popen) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM])
 def test_killed_and_begun_again_all_seeds_end_as_if_nothing_had_happened(kind, tmp_path):
@@ -107,6 +108,7 @@ def trainings_of(process: subprocess.Popen) -> list[int]:
     return [pid for pid in descendants(process.pid) if words in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 def test_a_cluster_trains_the_same_whatever_dies(tmp_path):
     pytest.importorskip("ray")
@@ -134,6 +136,7 @@ def test_a_cluster_trains_the_same_whatever_dies(tmp_path):
     assert weights(there) == weights(alone)
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_all_trainings_with_one_line(tmp_path):
     process = start(tmp_path, "--seeds", "1-2", "--jobs", "2", steps=100_000)
     wait_for_checkpoints(tmp_path, process)
@@ -145,6 +148,7 @@ def test_ctrl_c_ends_all_trainings_with_one_line(tmp_path):
     assert not weights(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_training_that_fails_is_told(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("r.yml").write_text(yaml.safe_dump({"OwnBit-v0": {**RECIPE, "batch_size": -1}}))
@@ -172,6 +176,7 @@ def test_what_does_not_go_together_is_refused(words, message, tmp_path, monkeypa
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_command_with_an_environment_of_the_present_folder_resumes_its_runs(tmp_path):
     pytest.importorskip("mpe2")
     (tmp_path / "my_team.py").write_text("from mpe2.simple_spread_v3 import parallel_env\n")

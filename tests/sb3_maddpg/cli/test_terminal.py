@@ -42,6 +42,7 @@ def trains() -> bool:
     return any(len(path.read_text().splitlines()) > 20 for path in Path().glob("logs/*/*/0.monitor.csv"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["--log-interval", "1"], ["--progress"]])
 def test_a_training_whose_terminal_is_closed_writes_its_checkpoint_and_ends_by_the_signal(words):
     ours, theirs = pty.openpty()
@@ -65,6 +66,7 @@ def test_a_training_whose_terminal_is_closed_writes_its_checkpoint_and_ends_by_t
     assert len(checkpoints()) == 1
 
 
+@pytest.mark.slow
 def test_a_training_whose_tee_ends_with_the_terminal_writes_its_checkpoint_too():
     """Its tables meet the broken pipe before the signal arrives."""
     process = subprocess.Popen(
@@ -94,6 +96,7 @@ def read_all(terminal: int) -> None:
         return
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [[], ["--seeds", "0", "--jobs", "1"]])
 def test_ignored_signals_stay_ignored(words):
     with Path("out.txt").open("wb") as out:
@@ -116,6 +119,7 @@ def test_ignored_signals_stay_ignored(words):
     assert "SIGHUP" not in Path("out.txt").read_text()
 
 
+@pytest.mark.slow
 def test_a_reader_that_ends_is_no_error():
     process = subprocess.Popen(
         [sys.executable, "-m", "sb3_maddpg", "pretrained"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -125,6 +129,7 @@ def test_a_reader_that_ends_is_no_error():
     assert process.wait(timeout=300) == 128 + signal.SIGPIPE
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="shells close streams there in another way")
 @pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
 def test_commands_work_without_standard_streams(closed):

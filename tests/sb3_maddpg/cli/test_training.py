@@ -88,6 +88,7 @@ def test_a_full_disk_is_named_with_the_remedy(monkeypatch, capsys):
     assert "OwnBit-v0_2: No space left on device: free space (" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_tables_come_at_a_readable_rate_and_short_trainings_log_their_rewards(capsys):
     assert train() == 0  # 400 steps
     assert capsys.readouterr().out.count("ep_rew_mean") == 1
@@ -105,6 +106,7 @@ def test_a_progress_bar_stands_alone(capsys):
     assert list(Path("tb").rglob("events*"))
 
 
+@pytest.mark.slow
 def test_a_model_loads_where_rl_zoo3_is_not_installed():
     assert train("--verbose", "0") == 0
     path = "logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip"

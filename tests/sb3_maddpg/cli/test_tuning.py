@@ -163,6 +163,7 @@ def test_batches_fit_into_the_replay_buffer_of_the_recipe(buffer_size, sizes):
     assert {trial.params["batch_size"] for trial in trials} == sizes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algo", ALGOS)
 def test_the_first_trial_of_a_study_is_taken_up_again(algo, folder, capsys):
     stored = ["--storage", "s.log", "--study-name", "s"]

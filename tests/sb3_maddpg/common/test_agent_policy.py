@@ -118,6 +118,7 @@ assert "sb3_maddpg" not in sys.modules and "stable_baselines3" not in sys.module
 """
 
 
+@pytest.mark.slow
 def test_exported_agents_run_without_this_package(tmp_path):
     cases = team_actions(varied(MODELS["mixed"]))
     cases += [case for make in MODELS.values() for case in team_actions(varied(make))[:2]]
@@ -133,6 +134,7 @@ def test_exported_agents_run_without_this_package(tmp_path):
         assert np.allclose(actions, expected, atol=1e-6)
 
 
+@pytest.mark.slow
 @each_model
 def test_agents_exported_to_onnx_act_as_in_the_team(make, tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
@@ -167,6 +169,7 @@ class Bounded(Toy):
         self.possible_agents = [f"agent_{i}" for i in range(len(self.spaces))]
 
 
+@pytest.mark.slow
 def test_actions_lie_within_their_space_and_those_of_integers_are_whole(tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     saturated = 0
@@ -207,6 +210,7 @@ class Alike(Toy):
         return super().step(actions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "space",
     [

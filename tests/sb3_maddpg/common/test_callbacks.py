@@ -76,6 +76,7 @@ def test_the_level_survives_the_model_file(tmp_path):
     assert env.levels_set == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
 def test_every_training_environment_is_raised_for_any_algorithm(vec_env_cls):
     env = make_vec_env(Levelled, 2, vec_env_cls=vec_env_cls)

@@ -163,6 +163,7 @@ class Thousand(ParallelEnv):
         return self.look(), rewards, dict.fromkeys(rewards, False), over, {}
 
 
+@pytest.mark.slow
 def test_a_model_of_normalised_observations_scores_as_its_card_says(tmp_path, monkeypatch):
     def make_env():
         return Monitor(TeamEnv(Thousand()))

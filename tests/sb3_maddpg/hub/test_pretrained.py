@@ -37,6 +37,7 @@ def test_shipped_models_are_the_recorded_files_and_hold_no_pickle():
         refuse_pickled(path, {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "n_robots"), [(name, n) for name, (_, most) in SHIPPED.items() for n in most])
 def test_flies_safely_and_asks_seldom(name, n_robots):
     preset, most = SHIPPED[name]
@@ -83,6 +84,7 @@ def test_belongs_to_a_recipe_a_command_and_results():
         }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_loads_without_the_zoo(name):
     code = f"""

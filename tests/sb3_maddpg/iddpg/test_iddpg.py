@@ -71,6 +71,7 @@ def test_one_value_for_the_team_is_refused():
         IDDPG("MlpPolicy", Neighbours(), policy_kwargs={"share_critic": "team"})
 
 
+@pytest.mark.slow
 def test_it_learns_what_needs_no_others():
     model = IDDPG(
         "MlpPolicy", OwnBit(), learning_rate=3e-3, learning_starts=200, batch_size=128, train_freq=2, seed=0

@@ -101,6 +101,7 @@ def drawn(model, batch: int = 5) -> tuple[th.Tensor, th.Tensor]:
     return obs, model.actor.act(obs, deterministic=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [MADDPG, MATD3])
 def test_it_learns_to_see(algorithm):
     model = made(algorithm).learn(1600)
@@ -304,6 +305,7 @@ def _without_kwargs(arguments: dict) -> dict:
     return {name: value for name, value in arguments.items() if name != "policy_kwargs"}
 
 
+@pytest.mark.slow
 def test_a_team_s_single_value_is_fitted_to_the_team_s_reward():
     class Paid(Pictures):
         def step(self, actions):

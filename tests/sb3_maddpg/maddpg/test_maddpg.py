@@ -48,6 +48,7 @@ def parameters(model: MADDPG) -> np.ndarray:
     return model.policy.parameters_to_vector()
 
 
+@pytest.mark.slow
 def test_processes_train_the_same_parameters():
     models = []
     for vec_env_cls in (DummyVecEnv, SubprocVecEnv):
@@ -759,6 +760,7 @@ class EndsForGymnasium(gymnasium.Wrapper):
         return obs, reward, terminated, truncated, {name: info[name] for name in names}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "a", "kwargs", "expected"),
     [

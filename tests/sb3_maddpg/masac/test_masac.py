@@ -16,6 +16,7 @@ def made(kind: str = "continuous", **kwargs) -> MASAC:
     return MASAC("MlpPolicy", TeamEnv(Toy(kind)), **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [*BINARY_TASKS, OwnCategory, FollowTarget])
 def test_it_solves_tasks_whose_best_return_is_known(task):
     steps = 2500 if task is PricedBit else 1000

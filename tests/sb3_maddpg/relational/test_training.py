@@ -104,6 +104,7 @@ def test_a_team_that_acts_by_itself(algorithm, continuous, tmp_path):
     assert all(model.action_space.contains(action) for action in actions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_choices", "pair_credit"), [(2, False), (2, True), (3, True)])
 def test_what_holds_for_every_neighbour_is_learned_from_all_of_them(n_choices, pair_credit):
     recipe = {"learning_rate": 1e-2, "learning_starts": 100, "batch_size": 64, "train_freq": 4, "gamma": 0.5, "seed": 0}

@@ -199,6 +199,7 @@ def test_random_actions_become_legal_and_stay_otherwise_as_they_are():
     assert 0 < was_legal[:, 0].float().mean() < 1
 
 
+@pytest.mark.slow
 def test_masks_travel_with_models_and_single_agents(tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     model = MADDPG("MlpPolicy", Masked(("one", "some", "bits")), **SMALL)
@@ -244,6 +245,7 @@ def test_who_has_other_masks_shares_no_network():
 
 
 # PettingZoo's noughts and crosses: who chooses a taken field loses at once, and a warning is printed
+@pytest.mark.slow
 def test_a_game_with_turns_is_played_by_its_rules(capfd):
     env = TeamEnv(tictactoe_v3.env())
     model = MADDPG("MlpPolicy", env, learning_starts=200, batch_size=32, train_freq=4, buffer_size=2000, seed=0)

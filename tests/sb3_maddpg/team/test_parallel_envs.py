@@ -185,6 +185,7 @@ def test_categories_of_one_type_are_passed_on_in_another():
         assert [(type(part), part.item()) for part in zoo.sent.values()] == [(np.int64, 2), (np.int64, 6)]
 
 
+@pytest.mark.slow
 def test_processes_make_the_same_steps():
     steps = []
     for vec_env_cls in (DummyVecEnv, SubprocVecEnv):

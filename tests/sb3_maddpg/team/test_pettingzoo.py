@@ -326,6 +326,7 @@ def script_with_successes():
     return TeamEnv(Broken(spoil, {"a": (2, TERMINATED), "b": (8, TRUNCATED)}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vectorised", [DummyVecEnv, SubprocVecEnv])
 @pytest.mark.parametrize("limit", [lambda env: gymnasium.wrappers.TimeLimit(env, 3), Limited])
 def test_returns_are_logged_where_a_wrapper_ends_the_episodes(vectorised, limit, tmp_path):

@@ -147,6 +147,7 @@ def test_copies_are_whole(copied):
     assert np.array_equal(action.sample(), again[1].sample())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
 def test_vector_environments_and_their_wrappers_keep_the_spaces(vec_env_cls):
     def make() -> TeamEnv:

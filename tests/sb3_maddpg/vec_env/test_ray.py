@@ -85,6 +85,7 @@ def flown(env, steps: int = 50, kill_at: tuple[int, ...] = ()):
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "local"), [(swarms, swarms), (bits, replayed_bits)])
 @pytest.mark.parametrize("kill_at", [(), (0, 7, 8, 21, 33, 34, 49)])
 def test_what_is_seen_is_what_the_shards_would_return_here(make, local, kill_at):
@@ -106,6 +107,7 @@ class WritesIntoActions(OwnBit):
         return returned
 
 
+@pytest.mark.slow
 def test_environments_may_write_into_their_actions():
     actions = np.ones((1, 9), np.int8)
     env = RayVecEnv([lambda: DummyVecEnv([WritesIntoActions])])
@@ -134,6 +136,7 @@ class WritesAgain(OwnBit):
         return self.seen, *rest
 
 
+@pytest.mark.slow
 def test_last_observations_are_copied_behind_wrappers_of_a_shard():
     env = RayVecEnv([lambda: VecMonitor(DummyVecEnv([WritesAgain]))])
     last = []
@@ -148,6 +151,7 @@ def test_last_observations_are_copied_behind_wrappers_of_a_shard():
     assert min(last) > 0
 
 
+@pytest.mark.slow
 def test_what_is_learned_is_the_same_to_the_last_bit():
     digests = []
     for env in (RayVecEnv([swarms, swarms], snapshot_every=7), Together(swarms)):
@@ -160,6 +164,7 @@ def test_what_is_learned_is_the_same_to_the_last_bit():
     assert digests[0] == digests[1]
 
 
+@pytest.mark.slow
 def test_attributes_and_methods_reach_the_environments():
     env = RayVecEnv([bits, bits], snapshot_every=5)
     try:
@@ -178,6 +183,7 @@ def broken():
     raise KeyError("cannot be made")
 
 
+@pytest.mark.slow
 def test_a_shard_that_cannot_be_made_is_told():
     with pytest.raises(ValueError, match=r"processes died during describe\(\) of a shard.*cannot be made"):
         RayVecEnv([broken])

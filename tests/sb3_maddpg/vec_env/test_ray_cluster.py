@@ -24,6 +24,7 @@ def test_an_address_where_nobody_answers(monkeypatch):
             connect(address, 1)
 
 
+@pytest.mark.slow
 def test_only_the_first_call_connects(monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # of another cluster, as in any job of Ray

@@ -63,6 +63,7 @@ def test_a_replayable_environment_draws_episodes_from_its_seed():
     fresh.load_state_dict(Replayable(gymnasium.make("CartPole-v1")).state_dict())  # before any reset
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [lambda: DummyVecEnv([OwnBit]), lambda: SubprocVecEnv([OwnBit])])
 def test_says_what_tells_no_state(make):
     env = make()

@@ -60,6 +60,7 @@ def test_absurd_problems_stay_in_their_lanes(bad):
         assert not solution.success[[3, 8, 13, 17]].any()
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32), scale=st.floats(0.01, 20), n_others=st.sampled_from([1, 3]), yaw=st.booleans())
 @settings(max_examples=60, deadline=None)
 def test_plans_obey_dynamics_and_limits_whatever_is_asked(seed, scale, n_others, yaw):

@@ -96,6 +96,7 @@ AGREEMENT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("sqp_iterations", [1, 2, 3])
 def test_agrees_with_the_converged_optimum(recorded, precision, sqp_iterations):
@@ -137,6 +138,7 @@ def test_extra_iterations_go_to_the_problems_that_need_them(recorded):
     assert (after - best)[~same].sum() < 0.5 * (before - best)[~same].sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [{}, {"pos": 0.004, "vel": 0.02, "attitude": 0.006}], ids=["quiet", "noisy"])
 @pytest.mark.parametrize(("preset", "rule", "episodes"), [("paper", "full", 8), ("dense", "cpa:0.8:1.5", 2)])
 def test_flies_no_worse_than_the_reference(preset, rule, episodes, noise):
