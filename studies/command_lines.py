@@ -260,12 +260,15 @@ def attempt(words: list[str]) -> tuple[str, str]:
         return "raw error", traceback.format_exc()[-600:]
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-    lines = [line for line in err.getvalue().splitlines() if line.startswith("error:") or ": error: " in line]
+    lines = [line for line in err.getvalue().splitlines() if line.startswith("error:")]
+    usage = [line for line in err.getvalue().splitlines() if line.startswith("sb3-maddpg") and ": error: " in line]
     told = err.getvalue()
     if status == 0:
         return "accepted", ""
     if "it hangs" in told or "Traceback" in told:
         return "raw error", told[-600:]
+    if usage:
+        return ("usage" if len(usage) == 1 else "several lines"), told[-600:]
     after = told[told.index("error:") :].strip().splitlines() if lines else []
     return ("one line" if len(after) == 1 else "several lines"), told[-600:]
 
