@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,8 @@ def record(args: argparse.Namespace, words: list[str]) -> int:
     :param words: unused
     :return: exit status
     """
+    if find_spec("moviepy") is None:  # which would be missed at the end
+        raise ImportError("record needs the extra 'render': in the clone, pip install -e '.[render]'.")
     model, env, (run, name) = _prepare(args, renders=True, render_mode="rgb_array")
     folder = args.output_folder or str(run / "videos")
     env = VecVideoRecorder(env, folder, lambda step: step == 0, video_length=args.n_timesteps, name_prefix=name)

@@ -202,6 +202,12 @@ def test_watching_and_recording_use_the_training_environment(arena, tmp_path, ca
     assert "did you mean 'Arena-v0'" in capsys.readouterr().err
 
 
+def test_record_tells_what_it_needs_before_it_begins(arena, monkeypatch, capsys):
+    monkeypatch.setattr("sb3_maddpg.cli.show.find_spec", lambda name: None)
+    assert main(["record", "--env", "Arena-v0"]) == 1
+    assert "pip install -e '.[render]'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", ["enjoy", "record"])
 def test_ctrl_c_while_watching_ends_with_the_usual_status(arena, capsys, command):
     assert train("--eval-freq", "-1") == 0
