@@ -17,7 +17,7 @@ import torch as th
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
+from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder, unwrap_vec_normalize
 from tqdm import tqdm
 
 from sb3_maddpg.cli.algorithms import algorithm
@@ -148,8 +148,9 @@ def _prepare(
         evaluates=True,
         statistics=statistics if settings.get("normalize") else None,
     )
-    if getattr(args, "norm_reward", False) and (normalization := getattr(env, "norm_reward", None)) is not None:
-        env.norm_reward = normalization or True  # type: ignore[attr-defined]
+    normalization = unwrap_vec_normalize(env)
+    if normalization is not None and getattr(args, "norm_reward", False):
+        normalization.norm_reward = True
     return _load(cls, path, args, shares, env, settings), env, (run, f"{title}-{args.algo}-{name}")
 
 
