@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -164,7 +165,10 @@ def _load(
             kwargs["env"] = env
     if not trusted(None):
         refuse_pickled(path, _UNUSED)
-    model = cls.load(path, custom_objects=_UNUSED, device=args.device, **kwargs)
+    with warnings.catch_warnings():
+        if settings.get("normalize"):  # as this environment does
+            warnings.filterwarnings("ignore", ".* was trained with VecNormalize")
+        model = cls.load(path, custom_objects=_UNUSED, device=args.device, **kwargs)
     return SharedPolicy(model) if shares else model
 
 
