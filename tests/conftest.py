@@ -15,7 +15,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 _OF_PETTINGZOO = "sb3_maddpg.team.pettingzoo:make"
-_REGISTRIES = (("quad_swarm.task.rules", "RULES"), ("quad_swarm.world.scenarios", "SCENARIOS"))
+_REGISTRIES = (
+    ("quad_swarm.task.rules", "RULES"),
+    ("quad_swarm.task.observation", "GROUPS"),
+    ("quad_swarm.world.scenarios", "SCENARIOS"),
+    ("quad_swarm.planner", "SOLVERS"),
+    ("quad_swarm.plants.base", "SIMULATORS"),
+)
 
 
 @pytest.fixture(autouse=True)

@@ -852,12 +852,10 @@ def cases_of(area: str, files: Files) -> list[Case]:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    before = os.environ.get("CXX")
-    yield prepare(tmp_path_factory.mktemp("malformed"))
-    if before is None:
-        del os.environ["CXX"]
-    else:
-        os.environ["CXX"] = before
+    with pytest.MonkeyPatch.context() as patch:  # puts back what `prepare` sets
+        patch.setenv("CXX", "")
+        patch.setitem(SOLVERS, "stay", Stay)
+        yield prepare(tmp_path_factory.mktemp("malformed"))
 
 
 @pytest.mark.slow

@@ -147,8 +147,9 @@ def other_code(names: Sequence[str]) -> ValueError:
     :param names: what differs, see `differences`
     """
     return ValueError(
-        f"A piece was computed with another content of {', '.join(names)} than this command began with: leave code and "
-        "models alone while it runs; on a cluster, give all machines the same ones and restart Ray after changes."
+        f"A piece was computed with another content of {', '.join(names)} than this command began with, or without: "
+        "leave code and models alone while it runs; on a cluster, give all machines the same ones, where Python finds "
+        "them, and restart Ray after changes."
     )
 
 
