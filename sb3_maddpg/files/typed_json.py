@@ -16,17 +16,13 @@ from stable_baselines3.common import buffers, utils
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
+from sb3_maddpg.files.archive import DEEPEST, LARGEST_ARRAY, MOST_AGENTS, MOST_REPEATED
 from sb3_maddpg.files.registry import class_in_files, name_in_files
 from sb3_maddpg.utils import shown, suggest
 
 Json = Any
 _TYPE = "$"
-_DEEPEST = 50
 _SMALL = 64  # arrays with more numbers may be stored outside the JSON
-_LARGEST_ARRAY = 10**7  # maximum number of values in an array, e.g. the bounds of a space
-_MOST_REPEATED = 2 * _LARGEST_ARRAY  # maximum number of values in all arrays of which only one value is written
-
-_MOST_AGENTS = 4096  # maximum number of agents of a team, or of parts of a space
 
 _Item = TypeVar("_Item")
 
@@ -90,7 +86,7 @@ def check_size(value: Json, name: str) -> None:
             parts.extend(part.values())
         elif isinstance(part, list):
             parts.extend(part)
-    if repeated > _MOST_REPEATED:
+    if repeated > MOST_REPEATED:
         raise InvalidFileError(f"{name} is damaged: it has arrays of {repeated} repeated numbers.")
 
 
@@ -118,9 +114,9 @@ def _read_array(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> np.nd
     dtype, shape = np.dtype(f"<{entry['dtype']}"), entry["shape"]
     if dtype.kind not in "biuf":
         raise InvalidFileError(f"it has an array of {shown(entry['dtype'])}")
-    if not all(isinstance(length, int) and length >= 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
+    if not all(isinstance(length, int) and length >= 0 for length in shape) or math.prod(shape) > LARGEST_ARRAY:
         raise InvalidFileError(
-            f"it has an array of shape {shown(shape)}, which is invalid or has more than {_LARGEST_ARRAY} numbers"
+            f"it has an array of shape {shown(shape)}, which is invalid or has more than {LARGEST_ARRAY} numbers"
         )
     values = np.frombuffer(base64.b64decode(entry["base64"], validate=True), dtype)
     if entry.get("repeated", False):
@@ -156,8 +152,8 @@ def few(agents: Sequence[_Item]) -> Sequence[_Item]:
     :return: the same
     :raises ValueError: if there are more than any team has
     """
-    if len(agents) > _MOST_AGENTS:
-        raise InvalidFileError(f"it has {len(agents)} agents or parts of a space, more than {_MOST_AGENTS}")
+    if len(agents) > MOST_AGENTS:
+        raise InvalidFileError(f"it has {len(agents)} agents or parts of a space, more than {MOST_AGENTS}")
     return agents
 
 
@@ -239,7 +235,7 @@ def add_codec(
 
 
 def _sizes(n: Any) -> Any:
-    if math.prod(n if isinstance(n, list) else [n]) > _LARGEST_ARRAY:
+    if math.prod(n if isinstance(n, list) else [n]) > LARGEST_ARRAY:
         raise InvalidFileError(f"it has a space of {shown(n)} bits")
     return n
 
@@ -271,8 +267,8 @@ def _encode(value: Any, name: str, depth: int, arrays: dict[str, np.ndarray] | N
     def part(one: Any) -> Json:
         return _encode(one, name, depth + 1, arrays)
 
-    if depth > _DEEPEST:
-        raise InvalidArgumentError(f"{name} cannot be saved: it is nested more than {_DEEPEST} levels deep.")
+    if depth > DEEPEST:
+        raise InvalidArgumentError(f"{name} cannot be saved: it is nested more than {DEEPEST} levels deep.")
     if _is_json(value):
         return value
     if type(value) is list:
@@ -308,8 +304,8 @@ def _decode(value: Json, depth: int, arrays: Mapping[str, np.ndarray]) -> Any:
     def part(one: Json) -> Any:
         return _decode(one, depth + 1, arrays)
 
-    if depth > _DEEPEST:
-        raise InvalidFileError(f"it is nested more than {_DEEPEST} levels deep")
+    if depth > DEEPEST:
+        raise InvalidFileError(f"it is nested more than {DEEPEST} levels deep")
     if isinstance(value, list):
         return [part(one) for one in value]
     if not isinstance(value, dict):
