@@ -19,10 +19,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout, UnixFileLock
 
 from sb3_maddpg.errors import InvalidFileError, TeamError
+from sb3_maddpg.files.archive import opened, read_json
 from sb3_maddpg.utils import shown, sync_folder
 
 PREFIX, UNFINISHED, _MANIFEST = "checkpoint-", ".unfinished", "manifest.json"
@@ -116,7 +118,7 @@ def remove_old(folder: Path, keep: int) -> None:
     needed: set[str] = set()
     for path in folders[-keep:]:
         with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-            needed |= {one["name"] for one in json.loads((path / "state.json").read_text())["segments"]}
+            needed |= {one["name"] for one in json_in(path, "state.json")["segments"]}
     for path in (folder / SEGMENTS).glob("*.rows"):
         if path.name not in needed:
             path.unlink(missing_ok=True)
@@ -127,17 +129,17 @@ def _damage(path: Path) -> str | None:
     try:
         for name in ("model.zip", "arrays.npz"):
             file_in(path, name)
-        for name, expected in json.loads(file_in(path, _MANIFEST).read_text()).items():
+        for name, expected in json_in(path, _MANIFEST).items():
             if sha256(file_in(path, name)) != expected:
                 return f"{name} is damaged"
-        segments = json.loads(file_in(path, "state.json").read_text())["segments"]
+        segments = json_in(path, "state.json")["segments"]
         if len({one["name"] for one in segments}) < len(segments):
             return "it names a segment twice"
         for one in segments:
             if sha256(file_in(path.parent / SEGMENTS, one["name"])) != one["sha256"]:
                 return f"segment {one['name']} is damaged"
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        return f"{type(error).__name__}: {error}"
+        return f"{type(error).__name__}: {error}".rstrip(".")
     return None
 
 
@@ -147,6 +149,12 @@ def file_in(folder: Path, name: str) -> Path:
     if path.name != name or not path.is_file():
         raise InvalidFileError(f"there is no file {shown(name)} in {folder}")
     return path
+
+
+def json_in(folder: Path, name: str) -> dict[str, Any]:
+    """:return: the values in a file of JSON in a folder, see ``file_in``"""
+    with opened(path := file_in(folder, name), "checkpoint") as file:
+        return read_json(file, str(path))
 
 
 def sha256(path: Path) -> str:

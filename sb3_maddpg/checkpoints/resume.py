@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import os
-import zipfile
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_maddpg.checkpoints.callback import RunCheckpoint
-from sb3_maddpg.checkpoints.commit import newest
+from sb3_maddpg.checkpoints.commit import json_in, newest
 from sb3_maddpg.checkpoints.fingerprints import compare_fingerprints, fingerprint
 from sb3_maddpg.checkpoints.state import FORMAT, check_random_state, check_values
 from sb3_maddpg.checkpoints.writer import columns, read_segments
 from sb3_maddpg.common.buffers import TeamReplayBuffer
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidEnvironmentError, InvalidFileError
-from sb3_maddpg.files.model_files import as_damage, check_not_compressed
+from sb3_maddpg.files.archive import Archive, as_damage, opened
 from sb3_maddpg.files.typed_json import decode
 from sb3_maddpg.maddpg.maddpg import MADDPG
 from sb3_maddpg.utils import shown
@@ -52,8 +48,11 @@ def resume(
     if path is None:
         return None
     with as_damage(path, "checkpoint"):
-        arrays, state = _read_state(path)
-        plain = decode(state, f"{path}: state", arrays)
+        state = json_in(path, "state.json")
+        if state.get("format") != FORMAT:
+            raise InvalidFileError(f"{path} has format {shown(state.get('format'))}, but this version reads {FORMAT}.")
+        with opened(path / "arrays.npz", "checkpoint") as file:
+            plain = decode(state, f"{path}: state", Archive(file, path / "arrays.npz").arrays())
         check_values(plain)
         model = algorithm.load(path / "model.zip", env=env, device=device, force_reset=False)
         compare_fingerprints(plain["fingerprint"], fingerprint(model.env))
@@ -76,13 +75,3 @@ def resume(
         callback._pending = plain
         callback.saved_at = model.num_timesteps
     return model, callback
-
-
-def _read_state(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    state = json.loads((path / "state.json").read_text())
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
-        raise InvalidFileError(f"{path} has format {shown(state.get('format'))}, but this version reads {FORMAT}.")
-    with zipfile.ZipFile(path / "arrays.npz") as members:
-        check_not_compressed(path / "arrays.npz", members)
-    with np.load(path / "arrays.npz", allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}, state

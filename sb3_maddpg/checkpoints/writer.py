@@ -9,7 +9,6 @@ import math
 import os
 import threading
 import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -20,6 +19,7 @@ from sb3_maddpg.checkpoints.commit import PREFIX, SEGMENTS, commit, file_in, rem
 from sb3_maddpg.common.buffers import TeamReplayBuffer
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidFileError
+from sb3_maddpg.files.archive import write_archive
 from sb3_maddpg.files.typed_json import encode
 from sb3_maddpg.utils import shown, sync_folder
 
@@ -82,11 +82,12 @@ class Writer(threading.Thread):
         self.error: BaseException | None = None
         self._copied = segment.first  # rows before this one may be overwritten
         self._progress = threading.Condition()
-        file = io.BytesIO()
-        model.save(file)
+        model_file, arrays_file = io.BytesIO(), io.BytesIO()
+        model.save(model_file)
         arrays: dict[str, np.ndarray] = {}
         self._state = cast("dict[str, Any]", encode(state, "state", arrays))
-        self._files = {"model.zip": file.getvalue(), "arrays.npz": _npz(arrays)}
+        write_archive(arrays_file, {}, arrays)
+        self._files = {"model.zip": model_file.getvalue(), "arrays.npz": arrays_file.getvalue()}
 
     def has_copied(self, row: int) -> bool:
         """:return: whether a row may be overwritten"""
@@ -245,12 +246,3 @@ def _check_segments(segments: list[dict[str, Any]], counters: dict[str, Any], si
         end = one["end"]
     if end != n_added:
         raise InvalidFileError(f"A checkpoint is damaged: its segments end at row {end}, but it has {n_added} rows.")
-
-
-def _npz(arrays: dict[str, np.ndarray]) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
-    return file.getvalue()

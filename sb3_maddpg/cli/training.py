@@ -46,7 +46,7 @@ from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.common.callbacks import DashboardCallback, check_drawn, check_layout
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidArgumentError
-from sb3_maddpg.files.model_files import refuse_pickled, refuse_pickled_file, trusted
+from sb3_maddpg.files.model_files import not_ours, refuse_pickled, trusted
 from sb3_maddpg.maddpg.maddpg import MADDPG
 from sb3_maddpg.offers import broken, load_offer, offer_named, package_of
 from sb3_maddpg.team.team import Team
@@ -268,7 +268,7 @@ class Training:
         buffer = Path(path).parent / "replay_buffer.pkl"
         if buffer.exists() and isinstance(model, OffPolicyAlgorithm):
             if not trusts and not isinstance(model, TeamAlgorithm):
-                refuse_pickled_file(buffer)
+                raise not_ours(buffer, "a replay buffer")
             # The second argument is for HerReplayBuffer only
             model.load_replay_buffer(buffer, truncate_last_traj=self.args.truncate_last_trajectory)
         print(f"Continuing at step {model.num_timesteps}")

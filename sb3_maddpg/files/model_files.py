@@ -303,15 +303,15 @@ def refuse_pickled(path: str | pathlib.Path | io.BufferedIOBase, given: Mapping[
         )
 
 
-def refuse_pickled_file(path: Any) -> None:
+def not_ours(path: Any, what: str) -> UntrustedFileError:
     """
-    Refuse a pickle.
-
-    :param path: path of the file
-    :raises ValueError: always
+    :param path: path of a file that was not written by this version
+    :param what: what it should hold
+    :return: the error that it may be a pickle
     """
-    raise UntrustedFileError(
-        f"{path} is a pickle, which may run any code when it is loaded: if you trust its author, pass --trust."
+    return UntrustedFileError(
+        f"{path} does not hold {what} that this version writes. If it is pickled, it may run any code when it is "
+        "loaded: if you trust its author, load it with `trust=True` (on the command line `--trust`)."
     )
 
 

@@ -15,8 +15,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
-from sb3_maddpg.errors import InvalidEnvironmentError, InvalidFileError, UntrustedFileError
-from sb3_maddpg.files.model_files import as_damage, trusted
+from sb3_maddpg.errors import InvalidEnvironmentError, InvalidFileError
+from sb3_maddpg.files.archive import opened, read_json
+from sb3_maddpg.files.model_files import not_ours, trusted
 from sb3_maddpg.files.typed_json import decode, encode
 from sb3_maddpg.utils import atomic_write, shown
 from sb3_maddpg.validation import NormalizationArguments, validated_as
@@ -24,7 +25,6 @@ from sb3_maddpg.vec_env.arrivals import check_returned
 
 _FORMAT = "VecNormalize 1"
 _SETTINGS = tuple(NormalizationArguments.model_fields)
-_MOST_BYTES = 2**28
 
 
 class TeamVecNormalize(VecNormalize):
@@ -261,18 +261,12 @@ class SafeVecNormalize(TeamVecNormalize):
         path = Path(load_path)
         if not path.suffix and not path.exists():
             path = path.with_suffix(".pkl")  # which `save` has added
-        with path.open("rb") as file:
-            start = file.read(1)
-        with as_damage(path, "statistics"):
-            if start != b"{":
+        with opened(path, "statistics") as file:
+            if file.read(1) != b"{":
                 if trusted(trust):
                     return VecNormalize.load(str(path), venv)
-                raise UntrustedFileError(
-                    f"{path} does not hold statistics that this version writes. If it is pickled, it may run any code "
-                    "when it is loaded: if you trust its author, load it with `trust=True` (on the command line "
-                    "`--trust`)."
-                )
-            data = _read(path)
+                raise not_ours(path, "statistics")
+            data = _read(file, path)
             settings = decode(data["settings"], f"{path}: settings")
             given = validated_as(NormalizationArguments, settings, lambda name: f"{path}: {name}")
             found = SafeVecNormalize(venv, **given)
@@ -292,8 +286,8 @@ def read_observation_statistics(path: Path, shape: tuple[int, ...]) -> Observati
     :return: the statistics of observations, None if the file holds none
     :raises ValueError: if the file holds no statistics of such observations
     """
-    with as_damage(path, "statistics"):
-        data = _read(path)
+    with opened(path, "statistics") as file:
+        data = _read(file, path)
         settings = decode(data["settings"], f"{path}: settings")
         if not settings["norm_obs"]:
             return None
@@ -308,10 +302,9 @@ def read_observation_statistics(path: Path, shape: tuple[int, ...]) -> Observati
         return ObservationStatistics.checked(values, shape, str(path))
 
 
-def _read(path: Path) -> dict[str, Any]:
-    if path.stat().st_size > _MOST_BYTES:
-        raise InvalidFileError(f"{path} is too large to hold statistics.")
-    data = json.loads(path.read_bytes())
+def _read(file: Any, path: Path) -> dict[str, Any]:
+    file.seek(0)
+    data = read_json(file, str(path))
     if data.get("format") != _FORMAT:
         raise InvalidFileError(
             f"{path} has format {data.get('format')}, but this version of sb3-maddpg reads {_FORMAT}."

@@ -15,8 +15,9 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_maddpg import MADDPG, PrioritizedTeamReplayBuffer, TeamReplayBuffer
-from sb3_maddpg.common.buffer_files import is_buffer_file, read_buffer, write_buffer
+from sb3_maddpg.common.buffer_files import read_buffer, write_buffer
 from sb3_maddpg.common.buffers import SumTree
+from sb3_maddpg.files.archive import Archive
 from sb3_maddpg.team.spaces import MixedActions
 from sb3_maddpg.team.toys import OwnBit
 
@@ -330,9 +331,8 @@ def through_pickle(memory: TeamReplayBuffer) -> tuple[TeamReplayBuffer, int]:
 def through_file(memory: TeamReplayBuffer) -> tuple[TeamReplayBuffer, int]:
     file = io.BytesIO()
     write_buffer(memory, file)
-    assert is_buffer_file(file)
     with patch("pickle.loads", side_effect=AssertionError), patch("pickle.load", side_effect=AssertionError):
-        return read_buffer(file, "cpu"), len(file.getvalue())
+        return read_buffer(Archive(file, "buffer"), "cpu"), len(file.getvalue())
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"optimize_memory_usage": True, "handle_timeout_termination": False}])

@@ -284,7 +284,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path):
         for read in (MADDPG.load, model.set_parameters):
             if "data" in members and read == model.set_parameters:
                 continue  # which does not read it
-            with pytest.raises(ValueError, match=r"spoilt\.zip is damaged") as told:
+            with pytest.raises(ValueError, match=r"spoilt\.zip(: [a-z.]+)? is damaged") as told:
                 read(spoilt(tmp_path / "model.zip", **members))
             assert "\n" not in str(told.value)
     with pytest.raises(ValueError, match="5 is neither a path nor a file"):
@@ -324,7 +324,7 @@ def test_a_truncated_replay_buffer_is_refused(tmp_path):
     content = (tmp_path / "buffer.pkl").read_bytes()
     (tmp_path / "buffer.pkl").write_bytes(content[: len(content) // 2])
     present = model.replay_buffer
-    with pytest.raises(ValueError, match=r"buffer\.pkl is not a replay buffer that this version writes"):
+    with pytest.raises(ValueError, match=r"buffer\.pkl does not hold a replay buffer that this version writes"):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is present
 
