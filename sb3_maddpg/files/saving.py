@@ -19,14 +19,13 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.errors import DivergedError, InvalidArgumentError, UnusableParametersError
+from sb3_maddpg.files.archive import Archive, check_path, opened
 from sb3_maddpg.files.model_files import (
     FILE_FORMAT,
     NetworkLimit,
-    as_damage,
     attributes,
     check_attributes,
     check_members,
-    check_path,
     keep_curves_inside,
     optimizer_not_finite,
     optimizer_problem,
@@ -103,8 +102,9 @@ class SavesSafely(BaseAlgorithm):
         """
         algorithms = (base for base in cls.__mro__ if getattr(base, "algorithm_name", None) == cls.algorithm_name)
         vec_env = None if env is None else cls._wrap_env(env)
-        with as_damage(path):
-            data = read_data(path, cls.__name__, {base.__name__ for base in algorithms})
+        with opened(path, suffix="zip") as file:
+            archive = Archive(file, path)
+            data = read_data(archive, cls.__name__, {base.__name__ for base in algorithms})
             values = attributes(data, cls, path, trust, custom_objects or {})
             for name in kwargs:
                 if name in NOT_LOADED:
@@ -118,8 +118,8 @@ class SavesSafely(BaseAlgorithm):
             if not ({"tensorboard_log"} & {*kwargs, *(custom_objects or {})} or trusted(trust)):
                 keep_curves_inside(values, path)
             cls._fit_to(vec_env, values, kwargs, path)
-            with cls._explain_spaces(), NetworkLimit(path, trust):
-                model = super().load(path, vec_env, device, values, print_system_info, force_reset, **kwargs)
+            with cls._explain_spaces(), NetworkLimit(archive, trust):
+                model = super().load(file, vec_env, device, values, print_system_info, force_reset, **kwargs)
             check_attributes(model, path)
             model._after_load(vec_env, path)
         model.file_format = FILE_FORMAT
@@ -205,10 +205,11 @@ class SavesSafely(BaseAlgorithm):
         """
         parameters, lean = cast(dict[str, Any], load_path_or_dict), self.lean
         if not isinstance(load_path_or_dict, dict):
-            check_path(load_path_or_dict)
-            with as_damage(load_path_or_dict):
-                lean = check_members(load_path_or_dict).get("lean")
-                parameters = load_from_zip_file(load_path_or_dict, device=device, load_data=False)[1]
+            with opened(load_path_or_dict, suffix="zip") as file:
+                archive = Archive(file, load_path_or_dict)
+                check_members(archive)
+                lean = archive.json("data").get("lean")
+                parameters = load_from_zip_file(file, device=device, load_data=False)[1]
         before: Any = deepcopy(self.get_parameters())
         try:
             if lean is not None and "actor.optimizer" not in parameters:

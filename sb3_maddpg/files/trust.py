@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import zipfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from sb3_maddpg.errors import InvalidFileError
+from sb3_maddpg.files.archive import Archive, opened, read_json
 from sb3_maddpg.files.model_files import pickled_values
 from sb3_maddpg.files.registry import knows
 
-_MOST = 2**24  # bytes of JSON
 _PICKLE = b"\x80"  # first byte of pickles since Python 2
 
 
@@ -28,37 +26,22 @@ def untrusted(path: str | os.PathLike[str]) -> list[str]:
     :raises InvalidFileError: if it is none of these files
     :raises OSError: if it cannot be read
     """
-    path = Path(path)
-    with path.open("rb") as file:
+    with opened(path) as file:
         first = file.read(1)
+        file.seek(0)
         if first == _PICKLE:
             return ["the whole file is a pickle"]
         if first == b"{":
-            return _classes_of(_parsed(path, file.read(_MOST + 1), first))
+            return _classes_of(read_json(file, str(path)))
         if not zipfile.is_zipfile(file):
             raise InvalidFileError(f"{path} is neither a model, a replay buffer nor statistics of VecNormalize.")
-        with zipfile.ZipFile(file) as archive:
-            found = []
-            for member in archive.infolist():
-                if member.filename == "data" or member.filename.endswith(".json"):
-                    if member.file_size > _MOST:
-                        raise InvalidFileError(
-                            f"{path} is too large: its {member.filename} has {member.file_size} bytes."
-                        )
-                    data = _parsed(path, archive.read(member))
-                    found += [f"{key} is pickled" for key in sorted(pickled_values(data))]
-                    found += _classes_of(data)
-            return found
-
-
-def _parsed(path: Path, text: bytes, first: bytes = b"") -> dict[str, Any]:
-    try:
-        data = json.loads(first + text)
-    except (ValueError, RecursionError) as error:
-        raise InvalidFileError(f"{path} is damaged: its JSON cannot be read ({type(error).__name__}).") from error
-    if not isinstance(data, dict):
-        raise InvalidFileError(f"{path} is damaged: it holds a {type(data).__name__} instead of values by name.")
-    return data
+        archive, found = Archive(file, path), []
+        for name in archive.members:
+            if name == "data" or name.endswith(".json"):
+                data = archive.json(name)
+                found += [f"{key} is pickled" for key in sorted(pickled_values(data))]
+                found += _classes_of(data)
+        return found
 
 
 def _classes_of(data: Any) -> list[str]:

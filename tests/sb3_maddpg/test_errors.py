@@ -16,7 +16,7 @@ from sb3_maddpg.errors import (
     TeamError,
     UntrustedFileError,
 )
-from sb3_maddpg.files.model_files import as_damage
+from sb3_maddpg.files.archive import as_damage
 from sb3_maddpg.team.toys import OwnBit
 
 SMALL = {"buffer_size": 100, "batch_size": 10, "learning_starts": 20, "seed": 0}

@@ -1,16 +1,23 @@
 """Archives: what comes back from them, each limit, and how often a file is opened."""
 
 import io
+import json
 import struct
+import sys
 import warnings
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_maddpg import MADDPG, SafeVecNormalize, untrusted
 from sb3_maddpg.errors import InvalidFileError
 from sb3_maddpg.files import archive
 from sb3_maddpg.files.archive import Archive, opened, read_json, write_archive
+from sb3_maddpg.files.model_files import refuse_pickled
+from sb3_maddpg.team.toys import OwnBit
 
 ARRAYS = {
     "floats": np.array([[1.5, -0.0], [np.inf, 3]], np.float32),
@@ -191,3 +198,46 @@ def test_a_path_may_lack_the_suffix(tmp_path):
     for name, suffix in (("a", None), ("a.zip.zip", "zip"), ("c", "zip")):
         with pytest.raises(FileNotFoundError), opened(tmp_path / name, suffix=suffix):
             pass
+
+
+_watched: dict[str, int] = {}
+
+
+def _watch(event, args):
+    if event == "open" and isinstance(args[0], (str, Path)) and (name := Path(args[0]).name) in _watched:
+        _watched[name] += 1
+
+
+def test_every_reader_opens_its_file_once(tmp_path):
+    env = SafeVecNormalize(DummyVecEnv([OwnBit]))
+    model = MADDPG("MlpPolicy", env, learning_starts=10, batch_size=8, buffer_size=50).learn(20)
+    model.save(tmp_path / "model.zip")
+    model.save(tmp_path / "pickled.zip", pickle=True)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    env.save(str(tmp_path / "statistics.pkl"))
+    sys.addaudithook(_watch)  # which cannot be removed
+    for name, read in {
+        "model.zip": MADDPG.load,
+        "pickled.zip": lambda path: MADDPG.load(path, trust=True),
+        "buffer.pkl": model.load_replay_buffer,
+        "statistics.pkl": lambda path: SafeVecNormalize.load(str(path), DummyVecEnv([OwnBit])),
+    }.items():
+        further = (untrusted, *((model.set_parameters, lambda path: refuse_pickled(path, {})) * (name == "model.zip")))
+        for one in (read, *further):
+            _watched[name] = 0
+            one(tmp_path / name)
+            assert _watched.pop(name) == 1, (name, one)
+
+
+def test_damaged_weights_are_called_by_their_cause(tmp_path):
+    MADDPG("MlpPolicy", OwnBit(), buffer_size=50, batch_size=8).save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as old:
+        members = {name: old.read(name) for name in old.namelist()}
+        assert json.loads(members["data"])["algorithm"] == "MADDPG"
+    raw = bytearray((tmp_path / "model.zip").read_bytes())
+    raw[raw.index(members["policy.pth"]) + len(members["policy.pth"]) // 2] ^= 255
+    (tmp_path / "model.zip").write_bytes(raw)
+    with pytest.raises(
+        InvalidFileError, match=r"model\.zip is damaged .*BadZipFile: Bad CRC-32 for file 'policy\.pth'"
+    ):
+        MADDPG.load(tmp_path / "model.zip")

@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3 import PPO, TD3
 
 from sb3_maddpg import MADDPG
+from sb3_maddpg.files.archive import Archive, opened
 from sb3_maddpg.files.model_files import FILE_FORMAT, optimizer_not_finite, read_data
 from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.team.toys import OwnBit
@@ -32,7 +33,7 @@ def assert_equal_state(a: dict, b: dict) -> None:
 def test_what_is_no_archive_is_refused(tmp_path):
     path = tmp_path / "model.zip"
     path.write_bytes(b"no archive")
-    with pytest.raises(ValueError, match="models are zip files"):
+    with pytest.raises(ValueError, match=r"model\.zip is damaged or holds something else: it is no zip file"):
         MADDPG.load(path)
 
 
@@ -46,7 +47,9 @@ def test_a_missing_file_is_named_as_it_was_given(tmp_path):
 def test_a_stream_can_be_read_after_the_check(tmp_path):
     learned().save(tmp_path / "model.zip")
     stream = io.BytesIO((tmp_path / "model.zip").read_bytes())
-    read_data(stream, "MADDPG", {"MADDPG"})
+    stream.seek(7)
+    with opened(stream) as file:
+        assert read_data(Archive(file, "model"), "MADDPG", {"MADDPG"})["algorithm"] == "MADDPG"
     assert stream.tell() == 0
     with zipfile.ZipFile(stream) as archive:
         assert json.loads(archive.read("data"))["file_format"] == FILE_FORMAT
