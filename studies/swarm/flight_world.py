@@ -113,7 +113,7 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="parts to fly (default: all)")
     parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--json", type=absolute_path, default=DATA / "flight_world.json", metavar="FILE")
+    parser.add_argument("--json", type=absolute_path, default=DATA / "flight_world.json.gz", metavar="FILE")
     args = parser.parse_args()
     with workers(args) as pool:
         for part in args.parts or PARTS:

@@ -41,7 +41,7 @@ QUICK = 10
 PAPERS = "faithful_flight"
 
 
-FLOWN = {12: "flight.json", 16: "flight_sixteen_sealed.json"}  # by the number of robots of the largest team
+FLOWN = {12: "flight.json.gz", 16: "flight_sixteen_sealed.json.gz"}  # by the number of robots of the largest team
 
 
 class Job(NamedTuple):

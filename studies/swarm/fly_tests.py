@@ -429,15 +429,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--quick", action="store_true", help=f"fly only {QUICK} episodes per condition")
     add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument(
-        "--out", type=absolute_path, default=DATA, help="folder of the JSON files (default %(default)s)"
-    )
+    parser.add_argument("--out", type=absolute_path, default=DATA, help="folder of the rows (default %(default)s)")
     args = parser.parse_args(argv)
     os.chdir(ROOT)
     with workers(args) as pool:
         for part in args.parts or PARTS:
             make_jobs, run = PARTS[part]
-            path = args.out / f"{part}.json"
+            path = args.out / f"{part}.json.gz"
             jobs = [
                 job
                 for job in make_jobs(QUICK if args.quick else EPISODES[part])

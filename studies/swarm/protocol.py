@@ -1,6 +1,7 @@
 """Common parts of the study: sets of episodes, worlds, the criterion of safety, and tables of rows.
 
-Rows are JSON objects, one per line, in ``studies/swarm/data``. CONTRIBUTING.md explains how test sets are sealed.
+Rows are JSON objects, one per line, compressed in ``studies/swarm/data``: ``pandas.read_json`` reads them.
+CONTRIBUTING.md explains how test sets are sealed.
 """
 
 from __future__ import annotations
@@ -168,7 +169,7 @@ def best_rules(preset: str, n_robots: int | None = None) -> dict[str, str]:
     """Return for each scenario the rule with the fewest requests that was as safe as full communication on the
     validation set, in a preset or with another number of robots."""
     best: dict[str, dict[str, Any]] = {}
-    for row in known_rows(DATA / ("rules.json" if n_robots is None else "team_rules.json")):
+    for row in known_rows(DATA / ("rules.json.gz" if n_robots is None else "team_rules.json.gz")):
         if row["preset"] == preset and row.get("n_robots") == n_robots and row["safe"]:
             known = best.setdefault(row["scenario"], row)
             if row["request_share"] < known["request_share"]:
@@ -182,7 +183,7 @@ def tuned(recipe: str, scenario: str, n_robots: int | None = None) -> list[str]:
     for_all: dict[str, float] = {}
     for_this: dict[str, float] = {}
     paths = models(recipe)
-    for row in known_rows(DATA / "thresholds.json"):  # tried from the highest on
+    for row in known_rows(DATA / "thresholds.json.gz"):  # tried from the highest on
         if (path := row["model"]) in paths:
             for_all[path] = min(row["threshold"], for_all.get(path, 1.0))
             if row["scenario"] == scenario and n_robots in (None, row["n_robots"]):

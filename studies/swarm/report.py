@@ -572,9 +572,7 @@ def fill(page: str, blocks: dict[str, str]) -> str:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--data", type=absolute_path, default=DATA, help="folder of the JSON files (default %(default)s)"
-    )
+    parser.add_argument("--data", type=absolute_path, default=DATA, help="folder of the rows (default %(default)s)")
     parser.add_argument("--pages", type=absolute_path, default=ROOT, help="folder of the pages (default %(default)s)")
     parser.add_argument(
         "--images", type=absolute_path, default=IMAGES, help="folder of the figures (default %(default)s)"
@@ -583,7 +581,7 @@ def main() -> None:
     os.chdir(ROOT)
     names = "rules test sweep robustness unseen teams asking interventions ppo counterfactual training counts quadrants"
     rows = {
-        name: read_rows(args.data / f"{name}.json")
+        name: read_rows(args.data / f"{name}.json.gz")
         for name in [*names.split(), "checkpoints", "flight", "flight_tuning", "flight_sixteen_sealed", "flight_world"]
     }
     rules, test, sweep, robustness, asking = (rows[k] for k in ("rules", "test", "sweep", "robustness", "asking"))

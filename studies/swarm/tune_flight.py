@@ -100,7 +100,7 @@ AIMS = {
     ),
     16: Aim({16: 4000, 12: 4000, 8: 4000, 4: 4000}, 0.002, (0.02, *(round(0.05 * k, 2) for k in range(1, 17))), 0.45),
 }
-FILES = {12: "flight_tuning.json", 16: "flight_sixteen.json"}
+FILES = {12: "flight_tuning.json.gz", 16: "flight_sixteen.json.gz"}
 UP_TO = 12  # robots of the largest team by default
 PRICED_ON = 100  # episodes of each swap in which the requests of a threshold are measured
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 # Registered before the first page, so that they stay so after it
 import quad_swarm
 import sb3_maddpg.team.toys  # noqa: F401
+from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.task.rules import RULES
 from sb3_maddpg import MADDPG, MATD3, MADDPGPolicy, PairPolicy
 from sb3_maddpg.common.estimators import ESTIMATORS
@@ -183,7 +184,7 @@ def test_every_estimator_is_described():
 
 def test_a_duration_is_the_same_on_every_page():
     """Those of `python -m studies.swarm.training_time` and `python benchmarks/checkpoints.py --whole`."""
-    runs = json.loads(text_of("studies/swarm/data/training.json"))
+    runs = read_rows(ROOT / "studies/swarm/data/training.json.gz")
     (paper,) = (run["seconds"] / 60 for run in runs if run["recipe"] == "zoo_configs/quad_swarm_paper.yml")
     whole = json.loads(text_of("benchmarks/results/checkpoints.json"))
     (flight,) = (run["seconds"] / 60 for run in whole if run["whole"])

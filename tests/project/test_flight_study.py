@@ -288,12 +288,12 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
         for setting, safe, share in (("plan:0.8", True, 0.03), ("cpa:0.8:1", True, 0.02), ("plan:0.7", False, 0.01))
         for name in NAMES
     ]
-    write_rows(tmp_path / "flight_tuning.json", rules)
+    write_rows(tmp_path / "flight_tuning.json.gz", rules)
     assert fly_flight.best_rule() == "cpa:0.8:1"
     assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
-    with pytest.raises(ValueError, match=r"flight_sixteen\.json holds no safe rule"):
+    with pytest.raises(ValueError, match=r"flight_sixteen\.json\.gz holds no safe rule"):
         fly_flight.jobs([16], quick=False, up_to=16)
-    write_rows(tmp_path / "flight_sixteen.json", rules[: len(NAMES)])
+    write_rows(tmp_path / "flight_sixteen.json.gz", rules[: len(NAMES)])
     work = fly_flight.jobs([16], quick=False, up_to=16)
     assert {(job.set, job.episodes) for job in work} == {(FLIGHT_TESTS[16], 4000)}
     assert {"full", "plan:0.8"} <= {job.policy for job in work}

@@ -1,7 +1,6 @@
 """The scripts behind docs/results.md, with few episodes."""
 
 import itertools
-import json
 import shutil
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from PIL import Image
 
 from quad_swarm.evaluation.evaluation import fly_all
 from quad_swarm.evaluation.inference import Comparison
-from quad_swarm.evaluation.rows import read_rows
+from quad_swarm.evaluation.rows import read_rows, write_rows
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
@@ -63,7 +62,7 @@ def test_teams_of_another_size_need_fewer_episodes_and_fly_full_communication_on
 
 @pytest.mark.slow
 def test_rules_are_tuned_for_each_size_of_the_team(tmp_path, monkeypatch):
-    table = tmp_path / "team_rules.json"
+    table = tmp_path / "team_rules.json.gz"
     words = ["tune_rules.py", "--preset", "dense", "--scenario", "random", "--family", "random", "--quick"]
     monkeypatch.setattr(sys, "argv", [*words, "--n-robots", "3", "4", "--jobs", "1", "--json", str(table)])
     tune_rules.main()
@@ -83,7 +82,7 @@ def test_thresholds_of_a_model_for_all_sizes_are_those_of_the_size_that_flies(tm
     rows = [
         dict(zip(("n_robots", "scenario", "threshold"), c, strict=True)) | {"model": "any_seed0.zip"} for c in cells
     ]
-    (tmp_path / "thresholds.json").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    write_rows(tmp_path / "thresholds.json.gz", rows)
     assert protocol.tuned("any", "random", 4) == ["any_seed0.zip@0.8"], "the last that was tried"
     assert protocol.tuned("any", "random", 8) == ["any_seed0.zip@0.7"]
     assert protocol.tuned("any", "symmetric_swap", 8) == ["any_seed0.zip@0.5"]
@@ -102,8 +101,8 @@ def test_tables_of_flown_episodes(tmp_path):
         == none["collisions"] - full["collisions"] + none["against_full"]["only_rival"]
     )
     assert none["requests"] == 0 < rule["requests"] < full["requests"] == full["possible_requests"]
-    (tmp_path / "test.json").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    text = page.main_table(read_rows(tmp_path / "test.json"), "paper")
+    write_rows(tmp_path / "test.json.gz", rows)
+    text = page.main_table(read_rows(tmp_path / "test.json.gz"), "paper")
     assert f"| symmetric swap | `none` | {none['collisions']}/30 [" in text
 
 
@@ -193,7 +192,7 @@ def test_rows_of_an_earlier_rule_do_not_stay(tmp_path, monkeypatch):
         monkeypatch.setattr(fly_tests, "best_rules", lambda preset, n_robots=None, rules=rules: rules)
         command = "asking --quick --preset paper --scenario random --jobs 1 --out"
         fly_tests.main([*command.split(), str(tmp_path)])
-    policies = {row["policy"] for row in read_rows(tmp_path / "asking.json")}
+    policies = {row["policy"] for row in read_rows(tmp_path / "asking.json.gz")}
     assert policies == {"full", protocol.models("paper")[0]}
 
 
@@ -215,11 +214,11 @@ def test_interventions_change_the_steps_that_they_should():
 
 @pytest.mark.slow
 def test_thresholds_are_kept_by_scenario_and_written_into_the_model_only_when_asked(tmp_path, monkeypatch):
-    path, table = tmp_path / "model.zip", tmp_path / "thresholds.json"
+    path, table = tmp_path / "model.zip", tmp_path / "thresholds.json.gz"
     path.write_bytes((pretrained_folder("quad-swarm-paper") / "model.zip").read_bytes())
     other_cell = {"model": str(path), "scenario": "symmetric_swap", "n_robots": 4, "threshold": 0.3, "safe": True}
     stale = {"model": str(path), "scenario": "random", "n_robots": 4, "threshold": 0.1, "safe": True}
-    table.write_text("".join(json.dumps(row) + "\n" for row in (other_cell, stale)))
+    write_rows(table, [other_cell, stale])
     words = ["tune_thresholds.py", str(path), "--scenario", "random", "--quick", "--jobs", "1", "--json", str(table)]
     monkeypatch.setattr(sys, "argv", words)
     before = path.read_bytes()

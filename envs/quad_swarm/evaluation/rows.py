@@ -1,6 +1,6 @@
-"""Files of rows: a JSON list with an object per line, or comma-separated values.
+"""Files of rows: a JSON list with an object per line, or comma-separated values, both compressed if a name ends in .gz.
 
-The path ``-`` stands for the standard output.
+The path ``-`` stands for the standard output. ``pandas.read_json`` and ``pandas.read_csv`` read these files as well.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import glob
+import gzip
 import io
 import json
 import os
@@ -25,7 +26,8 @@ _LEFT_OVER = 3600  # seconds, after which a temporary file belongs to a process 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """Read the rows of a file, none if it does not exist. Files of earlier versions, JSON Lines, are read as well."""
-    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    data = path.read_bytes() if path.is_file() else b""
+    text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8")
     return json.loads(text) if text.startswith("[") else [json.loads(line) for line in text.splitlines()]
 
 
@@ -45,7 +47,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text to a file, atomically. Missing folders are created.
+    """Write text to a file, atomically, with gzip if its name ends in ``.gz``. Missing folders are created.
 
     Threads, processes and containers may write the same file at the same time; one of their files remains, whole. A
     pipe or device, such as /dev/stdout, is written to and stays.
@@ -57,6 +59,7 @@ def write_text(path: Path, text: str) -> None:
         with path.open("w", encoding="utf-8", newline="") as file:
             file.write(text)
         return
+    data = _compressed(text.encode("utf-8")) if path.suffix == ".gz" else text.encode("utf-8")
     path.parent.mkdir(parents=True, exist_ok=True)
     prefix = f".{path.name[:50]}."  # file systems limit names to 255 bytes
     for left in path.parent.glob(f"{glob.escape(prefix)}*.part"):
@@ -65,13 +68,21 @@ def write_text(path: Path, text: str) -> None:
                 left.unlink()
     temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}.part")
     try:
-        with temporary.open("x", encoding="utf-8", newline="") as file:
-            file.write(text)
+        with temporary.open("xb") as file:
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _compressed(data: bytes) -> bytes:
+    """Compress without name and time, so that the same rows are the same bytes."""
+    packed = io.BytesIO()
+    with gzip.GzipFile("", "wb", 9, packed, mtime=0) as file:
+        file.write(data)
+    return packed.getvalue()
 
 
 def _is_stream(path: Path) -> bool:

@@ -23,6 +23,21 @@ def test_rows_come_back(tmp_path):
     assert read_rows(path) == json.loads(path.read_text()) == []
 
 
+def test_compressed_rows_come_back_and_are_the_same_bytes_every_time(tmp_path, monkeypatch):
+    pandas = pytest.importorskip("pandas")
+    rows = [{"a": 1, "b": None, "c": "é"}, {"a": 2, "b": 0.1, "c": "d"}] * 50
+    first, second = tmp_path / "table.json.gz", tmp_path / "other.json.gz"
+    write_rows(first, rows)
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    write_rows(second, rows)
+    assert read_rows(first) == rows
+    assert first.read_bytes() == second.read_bytes()
+    assert first.stat().st_size < len(json.dumps(rows)) / 10
+    assert pandas.read_json(first).equals(pandas.DataFrame(rows))
+    write_csv(tmp_path / "table.csv.gz", rows)
+    assert pandas.read_csv(tmp_path / "table.csv.gz").equals(pandas.DataFrame(rows))
+
+
 def test_files_of_earlier_versions_are_read(tmp_path):
     path = tmp_path / "table.json"
     path.write_text('{"a": 1}\n{"a": [2]}\n')
