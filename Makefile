@@ -59,29 +59,26 @@ bench: install  ## speed of planner, environment and learner, and the estimators
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done
 
 STUDY := $(BIN)/python -m studies.swarm
-results: install  ## fly everything that docs/results.md says again: tuned rules and thresholds, test set, tables and figures (hours)
+QUICK_PARTS := test teams counts quadrants sweep robustness unseen asking interventions world delays
+results: install  ## fly everything that docs/results.md says again: tuned rules and thresholds, test sets, tables and figures (hours)
 	$(STUDY).tune_rules --jobs $(JOBS) --json studies/swarm/data/rules.json.gz
 	$(STUDY).tune_rules --preset dense --n-robots $(TEAMS) --family $(TEAM_FAMILIES) --jobs $(JOBS) \
 		--json studies/swarm/data/team_rules.json.gz
 	$(STUDY).tune_thresholds --jobs $(JOBS) --json studies/swarm/data/thresholds.json.gz --write
 	$(STUDY).tune_thresholds studies/swarm/data/any_seed*.zip --n-robots $(TEAMS) --jobs $(JOBS) \
 		--json studies/swarm/data/thresholds.json.gz --write
-	$(STUDY).fly_tests --jobs $(JOBS)
 	$(STUDY).tune_flight rules --jobs $(JOBS)
 	$(STUDY).tune_flight thresholds studies/swarm/data/flight_seed*.zip --jobs $(JOBS)
-	$(STUDY).fly_flight --jobs $(JOBS)
 	$(STUDY).tune_flight rules --up-to 16 --jobs $(JOBS)
 	$(STUDY).tune_flight thresholds studies/swarm/data/flight_seed*.zip --up-to 16 --jobs $(JOBS)
-	$(STUDY).fly_flight --up-to 16 --jobs $(JOBS)
-	$(STUDY).flight_world --jobs $(JOBS)
+	$(STUDY).fly --jobs $(JOBS)
 	$(STUDY).ppo --models $(LOGS) --json studies/swarm/data/ppo.json.gz
 	$(STUDY).counterfactual --models $(LOGS) --json studies/swarm/data/counterfactual.json.gz
 	$(STUDY).report
 
 results-quick: install  ## the same with few episodes and rules, into $(LOGS)/results
 	$(STUDY).tune_rules --quick --jobs $(JOBS) --json $(LOGS)/results/rules.json.gz
-	$(STUDY).fly_tests --quick --jobs $(JOBS) --out $(LOGS)/results
-	$(STUDY).flight_world world delays --quick --jobs $(JOBS) --json $(LOGS)/results/flight_world.json.gz
+	$(STUDY).fly $(QUICK_PARTS) --quick --jobs $(JOBS) --out $(LOGS)/results
 	$(STUDY).ppo --steps 4096 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/ppo.json.gz
 	$(STUDY).counterfactual --forks 10 --episodes 20 --models $(LOGS)/results --json $(LOGS)/results/counterfactual.json.gz
 	$(STUDY).report --data $(LOGS)/results --pages $(LOGS)/results --images $(LOGS)/results

@@ -23,7 +23,7 @@ import quad_swarm  # noqa: F401 - registers the environment
 from quad_swarm.evaluation.flight import first_episode, run_episodes
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import make_config
-from studies.swarm.protocol import condition
+from studies.swarm.experiment import condition
 
 BATCH = 500
 GROWTH = 32.0  # maximum growth of the process (MB): allocator noise, less than half a kilobyte per episode

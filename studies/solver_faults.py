@@ -8,22 +8,20 @@ be finite. JSON: one row for each share and kind, with the keys of `summarise`.
 
 from __future__ import annotations
 
-import argparse
-import os
+import itertools
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.command import workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.flight import begin, first_episode, fly_steps
-from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.planner import Problems, Solution, Solver
 from quad_swarm.world.presets import make_config
-from studies.swarm.protocol import VALIDATION, condition, progress
+from studies.swarm.experiment import Experiment, Row, absolute_path, command_line, condition
+from studies.swarm.protocol import VALIDATION
 
 KINDS = ("reports failure", "NaN and failure", "NaN and success", "raises", "takes too long")
 SHARES = (0.1, 0.5)
@@ -85,34 +83,27 @@ def fly(scenario: str, share: float, kind: str, episodes: Sequence[int]) -> Rows
     return rows
 
 
-def row(scenario: str, share: float, kind: str, episodes: int) -> dict[str, Any]:
-    """Return the row of a condition."""
+def rows_of(scenario: str, share: float, kind: str, episodes: int) -> list[Row]:
+    """Fly a condition and return its row."""
     first = first_episode(VALIDATION)
-    flown = fly(scenario, share, kind, range(first, first + episodes))
-    return {"scenario": scenario, "share": share, "kind": kind, **summarise(flown, make_config("flight"))}
+    row = summarise(fly(scenario, share, kind, range(first, first + episodes)), make_config("flight"))
+    failed, collisions = row["planner_failures"], f"{row['collisions']:4}/{row['episodes']}"
+    print(
+        f"{scenario:16} {share:4.0%} {kind:16} collisions {collisions}, plans without a solution {failed}", flush=True
+    )
+    return [{"scenario": scenario, "share": share, "kind": kind, **row}]
 
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--episodes", type=int, default=1000)
-    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--json", type=absolute_path, metavar="FILE")
     args = parser.parse_args()
-    work = [(name, 0.0, "none") for name in SCENARIOS]
-    work += [(name, share, kind) for share in SHARES for kind in KINDS for name in SCENARIOS]
-    rows = []
+    work = [(name, 0.0, "none", args.episodes) for name in SCENARIOS]
+    work += [(name, *fault, args.episodes) for *fault, name in itertools.product(SHARES, KINDS, SCENARIOS)]
     with workers(args) as pool:
-        done = pool.map(row, *zip(*work, strict=True), [args.episodes] * len(work))
-        for one in progress(done, "faults", len(work)):
-            rows.append(one)
-            print(
-                f"{one['scenario']:16} {one['share']:4.0%} {one['kind']:16} collisions {one['collisions']:4}/"
-                f"{one['episodes']}, plans without a solution {one['planner_failures']}",
-                flush=True,
-            )
-    if args.json:
-        write_rows(args.json, rows)
+        Experiment(args.json, "scenario", "share", "kind").run(pool, "faults", rows_of, work)
 
 
 if __name__ == "__main__":

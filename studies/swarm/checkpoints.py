@@ -9,51 +9,39 @@ keys of `summarise`, and run, choice, model.
 
 from __future__ import annotations
 
-import argparse
-import os
 import re
+from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import torch as th
 
-from quad_swarm.evaluation.command import add_worker_arguments, workers
-from quad_swarm.evaluation.evaluation import summarise
-from quad_swarm.evaluation.rows import write_rows
+from quad_swarm.evaluation.command import workers
 from quad_swarm.world.presets import make_config
 from sb3_maddpg import MADDPG
-from studies.swarm.protocol import EARLIER, NAMES, VALIDATION, condition, fly_kept, progress
+from studies.swarm.experiment import Experiment, Job, Row, absolute_path, command_line, progress, summaries
+from studies.swarm.protocol import EARLIER, NAMES, VALIDATION
 
 # Number of checkpoints whose actors are averaged
 LAST = 5
 
 
-class Flown(NamedTuple):
-    """Results of a model in all scenarios.
+def fly(pool: Executor, paths: list[str], episodes: int, seed: int, what: str) -> dict[str, list[Row]]:
+    """Fly episodes of all scenarios with several models.
 
-    :param path: path of the model
-    :param rows: scenario -> result, see `summarise`
-    """
-
-    path: str
-    rows: dict[str, dict[str, Any]]
-
-    @property
-    def collisions(self) -> int:
-        """Number of collisions in all scenarios."""
-        return sum(row["collisions"] for row in self.rows.values())
-
-
-def fly(path: str, episodes: int, seed: int) -> Flown:
-    """Fly episodes of all scenarios.
-
-    :param path: path of the model
+    :param pool: executor of the flights
+    :param paths: paths of the models
     :param episodes: number of episodes per scenario
     :param seed: index of the set of held-out episodes
+    :param what: name of the progress bar
+    :return: path -> its rows
     """
-    config = make_config("paper")
-    flown = fly_kept([condition(path, name, config) for name in NAMES], episodes, seed)
-    return Flown(path, {one.scenario: summarise(rows, config) for one, rows in flown.items()})
+    jobs = [
+        Job({}, [path], name, make_config("paper"), episodes, seed) for path in dict.fromkeys(paths) for name in NAMES
+    ]
+    table: dict[str, list[Row]] = {}
+    for (row,) in progress(pool.map(summaries, jobs), what, len(jobs)):
+        table.setdefault(row["policy"], []).append(row)
+    return table
 
 
 def checkpoints(run: Path) -> list[Path]:
@@ -74,7 +62,7 @@ def average(paths: list[Path], target: Path) -> str:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     parser.add_argument(
         "--choosing", type=int, default=250, help="episodes per scenario for the choice (default %(default)s)"
@@ -82,40 +70,31 @@ def main() -> None:
     parser.add_argument(
         "--episodes", type=int, default=2000, help="episodes per scenario for the test (default %(default)s)"
     )
-    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
     parser.add_argument(
         "--models", type=Path, default=Path("logs"), help="folder for averaged models (default %(default)s)"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--json", type=absolute_path, metavar="FILE")
     args = parser.parse_args()
-    choices: list[tuple[str, str, str]] = []
+    experiment = Experiment(args.json, "run", "choice", "scenario")
     with workers(args) as pool:
         for run in args.runs:
-            tried = checkpoints(run)
-            count = len(tried)
-            paths = [str(path) for path in tried]
-            flown = pool.map(fly, paths, [args.choosing] * count, [VALIDATION] * count)
-            best = min(progress(flown, run.parents[1].name, count), key=lambda one: one.collisions)
-            mean = average(tried[-LAST:], args.models / f"{run.parents[1].name}_mean.zip")
-            last = next(path for path in run.glob("*-v0.zip"))
-            name = run.parents[1].name
-            choices += [
-                (name, "last", str(last)),
-                (name, "highest return in evaluation", str(run / "best_model.zip")),
-                (name, "fewest collisions on the validation set", best.path),
-                (name, f"mean of the last {LAST}", mean),
-            ]
-        tested = pool.map(fly, [path for *_, path in choices], [args.episodes] * len(choices), [EARLIER] * len(choices))
-        table = []
-        for (name, choice, path), one in zip(choices, progress(tested, "choices", len(choices)), strict=True):
-            keys = {"run": name, "choice": choice, "model": Path(path).name}
-            table += [keys | {"scenario": scenario} | row for scenario, row in one.rows.items()]
-            shares = ", ".join(
-                f"{row['collisions'] / row['episodes']:.1%} ({row['request_share']:.0%})" for row in one.rows.values()
-            )
-            print(f"{name:14} {choice:40} {shares}", flush=True)
-    if args.json:
-        write_rows(args.json, table)
+            name, tried = run.parents[1].name, checkpoints(run)
+            flown = fly(pool, [str(path) for path in tried], args.choosing, VALIDATION, name)
+            choices = {
+                "last": str(next(path for path in run.glob("*-v0.zip"))),
+                "highest return in evaluation": str(run / "best_model.zip"),
+                "fewest collisions on the validation set": min(
+                    flown, key=lambda path: sum(row["collisions"] for row in flown[path])
+                ),
+                f"mean of the last {LAST}": average(tried[-LAST:], args.models / f"{name}_mean.zip"),
+            }
+            tested = fly(pool, list(choices.values()), args.episodes, EARLIER, f"{name}, choices")
+            for choice, path in choices.items():
+                rows = tested[path]
+                keys = {"run": name, "choice": choice, "model": Path(path).name}
+                experiment.keep([keys | {k: row[k] for k in row if k != "policy"} for row in rows])
+                shares = (f"{row['collisions'] / row['episodes']:.1%} ({row['request_share']:.0%})" for row in rows)
+                print(f"{name:14} {choice:40} {', '.join(shares)}", flush=True)
 
 
 if __name__ == "__main__":

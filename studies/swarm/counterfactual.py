@@ -10,23 +10,19 @@ a request on episodes of the validation set. JSON: one row per scenario and pric
 
 from __future__ import annotations
 
-import argparse
 import time
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
 import torch as th
 from torch.nn import functional as F
 
-from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.task.request_task import RequestTask, make_task
 from quad_swarm.world.presets import make_config
-from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
-from studies.swarm.ppo import env_kwargs, validate
-from studies.swarm.protocol import condition
+from studies.swarm.experiment import Experiment, Row
+from studies.swarm.ppo import env_kwargs, reference_arguments, validate
 
 PRICES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 # Range of the prices of the behaviour policy, drawn for each pair and step
@@ -142,31 +138,20 @@ def train(forks: int, seed: int) -> tuple[MADDPG, Forks]:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = reference_arguments(__doc__)
     parser.add_argument(
         "--forks", type=int, default=600, help=f"number of forks of {SWARMS} swarms each (default %(default)s)"
     )
-    parser.add_argument("--episodes", type=int, default=2000, help="episodes per scenario (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the model (default %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     args.models.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     model, source = train(args.forks, args.seed)
-    keys: dict[str, Any] = {"forks": args.forks, "steps": source.steps, "seed": args.seed}
+    keys: Row = {"forks": args.forks, "steps": source.steps, "seed": args.seed}
     keys |= {"labels": args.forks * SWARMS * (source.copies - 1), "seconds": time.perf_counter() - started}
     path = args.models / f"counterfactual_seed{args.seed}.zip"
     model.save(path)
-    config = make_config("paper")
-    rows: list[dict[str, Any]] = []
-    for name in SCENARIOS:
-        conditions = {
-            price: condition(f"{path}@{1 / (1 + np.exp(-SCALE * price)):.6f}", name, config) for price in PRICES
-        }
-        rows += validate(conditions, "price", args.episodes, keys)
-    if args.json:
-        write_rows(args.json, rows)
+    policies = {price: f"{path}@{1 / (1 + np.exp(-SCALE * price)):.6f}" for price in PRICES}
+    Experiment(args.json, "scenario", "price", "seed").keep(validate(policies, "price", args.episodes, keys))
 
 
 if __name__ == "__main__":

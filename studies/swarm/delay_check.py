@@ -25,7 +25,7 @@ from quad_swarm.world.beliefs import BeliefSource, resampled
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm
-from studies.swarm.protocol import LINGER
+from studies.swarm.experiment import LINGER
 
 COMMITTED, CANDIDATE = 0, 1
 _CHUNK = 100  # episodes per batch

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,11 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from quad_swarm.evaluation.evaluation import summarise
-from quad_swarm.evaluation.flight import Condition
-from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
-from studies.swarm.protocol import ROOT, VALIDATION, condition, fly_kept
+from studies.swarm.experiment import Experiment, Job, Row
+from studies.swarm.protocol import ROOT, VALIDATION
 
 RECIPE = ROOT / "zoo_configs" / "quad_swarm_paper.yml"
 THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 0.7)
@@ -127,42 +127,52 @@ def train(price: float, steps: int, seed: int) -> PPO:
     return model.learn(steps * env.n)
 
 
-def validate(
-    conditions: dict[float, Condition], what: str, episodes: int, keys: dict[str, Any]
-) -> list[dict[str, Any]]:
-    """Fly a scenario of the validation set with several values of a parameter.
+def reference_arguments(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the options of a reference that is trained here.
 
-    :param conditions: value -> condition
+    :param doc: docstring of the module
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=2000, help="episodes per scenario (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for models (default %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    return parser
+
+
+def validate(
+    policies: Mapping[float, str], what: str, episodes: int, keys: Row, algo: str = "sb3_maddpg:MADDPG"
+) -> list[Row]:
+    """Fly all scenarios of the validation set with several values of a parameter.
+
+    :param policies: value -> policy
     :param what: name of the parameter
     :param episodes: number of episodes
     :param keys: common entries of all rows
-    :return: a row per value
+    :param algo: see `Job`
+    :return: a row per scenario and value
     """
-    flown = fly_kept(list(conditions.values()), episodes, VALIDATION)
-    rows = []
-    for value, one in conditions.items():
-        row = {"scenario": one.scenario, what: value} | summarise(flown[one], one.config)
-        rows.append(keys | row)
-        figures = f"{row['collisions']}/{row['episodes']} at {row['request_share']:.1%}"
-        print(f"{one.scenario}, {what} {value:g}: {figures}", flush=True)
-    return rows
+    table = []
+    for name in SCENARIOS:
+        job = Job({}, list(policies.values()), name, make_config("paper"), episodes, VALIDATION, algo)
+        for value, rows in zip(policies, job.fly().values(), strict=True):
+            row = {"scenario": name, what: value} | summarise(rows, job.config)
+            table.append(keys | row)
+            figures = f"{row['collisions']}/{row['episodes']} at {row['request_share']:.1%}"
+            print(f"{name}, {what} {value:g}: {figures}", flush=True)
+    return table
 
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = reference_arguments(__doc__)
     parser.add_argument(
         "--price", type=float, nargs="+", default=[0.02, 0.1], help="price of a request (default %(default)s)"
     )
     parser.add_argument("--steps", type=int, default=400_000, help="steps of the swarm (default %(default)s)")
-    parser.add_argument("--episodes", type=int, default=2000, help="episodes per scenario (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--models", type=Path, default=Path("logs"), help="folder for the models (default %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     args.models.mkdir(parents=True, exist_ok=True)
-    config = make_config("paper")
-    rows: list[dict[str, Any]] = []
+    experiment = Experiment(args.json, "price", "scenario", "threshold", "seed")
     for price in args.price:
         started = time.perf_counter()
         model = train(price, args.steps, args.seed)
@@ -170,13 +180,8 @@ def main() -> None:
         path = args.models / f"ppo_price{price:g}_seed{args.seed}.zip"
         model.save(path)
         print(f"price {price:g}", flush=True)
-        for name in SCENARIOS:
-            conditions = {
-                d: condition(f"{path}@{d}", name, config, algo="studies.swarm.ppo:SharedPPO") for d in THRESHOLDS
-            }
-            rows += validate(conditions, "threshold", args.episodes, keys)
-        if args.json:
-            write_rows(args.json, rows)
+        policies = {threshold: f"{path}@{threshold}" for threshold in THRESHOLDS}
+        experiment.keep(validate(policies, "threshold", args.episodes, keys, "studies.swarm.ppo:SharedPPO"))
 
 
 if __name__ == "__main__":

@@ -1,28 +1,18 @@
-"""Common parts of the study: sets of episodes, worlds, the criterion of safety, and tables of rows.
+"""Common parts of the study: sets of episodes, worlds, and the criterion of safety.
 
-Rows are JSON objects, one per line, compressed in ``studies/swarm/data``: ``pandas.read_json`` reads them.
 CONTRIBUTING.md explains how test sets are sealed.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Sequence
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-from tqdm import tqdm
-
-from quad_swarm.evaluation.evaluation import Rows, fly_all
-from quad_swarm.evaluation.flight import Condition
+from quad_swarm.evaluation.evaluation import Rows
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
-from quad_swarm.evaluation.rows import read_rows, write_rows
-from quad_swarm.jobs.journal import default_folder
 from quad_swarm.world.presets import SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS
-
-Item = TypeVar("Item")
+from studies.swarm.experiment import condition, fly_kept, known_rows
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "studies" / "swarm" / "data"
@@ -39,8 +29,6 @@ VALIDATION, EARLIER, EARLIER_TEAMS, TEST = 1, 2, 3, 4
 FLIGHT_TESTS, WORLDS = {12: 6, 16: 9}, 8
 # The paper's hand-made rule
 DBCP = "distance:4"
-# Number of steps to fly after arrival
-LINGER = 10
 STAGES, QUICK_STAGES = (30, 100, 250, 500, 1000, 2000, 4000, 12000), (10, 20)
 # Circle for more than twelve robots, which do not fit on that of eight. With full communication, 16 robots on this one
 # collide in 22 of 2,000 episodes, twelve robots on that of eight in 17 of 2,000, and 16 on one of 3 to 3.5 m in 14 of
@@ -66,16 +54,6 @@ OF_PRESET, OF_TEAM = Standard(SAFETY_MARGIN, 12000), Standard(0.005, 2000)
 def world(preset: str, n_robots: int | None = None) -> SwarmConfig:
     """Return a preset, optionally with another number of robots."""
     return make_config(preset, n_robots=n_robots, space=WIDER if n_robots is not None and n_robots > 12 else None)
-
-
-def condition(policy: str, scenario: str, config: SwarmConfig, algo: str = "sb3_maddpg:MADDPG") -> Condition:
-    """Return a policy in a scenario with the settings of all results of the study."""
-    return Condition(policy, scenario, config, algo=algo, solver="rti", linger=LINGER)
-
-
-def fly_kept(conditions: Sequence[Condition], episodes: int, seed: int, skip: int = 0) -> dict[Condition, Rows]:
-    """Call `fly_all` with a journal, so that a killed run continues from its finished pieces."""
-    return fly_all(conditions, episodes, seed, skip=skip, journal=default_folder())
 
 
 def fly_validation(
@@ -128,36 +106,6 @@ def in_stages(
         if episodes >= enough and (high - low) / 2 < margin:
             return figures, comparison.as_safe(margin)
     return figures, quick
-
-
-def progress(items: Iterable[Item], what: str, total: int) -> Iterable[Item]:
-    """Show a progress bar in a terminal."""
-    return tqdm(items, what, total, unit="job", disable=not sys.stderr.isatty(), leave=False)
-
-
-def replace_rows(path: Path, rows: list[dict[str, Any]], keys: tuple[str, ...]) -> None:
-    """Replace rows of a file by those with the same keys. All other rows stay."""
-    new = {tuple(row.get(key) for key in keys) for row in rows}
-    kept = [row for row in read_rows(path) if tuple(row.get(key) for key in keys) not in new]
-    write_rows(path, [*kept, *rows])
-
-
-def known_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a table, from a cache if its file has not changed. Do not modify them."""
-    if not path.exists():
-        return []
-    stat = path.stat()
-    return _parsed(path, stat.st_mtime_ns, stat.st_size)
-
-
-@lru_cache(maxsize=8)
-def _parsed(path: Path, modified: int, size: int) -> list[dict[str, Any]]:
-    return read_rows(path)
-
-
-def absolute_path(text: str) -> Path:
-    """Convert an argument of the command line to an absolute path, so that the working directory may change."""
-    return Path(text).resolve()
 
 
 def models(recipe: str) -> list[str]:

@@ -20,10 +20,11 @@ from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.policies import is_model
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.world.beliefs import other_indices
+from studies.swarm.experiment import absolute_path
 from studies.swarm.figures import NAMES, draw_asking, draw_fronts, draw_trajectories, flights, rate_of
-from studies.swarm.fly_flight import PAPERS, best_rule
-from studies.swarm.protocol import DATA, OF_TEAM, ROOT, absolute_path, best_rules, models
-from studies.swarm.tune_flight import FULL, SWAPS, families
+from studies.swarm.fly import PAPERS
+from studies.swarm.protocol import DATA, OF_TEAM, ROOT, best_rules, models
+from studies.swarm.tune_flight import FULL, SWAPS, best_rule, families
 
 APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
@@ -321,7 +322,7 @@ def unseen_table(rows: Rows) -> str:
 
 
 def worlds_table(rows: Rows, part: str) -> str:
-    """Format a part of `studies.swarm.flight_world`: contact at any time, with the changes to the worlds.
+    """Format a part of the rows in disturbed worlds: contact at any time, with the changes to the worlds.
     The columns of the world, the changes and the policy are left out if they are the same in all rows."""
     columns: dict[str, list[str]] = {}
     for row in rows:
@@ -348,7 +349,7 @@ def worlds_table(rows: Rows, part: str) -> str:
 
 
 def plants_table(rows: Rows) -> str:
-    """Format the part `plants` of `studies.swarm.flight_world`: collisions, arrivals and requests by policy."""
+    """Format the part `plants` of `studies.swarm.fly`: collisions, arrivals and requests by policy."""
     chosen = [row for row in rows if row["part"] == "plants"]
     policies = list(dict.fromkeys(row["policy"] for row in chosen))
     lines: dict[tuple[str, str, float], dict[str, str]] = {}

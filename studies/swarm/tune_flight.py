@@ -18,32 +18,20 @@ family, setting, safe (None if only the requests are known). Results that the fi
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.command import workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.flight import first_episode, run_episodes
 from quad_swarm.evaluation.inference import SAFETY_MARGIN, Comparison
 from quad_swarm.evaluation.policies import is_model
-from quad_swarm.evaluation.rows import read_rows
-from studies.swarm.protocol import (
-    DATA,
-    NAMES,
-    QUICK_STAGES,
-    VALIDATION,
-    condition,
-    fly_validation,
-    progress,
-    replace_rows,
-    world,
-)
+from studies.swarm.experiment import Experiment, Row, absolute_path, command_line, condition, known_rows, progress
+from studies.swarm.protocol import DATA, NAMES, QUICK_STAGES, VALIDATION, fly_validation, models, world
 
 FULL = "full"
 Cell = tuple[int, str]  # number of robots, scenario
@@ -224,9 +212,9 @@ def may_be_safe(flown: Rows, full: Rows, deciding: int, margin: float) -> bool:
     return Comparison.of([*flown, *no_more][:deciding], [*full, *no_more][:deciding]).as_safe(margin)
 
 
-def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected: bool = False) -> list[dict[str, Any]]:
+def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected: bool = False) -> list[Row]:
     """Return the rows of a setting."""
-    keys: dict[str, Any] = {"preset": PRESET, "family": family, "setting": setting, "safe": safe}
+    keys: Row = {"preset": PRESET, "family": family, "setting": setting, "safe": safe}
     keys |= {"selected": True} if selected else {}
     return [
         keys | {"n_robots": n_robots, "scenario": name} | summarise(rows, world(PRESET, n_robots))
@@ -235,26 +223,33 @@ def rows_of(family: str, setting: str, flown: Flown, safe: bool | None, selected
     ]
 
 
-def fly_full(pool: Executor, path: Path, stages: Sequence[int], aim: Aim = AIMS[12]) -> Flown:
+def table_of(path: Path) -> Experiment:
+    """Return the table in a file."""
+    return Experiment(path, "preset", "setting", "n_robots", "scenario")
+
+
+def fly_full(pool: Executor, table: Experiment, stages: Sequence[int], aim: Aim = AIMS[12]) -> Flown:
     """Return the collisions with full communication in all episodes for a decision. Known results are reused."""
-    known = {cell_of(row): row["outcomes"] for row in read_rows(path) if row["family"] == FULL}
+    known = {cell_of(row): row["outcomes"] for row in table.rows() if row["family"] == FULL}
     missing = [cell for cell in aim.cells if len(known.get(cell, "")) < last(aim, cell, stages)]
     work = pool.map(fly, [FULL] * len(missing), missing, [last(aim, cell, stages) for cell in missing])
     for cell, rows in zip(missing, progress(work, FULL, len(missing)), strict=True):
         known[cell] = "".join("1" if row["collided"] else "0" for row in rows)
         (line,) = rows_of(FULL, FULL, {cell: rows}, True)
-        replace_rows(path, [line | {"outcomes": known[cell]}], ("preset", "setting", "n_robots", "scenario"))
+        table.keep([line | {"outcomes": known[cell]}])
     return {cell: [{"collided": letter == "1"} for letter in known[cell]] for cell in aim.cells}
 
 
-def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool, up_to: int = UP_TO) -> list[Setting]:
+def by_requests(
+    pool: Executor, table: Experiment, stages: Sequence[int], quick: bool, up_to: int = UP_TO
+) -> list[Setting]:
     """Return the rules by increasing number of requests in both swaps of eight robots, without rules with identical
     flights."""
     rules = [
         Setting(family, rule) for family, rules in families(up_to).items() for rule in rules[:: 12 if quick else 1]
     ]
-    known: dict[str, list[dict[str, Any]]] = {}
-    for row in read_rows(path):
+    known: dict[str, list[Row]] = {}
+    for row in table.rows():
         if cell_of(row) in OWN_SWAPS:
             known.setdefault(row["setting"], []).append(row)
     work = [(rule, cell) for rule in rules if len(known.get(rule.name, [])) < len(OWN_SWAPS) for cell in OWN_SWAPS]
@@ -263,14 +258,14 @@ def by_requests(pool: Executor, path: Path, stages: Sequence[int], quick: bool, 
     for (rule, cell), rows in zip(work, progress(flown, "requests", len(work)), strict=True):
         lines += rows_of(*rule, {cell: rows}, None)
         known.setdefault(rule.name, []).append(lines[-1])
-    replace_rows(path, lines, ("preset", "setting"))
+    table.keep(lines, "preset", "setting")
     rules.sort(key=lambda rule: sum(row["request_share"] for row in known[rule.name]))
     figures = ("request_share", "requests_flown", "path_length", "min_separation")
     alike = {repr([[row.get(key) for key in figures] for row in known[rule.name]]): rule for rule in reversed(rules)}
     return [rule for rule in rules if rule in alike.values()]
 
 
-def cheapest_rule(rows: Iterable[Mapping[str, Any]]) -> str | None:
+def cheapest_rule(rows: Iterable[Row]) -> str | None:
     """Return the safe rule that makes the fewest requests in both swaps of eight robots, None if no rule is safe."""
     shares: Counter[str] = Counter()
     for row in rows:
@@ -279,22 +274,40 @@ def cheapest_rule(rows: Iterable[Mapping[str, Any]]) -> str | None:
     return min(shares, key=lambda rule: shares[rule], default=None)
 
 
+def best_rule(up_to: int = UP_TO) -> str:
+    """Return the rule that is safe everywhere and makes the fewest requests in both swaps of eight robots.
+
+    :param up_to: number of robots of the largest team that it was tuned for
+    :raises ValueError: if no rule is safe
+    """
+    if (rule := cheapest_rule(known_rows(DATA / FILES[up_to]))) is None:
+        raise ValueError(f"{DATA / FILES[up_to]} holds no safe rule: run `studies.swarm.tune_flight` first.")
+    return rule
+
+
+def tuned_models(up_to: int = UP_TO) -> list[str]:
+    """Return the models with their tuned thresholds. Models without one keep their own."""
+    rows = known_rows(DATA / FILES[up_to])
+    tuned = {row["family"]: row["setting"] for row in rows if row.get("chosen", row["safe"])}
+    return [tuned.get(path, path) for path in models("flight")]
+
+
 def at_the_price_of(
-    rule: str, pool: Executor, path: Path, models: Sequence[str], aim: Aim, episodes: int = PRICED_ON
+    rule: str, pool: Executor, table: Experiment, models: Sequence[str], aim: Aim, episodes: int = PRICED_ON
 ) -> None:
     """Choose the first threshold of each model with which it makes few enough requests in each swap, and write its
     rows.
 
-    :param rule: the rule whose requests are the measure; the file contains its rows
+    :param rule: the rule whose requests are the measure; the table contains its rows
     :param pool: executor of the flights
-    :param path: file of the table
+    :param table: the table
     :param models: the models
     :param aim: thresholds and price
     :param episodes: number of episodes of each swap
     :raises ValueError: if a model makes too many requests with all thresholds
     """
     assert aim.price is not None
-    known = {cell_of(row): row["request_share"] for row in read_rows(path) if row["setting"] == rule}
+    known = {cell_of(row): row["request_share"] for row in table.rows() if row["setting"] == rule}
     limits = {cell: aim.price * known[cell] for cell in aim.cells if cell[1] in SWAPS}
     for model in models:
         for threshold in aim.thresholds:
@@ -306,11 +319,11 @@ def at_the_price_of(
                 break
         else:
             raise ValueError(f"{model} makes more than {aim.price:.0%} of the requests of {rule} with all thresholds.")
-        replace_rows(path, rows, ("family", "chosen", "n_robots", "scenario"))
+        table.keep(rows, "family", "chosen", "n_robots", "scenario")
         print(setting, *(f"{row['request_share']:.2%}" for row in rows), flush=True)
 
 
-def cell_of(row: Mapping[str, Any]) -> Cell:
+def cell_of(row: Row) -> Cell:
     """Return the number of robots and the scenario of a row."""
     return row["n_robots"], row["scenario"]
 
@@ -321,7 +334,7 @@ def tune(
     ladders: list[list[Setting]],
     full: Flown,
     stages: Sequence[int],
-    path: Path,
+    table: Experiment,
     aim: Aim = AIMS[12],
 ) -> None:
     """Try the settings of each ladder in order until one is safe, and write their rows. Known results are reused.
@@ -331,13 +344,13 @@ def tune(
     :param ladders: ordered settings
     :param full: see `fly_full`
     :param stages: numbers of episodes of the stages
-    :param path: file of the table
+    :param table: the table
     :param aim: what the settings have to achieve
     """
     hardest = aim.cells[0]
-    decided = {row["setting"]: row["safe"] for row in read_rows(path) if row["safe"] is not None}
+    decided = {row["setting"]: row["safe"] for row in table.rows() if row["safe"] is not None}
     running: dict[Future[Trial], Setting] = {}
-    collisions = Counter(k for row in read_rows(path) if cell_of(row) == hardest for k in row.get("collided", []))
+    collisions = Counter(k for row in table.rows() if cell_of(row) == hardest for k in row.get("collided", []))
 
     def following() -> Setting | None:
         busy = {setting.name for setting in running.values()}
@@ -362,7 +375,7 @@ def tune(
             rows = rows_of(*setting, trial.flown, trial.safe, trial.selected)
             for row in rows:
                 row |= {"collided": trial.collided} if cell_of(row) == hardest else {}
-            replace_rows(path, rows, ("preset", "setting", "n_robots", "scenario"))
+            table.keep(rows)
             print(f"{setting.name:50} {verdict(trial, full, hardest)}", flush=True)
 
 
@@ -381,29 +394,29 @@ def verdict(trial: Trial, full: Flown, hardest: Cell) -> str:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "fly few episodes")
     parser.add_argument("what", choices=("rules", "thresholds"))
     parser.add_argument("models", nargs="*", metavar="MODEL.zip")
     parser.add_argument("--up-to", type=int, choices=AIMS, default=UP_TO, help="number of robots of the largest team")
-    parser.add_argument("--quick", action="store_true", help="fly few episodes, to check that everything runs")
-    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--json", type=Path, metavar="FILE", help=f"default: {', '.join(FILES.values())} in {DATA}")
+    parser.add_argument(
+        "--json", type=absolute_path, metavar="FILE", help=f"default: {', '.join(FILES.values())} in {DATA}"
+    )
     args = parser.parse_args()
-    aim, path = AIMS[args.up_to], args.json or DATA / FILES[args.up_to]
+    aim, table = AIMS[args.up_to], table_of(args.json or DATA / FILES[args.up_to])
     if args.what == "thresholds" and not args.models:
         parser.error("pass the models whose thresholds should be tuned")
     stages = QUICK_STAGES if args.quick else STAGES
     with workers(args) as pool:
-        full = fly_full(pool, path, stages, aim)
+        full = fly_full(pool, table, stages, aim)
         if args.what == "thresholds" and aim.price is not None:
-            rule = cheapest_rule(read_rows(path)) or parser.error(f"{path} holds no safe rule: tune the rules first")
-            at_the_price_of(rule, pool, path, args.models, aim, stages[0] if args.quick else PRICED_ON)
+            rule = cheapest_rule(table.rows()) or parser.error(f"{table.path} holds no safe rule: tune the rules first")
+            at_the_price_of(rule, pool, table, args.models, aim, stages[0] if args.quick else PRICED_ON)
             return
         if args.what == "rules":
-            ladders = [by_requests(pool, path, stages, args.quick, args.up_to)]
+            ladders = [by_requests(pool, table, stages, args.quick, args.up_to)]
         else:
             ladders = [[Setting(model, f"{model}@{t:g}") for t in aim.thresholds] for model in args.models]
-        tune(pool, args.jobs, ladders, full, stages, path, aim)
+        tune(pool, args.jobs, ladders, full, stages, table, aim)
 
 
 if __name__ == "__main__":

@@ -10,26 +10,14 @@ and scenario with the keys of `summarise` over the episodes flown, and preset, s
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import os
-from pathlib import Path
-from typing import Any
 
-from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.command import workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.world.presets import PRESETS
 from quad_swarm.world.scenarios import SCENARIOS
-from studies.swarm.protocol import (
-    PRESETS_TESTED,
-    QUICK_STAGES,
-    STAGES,
-    fly_validation,
-    in_stages,
-    progress,
-    replace_rows,
-    world,
-)
+from studies.swarm.experiment import Experiment, Row, absolute_path, command_line
+from studies.swarm.protocol import PRESETS_TESTED, QUICK_STAGES, STAGES, fly_validation, in_stages, world
 
 DISTANCES = (0.62, 0.65, 0.7, 0.8, 0.9, 1.05, 1.2, 1.5)
 LOOK_AHEADS = (1.0, 1.5, 2.0, 3.0, 4.0)
@@ -91,7 +79,7 @@ def fine_families() -> dict[str, list[str]]:
     }
 
 
-def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], quick: bool) -> list[dict[str, Any]]:
+def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], quick: bool) -> list[Row]:
     """Tune several families in one scenario and return their rows."""
     stages, thin = (QUICK_STAGES, 20) if quick else (STAGES, 1)
     config = world(preset, n_robots)
@@ -105,7 +93,7 @@ def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], qui
             flown[rule], safe[rule] = in_stages(rule, preset, scenario, full, quick, n_robots, flown[rule])
             if safe[rule]:
                 break
-        keys: dict[str, Any] = {"preset": preset, "scenario": scenario, "family": family}
+        keys: Row = {"preset": preset, "scenario": scenario, "family": family}
         keys |= {} if n_robots is None else {"n_robots": n_robots}
         table += [keys | {"rule": rule, "safe": safe.get(rule)} | summarise(flown[rule], config) for rule in flown]
         best = [rule for rule in safe if safe[rule]]
@@ -119,28 +107,16 @@ def tune(preset: str, n_robots: int | None, scenario: str, names: list[str], qui
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "fly few episodes and rules")
     parser.add_argument("--preset", nargs="+", default=PRESETS_TESTED, choices=list(PRESETS))
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
     parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="default: the preset's")
     parser.add_argument("--family", nargs="+", default=list(families()), choices=list(families()))
-    parser.add_argument(
-        "--quick", action="store_true", help="fly few episodes and rules, to check that everything runs"
-    )
-    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--json", type=absolute_path, metavar="FILE")
     args = parser.parse_args()
-    work = [
-        (preset, n, scenario, args.family, args.quick)
-        for preset in args.preset
-        for n in args.n_robots
-        for scenario in args.scenario
-    ]
-    keys = ("preset", "scenario", "family", "n_robots")
+    work = [(*cell, args.family, args.quick) for cell in itertools.product(args.preset, args.n_robots, args.scenario)]
     with workers(args) as pool:
-        for table in progress(pool.map(tune, *zip(*work, strict=True)), "rules", len(work)):
-            if args.json:
-                replace_rows(args.json, table, keys if "n_robots" in table[0] else keys[:-1])
+        Experiment(args.json, "preset", "scenario", "family", "n_robots").run(pool, "rules", tune, work)
 
 
 if __name__ == "__main__":

@@ -12,18 +12,16 @@ scenarios and teams stay, and count for a model's threshold.
 
 from __future__ import annotations
 
-import argparse
 import functools
-import os
-from pathlib import Path
-from typing import Any
+import itertools
 
-from quad_swarm.evaluation.command import add_worker_arguments, workers
+from quad_swarm.evaluation.command import workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.inference import Comparison
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
-from studies.swarm.protocol import OF_PRESET, OF_TEAM, in_stages, models, progress, read_rows, replace_rows, world
+from studies.swarm.experiment import Experiment, Row, absolute_path, command_line
+from studies.swarm.protocol import OF_PRESET, OF_TEAM, in_stages, models, world
 
 # Recipes whose threshold is free and whose team is the preset's. The faithful recipe has the paper's threshold of 0.5.
 TUNED = ("paper", "dense", "ablation*")
@@ -48,12 +46,12 @@ def has_reserve(comparison: Comparison, margin: float, share: float) -> bool:
     return comparison.only_first - comparison.only_second <= share * margin * comparison.episodes
 
 
-def tune(path: str, preset: str, n: int | None, scenario: str, quick: bool) -> list[dict[str, Any]]:
+def tune(n: int | None, scenario: str, path: str, preset: str, quick: bool) -> list[Row]:
     """Tune a model in one scenario and return its rows."""
     rival = full(preset, scenario, n)
     config = world(preset, n)
     standard, share = STANDARDS["preset" if n is None else "team"]
-    table: list[dict[str, Any]] = []
+    table: list[Row] = []
     for threshold in THRESHOLDS if n is None else TEAM_THRESHOLDS:
         figures, safe = in_stages(f"{path}@{threshold:g}", preset, scenario, rival, quick, n, standard=standard)
         safe &= quick or has_reserve(Comparison.of(figures, rival[: len(figures)]), standard.margin, share)
@@ -75,7 +73,7 @@ def preset_of(path: str) -> str:
     return spec["kwargs"]["preset"]
 
 
-def set_threshold(path: str, table: list[dict[str, Any]]) -> None:
+def set_threshold(path: str, table: list[Row]) -> None:
     """Write the smallest threshold of all scenarios and numbers of robots into a model's file."""
     last = {(row["scenario"], row["n_robots"]): row["threshold"] for row in table if row["model"] == path}
     model = MADDPG.load(path, device="cpu")
@@ -85,33 +83,23 @@ def set_threshold(path: str, table: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "fly few episodes")
     parser.add_argument("models", nargs="*", metavar="MODEL.zip", help="default: all models with a free threshold")
     parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS)[::-1], choices=list(SCENARIOS))
     parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="default: the preset's")
-    parser.add_argument("--quick", action="store_true", help="fly few episodes, to check that everything runs")
-    add_worker_arguments(parser, jobs=os.cpu_count() or 1)
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--json", type=absolute_path, metavar="FILE")
     parser.add_argument("--write", action="store_true", help="write each model's threshold into its file")
     args = parser.parse_args()
     if args.quick and args.write:
         parser.error("--quick flies too few episodes to choose a threshold: leave out --write")
     paths = args.models or [path for recipe in TUNED for path in models(recipe)]
     presets = {path: preset_of(path) for path in paths}
-    work = [
-        (path, presets[path], n, scenario, args.quick)
-        for n in args.n_robots
-        for scenario in args.scenario
-        for path in paths
-    ]
-    rows: list[dict[str, Any]] = []
+    work = [(*cell, presets[cell[-1]], args.quick) for cell in itertools.product(args.n_robots, args.scenario, paths)]
+    experiment = Experiment(args.json, "model", "scenario", "n_robots")
     with workers(args) as pool:
-        for table in progress(pool.map(tune, *zip(*work, strict=True)), "thresholds", len(work)):
-            rows += table
-            if args.json:
-                replace_rows(args.json, table, ("model", "scenario", "n_robots"))
+        experiment.run(pool, "thresholds", tune, work)
     for path in paths if args.write else ():
-        set_threshold(path, read_rows(args.json) if args.json else rows)
+        set_threshold(path, experiment.rows())
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ from quad_swarm.quadrotor import POSITION
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
-from studies.swarm import delay_check, flight_world, fly_flight, report, tune_flight
+from studies.swarm import delay_check, fly, report, tune_flight
+from studies.swarm.experiment import Experiment
 from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TESTS, NAMES, TEST, VALIDATION, WORLDS
 
 CALM = {
@@ -37,14 +38,19 @@ def test_every_rule_can_be_read(family):
         parse_rule(rule)
 
 
-@pytest.mark.parametrize("part", flight_world.PARTS)
-def test_every_condition_is_a_world_and_none_is_named_twice(part, monkeypatch):
-    monkeypatch.setattr(flight_world, "best_rule", lambda: "plan:0.8&stale:8")
-    monkeypatch.setattr(flight_world, "tuned_models", lambda: [f"model{seed}.zip@0.9" for seed in range(5)])
-    work = list(flight_world.jobs(part))
-    assert len({str(job) for job in work}) == len(work) >= 12
-    for job in work:
-        make_config(job.preset, job.changed)
+@pytest.mark.parametrize("name", fly.PARTS)
+def test_every_condition_is_a_world_and_none_is_named_twice(name, monkeypatch):
+    monkeypatch.setattr(fly, "best_rule", lambda up_to=12: "plan:0.8&stale:8")
+    monkeypatch.setattr(fly, "tuned_models", lambda up_to=12: [f"model{seed}.zip@0.9" for seed in range(5)])
+    part = fly.PARTS[name]
+    work = list(part.jobs())
+    conditions = [str((job.keys, job.scenario, policy)) for job in work for policy in dict.fromkeys(job.policies)]
+    assert len(set(conditions)) == len(conditions) >= 2
+    identities = {
+        str([(job.keys | job._asdict() | {"policy": job.policies[0]}).get(key) for key in part.keys]) for job in work
+    }
+    assert len(identities) == len(work), "no job replaces the rows of another"
+    assert all((job.episodes or part.episodes) >= 200 for job in work)
 
 
 class Inline(Executor):
@@ -120,23 +126,24 @@ def test_rules_are_tried_from_the_cheapest_on_until_one_is_safe(flown, monkeypat
     families = {"one": ["good 0.4", "bad 0.1", "good 0.3"], "two": ["bad 0.35", "good 0.2"]}
     monkeypatch.setattr(tune_flight, "families", lambda up_to: families)
     path, stages = tmp_path / "tuning.json", tune_flight.STAGES
-    rules = tune_flight.by_requests(Inline(), path, stages, quick=False)
+    table = tune_flight.table_of(path)
+    rules = tune_flight.by_requests(Inline(), table, stages, quick=False)
     assert [rule.name for rule in rules] == ["bad 0.1", "good 0.2", "good 0.3", "bad 0.35", "good 0.4"]
-    tune_flight.tune(Inline(), 1, [rules], FULL, stages, path)
+    tune_flight.tune(Inline(), 1, [rules], FULL, stages, table)
     expected = {"bad 0.1": False, "good 0.2": True, "good 0.3": None, "bad 0.35": None, "good 0.4": None}
     assert settings(path) == expected
     assert {row["setting"] for row in read_rows(path) if row["family"] == "two"} == {"bad 0.35", "good 0.2"}
     assert max(episodes for policy, *_, episodes in flown if policy == "good 0.4") == stages[0]
     # Neither what was screened nor what was decided is flown again.
     flown.clear()
-    assert tune_flight.by_requests(Inline(), path, stages, quick=False) == rules
-    tune_flight.tune(Inline(), 1, [rules], FULL, stages, path)
+    assert tune_flight.by_requests(Inline(), table, stages, quick=False) == rules
+    tune_flight.tune(Inline(), 1, [rules], FULL, stages, table)
     assert not flown
     assert settings(path) == expected
     # A cheaper rule that is undecided is tried although a dearer one is known to be safe
     rows = [row for row in read_rows(path) if row["setting"] != "good 0.2"]
     write_rows(path, [*rows, {"setting": "good 0.3", "safe": True, "n_robots": 8, "scenario": "random"}])
-    tune_flight.tune(Inline(), 1, [rules], FULL, stages, path)
+    tune_flight.tune(Inline(), 1, [rules], FULL, stages, table)
     assert settings(path)["good 0.2"]
 
 
@@ -144,7 +151,7 @@ def test_thresholds_are_tried_from_the_highest_on_each_model_by_itself(flown, tm
     ladders = [
         [tune_flight.Setting(path, f"{path}@{threshold}") for threshold in (0.9, 0.8)] for path in ("a.zip", "bad.zip")
     ]
-    tune_flight.tune(Inline(), 1, ladders, FULL, tune_flight.STAGES, tmp_path / "t.json")
+    tune_flight.tune(Inline(), 1, ladders, FULL, tune_flight.STAGES, tune_flight.table_of(tmp_path / "t.json"))
     assert settings(tmp_path / "t.json") == {"a.zip@0.9": True, "bad.zip@0.9": False, "bad.zip@0.8": False}
 
 
@@ -158,6 +165,7 @@ def test_models_fly_at_half_the_price_of_the_best_rule(flown, monkeypatch, tmp_p
         for n, name in cells
     ]
     write_rows(path, rows)
+    table = tune_flight.table_of(path)
     assert tune_flight.cheapest_rule(read_rows(path)) == "rule"
     assert tune_flight.cheapest_rule(rows[-4:]) is None
     shares = {"m@0.02": 0.15, "m@0.05": 0.12, "m@0.1": 0.11, "m@0.15": 0.1}
@@ -167,28 +175,31 @@ def test_models_fly_at_half_the_price_of_the_best_rule(flown, monkeypatch, tmp_p
         return [{"requests": shares.get(policy, 1.0) + (policy == "m@0.1" and cell == (4, "asymmetric_swap")) * 0.1}]
 
     monkeypatch.setattr(tune_flight, "fly", fly)
-    tune_flight.at_the_price_of("rule", Inline(), path, ["m"], aim)
-    tune_flight.at_the_price_of("rule", Inline(), path, ["m"], aim)  # replaces its rows
+    tune_flight.at_the_price_of("rule", Inline(), table, ["m"], aim)
+    tune_flight.at_the_price_of("rule", Inline(), table, ["m"], aim)  # replaces its rows
     chosen = [row for row in read_rows(path) if row.get("chosen")]
     assert [(row["setting"], tune_flight.cell_of(row)) for row in chosen] == [("m@0.15", cell) for cell in cells]
     with pytest.raises(ValueError, match="more than 45% of the requests of rule"):
-        tune_flight.at_the_price_of("rule", Inline(), path, ["other"], aim)
+        tune_flight.at_the_price_of("rule", Inline(), table, ["other"], aim)
 
 
 def test_full_communication_is_flown_once(flown, tmp_path):
     stages = (5, 10)
-    full = tune_flight.fly_full(Inline(), tmp_path / "t.json", stages)
+    full = tune_flight.fly_full(Inline(), tune_flight.table_of(tmp_path / "t.json"), stages)
     assert {len(rows) for rows in full.values()} == {10}
     assert {one[1] for one in flown} == set(CELLS)
     flown.clear()
-    assert tune_flight.fly_full(Inline(), tmp_path / "t.json", stages) == full
+    assert tune_flight.fly_full(Inline(), tune_flight.table_of(tmp_path / "t.json"), stages) == full
     assert not flown
 
 
 @pytest.mark.slow
 def test_conditions_fill_their_tables(tmp_path: Path):
-    parts = {part: list(flight_world.jobs(part)) for part in ("world", "delays", "delay_check")}
-    rows = [flight_world.fly(job, 3) for jobs in parts.values() for job in (jobs[0], jobs[-1])]
+    parts = {part: list(fly.PARTS[part].jobs()) for part in ("world", "delays", "delay_check")}
+    jobs = [
+        (part, job._replace(episodes=3, seed=WORLDS)) for part, jobs in parts.items() for job in (jobs[0], jobs[-1])
+    ]
+    rows = [row for part, job in jobs for row in fly.PARTS[part].fly(job)]
     assert report.worlds_table(rows, "world").startswith("| world | scenario | policy | collisions")
     for part in ("delays", "delay_check"):
         table = report.worlds_table(rows, part)
@@ -280,34 +291,37 @@ def test_the_headline_table_has_five_rows_and_gives_seeds_as_ranges():
 
 @pytest.mark.slow
 def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown(tmp_path, monkeypatch):
-    monkeypatch.setattr(fly_flight, "DATA", tmp_path)
+    monkeypatch.setattr(tune_flight, "DATA", tmp_path)
     with pytest.raises(ValueError, match="holds no safe rule"):
-        fly_flight.best_rule()
+        tune_flight.best_rule()
     rules = [
         {"family": setting, "setting": setting, "n_robots": 8, "scenario": name, "safe": safe, "request_share": share}
         for setting, safe, share in (("plan:0.8", True, 0.03), ("cpa:0.8:1", True, 0.02), ("plan:0.7", False, 0.01))
         for name in NAMES
     ]
     write_rows(tmp_path / "flight_tuning.json.gz", rules)
-    assert fly_flight.best_rule() == "cpa:0.8:1"
-    assert {job.policy for job in fly_flight.jobs([8, 4], quick=True)} >= {"full", "none", "cpa:0.8:1"}
+    assert tune_flight.best_rule() == "cpa:0.8:1"
+    assert {job.policies[0] for job in fly.flight(12)} >= {"full", "none", "cpa:0.8:1"}
     with pytest.raises(ValueError, match=r"flight_sixteen\.json\.gz holds no safe rule"):
-        fly_flight.jobs([16], quick=False, up_to=16)
+        fly.flight(16)
     write_rows(tmp_path / "flight_sixteen.json.gz", rules[: len(NAMES)])
-    work = fly_flight.jobs([16], quick=False, up_to=16)
-    assert {(job.set, job.episodes) for job in work} == {(FLIGHT_TESTS[16], 4000)}
-    assert {"full", "plan:0.8"} <= {job.policy for job in work}
-    assert "none" not in {job.policy for job in work}
+    work = fly.flight(16)
+    assert [job.config.n_robots for job in work[:2]] == [16, 16]
+    assert {job.episodes for job in work if job.config.n_robots == 16} == {4000}
+    assert {"full", "plan:0.8"} <= {job.policies[0] for job in work}
+    assert "none" not in {job.policies[0] for job in work}
     assert [job.scenario in tune_flight.SWAPS for job in work] == [True] * (len(work) // 2) + [False] * (len(work) // 2)
-    assert [job.n_robots for job in fly_flight.jobs([4, 16], quick=True, up_to=16)][:: len(work) // 2] == [16, 4] * 2
-    monkeypatch.setattr(fly_flight, "NAMES", NAMES[:1])
-    monkeypatch.setattr(fly_flight, "models", lambda recipe: [])
-    monkeypatch.setattr("sys.argv", ["", "--quick", "--jobs", "1", "--n-robots", "4", "--json", f"{tmp_path}/f.json"])
-    fly_flight.main()
-    rows = read_rows(tmp_path / "f.json")
-    assert {(row["n_robots"], row["policy"], len(row["outcomes"])) for row in rows} == {
-        (4, policy, fly_flight.QUICK) for policy in ("full", "none", "cpa:0.8:1")
+    monkeypatch.setattr(fly, "NAMES", NAMES[:1])
+    monkeypatch.setattr(fly, "models", lambda recipe: [])
+    monkeypatch.setattr(fly, "tuned_models", lambda up_to: [])
+    words = ["flight", "--quick", "--jobs", "1", "--n-robots", "4", "--out", str(tmp_path)]
+    fly.main(words)
+    rows = read_rows(tmp_path / "flight.json.gz")
+    assert {(row["n_robots"], row["policy"], len(row["outcomes"]), row["set"]) for row in rows} == {
+        (4, policy, fly.QUICK, FLIGHT_TESTS[12]) for policy in ("full", "none", "cpa:0.8:1")
     }
-    monkeypatch.setattr(fly_flight, "fly", None)
-    fly_flight.main()
-    assert read_rows(tmp_path / "f.json") == rows
+    ran = []
+    monkeypatch.setattr(Experiment, "run", lambda self, pool, what, fly, work: ran.append(len(work)))
+    fly.main(words)
+    fly.main([*words, "--again"])
+    assert ran == [0, 3]

@@ -15,7 +15,7 @@ from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 from studies import command_lines, random_worlds, solver_faults
 from studies.commit_points import POINTS
-from studies.swarm.protocol import condition
+from studies.swarm.experiment import condition
 
 ROOT = Path(__file__).parents[2]
 

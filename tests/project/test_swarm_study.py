@@ -18,8 +18,9 @@ from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import SCENARIOS
 from sb3_maddpg import MADDPG
 from sb3_maddpg.hub.pretrained import pretrained_folder
-from studies.swarm import counterfactual, fly_tests, ppo, protocol, tune_rules, tune_thresholds
+from studies.swarm import checkpoints, counterfactual, fly, ppo, protocol, requests, tune_rules, tune_thresholds, unseen
 from studies.swarm import report as page
+from studies.swarm.experiment import Experiment, Job, condition, known_rows
 
 
 def test_every_rule_of_every_family_can_be_read():
@@ -91,8 +92,8 @@ def test_thresholds_of_a_model_for_all_sizes_are_those_of_the_size_that_flies(tm
 
 def test_tables_of_flown_episodes(tmp_path):
     policies = ["full", "cpa:0.65:1.5", "none"]
-    job = fly_tests.Job({"preset": "paper"}, policies, "symmetric_swap", make_config("paper"), 30, protocol.EARLIER)
-    rows = fly_tests.compare(job)
+    job = Job({"preset": "paper"}, policies, "symmetric_swap", make_config("paper"), 30, protocol.EARLIER)
+    rows = fly.compare(job)
     assert [row["policy"] for row in rows] == ["full", "cpa:0.65:1.5", "none"]
     full, rule, none = rows
     assert full["against_full"]["only_policy"] == rule["against_rule"]["only_policy"] == 0
@@ -138,8 +139,9 @@ def test_table_of_teams_shows_models_beside_the_rule_of_their_cell():
 
 @pytest.mark.slow
 def test_flights_of_teams_fill_their_table(monkeypatch):
-    monkeypatch.setattr(fly_tests, "TEAMS", (4, 6))  # flown in seconds
-    rows = [row for job in fly_tests.teams(4) for row in fly_tests.compare(job)]
+    monkeypatch.setattr(fly, "TEAMS", (4, 6))  # flown in seconds
+    jobs = [job._replace(episodes=4, seed=protocol.TEST) for job in fly.teams()]
+    rows = [row for job in jobs for row in fly.compare(job)]
     assert {(row["n_robots"], row["scenario"]) for row in rows} == {(n, name) for n in (4, 6) for name in page.NAMES}
     lines = page.teams_table(rows).splitlines()[2:]
     assert [line.split(" | ")[0] for line in lines] == sorted(line.split(" | ")[0] for line in lines)
@@ -147,18 +149,18 @@ def test_flights_of_teams_fill_their_table(monkeypatch):
     assert all(line.count("|") == 7 for line in lines)
 
 
-@pytest.mark.parametrize("name", fly_tests.UNSEEN)
+@pytest.mark.parametrize("name", unseen.UNSEEN)
 @pytest.mark.parametrize("preset", ["paper", "dense"])
 def test_unseen_scenarios_are_other_ones(name, preset):
     config = make_config(preset)
     for seed in range(20):
-        starts, goals = fly_tests.UNSEEN[name](config.n_robots, config.space, np.random.default_rng(seed))
+        starts, goals = unseen.UNSEEN[name](config.n_robots, config.space, np.random.default_rng(seed))
         assert starts.shape == goals.shape == (config.n_robots, 3)
         for points in (starts, goals):
-            assert fly_tests.apart(points) >= config.space.spacing - 1e-9
+            assert unseen.apart(points) >= config.space.spacing - 1e-9
     known = list(SCENARIOS)
-    job = fly_tests.Job({"preset": preset}, ["full", "none"], name, config, 60, protocol.EARLIER)
-    rows = fly_tests.compare_unseen(job)
+    job = Job({"preset": preset}, ["full", "none"], name, config, 60, protocol.EARLIER)
+    rows = fly.compare_unseen(job)
     assert list(SCENARIOS) == known
     assert [row["scenario"] for row in rows] == [name] * 2
     assert rows[1]["collisions"] > rows[0]["collisions"], "robots meet there"
@@ -167,48 +169,67 @@ def test_unseen_scenarios_are_other_ones(name, preset):
 
 def test_rows_of_other_keys_stay(tmp_path):
     path = tmp_path / "rows.json"
-    assert read_rows(path) == []
-    protocol.replace_rows(path, [{"a": 1, "b": 1}, {"a": 1, "b": 2}, {"a": 2, "b": 3}], ("a",))
-    protocol.replace_rows(path, [{"a": 1, "b": 4}], ("a",))
-    assert read_rows(path) == [{"a": 2, "b": 3}, {"a": 1, "b": 4}]
+    for experiment in (Experiment(path, "a"), Experiment(None, "a")):
+        assert experiment.rows() == []
+        experiment.keep([{"a": 1, "b": 1}, {"a": 1, "b": 2}, {"a": {"c": 2}, "b": 3}])
+        experiment.keep([{"a": 1, "b": 4}])
+        assert experiment.rows() == [{"a": {"c": 2}, "b": 3}, {"a": 1, "b": 4}]
+        experiment.keep([{"a": 5, "b": 4}], "b")
+        assert experiment.rows() == [{"a": {"c": 2}, "b": 3}, {"a": 5, "b": 4}]
+    assert read_rows(path) == experiment.rows()
+
+
+def test_what_has_flown_as_many_of_the_same_episodes_is_not_missing(tmp_path):
+    experiment = Experiment(tmp_path / "rows.json.gz", "n", "scenario", "policy")
+    job = Job({"n": 4}, ["full", "none"], "random", make_config("paper"), 5, seed=1)
+    row = {"n": 4, "scenario": "random", "policy": "full", "set": 1, "episodes": 5}
+    experiment.keep([row])
+    assert experiment.missing([job]) == [job], "one policy has not"
+    experiment.keep([row | {"policy": "none"}])
+    assert experiment.missing([job]) == []
+    others = [job._replace(episodes=6), job._replace(seed=2), job._replace(keys={"n": 5})]
+    others += [job._replace(scenario="random_swap"), job._replace(policies=["full", "distance:4"])]
+    assert experiment.missing([job, *others]) == others
+    experiment.keep([{"n": 4, "scenario": "random_swap", "policy": policy} for policy in job.policies])
+    assert others[3] not in experiment.missing(others), "its rows do not say how many"
 
 
 def test_a_table_is_read_again_when_it_has_changed(tmp_path):
     path = tmp_path / "rows.json"
-    assert protocol.known_rows(path) == []
-    protocol.replace_rows(path, [{"a": 1}], ("a",))
-    rows = protocol.known_rows(path)
+    assert known_rows(path) == []
+    write_rows(path, [{"a": 1}])
+    rows = known_rows(path)
     assert rows == [{"a": 1}]
-    assert protocol.known_rows(path) is rows, "parsed once"
-    protocol.replace_rows(path, [{"a": 2}], ("a",))
-    assert protocol.known_rows(path) == [{"a": 1}, {"a": 2}]
+    assert known_rows(path) is rows, "parsed once"
+    write_rows(path, [{"a": 1}, {"a": 2}])
+    assert known_rows(path) == [{"a": 1}, {"a": 2}]
 
 
 @pytest.mark.slow
 def test_rows_of_an_earlier_rule_do_not_stay(tmp_path, monkeypatch):
-    monkeypatch.setattr(fly_tests, "QUICK", 1)
+    monkeypatch.setattr(fly, "QUICK", 1)
     for rule in ("none", "full"):
         rules = dict.fromkeys(protocol.NAMES, rule)
-        monkeypatch.setattr(fly_tests, "best_rules", lambda preset, n_robots=None, rules=rules: rules)
+        monkeypatch.setattr(fly, "best_rules", lambda preset, n_robots=None, rules=rules: rules)
         command = "asking --quick --preset paper --scenario random --jobs 1 --out"
-        fly_tests.main([*command.split(), str(tmp_path)])
+        fly.main([*command.split(), str(tmp_path)])
     policies = {row["policy"] for row in read_rows(tmp_path / "asking.json.gz")}
     assert policies == {"full", protocol.models("paper")[0]}
 
 
 def test_interventions_change_the_steps_that_they_should():
-    one = protocol.condition("none", "symmetric_swap", make_config("paper"))
+    one = condition("none", "symmetric_swap", make_config("paper"))
     rows = fly_all([one], 8, protocol.EARLIER)[one]
     number = next(k for k, row in enumerate(rows) if row["collided"])
-    collided, end, pair = fly_tests.replay(one, protocol.EARLIER, number)
+    collided, end, pair = requests.replay(one, protocol.EARLIER, number)
     assert (collided, end) == (True, rows[number]["steps_counted"])
-    everybody = fly_tests.INTERVENTIONS["everybody asks everybody"]
-    assert fly_tests.replay(one, protocol.EARLIER, number, everybody, pair, range(end, 100)) == (collided, end, pair)
-    assert not fly_tests.replay(one, protocol.EARLIER, number, everybody, pair, range(100))[0]
+    everybody = requests.INTERVENTIONS["everybody asks everybody"]
+    assert requests.replay(one, protocol.EARLIER, number, everybody, pair, range(end, 100)) == (collided, end, pair)
+    assert not requests.replay(one, protocol.EARLIER, number, everybody, pair, range(100))[0]
     asked = np.zeros((4, 4), dtype=bool)
-    each_other = fly_tests.INTERVENTIONS["the two ask each other"](asked.copy(), 1, 3)
+    each_other = requests.INTERVENTIONS["the two ask each other"](asked.copy(), 1, 3)
     assert {tuple(map(int, place)) for place in np.argwhere(each_other)} == {(1, 3), (3, 1)}
-    third = fly_tests.INTERVENTIONS["all others ask the two"](asked.copy(), 1, 3)
+    third = requests.INTERVENTIONS["all others ask the two"](asked.copy(), 1, 3)
     assert {tuple(map(int, place)) for place in np.argwhere(third)} == {(0, 1), (0, 3), (2, 1), (2, 3)}
 
 
@@ -262,6 +283,23 @@ def test_ppo_is_trained_and_flown(tmp_path, monkeypatch):
     assert page.reference_table(rows, "price", "threshold").count("/3, ") == len(rows)
 
 
+@pytest.mark.slow
+def test_models_from_different_times_of_a_training_are_flown(tmp_path, monkeypatch):
+    run, model = tmp_path / "faithful_0" / "maddpg" / "QuadSwarm-v0_1", protocol.ROOT / protocol.models("faithful")[0]
+    run.mkdir(parents=True)
+    for name in ("rl_model_1000_steps", "rl_model_2000_steps", "best_model", "QuadSwarm-v0"):
+        shutil.copy(model, run / f"{name}.zip")
+    table = tmp_path / "checkpoints.json.gz"
+    words = ["checkpoints.py", str(run), "--choosing", "1", "--episodes", "2", "--jobs", "1", "--models", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*words, "--json", str(table)])
+    checkpoints.main()
+    rows = read_rows(table)
+    assert len({(row["choice"], row["scenario"]) for row in rows}) == len(rows) == 16
+    assert {(row["run"], row["episodes"], row["set"]) for row in rows} == {("faithful_0", 2, protocol.EARLIER)}
+    assert len({row["requests"] for row in rows if row["scenario"] == "random"}) == 1, "all are the same model"
+    assert len(page.checkpoints_table(rows).splitlines()) == 6
+
+
 def test_forks_differ_by_the_request_that_is_turned_round_and_by_nothing_else(monkeypatch):
     env = gymnasium.make("QuadSwarm-v0", **ppo.env_kwargs(0.0))
     model = MADDPG(
@@ -283,18 +321,8 @@ def test_forks_differ_by_the_request_that_is_turned_round_and_by_nothing_else(mo
 @pytest.mark.slow
 def test_a_regression_on_forks_is_trained_and_flown(tmp_path, monkeypatch):
     table = tmp_path / "counterfactual.json"
-    words = [
-        "counterfactual.py",
-        "--forks",
-        "2",
-        "--episodes",
-        "3",
-        "--models",
-        str(tmp_path),
-        "--json",
-        str(table),
-    ]
-    monkeypatch.setattr(sys, "argv", words)
+    words = ["counterfactual.py", "--forks", "2", "--episodes", "3", "--models", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*words, "--json", str(table)])
     counterfactual.main()
     rows = read_rows(table)
     assert len(rows) == 4 * len(counterfactual.PRICES)
@@ -305,25 +333,24 @@ def test_a_regression_on_forks_is_trained_and_flown(tmp_path, monkeypatch):
 
 
 def test_the_test_set_is_one_that_nothing_was_chosen_on():
-    sealed = {"test", "teams", "counts", "quadrants"}
-    for part, (make_jobs, _) in fly_tests.PARTS.items():
-        sets = {job.seed for job in make_jobs(4)}
-        assert sets == {protocol.TEST if part in sealed else protocol.EARLIER}, part
+    sealed = dict.fromkeys(("test", "teams", "counts", "quadrants"), protocol.TEST)
+    sealed |= {"flight": protocol.FLIGHT_TESTS[12], "flight_sixteen_sealed": protocol.FLIGHT_TESTS[16]}
+    sealed |= dict.fromkeys(("world", "delays", "delay_check", "paper", "plants"), protocol.WORLDS)
+    for name, part in fly.PARTS.items():
+        assert part.seed == sealed.get(name, protocol.EARLIER), name
     assert len({protocol.VALIDATION, protocol.EARLIER, protocol.EARLIER_TEAMS, protocol.TEST}) == 4
 
 
 def test_requests_are_counted_over_whole_episodes_as_in_the_paper():
-    job = fly_tests.Job(
-        {"preset": "paper"}, ["full", "distance:4"], "random", make_config("paper"), 3, protocol.EARLIER
-    )
-    full, rule = fly_tests.compare_whole_episodes(job)
+    job = Job({"preset": "paper"}, ["full", "distance:4"], "random", make_config("paper"), 3, protocol.EARLIER)
+    full, rule = fly.whole(job)
     assert full["requests_flown"] == 3 * 100 * 12
     assert full["steps_flown"] == rule["steps_flown"] == 300
     assert 0 < rule["requests_flown"] < full["requests_flown"]
 
 
 def test_the_papers_asymmetric_swap_has_a_robot_in_each_quadrant():
-    (job,) = fly_tests.quadrants(4)
+    (job,) = fly.quadrants()
     for seed in range(20):
         starts, goals = SCENARIOS["asymmetric_swap"](4, job.config.space, np.random.default_rng(seed))
         assert [(x > 0, y > 0) for x, y, _ in starts] == [(True, True), (False, True), (False, False), (True, False)]
