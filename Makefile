@@ -8,7 +8,7 @@ SEED ?= 0
 LOGS ?= logs
 EPISODES ?= 500
 JOBS ?= $(shell $(PYTHON) -c "import os; print(os.cpu_count() or 1)")
-BENCHMARKS ?= planner env training scaling estimators
+BENCHMARKS ?= planner env training scaling
 TEAMS ?= 6 12 16
 TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan and stale" "plan, or cpa and stale" "two cpa"
 POLICIES ?= none full distance:4 "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
@@ -55,7 +55,7 @@ docs: install  ## the documentation site, in docs/_build; a warning is an error
 page:  ## the page of `sb3-maddpg replay` (needs npm)
 	cd envs/quad_swarm/figures/page && npm ci --no-audit --no-fund && npm run build
 
-bench: install  ## speed of planner, environment and learner, and the estimators, as tables and as JSON
+bench: install  ## speed of planner, environment and learner, as tables and as JSON
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py --json $(LOGS)/$$name.json || exit 1; done
 
 STUDY := $(BIN)/python -m studies.swarm

@@ -56,19 +56,30 @@ def missing(name: str) -> str | None:
     return None if importlib.util.find_spec("mpe2") else f"{sys.executable} -m pip install -c constraints.txt mpe2"
 
 
-def measure(name: str, networks: str, amounts: Mapping[str, int], core: int | None) -> Row:
+def installed(names: Sequence[str]) -> list[str]:
+    """:return: the drivers whose dependencies are installed; the others are named"""
+    commands = {name: missing(name) for name in names}
+    for name, command in commands.items():
+        if command:
+            print(f"{name} is skipped, since it is not installed: {command}", file=sys.stderr, flush=True)
+    return [name for name in names if not commands[name]]
+
+
+def drive(name: str, mode: str, options: Mapping[str, Any]) -> Row:
     """
     Run a driver once.
 
+    :param name: name of the driver
+    :param mode: speed or learn
+    :param options: the driver's options; those that are None are left out
     :raises RuntimeError: if the driver failed
     """
-    command = [str(python_of(name)), "-m", f"benchmarks.peers.{name}_bench", "speed", "--networks", networks]
-    for option, value in [*amounts.items(), *([] if core is None else [("core", core)])]:
-        command += [f"--{option}", str(value)]
+    command = [str(python_of(name)), "-m", f"benchmarks.peers.{name}_bench", mode]
+    command += [f"--{option}={value}" for option, value in options.items() if value is not None]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     run = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT, check=False)
     if run.returncode:
-        raise RuntimeError(f"{name}, {networks}: {' '.join(command)}\n{run.stderr[-2000:]}")
+        raise RuntimeError(f"{' '.join(command)}\n{run.stderr[-2000:]}")
     return json.loads(run.stdout.splitlines()[-1])
 
 
@@ -133,12 +144,7 @@ def main() -> None:
     parser.add_argument("--core", type=int, help="core to pin to (default: the last allowed one)")
     args = parser.parse_args()
 
-    names = []
-    for name in args.only:
-        if command := missing(name):
-            print(f"{name} is skipped, since it is not installed: {command}", flush=True)
-        else:
-            names.append(name)
+    names = installed(args.only)
     rounds: dict[tuple[str, str], list[Row]] = {
         (name, networks): [] for networks in args.networks for name in names if name in HAVE[networks]
     }
@@ -147,7 +153,7 @@ def main() -> None:
     for number in range(args.rounds):
         for name, networks in list(rounds):
             try:
-                row = measure(name, networks, amounts, args.core)
+                row = drive(name, "speed", {"networks": networks, **amounts, "core": args.core})
             except RuntimeError as error:
                 failures.append(str(error))
                 print(f"FAILED {error}", flush=True)

@@ -1,8 +1,8 @@
 """Train with the packaged recipes in the particle worlds of Lowe et al. (2017).
 
-``python benchmarks/mpe.py [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
+``python -m studies.mpe [--envs simple_spread simple_spread:discrete ...] [--algos maddpg matd3] [--seeds 0 1 2]``
 runs ``sb3-maddpg train`` for each environment, algorithm and seed, with an evaluation of 100 episodes without noise
-every 10,000 steps. It adds the learning curves to benchmarks/results/mpe2.json. Finished runs in ``--log-folder`` that
+every 10,000 steps. It adds the learning curves to studies/data/mpe2.json. Finished runs in ``--log-folder`` that
 used the current recipe are not repeated. Actions are continuous, except for environments followed by ``:discrete``.
 ``ppo`` is PPO with one policy for all agents; its recipes have discrete actions.
 
@@ -24,7 +24,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
-from statistics import mean, stdev
+from statistics import mean
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,8 +38,8 @@ from sb3_maddpg import IDDPG, MADDPG, MASAC, MATD3
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.team import pettingzoo as parallel
 from sb3_maddpg.team.pettingzoo import TeamEnv
+from studies.learning import ROOT, interval
 
-ROOT = Path(__file__).resolve().parent.parent
 MODULES = {
     "simple_spread": "mpe2/simple_spread_v3",
     "simple_speaker_listener": "mpe2/simple_speaker_listener_v4",
@@ -196,13 +196,6 @@ def returns_by_agent(model: Path, run: Run) -> dict[str, float]:
     return dict(zip(team.agent_names, (totals / EVAL_EPISODES).round(3).tolist(), strict=True))
 
 
-def interval(values: Sequence[float]) -> float:
-    """:return: the half-width of the 95 % t-interval of the mean"""
-    from scipy.stats import t
-
-    return float(t.ppf(0.975, len(values) - 1)) * stdev(values) / len(values) ** 0.5 if len(values) > 1 else np.nan
-
-
 def grouped(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[Row]]:
     """:return: rows of all seeds by environment, kind of actions and algorithm"""
     groups: dict[tuple[str, str, str], list[Row]] = {}
@@ -220,7 +213,7 @@ def report(rows: Sequence[Row]) -> None:
         short = {module: name for name, module in MODULES.items()}[env]
         for at in SHOWN:
             values = [row["mean_return"][row["timesteps"].index(at)] for row in seeds if at in row["timesteps"]]
-            cell = f"{mean(values):.2f} ± {interval(values):.2f}" if values else "-"
+            cell = "{:.2f} ± {:.2f}".format(*interval(values)) if values else "-"
             if values and (bar := BARS.get((short, at))) is not None:
                 cell += f" ({'better' if mean(values) > bar else 'WORSE'} than {bar:g})"
             line += f"{cell:>24}" if len(cell) < 24 else f"  {cell}"
@@ -275,7 +268,7 @@ def plot(rows: Sequence[Row], file: Path) -> None:
 def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> None:
     steps = np.array(seeds[0]["timesteps"]) / 1000
     curves = np.array([row["mean_return"] for row in seeds])
-    middle, half = curves.mean(axis=0), np.array([interval(values.tolist()) for values in curves.T])
+    middle, half = np.array([interval(values) for values in curves.T]).T
     style = ("-", "--", "-.", (0, (1, 1)), (0, (7, 2, 1, 2, 1, 2)))[index % 5]
     axes.plot(steps, middle, linestyle=style, color=colour_of(index), label=f"{label}, {len(seeds)} seeds")
     axes.fill_between(steps, middle - half, middle + half, color=colour_of(index), alpha=0.15, linewidth=0)
@@ -284,7 +277,7 @@ def _draw_curve(axes: Axes, seeds: Sequence[Row], label: str, index: int) -> Non
 def write(rows: Sequence[Row], file: Path) -> None:
     """Write the results with the versions and recipes that produced them."""
     about = {
-        "command": " ".join(["python", *sys.argv]),
+        "command": " ".join(["python -m studies.mpe", *sys.argv[1:]]),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
         "eval_freq": EVAL_FREQ,
         "eval_episodes": EVAL_EPISODES,
@@ -307,7 +300,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100_000, help="length of each training (default 100,000)")
     parser.add_argument("--jobs", type=int, default=1, help="parallel trainings, each with one thread")
     parser.add_argument("--log-folder", type=Path, default=Path("logs/mpe2"), help="folder of the trainings")
-    parser.add_argument("--json", type=Path, default=ROOT / "benchmarks/results/mpe2.json", metavar="FILE")
+    parser.add_argument("--json", type=Path, default=ROOT / "studies/data/mpe2.json", metavar="FILE")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the learning curves")
     parser.add_argument("--report", action="store_true", help="only report finished trainings")
     args = parser.parse_args()

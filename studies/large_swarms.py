@@ -1,6 +1,6 @@
 """Measure the steps per second and the memory of large swarms, with and without a limited neighbourhood.
 
-``python benchmarks/large_swarms.py [--json F]`` flies the preset `flight` with 4 to 128 robots, the preset's number of
+``python -m studies.large_swarms [--json F]`` flies the preset `flight` with 4 to 128 robots, the preset's number of
 robots per area, the observation of its recipe, and random actions:
 
 - ``all``: robots perceive all others,
@@ -25,8 +25,6 @@ import resource
 import time
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import torch as th

@@ -1,6 +1,6 @@
-"""Cross-play: let the agents of all libraries that learning.py trained play against each other.
+"""Cross-play: let the agents of all libraries that `studies.learning` trained play against each other.
 
-``python -m benchmarks.crossplay [--json F]`` after ``python -m benchmarks.learning --peers``. In tag and adversary, one
+``python -m studies.crossplay [--json F]`` after ``python -m studies.learning --peers``. In tag and adversary, one
 side gains what the other loses, and both learn, so a library's return against its own agents does not show how good
 they are. Here, each side of each training plays against the other side of all trainings, of its own library and the
 others, in the same episodes without exploration. For each side and library:
@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from benchmarks.learning import EVERYTHING, FOLDER, OURS, actors_of, interval, read, sides, welch, write
 from benchmarks.peers import common
+from studies.learning import EVERYTHING, FOLDER, OURS, actors_of, interval, read, sides, welch, write
 
 COMPETITIVE = ("simple_tag_v3", "simple_adversary_v3")
 EPISODES = range(10_000, 10_100)
@@ -259,7 +259,7 @@ def main() -> None:
             key=lambda training: (EVERYTHING.index(training[0]), training[1]),
         )
         if not trainings:
-            print(f"No trainings of {name}: python -m benchmarks.learning --peers", file=sys.stderr)
+            print(f"No trainings of {name}: python -m studies.learning --peers", file=sys.stderr)
             continue
         print(f"{name}: {len(trainings)} trainings", file=sys.stderr, flush=True)
         rows += summarise(name, trainings, play(name, trainings, args.folder, EPISODES))

@@ -1,13 +1,13 @@
 """Compare how well MADDPG learns here and in other libraries, on the tasks of Lowe et al. (mpe2, continuous actions).
 
-``python -m benchmarks.learning [--json F]`` trains our MADDPG and the plain loop, with ``--peers`` also all libraries
+``python -m studies.learning [--json F]`` trains our MADDPG and the plain loop, with ``--peers`` also all libraries
 that ``make bench-peers`` installs. All trainings use the settings of benchmarks/peers/common.py, one core and one
 thread. Each finished training is a line of runs.jsonl in ``--folder``, beside its policies. The script skips finished
 trainings, so it can be stopped and restarted. Rows, for each task, side and library:
 
 - ``return``: mean return of an agent over 100 episodes without exploration, averaged over seeds, with a 95 %
   t-interval. In tag and adversary, where one side gains what the other loses, this is each side's return against its
-  training partners, which is not informative: see crossplay.py.
+  training partners, which is not informative: see `studies.crossplay`.
 - ``ours_minus``: return of ours minus return of this library, with Welch's 95 % interval;
 - ``cpu_s``: median processor time of a training.
 
@@ -16,8 +16,6 @@ trainings, so it can be stopped and restarted. Rows, for each task, side and lib
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -27,7 +25,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from benchmarks.training import OURS, REFERENCE, ROOT, machine, missing, python_of
+from benchmarks.training import OURS, REFERENCE, ROOT, drive, installed, machine
 from quad_swarm.evaluation.rows import write_rows
 
 TASKS = ("simple_speaker_listener_v4", "simple_tag_v3", "simple_adversary_v3", "simple_spread_v3")
@@ -96,14 +94,14 @@ def train(name: str, env: str, seed: int, steps: int, folder: Path, core: int | 
 
     :raises RuntimeError: if the driver failed
     """
-    command = [str(python_of(name)), "-m", f"benchmarks.peers.{name}_bench", "learn", "--env", env]
-    command += ["--steps", str(steps), "--seed", str(seed), "--export", str(actors_of(folder, name, env, seed, steps))]
-    command += [] if core is None else ["--core", str(core)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT, check=False)
-    if run.returncode:
-        raise RuntimeError(f"{name}, {env}, seed {seed}: {' '.join(command)}\n{run.stderr[-2000:]}")
-    return {"driver": name, **json.loads(run.stdout.splitlines()[-1]), "machine": machine()}
+    options = {
+        "env": env,
+        "steps": steps,
+        "seed": seed,
+        "export": actors_of(folder, name, env, seed, steps),
+        "core": core,
+    }
+    return {"driver": name, **drive(name, "learn", options), "machine": machine()}
 
 
 def summarise(runs: Iterable[Row]) -> list[Row]:
@@ -162,14 +160,11 @@ def main() -> None:
     args = parser.parse_args()
 
     names = args.only or (EVERYTHING if args.peers else (OURS, REFERENCE))
-    for name in names:
-        if not args.no_train and (command := missing(name)):
-            print(f"{name} is skipped, since it is not installed: {command}", file=sys.stderr, flush=True)
-    available = [name for name in names if not missing(name)]
+    available = [] if args.no_train else installed(names)
     wanted = {name: args.seeds or SEEDS[name] for name in available}
     failures = 0
     # Seed by seed, so that intermediate results compare the same seeds
-    for seed in range(0 if args.no_train else max(wanted.values(), default=0)):
+    for seed in range(max(wanted.values(), default=0)):
         for name, env in [(name, env) for name in available for env in args.tasks if seed < wanted[name]]:
             key = (name, env, seed, args.steps)
             if key in {(run["driver"], run["env"], run["seed"], run["steps"]) for run in read(args.folder)}:

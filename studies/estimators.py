@@ -1,11 +1,10 @@
 """
 Compare how well the gradient estimators for bits and categories learn the small team tasks.
 
-``python benchmarks/estimators.py [--seeds 5] [--json FILE]``
+``python -m studies.estimators [--seeds 5] [--json FILE]``
 """
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from quad_swarm.evaluation.rows import write_rows
 from sb3_maddpg import MADDPG
 from sb3_maddpg.common.estimators import ESTIMATORS
 from sb3_maddpg.team.toys import BINARY_TASKS, OwnCategory, TeamTask
+from studies.learning import interval
 
 # Arguments for all estimators, and the steps after which the deterministic policy is evaluated
 RECIPE: dict[str, Any] = {
@@ -26,8 +26,6 @@ RECIPE: dict[str, Any] = {
     "gamma": 0.5,
 }
 CHECKPOINTS = (500, 1000, 2000, 4000)
-# Student's t for a two-sided 95 % interval, by degrees of freedom
-T_95 = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 7: 2.36, 8: 2.31, 9: 2.26}
 
 
 def learning_curve(task: type[TeamTask], estimator: str, seed: int) -> list[float]:
@@ -43,15 +41,6 @@ def learning_curve(task: type[TeamTask], estimator: str, seed: int) -> list[floa
         model.learn(steps, reset_num_timesteps=False)
         curve.append(task().play(model))
     return curve
-
-
-def cell(returns: Sequence[float]) -> str:
-    """
-    :param returns: returns of the seeds
-    :return: text with the mean and the half-width of the 95 % interval
-    """
-    half = T_95[len(returns) - 1] * np.std(returns, ddof=1) / len(returns) ** 0.5
-    return f"{np.mean(returns):5.2f} ± {half:.2f}"
 
 
 def main() -> None:
@@ -71,7 +60,7 @@ def main() -> None:
     for task in (*BINARY_TASKS, OwnCategory):
         for estimator in ESTIMATORS:
             curves = [learning_curve(task, estimator, seed) for seed in range(arguments.seeds)]
-            cells = [cell(returns) for returns in zip(*curves, strict=True)]
+            cells = ["{:5.2f} ± {:.2f}".format(*interval(returns)) for returns in zip(*curves, strict=True)]
             print(f"{task.__name__:12} {estimator:24}" + "".join(f"{text:>15}" for text in cells), flush=True)
             rows.append({"task": task.__name__, "estimator": estimator, "steps": CHECKPOINTS, "returns": curves})
     if arguments.json is not None:
