@@ -15,13 +15,24 @@ import numpy as np
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.geometry import length
 from quad_swarm.quadrotor import POSITION, VELOCITY
+from quad_swarm.task.columns import (
+    COLUMNS,
+    ERROR_RANGE,
+    ERROR_SCALE,
+    GAPS,
+    POSITION_SCALE,
+    SPEED,
+    STAGES,
+    VELOCITY_SCALE,
+    Column,
+    of_numbers,
+    of_pairs,
+    of_paper,
+    unnamed,
+)
 from quad_swarm.task.view import View
+from quad_swarm.world.knowledge import Knowledge
 from quad_swarm.world.presets import SwarmConfig
-from quad_swarm.world.swarm import Swarm
-
-# Approximate maximum speed (m/s) and typical distance (m), which scale observations to unit size
-_VELOCITY_SCALE = 4.0
-_POSITION_SCALE = 4.0
 
 
 class Observation(Protocol):
@@ -33,10 +44,14 @@ class Observation(Protocol):
     size: int
 
     @property
+    def columns(self) -> list[Column]:
+        """Name, unit, frame and meaning of each column."""
+
+    @property
     def layout(self) -> dict[str, Any]:
         """Meaning of the columns, see `sb3_maddpg.relational.ObservationLayout`."""
 
-    def __call__(self, swarm: Swarm) -> np.ndarray:
+    def __call__(self, knowledge: Knowledge) -> np.ndarray:
         """Return the observations of all robots, (E, n, size) float32."""
 
 
@@ -53,10 +68,12 @@ class PaperObservation:
 
     def __init__(self, config: SwarmConfig, scaled: bool = False):
         self.config = config
-        self._numbers = 6 * (config.n_others + 1)  # first column of the others' numbers, if there are any
-        self.size = self._numbers + (config.n_others if config.is_limited else 0)
+        self.columns = of_paper(config.n_others, scaled)
+        self._numbers = len(self.columns)  # first column of the others' numbers, if there are any
+        self.columns += of_numbers(config.n_others) if config.is_limited else []
+        self.size = len(self.columns)
         others = 3 * config.n_others
-        units = [_VELOCITY_SCALE, _POSITION_SCALE, _POSITION_SCALE, _VELOCITY_SCALE]
+        units = [VELOCITY_SCALE, POSITION_SCALE, POSITION_SCALE, VELOCITY_SCALE]
         self._scale = np.repeat(units, [3, 3, others, others]) if scaled else None
 
     @property
@@ -66,22 +83,22 @@ class PaperObservation:
         layout = {"own": list(range(6)), "neighbours": others, "acts_on_neighbours": True}
         return layout | (_numbered(self._numbers, self.size) if self.config.is_limited else {})
 
-    def __call__(self, swarm: Swarm) -> np.ndarray:
-        estimate, (others_pos, others_vel) = swarm.estimate(), swarm.observe()
+    def __call__(self, knowledge: Knowledge) -> np.ndarray:
+        estimate, (others_pos, others_vel) = knowledge.estimate(), knowledge.observe()
         pos, vel = estimate[..., POSITION], estimate[..., VELOCITY]
         flat = (*pos.shape[:2], -1)
         relative_pos, relative_vel = others_pos - pos[:, :, None], others_vel - vel[:, :, None]
-        present = swarm.neighbours.present
+        present = knowledge.neighbours.present
         if present is not None:
             relative_pos[~present], relative_vel[~present] = 0.0, 0.0
-        parts = (vel, swarm.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
+        parts = (vel, knowledge.goal - pos, relative_pos.reshape(flat), relative_vel.reshape(flat))
         if self._scale is None:
             observed = np.concatenate(parts, axis=-1, dtype=np.float32)
         else:
             observed = (np.concatenate(parts, axis=-1) / self._scale).astype(np.float32)
         if present is None:
             return observed
-        return np.concatenate([observed, swarm.neighbours.numbers() + 1], axis=-1, dtype=np.float32)
+        return np.concatenate([observed, knowledge.neighbours.numbers() + 1], axis=-1, dtype=np.float32)
 
 
 def _numbered(first: int, end: int) -> dict[str, Any]:
@@ -94,11 +111,11 @@ class PairView:
     so that the other robot moves to the left. Features of a pair thus do not depend on rotations and reflections.
 
     :param view: the knowledge of the robots
-    :param swarm: the swarm, for features that only critics see
+    :param swarm: the swarms, for features that only critics see, or a robot of its own
     :param config: the world
     """
 
-    def __init__(self, view: View, swarm: Swarm, config: SwarmConfig):
+    def __init__(self, view: View, swarm: Knowledge, config: SwarmConfig):
         self.view, self.swarm = view, swarm
         self.contact = 2 * config.radius
         self.horizon, self.dt = config.planner.horizon, config.planner.dt
@@ -117,14 +134,10 @@ class PairView:
 
     def closeness(self, distance: np.ndarray) -> np.ndarray:
         """Return a distance at several scales around contact, (..., 3)."""
-        return np.tanh((distance - self.contact)[..., None] / _MAGNIFICATIONS)
+        return np.tanh((distance - self.contact)[..., None] / _GAPS)
 
 
-_MAGNIFICATIONS = np.array([0.05, 0.2, 1.0])
-# Typical speed (m/s), which scales velocities in pair features to unit size
-_SPEED = 1.5
-# Stages of a trajectory that become features, as fractions of the horizon N
-_STAGES = (0.2, 0.5, 1.0)
+_GAPS = np.array(GAPS)
 # Distance of plans in separations, beyond which they hardly affect each other. 1.1 is enough for eight robots, but
 # leaves twice as many collisions among sixteen.
 _CONFLICT = 1.8
@@ -133,7 +146,7 @@ _ENCOUNTER, _LOOK_AHEAD = 1.2, 3.0
 
 
 def _stages(horizon: int) -> list[int]:
-    return [max(round(fraction * horizon), 1) - 1 for fraction in _STAGES]
+    return [max(round(fraction * horizon), 1) - 1 for fraction in STAGES]
 
 
 def _flat(array: np.ndarray, keep: int) -> np.ndarray:
@@ -147,10 +160,10 @@ def _own(view: View) -> np.ndarray:
     cos, sin = (goal[..., k] / np.maximum(flat, 1e-6) for k in (0, 1))
     along, across = cos * vel[..., 0] + sin * vel[..., 1], cos * vel[..., 1] - sin * vel[..., 0]
     columns = (
-        along / _SPEED,
-        across / _SPEED,
+        along / SPEED,
+        across / SPEED,
         vel[..., 2],
-        flat / _POSITION_SCALE,
+        flat / POSITION_SCALE,
         np.minimum(flat, 1.0),
         goal[..., 2],
     )
@@ -164,10 +177,10 @@ def _state(pair: PairView) -> np.ndarray:
     own_vel, goal = (np.broadcast_to(a[:, :, None], view.pos.shape) for a in (view.own_vel, view.goal))
     to_goal = goal / np.maximum(length(goal)[..., None], 1.0)
     parts = (
-        np.stack([distance / _POSITION_SCALE, view.pos[..., 2]], axis=-1),
+        np.stack([distance / POSITION_SCALE, view.pos[..., 2]], axis=-1),
         pair.closeness(distance)[..., 1:],
-        pair.turn(view.vel) / _SPEED,
-        pair.turn(own_vel) / _SPEED,
+        pair.turn(view.vel) / SPEED,
+        pair.turn(own_vel) / SPEED,
         pair.turn(to_goal),
     )
     return np.concatenate(parts, axis=-1)
@@ -229,8 +242,8 @@ def _known_by_other(pair: PairView) -> np.ndarray:
             [theirs.remembers.astype(float), np.minimum(theirs.age / pair.horizon, 1.0), np.exp(2 - theirs.age)],
             axis=-1,
         ),
-        np.tanh(length(off) / 0.1),
-        np.clip(2 * _flat(pair.turn(off[..., 1:, :]), 3), -2, 2),
+        np.tanh(length(off) / ERROR_SCALE),
+        np.clip(_flat(pair.turn(off[..., 1:, :]), 3) / ERROR_RANGE, -2, 2),
     )
     return np.concatenate(parts, axis=-1)
 
@@ -252,9 +265,9 @@ def _critic(pair: PairView) -> np.ndarray:
     surprise = certain.believed(stages) - view.own_pos[:, :, None, None] - view.expected(stages)
     size = length(surprise)
     parts = (
-        np.clip(2 * _flat(pair.turn(surprise), 3), -2, 2),
-        np.tanh(size / 0.1),
-        np.tanh(view.of_the_other(size) / 0.1),  # swaps the two robots of a pair
+        np.clip(_flat(pair.turn(surprise), 3) / ERROR_RANGE, -2, 2),
+        np.tanh(size / ERROR_SCALE),
+        np.tanh(view.of_the_other(size) / ERROR_SCALE),  # swaps the two robots of a pair
         pair.closeness(certain.approach(view.own_pos, view.plan).least),
         pair.closeness(view.plan_approach.least),
         view.of_the_other(prediction.remembers)[..., None],
@@ -323,15 +336,24 @@ class PairObservation:
                 raise unknown_name("observation", name, ["paper", *GROUPS])
         self.config = config
         self.groups = [name for name in GROUPS if name in groups]
-        sizes = [_features(name, self._pair(Swarm(config, 1))).shape[-1] for name in self.groups]
-        self._sizes = dict(zip(self.groups, sizes, strict=True))
-        self._seen = sum(sizes) - (sizes[-1] if self.groups[-1] == "critic" else 0)
-        self._numbers = 6 + config.n_others * sum(sizes)  # first column of the others' numbers, if there are any
-        self.size = self._numbers + (config.n_others if config.is_limited else 0)
-        self._blank = 0 if critics else sum(sizes) - self._seen
+        columns = {name: self._columns_of(name) for name in self.groups}
+        self._sizes = {name: len(about) for name, about in columns.items()}
+        self._seen = sum(size for name, size in self._sizes.items() if name != "critic")
+        self.columns = of_pairs(columns, config.n_others)
+        self._numbers = len(self.columns)  # first column of the others' numbers, if there are any
+        self.columns += of_numbers(config.n_others) if config.is_limited else []
+        self.size = len(self.columns)
+        self._blank = not critics
 
-    def _pair(self, swarm: Swarm) -> PairView:
-        return PairView(View(swarm), swarm, self.config)
+    def _columns_of(self, name: str) -> list[Column]:
+        if GROUPS[name] in _OWN_GROUPS:
+            return COLUMNS[name]
+        from quad_swarm.world.swarm import Swarm  # which alone tells how many columns a registered group has
+
+        return unnamed(_features(name, self._pair(Swarm(self.config, 1))).shape[-1])
+
+    def _pair(self, knowledge: Knowledge) -> PairView:
+        return PairView(View(knowledge), knowledge, self.config)
 
     @property
     def layout(self) -> dict[str, Any]:
@@ -343,8 +365,8 @@ class PairObservation:
             layout["action_mask"] = seen[:, -1].tolist()  # the mask is the last group that robots see
         return layout | ({"critic": hidden.tolist()} if hidden.size else {})
 
-    def __call__(self, swarm: Swarm) -> np.ndarray:
-        pair = self._pair(swarm)
+    def __call__(self, knowledge: Knowledge) -> np.ndarray:
+        pair = self._pair(knowledge)
         teams = pair.view.pos.shape[:2]
         observed = np.zeros((*teams, self.size), dtype=np.float32)
         observed[..., :6] = _own(pair.view)
@@ -357,7 +379,7 @@ class PairObservation:
                 column += features.shape[-1]
         if pair.view.present is not None:
             blocks[~pair.view.present] = 0.0
-            observed[..., self._numbers :] = swarm.neighbours.numbers() + 1
+            observed[..., self._numbers :] = knowledge.neighbours.numbers() + 1
         return observed
 
 

@@ -9,7 +9,8 @@ separation, within 1.5 seconds.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -57,11 +58,17 @@ def event(drift: float) -> Rule:
 def push(distance: float) -> Rule:
     """Event-triggered by the sender: a robot's plan is sent if it deviates, anywhere over the horizon, by more than
     ``distance`` (m) from what, as far as the sender knows, the receiver predicts."""
+    tells = _deviates(distance)
+    return lambda view: view.of_the_other(tells(view))
+
+
+def _deviates(distance: float) -> Rule:
+    """Tell those whose prediction of the robot's plan is off by more than ``distance`` (m): `push` for the sender."""
 
     def rule(view: View) -> np.ndarray:
         believed = view.seen_by_others(range(view.horizon)).believed
         off = length(view.plan[:, :, None] + view.own_pos[:, :, None, None] - believed).max(axis=-1)
-        return view.of_the_other(off > distance)
+        return off > distance
 
     return rule
 
@@ -101,26 +108,63 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
 }
 
 
+# Those of them by which the sender decides, as the sender sees it
+_SENDERS: dict[str, Callable[..., Rule]] = {"push": _deviates}
+
+
 def parse_rule(text: str) -> Rule:
     """Parse a rule such as ``"cpa:0.7:1.5"`` or ``"cpa:0.7:1.5&stale:3|distance:1"``.
 
     :raises ValueError: if the rule is unknown, or arguments are missing, superfluous or not numbers
     """
-    either = [[_parse_one(part.strip()) for part in joined.split("&")] for joined in text.split("|")]
-    if len(either) == len(either[0]) == 1:
-        return either[0][0]
+    return _either([[_parse_one(part) for part in joined] for joined in _split(text)])
+
+
+def parse_decisions(text: str) -> tuple[Rule, Rule | None]:
+    """Parse a rule into what a robot of its own decides: whom it asks, and whom it tells without being asked.
+
+    :return: whom to ask, and whom to tell, None if the rule tells nobody
+    :raises ValueError: if the rule is invalid, see `parse_rule`, or "&" joins what the receiver and the sender know
+    """
+    parse_rule(text)
+    asks: list[list[Rule]] = []
+    tells: list[list[Rule]] = []
+    for joined in _split(text):
+        by_sender = {part.partition(":")[0] in _SENDERS for part in joined}
+        if len(by_sender) > 1:
+            raise ValueError(
+                f"Rule {text!r}: {'&'.join(joined)!r} joins what the receiver and the sender know, so no robot can "
+                "decide it; join them with '|'."
+            )
+        parsed = [_parse_one(part, _SENDERS) for part in joined]
+        (tells if by_sender == {True} else asks).append(parsed)
+    return _either(asks or [[none()]]), _either(tells) if tells else None
+
+
+def _split(text: str) -> list[list[str]]:
+    return [[part.strip() for part in joined.split("&")] for joined in text.split("|")]
+
+
+def _either(alternatives: list[list[Rule]]) -> Rule:
+    if len(alternatives) == len(alternatives[0]) == 1:
+        return alternatives[0][0]
 
     def rule(view: View) -> np.ndarray:
-        return np.logical_or.reduce([np.logical_and.reduce([part(view) for part in joined]) for joined in either])
+        return np.logical_or.reduce([np.logical_and.reduce([part(view) for part in joined]) for joined in alternatives])
 
     return rule
 
 
-def _parse_one(text: str) -> Rule:
+def _parse_one(text: str, instead: Mapping[str, Callable[..., Rule]] = MappingProxyType({})) -> Rule:
+    """Parse a rule without operators.
+
+    :param instead: factories of rules that take the place of those in `RULES`
+    """
     name, *values = text.split(":")
     if name not in RULES:
         raise unknown_name("rule", name, RULES)
     factory, arguments = RULES[name]
+    factory = instead.get(name, factory)
     usage = ":".join((name, *arguments))
     relative = [value.endswith("s") for value in values]
     try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,46 +15,31 @@ from quad_swarm.geometry import closest_approach, length
 from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
-from quad_swarm.world.swarm import Swarm
-
-
-class SeenByOthers(NamedTuple):
-    """How each of the others predicts a robot, as far as that robot knows.
-
-    :param believed: predicted positions at the given stages, (E, n, n - 1, stages, 3), world frame (m)
-    :param remembers: whether the prediction is a plan, otherwise a constant velocity, (E, n, n - 1) bool
-    :param age: steps since that plan was made, (E, n, n - 1)
-    :param error: current error of that plan, (E, n, n - 1) (m)
-    """
-
-    believed: np.ndarray
-    remembers: np.ndarray
-    age: np.ndarray
-    error: np.ndarray
+from quad_swarm.world.knowledge import Knowledge, SeenByOthers
 
 
 class View:
     """The knowledge of the robots of E swarms before they make requests. Positions are relative to the robot, along the
     world's axes.
 
-    :param swarm: the swarms
+    :param knowledge: the swarms, or a robot of its own
     :param rngs: one random number generator per swarm, so that an episode does not depend on the batch it is in
     """
 
-    def __init__(self, swarm: Swarm, rngs: Sequence[np.random.Generator] = ()):
-        self._swarm = swarm
+    def __init__(self, knowledge: Knowledge, rngs: Sequence[np.random.Generator] = ()):
+        self._knowledge = knowledge
         self.rngs = rngs
-        self.memory = swarm.config.memory
-        self.horizon = swarm.config.planner.horizon
-        self.separation = swarm.config.planner.separation
+        self.memory = knowledge.config.memory
+        self.horizon = knowledge.config.planner.horizon
+        self.separation = knowledge.config.planner.separation
 
     @cached_property
     def _observed(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._swarm.observe()
+        return self._knowledge.observe()
 
     @cached_property
     def _estimate(self) -> np.ndarray:
-        return self._swarm.estimate()
+        return self._knowledge.estimate()
 
     @property
     def own_pos(self) -> np.ndarray:
@@ -80,7 +64,7 @@ class View:
     @cached_property
     def goal(self) -> np.ndarray:
         """Relative positions of the robots' goals, (E, n, 3) (m)."""
-        return self._swarm.goal - self.own_pos
+        return self._knowledge.goal - self.own_pos
 
     @cached_property
     def plan(self) -> np.ndarray:
@@ -95,12 +79,12 @@ class View:
     @cached_property
     def absolute_plans(self) -> np.ndarray:
         """Like `current_plans`, but in the world frame, (E, n, N + 1, 3) (m)."""
-        return advance(self._swarm.planned_positions())
+        return advance(self._knowledge.planned_positions())
 
     @cached_property
     def prediction(self) -> Prediction:
         """Predictions of the others without requests, in the world frame."""
-        return self._swarm.beliefs.predict(*self._observed)
+        return self._knowledge.beliefs.predict(*self._observed)
 
     def expected(self, stages: Sequence[int] | None = None) -> np.ndarray:
         """Return the predicted relative positions of the others without requests, (E, n, n - 1, stages, 3) (m).
@@ -115,16 +99,7 @@ class View:
 
         :param stages: indices among the next N steps, counting from 0
         """
-        predictions = self._swarm.predictions_seen_by_others()
-        # Others that do not perceive this robot have no plan of it: they predict a constant velocity
-        times = self._swarm.config.planner.dt * (np.array(stages) + 1)
-        steady = self.own_pos[:, :, None] + times[:, None] * self.own_vel[:, :, None]
-        return SeenByOthers(
-            self.of_the_other(predictions.believed(stages), steady[:, :, None]),
-            self.of_the_other(predictions.remembers),
-            self.of_the_other(predictions.age, self.horizon),
-            self.of_the_other(predictions.error),
-        )
+        return self._knowledge.seen_by_others(stages)
 
     def of_the_other(self, field: np.ndarray, otherwise: np.ndarray | float = 0) -> np.ndarray:
         """Swap the roles in values that robots have about others: return the values that the others have about this
@@ -133,19 +108,19 @@ class View:
         :param field: values that robots have about others, (E, n, n - 1, ...)
         :param otherwise: value for others that do not perceive this robot, which knows who does
         """
-        return self._swarm.neighbours.of_the_other(field, otherwise)
+        return self._knowledge.neighbours.of_the_other(field, otherwise)
 
     def of_others(self, field: np.ndarray) -> np.ndarray:
         """Return the values of each robot's others, (E, n, n - 1, ...).
 
         :param field: values of all robots, (E, n, ...)
         """
-        return of_others(field, self._swarm.neighbours.others)
+        return of_others(field, self._knowledge.neighbours.others)
 
     @property
     def present(self) -> np.ndarray | None:
         """Whether each slot is taken, (E, n, n - 1) bool; None if all slots always are."""
-        return self._swarm.neighbours.present
+        return self._knowledge.neighbours.present
 
     @property
     def age(self) -> np.ndarray:

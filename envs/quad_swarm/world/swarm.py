@@ -6,26 +6,24 @@ If the neighbourhood is limited, axes of length n - 1 have fewer entries, one pe
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.native.pairs import resample
 from quad_swarm.native.steps import measure
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.world.beliefs import Beliefs, BeliefSource, Prediction, of_others, other_indices, resampled
+from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
+from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig, points
 from quad_swarm.world.radio import RadioChannel
 from quad_swarm.world.realisation import Realisation
 from quad_swarm.world.swarm_state import SwarmState
 
-# Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
-# keeps less than half of it from the robot. In "flight-hard", plans are up to 0.15 m off, less than a fifth
-_MISFIT = 0.5
 # Distance (in separations) at which an empty slot shows a robot, far beyond all plans
 _EMPTY_SLOT = 30.0
 
@@ -91,12 +89,11 @@ class Swarm(SwarmState):
         self.config = config
         self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_others + 1, solver)
         self.planner.checks = False
-        n, horizon, dt = config.n_robots, config.planner.horizon, config.planner.dt
-        self._plant = make_plant(config.plant, config.quadrotor, dt / config.substeps, n_swarms, n)
+        n, horizon = config.n_robots, config.planner.horizon
+        self._plant = make_plant(config.plant, config.quadrotor, config.planner.dt / config.substeps, n_swarms, n)
         state = np.zeros((n_swarms, n, 9))
         plans = Plans.hover(state.reshape(-1, 9), horizon)
         plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
-        beliefs = (n_swarms, n, horizon, dt, config.memory, config.n_others, _MISFIT * config.planner.separation)
         differ = config.radio.is_random or config.sensing.others
         super().__init__(
             state=state,
@@ -104,8 +101,8 @@ class Swarm(SwarmState):
             _u=np.zeros((n_swarms, n, 4)),
             _plans=plans,
             _radio=RadioChannel(config.radio.delay, config.radio.jitter, plans_of_robots[..., POSITION]),
-            beliefs=Beliefs(*beliefs),
-            _other_beliefs=Beliefs(*beliefs) if differ else None,
+            beliefs=make_beliefs(config, n_swarms, n),
+            _other_beliefs=make_beliefs(config, n_swarms, n) if differ else None,
             disturbances=Realisation(config, n_swarms),
             neighbours=Neighbours(n_swarms, n, config.neighbourhood),
         )
@@ -158,10 +155,23 @@ class Swarm(SwarmState):
             pos[..., 0] += np.where(neighbours.present, 0.0, _EMPTY_SLOT * self.config.planner.separation)
         return pos, vel
 
-    def predictions_seen_by_others(self) -> Prediction:
-        """Return each robot's predictions without requests, as the others see them: they assume that all their answers
-        arrived."""
-        return self.beliefs_seen_by_others.predict(*self._seen_by_all())
+    def seen_by_others(self, stages: Sequence[int]) -> SeenByOthers:
+        """Return how each of the others predicts a robot without a request, as far as that robot knows. It knows the
+        plans that it sent and assumes that all of them arrived.
+
+        :param stages: indices among the next N steps, counting from 0
+        """
+        predictions, estimate = self.beliefs_seen_by_others.predict(*self._seen_by_all()), self._estimate()
+        # Others that do not perceive this robot have no plan of it: they predict a constant velocity
+        times = self.config.planner.dt * (np.array(stages) + 1)
+        steady = estimate[..., None, POSITION] + times[:, None] * estimate[..., None, VELOCITY]
+        theirs = self.neighbours.of_the_other
+        return SeenByOthers(
+            theirs(predictions.believed(stages), steady[:, :, None]),
+            theirs(predictions.remembers),
+            theirs(predictions.age, self.config.planner.horizon),
+            theirs(predictions.error),
+        )
 
     @property
     def plans(self) -> np.ndarray:
@@ -293,17 +303,10 @@ class Swarm(SwarmState):
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""
-        x, start = self._estimate(), self.disturbances.start
-        if start is not None:
-            later = start / self.config.substeps
-            x = self.planner.model.ahead(x, self._u, later * self.config.planner.dt)
-            resample(believed, later)
-        announced = None
-        if self.config.planner.right_of_way:
-            announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
-        others = believed.reshape(-1, *believed.shape[2:])
-        # Copies: a solver that writes into its problem must not move robots or goals
-        return Problems(x.reshape(-1, 9).copy(), self.goal.reshape(-1, 3).copy(), others, announced=announced)
+        start = self.disturbances.start
+        late = None if start is None else start / self.config.substeps
+        arguments = (self._estimate(), self.goal, believed, source, self._u, late)
+        return make_problems(self.config, self.planner.model, *arguments)
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""

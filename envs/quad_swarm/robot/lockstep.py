@@ -1,0 +1,109 @@
+"""Robots of their own in one process, in lock-step: the world around them, with all the randomness there is.
+
+It draws as `Swarm` does, so that both fly the same episode from the same seed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from quad_swarm.plants import make_plant
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
+from quad_swarm.robot.robot import Plan, Robot
+from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.realisation import Realisation
+
+
+class LockstepWorld:
+    """Vehicles, sensors and radio of one team.
+
+    :ivar state: true states, (1, n, 9)
+    :ivar now: start of the current period (us)
+
+    :param config: the world
+    :param robots: the robots, in the order of their numbers
+    """
+
+    def __init__(self, config: SwarmConfig, robots: Sequence[Robot]):
+        n = config.n_robots
+        self.config, self.robots = config, list(robots)
+        self.realisation = Realisation(config, 1)
+        self.plant = make_plant(config.plant, config.quadrotor, config.planner.dt / config.substeps, 1, n)
+        self.state, self.now = np.zeros((1, n, N_STATES)), 0
+        self._u = np.zeros((1, n, N_INPUTS))
+        self._others = other_indices(n)
+        # The plans that answers may contain, oldest first
+        self._plans: list[deque[Plan]] = []
+
+    def reset(self, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
+        """Begin an episode, see `Swarm.reset`."""
+        self.state[:], self._u[:], self.now = 0.0, 0.0, 0
+        self.state[0, :, POSITION] = starts
+        self.plant.place(0, self.state[0])
+        if self.config.is_random:
+            self.realisation.reset(0, noise_seed)
+        radio, start = self.config.radio, self.realisation.start
+        late = np.zeros(len(self.robots)) if start is None else start[0] / self.config.substeps
+        for robot, where, goal, delay in zip(self.robots, starts, goals, late, strict=True):
+            robot.reset(where, goal, float(delay), kept=1 + radio.delay)
+        most = 1 + radio.delay + radio.jitter
+        self._plans = [
+            deque([Plan(-k * robot.period, robot.newest.positions) for k in range(most, 0, -1)], most)
+            for robot in self.robots
+        ]
+
+    def step(self) -> np.ndarray:
+        """Let all robots fly for a period.
+
+        :return: what they decided, (n, n - 1, 1 or 2) bool, see `Robot.decide`
+        """
+        perceived = zip(self.robots, *self._perceived(), strict=True)
+        bits = np.stack([robot.decide(self.now, state, pos, vel) for robot, state, pos, vel in perceived])
+        self._exchange(bits)
+        self._fly(np.stack([robot.plan() for robot in self.robots])[None])
+        self.now += self.robots[0].period
+        return bits
+
+    def _perceived(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return estimates of the robots' own states, (n, 9), and positions and velocities of their others as they
+        observe them, (n, n - 1, 3) each."""
+        estimate = self.realisation.estimate(self.state)
+        seen = estimate.take(self._others, axis=1)
+        pos, vel = self.realisation.observe(seen[..., POSITION], seen[..., VELOCITY])
+        return estimate[0], pos[0], vel[0]
+
+    def _exchange(self, bits: np.ndarray) -> None:
+        """Let the radio carry requests, answers and announcements of a period."""
+        radio, n = self.config.radio, len(self.robots)
+        wanted = np.zeros((n, n), dtype=bool)  # [receiver, sender]
+        for i in range(n):
+            wanted[i, self._others[i]] |= bits[i, :, 0]
+            if bits.shape[2] == 2:
+                wanted[self._others[i], i] |= bits[i, :, 1]
+        wanted = np.take_along_axis(wanted, self._others, axis=1)
+        for plans, robot in zip(self._plans, self.robots, strict=True):
+            if robot.newest.stamp != plans[-1].stamp:
+                plans.append(robot.newest)
+        arriving, lateness = self.realisation.arrivals(wanted[None], self._others)
+        for i, k in np.argwhere(wanted):
+            robot = self.robots[self._others[i, k]]
+            robot.sent(int(i), self.now - (1 + radio.delay) * robot.period)
+        for i, k in np.argwhere(arriving[0]):
+            age = 1 + radio.delay + (0 if lateness is None else int(lateness[0, i, k]))
+            sender = int(self._others[i, k])
+            self.robots[i].receive(sender, self._plans[sender][-age])
+
+    def _fly(self, planned: np.ndarray) -> None:
+        realisation, before = self.realisation, self._u
+        for k in range(self.config.substeps):
+            late = realisation.start
+            self._u = planned if late is None else np.where((late <= k)[..., None], planned, before)
+            self.state = self.plant.step(self.state, self._u, realisation.air, realisation.factors)
+        if self.config.is_random:
+            kicks = realisation.advance()
+            if kicks is not None:
+                self.state = self.state + kicks

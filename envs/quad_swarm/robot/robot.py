@@ -1,0 +1,222 @@
+"""One robot: beliefs, observation, policy and planner of a single quadrotor, on the classes of the swarm.
+
+A robot is told what it perceives and draws no random numbers. A period has two phases: `Robot.decide` says whom to ask
+and whom to tell, and `Robot.plan`, a little later, uses the plans that have arrived. Times are whole microseconds of a
+clock that all robots share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_swarm.native.pairs import advance
+from quad_swarm.planner import Planner, Plans, make_planner
+from quad_swarm.planner.base import shift
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
+from quad_swarm.world.beliefs import Beliefs, resampled
+from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
+from quad_swarm.world.presets import SwarmConfig
+
+# Whom a robot asks and whom it tells: (n - 1, 1 or 2) bool, see `Robot.decide`
+Policy = Callable[["Robot"], np.ndarray]
+
+
+class Plan(NamedTuple):
+    """A plan as it is sent.
+
+    :param stamp: start of the period in which it was made (us)
+    :param positions: positions at that time and at the starts of the N periods after it, (N + 1, 3), world frame (m)
+    """
+
+    stamp: int
+    positions: np.ndarray
+
+
+class _Others:
+    """All others of one robot, in ascending order, see `quad_swarm.world.knowledge.Perceived`."""
+
+    present = None
+
+    def __init__(self, others: np.ndarray):
+        self.others = others[None]
+
+    def numbers(self) -> np.ndarray:
+        return self.others
+
+    def of_the_other(self, field: np.ndarray, otherwise: Any = 0) -> np.ndarray:
+        raise ValueError("A robot does not know what the others know: only a swarm can fly such a rule or observation.")
+
+
+class Robot:
+    """A robot of a team, see `quad_swarm.world.knowledge.Knowledge` for what policies read.
+
+    :ivar others: numbers of the others in ascending order, (n - 1,)
+    :ivar period: length of a period (us)
+    :ivar now: start of the current period (us)
+    :ivar late: time from the start of a period until its command takes effect (periods)
+
+    :param config: the world as far as robots know it: team, vehicle, planner and memory
+    :param index: number of the robot, from 0
+    :param policy: whom to ask and whom to tell
+    :param planner: planner for a team of this size, which robots in one process may share; by default a new one
+    :raises ValueError: if there is no such robot, or the world limits whom robots perceive
+    """
+
+    def __init__(self, config: SwarmConfig, index: int, policy: Policy, planner: Planner | None = None):
+        if not 0 <= index < config.n_robots:
+            raise ValueError(f"index={index}: a team of {config.n_robots} has the robots 0 to {config.n_robots - 1}.")
+        if config.is_limited:
+            raise ValueError(
+                "neighbourhood: a robot of its own perceives all others; fly limited neighbourhoods as a swarm."
+            )
+        self.config, self.index, self.policy = config, index, policy
+        self.others = np.array([other for other in range(config.n_robots) if other != index], dtype=np.int64)
+        self.neighbours = _Others(self.others)
+        self.planner = planner or make_planner(config.planner, config.quadrotor, config.n_robots)
+        self.period = round(1e6 * config.planner.dt)
+        self.beliefs: Beliefs = make_beliefs(config, 1, 1)
+        # What the others presumably believe about this robot, from what it sent
+        self.presumed: Beliefs = make_beliefs(config, 1, 1)
+        self.reset(np.zeros(3), np.zeros(3))
+
+    def reset(self, start: np.ndarray, goal: np.ndarray, late: float = 0.0, kept: int = 1, now: int = 0) -> None:
+        """Begin to fly.
+
+        :param start: where the robot is commanded to hover, (3,), world frame (m)
+        :param goal: goal, (3,), world frame (m)
+        :param late: time from the start of a period until its command takes effect (periods), less than 1
+        :param kept: number of own plans that may still be sent, where the radio delays them by whole periods
+        :param now: start of the first period (us)
+        """
+        x = np.zeros((1, N_STATES))
+        x[:, POSITION] = start
+        self.goal, self.late, self.now = np.array(goal, float).reshape(1, 1, 3), late, now - self.period
+        self._estimate, self._u = x[None], np.zeros((1, 1, N_INPUTS))
+        self._pos = self._vel = np.zeros((1, 1, len(self.others), 3))
+        self._plans = Plans.hover(x, self.config.planner.horizon)
+        for beliefs in (self.beliefs, self.presumed):
+            beliefs.forget(np.array([0]))
+        self._sent: dict[int, Plan] = {}
+        self._inbox: dict[int, Plan] = {}
+        self._own = [Plan(now - k * self.period, self.planned_positions()[0, 0]) for k in range(kept, 0, -1)]
+        self.source = np.zeros((1, 1, len(self.others)), dtype=np.int64)
+
+    def estimate(self) -> np.ndarray:
+        """Return the estimate of the own state, (1, 1, 9)."""
+        return self._estimate
+
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (m) and velocities (m/s) of the others, (1, 1, n - 1, 3) each, world frame."""
+        return self._pos, self._vel
+
+    def planned_positions(self) -> np.ndarray:
+        """Return planned positions at the start of the last period and of the N periods after it, (1, 1, N + 1, 3)."""
+        positions = self._plans.x[None, ..., POSITION]
+        return resampled(positions, np.full((1, 1), -self.late)) if self.late else positions
+
+    def seen_by_others(self, stages: Sequence[int]) -> SeenByOthers:
+        """Return how each of the others predicts this robot without a request, if all that it sent has arrived.
+
+        :param stages: indices among the next N periods, counting from 0
+        """
+        predicted = self.presumed.predict(*self._own_motion())
+        return SeenByOthers(predicted.believed(stages), predicted.remembers, predicted.age, predicted.error)
+
+    @property
+    def plans(self) -> Plans:
+        """The current plan, with a batch axis of 1."""
+        return self._plans
+
+    @property
+    def newest(self) -> Plan:
+        """The plan of the last period, which answers and announcements contain."""
+        return self._own[-1]
+
+    def decide(self, now: int, state: np.ndarray, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
+        """Begin a period: perceive, and decide whom to ask and whom to tell. Periods that have been missed are made up
+        for: plans and beliefs advance as if nothing had arrived.
+
+        :param now: start of the period (us), a whole number of periods after the last one
+        :param state: estimate of the own state, (9,)
+        :param pos: positions of the others in ascending order, (n - 1, 3), world frame (m)
+        :param vel: velocities of the others, (n - 1, 3), world frame (m/s)
+        :return: whether to ask each of the others for its plan and, in a second column, whether to send it the own one,
+            (n - 1, 1 or 2) bool
+        """
+        missed = (now - self.now) // self.period - 1
+        for _ in range(min(missed, self.config.planner.horizon)):  # by then, plans and beliefs have expired
+            self._miss()
+        self._estimate = np.array(state, float).reshape(1, 1, N_STATES)
+        self._pos, self._vel = (np.array(a, float).reshape(1, 1, -1, 3) for a in (pos, vel))
+        self.now = now
+        return np.asarray(self.policy(self), bool)
+
+    def sent(self, other: int, stamp: int | None = None) -> None:
+        """Note that the own plan went to another robot, which now presumably knows it.
+
+        :param other: number of the other robot
+        :param stamp: stamp of the plan, by default of the newest
+        """
+        self._sent[self._place(other)] = next(plan for plan in reversed(self._own) if stamp in (None, plan.stamp))
+
+    def receive(self, sender: int, plan: Plan) -> None:
+        """Take a plan that arrived. Of several plans of one robot the one with the latest stamp counts.
+
+        :param sender: number of the robot whose plan it is
+        :param plan: its plan, not from the future
+        """
+        place = self._place(sender)
+        if place not in self._inbox or self._inbox[place].stamp < plan.stamp:
+            self._inbox[place] = plan
+
+    def plan(self) -> np.ndarray:
+        """End a period: plan with what has arrived.
+
+        :return: set-point: roll, pitch (rad), climb rate (m/s) and yaw rate (rad/s), (4,)
+        """
+        self.presumed.receive(*self._message(self._sent, *self._own_motion()))
+        believed, self.source = self.beliefs.update(*self._message(self._inbox, self._pos, self._vel))
+        late = np.full((1, 1), self.late) if self.late else None
+        arguments = (self._estimate, self.goal, believed, self.source, self._u, late)
+        problems = make_problems(self.config, self.planner.model, *arguments)
+        self._plans = self.planner.plan(problems, self._plans)
+        self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
+        self._sent, self._inbox = {}, {}
+        self._own = [*self._own[1:], Plan(self.now, self.planned_positions()[0, 0].copy())]
+        return self._u[0, 0]
+
+    def _miss(self) -> None:
+        """Let a period pass in which nothing was computed."""
+        self.now += self.period
+        self.presumed.receive(*self._message({}, *self._own_motion()))
+        self.beliefs.receive(*self._message({}, self._pos, self._vel))
+        plans = self._plans
+        self._plans = plans._replace(x=shift(plans.x), u=shift(plans.u), age=plans.age + 1)
+        self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
+
+    def _place(self, other: int) -> int:
+        """Return the place of another robot among the others."""
+        return other - (other > self.index)
+
+    def _own_motion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return own position and velocity once for each of the others, (1, 1, n - 1, 3) each."""
+        own, shape = self._estimate[..., None, :], self._pos.shape
+        return np.broadcast_to(own[..., POSITION], shape), np.broadcast_to(own[..., VELOCITY], shape)
+
+    def _message(self, plans: Mapping[int, Plan], pos: np.ndarray, vel: np.ndarray) -> tuple[Any, ...]:
+        """Return the arguments of `Beliefs.receive` for plans by places."""
+        arriving = np.zeros((1, 1, len(self.others)), dtype=bool)
+        arriving[0, 0, list(plans)] = True
+        horizon = self.config.planner.horizon
+        positions, ages = np.empty((len(plans), horizon + 1, 3)), np.empty(len(plans), dtype=np.int64)
+        for row, place in enumerate(sorted(plans)):
+            ages[row], rest = divmod(max(self.now - plans[place].stamp, 0), self.period)
+            positions[row] = plans[place].positions
+            for _ in range(min(ages[row], horizon)):
+                positions[row] = advance(positions[row])
+            if rest:
+                positions[row] = resampled(positions[row], np.array(rest / self.period))
+        return arriving, pos, vel, positions, ages

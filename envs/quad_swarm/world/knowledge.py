@@ -1,0 +1,140 @@
+"""What robots know, apart from whether one process flies all of them or each has its own.
+
+`Knowledge` is what views, observations and rules read. A swarm holds that of all its robots, (E, n), a
+`quad_swarm.robot.Robot` its own, (1, 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from quad_swarm.native.pairs import resample
+from quad_swarm.planner import Problems
+from quad_swarm.quadrotor import QuadrotorModel
+from quad_swarm.world.beliefs import Beliefs, BeliefSource
+from quad_swarm.world.presets import SwarmConfig
+
+# Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
+# keeps less than half of it from the robot. In "flight-hard", plans are up to 0.15 m off, less than a fifth
+_MISFIT = 0.5
+
+
+class SeenByOthers(NamedTuple):
+    """How each of the others predicts a robot, as far as that robot knows.
+
+    :param believed: predicted positions at the given stages, (E, n, n - 1, stages, 3), world frame (m)
+    :param remembers: whether the prediction is a plan, otherwise a constant velocity, (E, n, n - 1) bool
+    :param age: steps since that plan was made, (E, n, n - 1)
+    :param error: current error of that plan, (E, n, n - 1) (m)
+    """
+
+    believed: np.ndarray
+    remembers: np.ndarray
+    age: np.ndarray
+    error: np.ndarray
+
+
+class Perceived(Protocol):
+    """Whom robots perceive, see `Neighbours`."""
+
+    @property
+    def others(self) -> np.ndarray:
+        """Indices of the others, (n, n - 1) or (E, n, n - 1)."""
+
+    @property
+    def present(self) -> np.ndarray | None:
+        """Whether each slot is taken, (E, n, n - 1) bool; None if all slots always are."""
+
+    def numbers(self) -> np.ndarray:
+        """Return the indices of the others, -1 for an empty slot."""
+
+    def of_the_other(self, field: np.ndarray, otherwise: Any = 0) -> np.ndarray:
+        """Return the values that the others have about a robot, (E, n, n - 1, ...).
+
+        :raises ValueError: if it is a robot that asks, which does not know them
+        """
+
+
+class Knowledge(Protocol):
+    """The knowledge of n robots in E swarms before they make requests."""
+
+    @property
+    def config(self) -> SwarmConfig:
+        """The world, as far as robots know it."""
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Goals, (E, n, 3), world frame (m)."""
+
+    @property
+    def beliefs(self) -> Beliefs:
+        """Beliefs about the others."""
+
+    @property
+    def neighbours(self) -> Perceived:
+        """The others that the robots perceive."""
+
+    def estimate(self) -> np.ndarray:
+        """Return the robots' estimates of their own states, (E, n, 9)."""
+
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions (m) and velocities (m/s) of the others as the robots observe them, (E, n, n - 1, 3) each,
+        world frame."""
+
+    def planned_positions(self) -> np.ndarray:
+        """Return planned positions at the start of the last step and of the N steps after it, (E, n, N + 1, 3) (m)."""
+
+    def seen_by_others(self, stages: Sequence[int]) -> SeenByOthers:
+        """Return how each of the others predicts a robot without a request, as far as that robot knows. It knows the
+        plans that it sent and assumes that all of them arrived.
+
+        :param stages: indices among the next N steps, counting from 0
+        """
+
+
+def make_beliefs(config: SwarmConfig, n_swarms: int, n_robots: int) -> Beliefs:
+    """Create the beliefs that robots begin with: they have received no plan.
+
+    :param config: the world
+    :param n_swarms: number of swarms E
+    :param n_robots: number of robots whose beliefs these are
+    """
+    horizon, dt, separation = config.planner.horizon, config.planner.dt, config.planner.separation
+    return Beliefs(n_swarms, n_robots, horizon, dt, config.memory, config.n_others, _MISFIT * separation)
+
+
+def make_problems(
+    config: SwarmConfig,
+    model: QuadrotorModel,
+    estimate: np.ndarray,
+    goal: np.ndarray,
+    believed: np.ndarray,
+    source: np.ndarray,
+    u: np.ndarray,
+    late: np.ndarray | None,
+) -> Problems:
+    """Return robots' planning problems, which start when their inputs take effect.
+
+    :param config: the world
+    :param model: discrete dynamics
+    :param estimate: estimated states, (E, n, 9)
+    :param goal: goals, (E, n, 3), world frame (m)
+    :param believed: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), which become those at the problem's
+        stages
+    :param source: `BeliefSource` of each, (E, n, n - 1)
+    :param u: inputs that act until then, (E, n, 4)
+    :param late: when the inputs take effect, as a fraction of a step, (E, n); None if all do so at once
+    """
+    x = estimate
+    if late is not None:
+        x = model.ahead(x, u, late * config.planner.dt)
+        resample(believed, late)
+    announced = None
+    if config.planner.right_of_way:
+        announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
+    others = believed.reshape(-1, *believed.shape[2:])
+    # Copies: a solver that writes into its problem must not move robots or goals
+    return Problems(x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced)
