@@ -114,6 +114,12 @@ COMMANDS: dict[str, Command] = {
         None,
         f"  {PROG} identify --env ENV --plant SIMULATOR:VEHICLE --out vehicle.yml",
     ),
+    "export": Command(
+        "write what the robots of an environment load to fly with a model",
+        "offered:run",
+        None,
+        f"  {PROG} export --env ENV pretrained:NAME --out FOLDER",
+    ),
     "bench": Command(
         "measure how fast a recipe trains on this machine and where the time goes",
         "bench:bench",

@@ -1,4 +1,4 @@
-"""``sb3-maddpg evaluate``, ``replay`` and ``identify``: what installed packages provide for their environments."""
+"""``sb3-maddpg evaluate``, ``replay``, ``identify`` and ``export``: what installed packages provide for their environments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sb3_maddpg.hub.pretrained import pretrained_models
 from sb3_maddpg.offers import broken, load_offer, offer_named, offers
 from sb3_maddpg.utils import shown, suggest, told
 
-GROUPS = {"evaluate": "evaluators", "replay": "replays", "identify": "identifiers"}
+GROUPS = {"evaluate": "evaluators", "replay": "replays", "identify": "identifiers", "export": "exporters"}
 
 
 def run(args: argparse.Namespace, words: list[str], example: str, user_errors: tuple[type[Exception], ...]) -> int:

@@ -52,6 +52,7 @@ class AgentPolicy(nn.Module):
     start: th.Tensor
     mean: th.Tensor
     std: th.Tensor
+    places: th.Tensor
 
     def __init__(
         self,
@@ -65,6 +66,7 @@ class AgentPolicy(nn.Module):
         statistics: tuple[np.ndarray, np.ndarray, float] | None = None,
     ):
         super().__init__()
+        self.n_hidden = 0
         self.limit = None if statistics is None else statistics[2]
         if statistics is not None:
             self.register_buffer("mean", th.as_tensor(statistics[0]).double())
@@ -120,12 +122,38 @@ class AgentPolicy(nn.Module):
             own = (mean, np.sqrt(var + statistics.epsilon), statistics.clip)
         return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask, own)
 
+    def of_columns(self, columns: Sequence[int]) -> AgentPolicy:
+        """
+        Return the same policy for observations that hold only some of the columns, such as those that an agent knows
+        but not those for critics. The others count as 0.
+
+        :param columns: indices of the columns, in the order of the new observations
+        :return: a policy whose ``obs_dim`` is the number of these columns
+        :raises ValueError: if a column is missing from the observation, or named twice
+        """
+        if len(set(columns)) < len(columns) or not set(columns) <= set(range(self.obs_dim)):
+            raise InvalidArgumentError(
+                f"columns={shown(list(columns))} must name different columns from 0 to {self.obs_dim - 1}."
+            )
+        if self.n_hidden:
+            raise InvalidArgumentError(f"This policy of {self.name} reads {self.obs_dim} columns already.")
+        policy = deepcopy(self)
+        policy.n_hidden = self.obs_dim - len(columns)
+        # Where each column of the network's observation is in one that is followed by a zero
+        places = np.full(self.obs_dim, len(columns))
+        places[list(columns)] = np.arange(len(columns))
+        policy.register_buffer("places", th.tensor(places))
+        policy.obs_dim = len(columns)
+        return policy
+
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
         :param obs: observations, (batch, obs_dim)
         :return: actions in the environment's units, in the data type of the agent's action space and within its bounds:
             batch first and then the space's shape, but (batch, 1) for ``Discrete``
         """
+        if self.n_hidden:
+            obs = th.cat([obs, th.zeros_like(obs[:, :1])], dim=1)[:, self.places]
         if self.limit is not None:
             obs = ((obs - self.mean) / self.std).clamp(-self.limit, self.limit).float()
         logits = self.network(obs)[:, self.columns].unsqueeze(1)

@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_maddpg.common.actions import TeamActions
+from sb3_maddpg.common.agent_policy import AgentPolicy
 from sb3_maddpg.common.heads import TeamHead, ValueHeads
 from sb3_maddpg.common.networks import StackedMLP, single_precision
 from sb3_maddpg.errors import InvalidArgumentError
@@ -23,6 +24,7 @@ from sb3_maddpg.team.spaces import MixedActions, into_box
 from sb3_maddpg.team.team import Team
 from sb3_maddpg.utils import all_finite, as_numbers, shown
 from sb3_maddpg.validation import PolicyArguments, ThresholdArgument, validated
+from sb3_maddpg.vec_env.normalize import ObservationStatistics
 
 Sharing = bool | Sequence[Sequence[str | int]]
 
@@ -704,6 +706,17 @@ class MADDPGPolicy(BasePolicy):
             "optimizer_class": self.optimizer_class,
             "optimizer_kwargs": self.optimizer_kwargs,
         }
+
+    def agent_policy(self, agent: str | int, statistics: ObservationStatistics | None = None) -> AgentPolicy:
+        """
+        Extract the policy of one agent, see ``AgentPolicy.of``.
+
+        :param agent: name or index of the agent
+        :param statistics: how ``VecNormalize`` normalises the team's observations, None if it does not
+        :return: the agent's policy
+        :raises ValueError: if there is no such agent, or parameters are not finite
+        """
+        return AgentPolicy.of(self, agent, statistics)
 
     def not_finite(self, parameters: Mapping[str, th.Tensor]) -> str | None:
         """

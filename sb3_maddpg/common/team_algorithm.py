@@ -518,7 +518,7 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
                 "the statistics: load it with env=SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env), or with "
                 "normalized_observations=False if you normalise observations yourself."
             )
-        return AgentPolicy.of(self.policy, agent, statistics)
+        return self.policy.agent_policy(agent, statistics)
 
     def set_threshold(self, threshold: float) -> None:
         """

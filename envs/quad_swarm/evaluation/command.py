@@ -125,7 +125,7 @@ def _latex(texts: Sequence[Sequence[str]]) -> str:
     return "\n".join((*lines, r"\bottomrule", r"\end{tabular}", ""))
 
 
-def _parse_world(assignments: Iterable[str]) -> dict[str, Any]:
+def parse_world(assignments: Iterable[str]) -> dict[str, Any]:
     """Convert ``["noise.wind=1", "memory=0.3"]`` to ``{"noise": {"wind": 1}, "memory": 0.3}``."""
     world: dict[str, Any] = {}
     for assignment in assignments:
@@ -219,8 +219,8 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
         if name not in SCENARIOS:
             raise unknown_name("scenario", name, SCENARIOS)
     models = {policy: trained_in(load_model(policy, args.algo)) for policy in args.policy if is_model(policy)}
-    args.preset = args.preset or _preset_of(models)
-    config = make_config(args.preset, _parse_world(args.world), n_robots=args.n_robots, plant=args.plant)
+    args.preset = args.preset or preset_of(models)
+    config = make_config(args.preset, parse_world(args.world), n_robots=args.n_robots, plant=args.plant)
     for policy, trained in models.items():
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, but this is {args.preset!r}", file=sys.stderr)
@@ -233,7 +233,12 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
     ]
 
 
-def _preset_of(models: Mapping[str, Mapping[str, Any]]) -> str:
+def preset_of(models: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the preset that models were trained in, "paper" if they do not say.
+
+    :param models: name -> arguments of its environment, see `trained_in`
+    :raises ValueError: if they were trained in several
+    """
     presets = {str(trained["preset"]) for trained in models.values() if "preset" in trained}
     if len(presets) > 1:
         raise ValueError(f"The models were trained in {', '.join(sorted(presets))}: choose one of these with --preset.")

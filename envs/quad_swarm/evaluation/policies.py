@@ -159,6 +159,37 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
     :raises ValueError: if the model has no ``predict``, or was trained for another number of robots or another space.
         The policy raises it if ``predict`` raises or answers with something else than bits
     """
+    predictor, observation, n_bits = fitted(model, name, config)
+    n, m = config.n_robots, config.n_others
+    options = {"deterministic": True} if _accepts(predictor.predict, "deterministic") else {}
+
+    def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
+        observed = task.observe()
+        try:
+            answer = predictor.predict(observed, **options)
+            bits = as_bits(answer[0] if isinstance(answer, tuple) else answer)
+        except Exception as error:  # whatever a foreign object raises
+            raise ValueError(
+                f"{name}: predict failed on the observations of {len(observed)} swarms, shape {observed.shape} "
+                f"({type(error).__name__}: {error})."
+            ) from error
+        if bits is None or bits.size != len(observed) * n * m * n_bits:
+            found = "no bits" if bits is None else f"shape {bits.shape}"
+            raise ValueError(
+                f"{name}: predict answered the observations of {len(observed)} swarms, shape {observed.shape}, with "
+                f"{found}; it must answer with {n * m * n_bits} bits, 0 or 1, for each swarm."
+            )
+        return bits.reshape(-1, n, m, n_bits)
+
+    return request, observation
+
+
+def fitted(model: Any, name: str, config: SwarmConfig) -> tuple[Any, Observation, int]:
+    """Return what predicts with a model for the robots of a world, its observation, and its number of bits for each of
+    the others. See `policy_of`.
+
+    :raises ValueError: if the model has no ``predict``, or was trained for another number of robots or another space
+    """
     if not callable(getattr(model, "predict", None)):
         raise ValueError(f"{name}: {shown(model)} is no policy, since it has no predict(observation).")
     arguments = {k: v for k, v in trained_in(model).items() if k in OBSERVATION_ARGUMENTS}
@@ -184,28 +215,7 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
             spaces.MultiBinary(n * m * n_bits),
             observation.layout,
         )
-
-    options = {"deterministic": True} if _accepts(predictor.predict, "deterministic") else {}
-
-    def request(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
-        observed = task.observe()
-        try:
-            answer = predictor.predict(observed, **options)
-            bits = as_bits(answer[0] if isinstance(answer, tuple) else answer)
-        except Exception as error:  # whatever a foreign object raises
-            raise ValueError(
-                f"{name}: predict failed on the observations of {len(observed)} swarms, shape {observed.shape} "
-                f"({type(error).__name__}: {error})."
-            ) from error
-        if bits is None or bits.size != len(observed) * n * m * n_bits:
-            found = "no bits" if bits is None else f"shape {bits.shape}"
-            raise ValueError(
-                f"{name}: predict answered the observations of {len(observed)} swarms, shape {observed.shape}, with "
-                f"{found}; it must answer with {n * m * n_bits} bits, 0 or 1, for each swarm."
-            )
-        return bits.reshape(-1, n, m, n_bits)
-
-    return request, observation
+    return predictor, observation, n_bits
 
 
 def _accepts(function: Any, argument: str) -> bool:

@@ -94,7 +94,9 @@ COLUMNS: dict[str, list[Column]] = {
         *(
             column
             for stage in _at(STAGES[1:])
-            for column in _vector(f"bend_{stage}", "m", "pair", f"predicted minus steady motion of the other at {stage}")
+            for column in _vector(
+                f"bend_{stage}", "m", "pair", f"predicted minus steady motion of the other at {stage}"
+            )
         ),
     ],
     "plan": [
@@ -110,7 +112,9 @@ COLUMNS: dict[str, list[Column]] = {
     "told": [
         *_known(_MINE),
         *(
-            Column(f"off_{stage}", "", "", f"tanh over {ERROR_SCALE} m of the error of the other's prediction at {stage}")
+            Column(
+                f"off_{stage}", "", "", f"tanh over {ERROR_SCALE} m of the error of the other's prediction at {stage}"
+            )
             for stage in _at(STAGES)
         ),
         *(
