@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from quad_swarm.errors import shown
 from quad_swarm.robot.robot import Policy, Robot
 from quad_swarm.task.observation import make_observation
 from quad_swarm.task.rules import parse_decisions
@@ -54,7 +55,13 @@ class Actor:
         self.observation, self.n_bits = make_observation(config, seen, scaled), n_bits
         self._run = _program(os.fspath(path))
         self.observed = np.zeros((1, self.observation.size), np.float32)
-        width, expected = self._run(self.observed).size, config.n_others * n_bits
+        expected = config.n_others * n_bits
+        try:
+            width: Any = self._run(self.observed).size
+        except Exception as error:  # ONNX Runtime has its own classes of errors
+            raise ValueError(
+                f"{path}: the policy does not read the {self.observation.size} columns of {seen!r} ({shown(error)})."
+            ) from None
         if width != expected:
             raise ValueError(f"{path}: the policy answers with {width} bits, not {expected}.")
 
@@ -75,7 +82,7 @@ def _program(path: str) -> Any:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         (given,), (returned,) = session.get_inputs(), session.get_outputs()
     except Exception as error:  # ONNX Runtime has its own classes of errors
-        raise ValueError(f"{path}: no policy that ONNX Runtime can load ({str(error).splitlines()[0]}).") from None
+        raise ValueError(f"{path}: no policy that ONNX Runtime can load ({shown(error)}).") from None
 
     def run(observed: np.ndarray) -> np.ndarray:
         return session.run([returned.name], {given.name: observed})[0]

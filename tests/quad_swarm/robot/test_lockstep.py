@@ -1,0 +1,176 @@
+"""n robots that exchange messages fly the episode of a swarm, to the last bit."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch as th
+
+from quad_swarm.evaluation.export import export
+from quad_swarm.evaluation.flight import Condition, begin, first_episode
+from quad_swarm.evaluation.policies import fitted, load_model
+from quad_swarm.planner import make_planner
+from quad_swarm.robot import Plan, Robot, RulePolicy
+from quad_swarm.robot.lockstep import LockstepWorld
+from quad_swarm.task.request_task import requests_of
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from sb3_maddpg.hub.pretrained import pretrained_folder
+
+MODEL = str(pretrained_folder("quad-swarm-flight") / "model.zip")
+EDGE = 1e-5  # of a probability to the threshold, within which a robot alone and a team may round differently
+RULES = ["none", "full", "cpa:1.2s:3&stale:4", "event:0.05|push:0.1"]
+
+
+@functools.cache
+def planner_of(config):
+    return make_planner(config.planner, config.quadrotor, config.n_robots)
+
+
+def differences(config, policies, rule, scenario, model=None, steps=60, episode=0, make_robot=Robot, at_edge=None):
+    """Fly the same episode as a swarm and as robots, and yield what differs. Ends where ``at_edge(observed, differing
+    bits)`` says that bits may differ.
+    """
+    seed = first_episode(0) + episode
+    policy, task, rngs = begin(Condition(rule, scenario, config), [seed], model)
+    swarm, rng = task.swarm, np.random.default_rng(seed)
+    _, starts, goals = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
+    noise_seed = int(rng.integers(2**63)) if config.is_random else 0
+    robots = [make_robot(config, k, one, planner_of(config)) for k, one in enumerate(policies)]
+    world = LockstepWorld(config, robots)
+    world.reset(starts, goals, noise_seed)
+    columns = [k for k, column in enumerate(task.observation.columns) if ".critic." not in column.name]
+    for step in range(steps):
+        observed = task.observe()[0][:, columns] if model else None
+        bits = policy(task, rngs)
+        flown = world.step()
+        task.act(bits)
+        theirs = swarm.beliefs_seen_by_others
+        pairs = {
+            "requests": (requests_of(flown[None])[0], requests_of(bits)[0]),
+            "states": (world.state, swarm.state),
+            "plans": (np.concatenate([robot.plans.x for robot in robots]), swarm._plans.x),
+            "inputs": (np.concatenate([robot.plans.u for robot in robots]), swarm._plans.u),
+            "status": (np.concatenate([robot.plans.status for robot in robots]), swarm._plans.status),
+            "ages": (np.concatenate([robot.beliefs.age for robot in robots], axis=1), swarm.beliefs.age),
+            "beliefs": (np.concatenate([r.beliefs._remembered for r in robots], axis=1), swarm.beliefs._remembered),
+            "presumed": (
+                np.concatenate([robot.presumed._remembered for robot in robots], axis=1),
+                swarm.neighbours.of_the_other(theirs._remembered),
+            ),
+        }
+        if model:
+            pairs["observations"] = (np.stack([robot.policy.observed[0] for robot in robots]), observed)
+        differing = flown != bits[0]
+        if at_edge is not None and differing.any() and at_edge(observed, differing):
+            return
+        for name, (mine, swarms) in pairs.items():
+            if np.ascontiguousarray(mine).tobytes() != np.ascontiguousarray(swarms).tobytes():
+                yield step, name
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(("preset", "n", "scenario"), [("paper", 4, "random"), ("flight-hard", 3, "symmetric_swap")])
+def test_robots_with_rules_fly_as_the_swarm(preset, n, scenario, rule):
+    config = make_config(preset, n_robots=n)
+    assert not list(differences(config, [RulePolicy(rule) for _ in range(n)], rule, scenario))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize("n", [2, 4, 8])
+@pytest.mark.parametrize("preset", ["paper", "flight", "flight-hard"])
+def test_robots_with_rules_fly_as_the_swarm_anywhere(preset, n, scenario):
+    config = make_config(preset, n_robots=n)
+    for rule in RULES:
+        assert not list(differences(config, [RulePolicy(rule) for _ in range(n)], rule, scenario, steps=100))
+
+
+CHANGED = {
+    "late answers": {"radio": {"delay": 3, "jitter": 2}},
+    "no losses": {"radio": {"loss": 0.0, "jitter": 0}},
+    "half lost": {"radio": {"loss": 0.5, "bursts": 0.2}},
+    "punctual": {"clock_skew": 0.0},
+    "no right of way": {"planner": {"right_of_way": 0.0}},
+    "no memory": {"memory": 0.0},
+    "few neighbours planned with": {"planner": {"max_neighbours": 2}},
+    "yaw": {"planner": {"max_yaw_rate": 1.0}},
+    "no sensing errors": {"sensing": {"pos": 0.0, "vel": 0.0, "attitude": 0.0, "others_pos": 0.0, "others_vel": 0.0}},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", CHANGED.values(), ids=CHANGED)
+def test_robots_fly_as_the_swarm_in_changed_worlds(world):
+    config = make_config("flight", world, n_robots=4)
+    rule = "event:0.05|push:0.1"
+    assert not list(differences(config, [RulePolicy(rule) for _ in range(4)], rule, "symmetric_swap"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "flight", "flight-hard"])
+@pytest.mark.parametrize("n", [2, 4, 8])
+def test_robots_with_a_learned_policy_fly_as_the_swarm(preset, n, tmp_path):
+    pytest.importorskip("onnxruntime")
+    config = make_config(preset, n_robots=n)
+    written, model = export(MODEL, config, tmp_path), load_model(MODEL, "sb3_maddpg:MADDPG")
+    edges = []
+
+    def at_edge(observed, differing):
+        probabilities = probabilities_of(model, config, observed)
+        edges.append(np.abs(probabilities[differing] - model.policy.threshold).max())
+        return edges[-1] < EDGE
+
+    for scenario in SCENARIOS:
+        policies = [written.actor() for _ in range(n)]
+        arguments = (config, policies, "model.zip", scenario, model)
+        assert not list(differences(*arguments, at_edge=at_edge))
+    assert len(edges) <= 1, edges  # expected about once in a million bits
+
+
+def probabilities_of(model, config, observed):
+    """Return the probability of each bit, (n, n - 1, bits), for observations without the critic's columns."""
+    predictor, observation, n_bits = fitted(model, MODEL, config)
+    known = [k for k, column in enumerate(observation.columns) if ".critic." not in column.name]
+    alone = predictor.agent_policy(0).of_columns(known)
+    with th.no_grad():
+        logits = alone.network(th.from_numpy(np.pad(observed, ((0, 0), (0, alone.n_hidden)))[:, alone.places]))
+    return logits.sigmoid().numpy().reshape(config.n_robots, -1, n_bits)
+
+
+class Forgetful(Robot):
+    """A robot that does not note what it sent."""
+
+    def sent(self, other, stamp=None):
+        pass
+
+
+class Rounding(Robot):
+    """A robot that takes plans in centimetres."""
+
+    def receive(self, sender, plan):
+        super().receive(sender, Plan(plan.stamp, plan.positions.round(2)))
+
+
+class Punctual(Robot):
+    """A robot that believes that its commands act at once."""
+
+    def reset(self, start, goal, late=0.0, kept=1, now=0):
+        super().reset(start, goal, 0.0, kept, now)
+
+
+class Ahead(Robot):
+    """A robot that takes plans for a period younger than they are."""
+
+    def receive(self, sender, plan):
+        super().receive(sender, plan._replace(stamp=plan.stamp + self.period))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "name"), [(Forgetful, "presumed"), (Rounding, "beliefs"), (Punctual, "plans"), (Ahead, "beliefs")]
+)
+def test_mistakes_are_noticed(mistake, name):
+    config, rule = make_config("flight", n_robots=3), "full"
+    found = differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap", make_robot=mistake)
+    first = next(found)[0]
+    assert name in {what for step, what in [(first, name), *found] if step == first}
