@@ -1,7 +1,7 @@
 """A quadrotor swarm with NMPC planners whose robots may request each other's plans (Serra-Gomez et al., IROS 2020).
 
-Importing the package registers ``QuadSwarm-v0`` in Gymnasium, now or when Gymnasium is imported, which a robot of its own
-does not do. `parallel_env` creates the PettingZoo environment.
+Importing the package registers ``QuadSwarm-v0`` in Gymnasium, now or when Gymnasium is imported, which a robot of its
+own does not do. `parallel_env` creates the PettingZoo environment.
 """
 
 from importlib import import_module

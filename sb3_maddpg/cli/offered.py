@@ -1,4 +1,4 @@
-"""``sb3-maddpg evaluate``, ``replay``, ``identify`` and ``export``: what installed packages provide for their environments."""
+"""``sb3-maddpg evaluate``, ``replay``, ``identify`` and ``export``: what packages provide for their environments."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Export a model for robots: ``sb3-maddpg export pretrained:quad-swarm-flight --n-robots 8 --out FOLDER``.
 
-The folder holds actor.onnx, the policy of each robot, and robot.json: the world, the observation's columns, versions and
-the program's digest. `quad_swarm.robot.files.load` reads it, without PyTorch.
+The folder holds actor.onnx, the policy of each robot, and robot.json: the world, the observation's columns, versions
+and the program's digest. `quad_swarm.robot.files.load` reads it, without PyTorch.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
     :param folder: folder to write to
     :param algo: ``module:Class`` that loads the model
     :return: what has been written, as a robot loads it
-    :raises ValueError: if the model does not fit the world, robots cannot fly by themselves in it, or the extra ``onnx``
-        is not installed
+    :raises ValueError: if the model does not fit the world, robots cannot fly by themselves in it, or the extra
+        ``onnx`` is not installed
     """
     if config.is_limited:
         raise ValueError("neighbourhood: a robot of its own perceives all others; leave it out.")

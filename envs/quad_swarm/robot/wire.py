@@ -12,9 +12,10 @@ offset size request, and the head of a plan
 ====== ==== =========================================================
 
 A plan continues with the age of its first point (0.1 ms, 2 bytes), the length of a stage (ms, 1 byte), and 2 bytes that
-hold the number of points (6 bits) and the widths of the first difference and of the second differences (4 bits each). The
-first point follows (mm, 3 x 2 bytes), and then without gaps the three numbers of the first difference and those of the
-second differences, in as few bits as hold all of them. Positions are thus exact to half a millimetre. A checksum (CRC-16/CCITT) may end a message, for radios without one of their own.
+hold the number of points (6 bits) and the widths of the first difference and of the second differences (4 bits each).
+The first point follows (mm, 3 x 2 bytes), and then without gaps the three numbers of the first difference and those of
+the second differences, in as few bits as hold all of them. Positions are thus exact to half a millimetre. A checksum
+(CRC-16/CCITT) may end a message, for radios without one of their own.
 
 `pack_plan` and `unpack` are inverse to each other on that grid. `unpack` raises `WireError` for everything else.
 """

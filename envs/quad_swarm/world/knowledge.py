@@ -122,8 +122,8 @@ def make_problems(
     :param model: discrete dynamics
     :param estimate: estimated states, (E, n, 9)
     :param goal: goals, (E, n, 3), world frame (m)
-    :param believed: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), which become those at the problem's
-        stages
+    :param believed: believed positions at the next N steps, (E, n, n - 1, N, 3) (m), which become those at the
+        problem's stages
     :param source: `BeliefSource` of each, (E, n, n - 1)
     :param u: inputs that act until then, (E, n, 4)
     :param late: when the inputs take effect, as a fraction of a step, (E, n); None if all do so at once

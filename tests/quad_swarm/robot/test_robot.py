@@ -75,7 +75,7 @@ def test_a_plan_that_arrives_is_believed_and_then_remembered(robot):
     robot.receive(2, plan_from(OTHERS[1], np.array([1.0, 0, 0]), -PERIOD)._replace(stamp=0))
     robot.plan()
     assert robot.source.tolist() == [[[BeliefSource.CONSTANT_VELOCITY, BeliefSource.REQUESTED]]]
-    moved = OTHERS + [[0, 0, 0], [0.1, 0, 0]]
+    moved = OTHERS + np.array([[0.0, 0, 0], [0.1, 0, 0]])
     robot.decide(PERIOD, state_at([0.0, 0, 1]), moved, STILL)
     robot.plan()
     assert robot.source.tolist() == [[[BeliefSource.CONSTANT_VELOCITY, BeliefSource.REMEMBERED]]]
