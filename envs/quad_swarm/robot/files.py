@@ -20,7 +20,7 @@ from quad_swarm.world.presets import SwarmConfig
 
 FORMAT = 1
 ACTOR, DESCRIPTION = "actor.onnx", "robot.json"
-_FIELDS = {
+_FIELDS: dict[str, Any] = {
     "format": int,
     "model": str,
     "world": dict,
