@@ -38,6 +38,8 @@ class LockstepWorld:
         self._others = other_indices(n)
         # The plans that answers may contain, oldest first
         self._plans: list[deque[Plan]] = []
+        # What is on its way, by the number of steps until it arrives: receiver, sender, plan
+        self._flying: deque[list[tuple[int, int, Plan]]] = deque()
 
     def reset(self, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
         """Begin an episode, see `Swarm.reset`."""
@@ -50,7 +52,9 @@ class LockstepWorld:
         late = np.zeros(len(self.robots)) if start is None else start[0] / self.config.substeps
         for robot, where, goal, delay in zip(self.robots, starts, goals, late, strict=True):
             robot.reset(where, goal, float(delay), kept=1 + radio.delay)
-        most = 1 + radio.delay + radio.jitter
+        causal = radio.round_trip is not None
+        self._flying = deque([] for _ in range(1 + (radio.round_trip or 0) + radio.jitter))
+        most = 1 + radio.delay + (0 if causal else radio.jitter)
         self._plans = [
             deque([Plan(-k * robot.period, robot.newest.positions) for k in range(most, 0, -1)], most)
             for robot in self.robots
@@ -93,9 +97,14 @@ class LockstepWorld:
             robot = self.robots[self._others[i, k]]
             robot.sent(int(i), self.now - (1 + radio.delay) * robot.period)
         for i, k in np.argwhere(arriving[0]):
-            age = 1 + radio.delay + (0 if lateness is None else int(lateness[0, i, k]))
-            sender = int(self._others[i, k])
-            self.robots[i].receive(sender, self._plans[sender][-age])
+            late, sender = 0 if lateness is None else int(lateness[0, i, k]), int(self._others[i, k])
+            if radio.round_trip is None:
+                self._flying[0].append((int(i), sender, self._plans[sender][-1 - radio.delay - late]))
+            else:
+                self._flying[radio.round_trip + late].append((int(i), sender, self._plans[sender][-1]))
+        self._flying.append([])
+        for receiver, sender, plan in self._flying.popleft():
+            self.robots[receiver].receive(sender, plan)
 
     def _fly(self, planned: np.ndarray) -> None:
         realisation, before = self.realisation, self._u

@@ -88,16 +88,22 @@ class SensingError:
 class Radio:
     """Transmission of plans. A request counts whether or not its answer arrives.
 
+    By default, an answer is used in the step of its request and is older by its delay, which is simple but not causal:
+    its sender must have known of the request when it made the plan. With ``round_trip``, the answer is the plan of the
+    last step, as of the request, and is used later, as in a network.
+
     :param loss: probability that an answer is lost, independently for each answer
     :param delay: delay of answers (steps); with 0 a robot receives the plan that was made one step ago
     :param jitter: maximum additional delay (steps), drawn uniformly from 0 to this for each answer; robots keep the
         newer of two plans
+    :param round_trip: steps from a request to the use of its answer, apart from jitter; 0 if robots wait for answers
+        within a step; None for answers that are used at once and are older, by ``delay``
     :param bursts: fraction of the time in which the link from one robot to another is interrupted
     :param burst_length: mean length of an interruption (steps)
     :param outage: probability that a robot stops answering for good, at a time drawn uniformly from the first 5 s; it
         still flies and makes requests
-    :raises ValueError: if a probability is outside [0, 1] (``bursts``: [0, 1)), a delay is outside 0 to 1000, or
-        ``burst_length`` is less than a step
+    :raises ValueError: if a probability is outside [0, 1] (``bursts``: [0, 1)), a delay is outside 0 to 1000,
+        ``burst_length`` is less than a step, or there are both ``delay`` and ``round_trip``
     """
 
     loss: Share = 0.0
@@ -106,6 +112,14 @@ class Radio:
     bursts: Annotated[float, Field(ge=0, lt=1)] = 0.0
     burst_length: Annotated[float, Field(ge=1)] = 10.0
     outage: Share = 0.0
+    round_trip: Annotated[int, Field(ge=0, le=1000)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.round_trip is not None and self.delay:
+            raise ValueError(
+                f"round_trip={self.round_trip} and delay={self.delay}: an answer comes later or is older; set delay=0, "
+                "or leave out round_trip"
+            )
 
     @functools.cached_property
     def is_random(self) -> bool:

@@ -10,6 +10,19 @@ import numpy as np
 from quad_swarm.native.pairs import advance
 from quad_swarm.states import like
 from quad_swarm.world.beliefs import answered
+from quad_swarm.world.disturbances import Radio
+
+
+def make_channel(radio: Radio, plans: np.ndarray, n_slots: int) -> RadioChannel:
+    """Create the channel of a radio.
+
+    :param radio: settings
+    :param plans: planned positions of robots at rest, (E, n, N + 1, 3) (m)
+    :param n_slots: number of others that a robot perceives
+    """
+    if radio.round_trip is None:
+        return RadioChannel(radio.delay, radio.jitter, plans)
+    return CausalChannel(radio.round_trip, radio.jitter, plans, n_slots)
 
 
 class RadioChannel:
@@ -54,6 +67,21 @@ class RadioChannel:
             received[late == k] = answered(arriving, self._available[-age - k], others)[late == k]
         return received, age + late
 
+    def deliver(
+        self, arriving: np.ndarray, others: np.ndarray, lateness: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | int]:
+        """Return which plans robots receive in this step, (E, n, n - 1) bool, and these plans and their ages.
+
+        :param arriving: which requests of this step are answered, (E, n, n - 1) bool
+        :param others: see `answers`
+        :param lateness: see `answers`
+        :return: whose plan each robot receives, and what `answers` returns for these
+        """
+        return (arriving, *self.answers(arriving, others, lateness))
+
+    def forget(self, slots: np.ndarray) -> None:
+        """Drop what is on its way to slots whose robot has changed, (E, n, n - 1) bool."""
+
     def reset(self, swarm: int, plans: np.ndarray) -> None:
         """Start one swarm with plans of robots at rest, (n, N + 1, 3) (m)."""
         for earlier in self._earlier:
@@ -75,4 +103,70 @@ class RadioChannel:
         if len(state) != len(self._earlier):
             raise ValueError(f"The state has {len(state)} earlier plans, but this world has {len(self._earlier)}.")
         self._earlier = [like(mine, one, "earlier plans") for mine, one in zip(self._earlier, state, strict=True)]
+        self._available = []
+
+
+class CausalChannel(RadioChannel):
+    """A channel on which answers are the plans of the last step, as of their requests, and come later.
+
+    :param round_trip: steps from a request to the use of its answer
+    :param jitter: maximum number of additional steps
+    :param plans: planned positions of robots at rest, (E, n, N + 1, 3) (m)
+    :param n_slots: number of others that a robot perceives
+    """
+
+    def __init__(self, round_trip: int, jitter: int, plans: np.ndarray, n_slots: int):
+        super().__init__(0, 0, plans)
+        self._round_trip = round_trip
+        shape = (round_trip + jitter, *plans.shape[:2], n_slots)
+        # By the number of steps until they are used, from 1: the plans on their way, from the current step on, and the
+        # steps since they were made, 0 where nothing is on its way
+        self._plans = np.zeros((*shape, *plans.shape[2:]))
+        self._ages = np.zeros(shape, dtype=np.int64)
+
+    def deliver(
+        self, arriving: np.ndarray, others: np.ndarray, lateness: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | int]:
+        fresh, age = self.answers(arriving, others)
+        if not len(self._ages):
+            return arriving, fresh, age
+        where = np.nonzero(arriving)
+        late = self._round_trip + (0 if lateness is None else lateness[where])
+        late = np.broadcast_to(late, len(fresh))
+        used, used_ages = self._pass()
+        at_once = late == 0
+        rows = tuple(index[at_once] for index in where)
+        used[rows], used_ages[rows] = fresh[at_once], age  # newer than what arrives from earlier steps
+        rows = (late[~at_once] - 1, *(index[~at_once] for index in where))
+        self._plans[rows], self._ages[rows] = fresh[~at_once], age
+        received = used_ages > 0
+        return received, used[received], used_ages[received]
+
+    def _pass(self) -> tuple[np.ndarray, np.ndarray]:
+        """Begin a step: return the plans that are used in it, and their ages, 0 for none; the others come closer."""
+        plans, ages = self._plans[0], self._ages[0]
+        last = np.zeros_like(plans), np.zeros_like(ages)
+        self._plans = np.concatenate([advance(self._plans[1:]), last[0][None]])
+        self._ages = np.concatenate([np.where(self._ages[1:] > 0, self._ages[1:] + 1, 0), last[1][None]])
+        return advance(plans), np.where(ages > 0, ages + 1, 0)
+
+    def forget(self, slots: np.ndarray) -> None:
+        self._ages[:, slots] = 0
+
+    def reset(self, swarm: int, plans: np.ndarray) -> None:
+        super().reset(swarm, plans)
+        self._ages[:, swarm] = 0
+
+    def keep(self, swarms: np.ndarray) -> None:
+        super().keep(swarms)
+        self._plans, self._ages = self._plans[:, swarms], self._ages[:, swarms]
+
+    def state_dict(self) -> list[np.ndarray]:
+        return [self._plans.copy(), self._ages.copy()]
+
+    def load_state_dict(self, state: Sequence[Any]) -> None:
+        if len(state) != 2:
+            raise ValueError(f"The state has {len(state)} arrays of plans on their way, but this world has 2.")
+        self._plans = like(self._plans, state[0], "plans on their way")
+        self._ages = like(self._ages, state[1], "ages of plans on their way", 0)
         self._available = []

@@ -20,7 +20,7 @@ from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resample
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.presets import SwarmConfig, points
-from quad_swarm.world.radio import RadioChannel
+from quad_swarm.world.radio import make_channel
 from quad_swarm.world.realisation import Realisation
 from quad_swarm.world.swarm_state import SwarmState
 
@@ -94,13 +94,13 @@ class Swarm(SwarmState):
         state = np.zeros((n_swarms, n, 9))
         plans = Plans.hover(state.reshape(-1, 9), horizon)
         plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
-        differ = config.radio.is_random or config.sensing.others
+        differ = config.radio.is_random or config.radio.round_trip or config.sensing.others
         super().__init__(
             state=state,
             goal=np.zeros((n_swarms, n, 3)),
             _u=np.zeros((n_swarms, n, 4)),
             _plans=plans,
-            _radio=RadioChannel(config.radio.delay, config.radio.jitter, plans_of_robots[..., POSITION]),
+            _radio=make_channel(config.radio, plans_of_robots[..., POSITION], config.n_others),
             beliefs=make_beliefs(config, n_swarms, n),
             _other_beliefs=make_beliefs(config, n_swarms, n) if differ else None,
             disturbances=Realisation(config, n_swarms),
@@ -287,6 +287,7 @@ class Swarm(SwarmState):
         if changed.any():
             for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
                 beliefs.forget_others(changed)
+            self._radio.forget(changed)
             self.disturbances.draw_for_new_neighbours(self.neighbours.perceived(changed))
         return changed
 
@@ -297,8 +298,8 @@ class Swarm(SwarmState):
         if self._other_beliefs is not None:
             sent = self._radio.answers(requests, others)
             self._other_beliefs.receive(requests, *self._seen_by_all(), *sent)
-        arriving, lateness = self.disturbances.arrivals(requests, others)
-        received = self._radio.answers(arriving, others, lateness)
+        answered, lateness = self.disturbances.arrivals(requests, others)
+        arriving, *received = self._radio.deliver(answered, others, lateness)
         return self.beliefs.update(arriving, *self.observe(), *received)
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:

@@ -89,6 +89,9 @@ def test_robots_with_rules_fly_as_the_swarm_anywhere(preset, n, scenario):
 CHANGED = {
     "late answers": {"radio": {"delay": 3, "jitter": 2}},
     "no losses": {"radio": {"loss": 0.0, "jitter": 0}},
+    "answers within the step": {"radio": {"delay": 0, "jitter": 0, "round_trip": 0}},
+    "answers a step later": {"radio": {"delay": 0, "jitter": 0, "round_trip": 1}},
+    "answers one to four steps later": {"radio": {"delay": 0, "jitter": 3, "round_trip": 1}},
     "half lost": {"radio": {"loss": 0.5, "bursts": 0.2}},
     "punctual": {"clock_skew": 0.0},
     "no right of way": {"planner": {"right_of_way": 0.0}},

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from quad_swarm.world.beliefs import other_indices
-from quad_swarm.world.radio import RadioChannel
+from quad_swarm.world.disturbances import Radio
+from quad_swarm.world.radio import RadioChannel, make_channel
 
 N = 4  # stages
 OTHERS = other_indices(3)
@@ -63,3 +64,68 @@ def test_it_goes_on_from_its_state():
     assert np.array_equal(radio.answers(arriving, OTHERS, lateness)[0], other.answers(arriving, OTHERS, lateness)[0])
     with pytest.raises(ValueError, match="The state has 2 earlier plans, but this world has 3"):
         RadioChannel(3, 0, plans_of(0)).load_state_dict(radio.state_dict())
+
+
+def causal(round_trip: int, jitter: int = 0) -> RadioChannel:
+    return make_channel(Radio(round_trip=round_trip, jitter=jitter), plans_of(0), n_slots=2)
+
+
+def test_answers_of_a_network_are_fresh_and_come_later():
+    radio, asked = causal(round_trip=2), np.zeros((2, 3, 2), dtype=bool)
+    asked[0, 1, 1] = True  # robot 2 to 1
+    for step in range(5):
+        radio.send(plans_of(step))
+        arriving, received, ages = radio.deliver(asked & (step == 1), OTHERS, None)
+        assert arriving.any() == (step == 3)
+    radio.send(plans_of(5))
+    radio.deliver(asked, OTHERS, None)
+    for step in (6, 7):
+        radio.send(plans_of(step))
+        arriving, received, ages = radio.deliver(~asked, OTHERS, None)
+    assert np.argwhere(arriving).tolist() == [[0, 1, 1]]
+    assert ages.tolist() == [3], "asked in step 6 for the plan of step 5"
+    assert received[0, 0].tolist() == [8 * 2, 5, 0]
+
+
+def test_an_answer_within_the_step_is_the_plan_of_the_last_one():
+    radio, asked = causal(round_trip=0), np.ones((2, 3, 2), dtype=bool)
+    radio.send(plans_of(4))
+    arriving, received, age = radio.deliver(asked, OTHERS, None)
+    assert arriving.all()
+    assert age == 1
+    assert (received[:, 0, 1] == 4).all()
+
+
+def test_of_two_answers_in_one_step_the_newer_counts():
+    radio, asked = causal(round_trip=0, jitter=2), np.zeros((2, 3, 2), dtype=bool)
+    asked[1, 0, 0] = True
+    for step, late in ((1, 2), (2, 1), (3, 0)):  # all arrive in step 3
+        radio.send(plans_of(step))
+        arriving, received, ages = radio.deliver(asked, OTHERS, np.full(asked.shape, late))
+        assert arriving.any() == (step == 3)
+    assert ages.tolist() == [1]
+    assert received[0, 0].tolist() == [4 * 11, 3, 0]
+
+
+def test_what_is_on_its_way_is_part_of_the_state_and_ends_with_the_episode():
+    radio, asked = causal(round_trip=2), np.ones((2, 3, 2), dtype=bool)
+    radio.send(plans_of(1))
+    radio.deliver(asked, OTHERS, None)
+    other = causal(round_trip=2)
+    other.load_state_dict(radio.state_dict())
+    forgetful = causal(round_trip=2)
+    forgetful.load_state_dict(radio.state_dict())
+    forgetful.reset(0, plans_of(9)[0])
+    left = np.zeros(asked.shape, dtype=bool)
+    left[1, 2, 0] = True  # its slot holds another robot now
+    forgetful.forget(left)
+    for step in (2, 3):
+        found = []
+        for one in (radio, other, forgetful):
+            one.send(plans_of(step))
+            found.append(one.deliver(~asked, OTHERS, None))
+    assert found[0][0].all()
+    assert all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))
+    assert np.array_equal(found[2][0], np.array([[[False] * 2] * 3, [[True] * 2, [True] * 2, [False, True]]]))
+    with pytest.raises(ValueError, match="plans on their way"):
+        causal(round_trip=3).load_state_dict(radio.state_dict())
