@@ -7,7 +7,6 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
@@ -19,10 +18,6 @@ from sb3_maddpg.common.networks import single_precision
 from sb3_maddpg.errors import DivergedError, InvalidArgumentError
 from sb3_maddpg.team.spaces import AgentActionSpace, into_box
 from sb3_maddpg.utils import as_numbers, atomic_write, shown
-
-if TYPE_CHECKING:
-    from sb3_maddpg.common.policies import MADDPGPolicy
-    from sb3_maddpg.vec_env.normalize import ObservationStatistics
 
 _TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
 
@@ -95,32 +90,6 @@ class AgentPolicy(nn.Module):
                 limit = np.ravel(getattr(action_space, bound))
                 self.register_buffer(bound, th.as_tensor(limit).float())
                 self.register_buffer(f"own_{bound}", th.as_tensor(_as_double(limit, bound)))
-
-    @classmethod
-    @single_precision()
-    def of(cls, policy: MADDPGPolicy, agent: str | int, statistics: ObservationStatistics | None = None) -> AgentPolicy:
-        """
-        Extract an agent's policy from the team's.
-
-        :param policy: policy of the team
-        :param agent: name or index of the agent
-        :param statistics: how ``VecNormalize`` normalises the team's observations, None if it does not
-        :return: the agent's policy
-        :raises ValueError: if there is no such agent, or parameters are not finite
-        """
-        if problem := policy.not_finite(policy.state_dict()):
-            raise DivergedError(
-                f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file."
-            )
-        team, index = policy.team, policy.team.index(agent)
-        network = deepcopy(policy.actor.single(index)).requires_grad_(False).cpu()
-        columns, space = policy.actions.columns_of(index), team.action_spaces[index]
-        mask = team.masks[index] if team.masks else ()
-        own = None
-        if statistics is not None:
-            mean, var = (part[index, : team.obs_dims[index]] for part in (statistics.mean, statistics.var))
-            own = (mean, np.sqrt(var + statistics.epsilon), statistics.clip)
-        return cls(team.names[index], network, columns, space, team.obs_dims[index], policy.threshold, mask, own)
 
     def of_columns(self, columns: Sequence[int]) -> AgentPolicy:
         """

@@ -18,7 +18,7 @@ from sb3_maddpg.common.actions import TeamActions
 from sb3_maddpg.common.agent_policy import AgentPolicy
 from sb3_maddpg.common.heads import TeamHead, ValueHeads
 from sb3_maddpg.common.networks import StackedMLP, single_precision
-from sb3_maddpg.errors import InvalidArgumentError
+from sb3_maddpg.errors import DivergedError, InvalidArgumentError
 from sb3_maddpg.files.registry import allow_in_files
 from sb3_maddpg.team.spaces import MixedActions, into_box
 from sb3_maddpg.team.team import Team
@@ -707,16 +707,30 @@ class MADDPGPolicy(BasePolicy):
             "optimizer_kwargs": self.optimizer_kwargs,
         }
 
+    @single_precision()
     def agent_policy(self, agent: str | int, statistics: ObservationStatistics | None = None) -> AgentPolicy:
         """
-        Extract the policy of one agent, see ``AgentPolicy.of``.
+        Extract the policy of one agent.
 
         :param agent: name or index of the agent
         :param statistics: how ``VecNormalize`` normalises the team's observations, None if it does not
         :return: the agent's policy
         :raises ValueError: if there is no such agent, or parameters are not finite
         """
-        return AgentPolicy.of(self, agent, statistics)
+        if problem := self.not_finite(self.state_dict()):
+            raise DivergedError(
+                f"This policy cannot act: {problem}. Its training diverged: go back to an earlier file."
+            )
+        team, index = self.team, self.team.index(agent)
+        network = deepcopy(self.actor.single(index)).requires_grad_(False).cpu()
+        columns, space = self.actions.columns_of(index), team.action_spaces[index]
+        mask = team.masks[index] if team.masks else ()
+        own = None
+        if statistics is not None:
+            mean, var = (part[index, : team.obs_dims[index]] for part in (statistics.mean, statistics.var))
+            own = (mean, np.sqrt(var + statistics.epsilon), statistics.clip)
+        arguments = (columns, space, team.obs_dims[index], self.threshold, mask, own)
+        return AgentPolicy(team.names[index], network, *arguments)
 
     def not_finite(self, parameters: Mapping[str, th.Tensor]) -> str | None:
         """

@@ -43,7 +43,8 @@ ROOMS = {
     "world": {"", "native", "planner", "plants"},
     "task": {"", "native", "planner", "world"},
     "interfaces": {"", "planner", "world", "task"},
-    "evaluation": {"", "jobs", "planner", "plants", "world", "task"},
+    "robot": {"", "native", "planner", "plants", "world", "task"},
+    "evaluation": {"", "jobs", "planner", "plants", "world", "task", "robot"},
     "figures": {"", "planner", "world", "task", "evaluation"},
     "models": set(),
 }

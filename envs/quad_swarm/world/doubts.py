@@ -278,11 +278,12 @@ def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
 
 def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
     planner, radio = config.planner, config.radio
-    name = "delay" if radio.round_trip is None else "round_trip"
-    oldest = 1 + getattr(radio, name) + radio.jitter
+    delay = "delay" if radio.round_trip is None else "round_trip"
+    steps = getattr(radio, delay)
+    oldest = 1 + steps + radio.jitter
     if oldest >= planner.horizon:
         yield (
-            f"radio.{name}={getattr(radio, name)} and radio.jitter={radio.jitter} are in steps of {planner.dt:g} s: answers that "
+            f"radio.{delay}={steps} and radio.jitter={radio.jitter} are in steps of {planner.dt:g} s: answers that "
             f"are {oldest} steps old have no future left in a plan of planner.horizon={planner.horizon}; use at most "
             f"{max(planner.horizon - 2, 0)} together"
         )

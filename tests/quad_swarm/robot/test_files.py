@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from quad_swarm.evaluation.export import export, main
+from quad_swarm.evaluation.export import export
 from quad_swarm.robot.files import FORMAT, load
 from quad_swarm.world.presets import make_config
 from sb3_maddpg.hub.pretrained import pretrained_folder
@@ -70,21 +70,3 @@ def test_missing_files_are_named(exported, tmp_path, name):
     (folder / name).unlink()
     with pytest.raises(ValueError, match=name.replace(".", r"\.")):
         load(folder)
-
-
-def test_the_command_writes_the_preset_of_the_training(tmp_path, capsys):
-    assert main([MODEL, "--n-robots", "2", "--world", "noise.wind=0", "--out", str(tmp_path / "robots")]) == 0
-    assert "2 robots in 'flight', 63 columns, 2 bits" in capsys.readouterr().out
-    assert load(tmp_path / "robots").config == make_config("flight", {"noise": {"wind": 0.0}}, n_robots=2)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["none", "--out", "x"], "'none' is no model"),
-        ([MODEL, "--world", "neighbourhood.max_others=2", "--out", "x"], "perceives all others"),
-    ],
-)
-def test_the_command_refuses_what_cannot_be_exported(words, message):
-    with pytest.raises(ValueError, match=message):
-        main(words)

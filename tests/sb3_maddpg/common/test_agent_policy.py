@@ -103,6 +103,25 @@ def test_an_agent_survives_pickling_and_carries_nothing_of_the_team(make):
     assert not any(parameter.requires_grad for parameter in policy.parameters())
 
 
+@each_model
+def test_columns_that_an_agent_is_not_given_count_as_zero(make):
+    for policy, obs, _ in team_actions(varied(make)):
+        known = [k for k in reversed(range(policy.obs_dim)) if k % 3]
+        if not known:
+            continue
+        blind = np.zeros_like(obs)
+        blind[:, known] = obs[:, known]
+        narrow = policy.of_columns(known)
+        assert narrow.obs_dim == len(known)
+        assert np.array_equal(narrow.predict(obs[:, known]), policy.predict(blind))
+        assert policy.obs_dim == obs.shape[1], "the policy itself stays"
+        with pytest.raises(ValueError, match="already"):
+            narrow.of_columns([0])
+    for wrong in ([0, 0], [policy.obs_dim], [-1]):
+        with pytest.raises(ValueError, match=rf"must name different columns from 0 to {policy.obs_dim - 1}"):
+            policy.of_columns(wrong)
+
+
 RUN = """
 import sys
 import numpy as np

@@ -1,0 +1,50 @@
+"""Models for robots: for which world, and what cannot be exported. `robot.test_files` reads what is written."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.evaluation.export import export, main
+from quad_swarm.evaluation.policies import fitted, load_model
+from quad_swarm.robot.files import load
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import Swarm
+from sb3_maddpg.hub.pretrained import pretrained_folder
+
+pytest.importorskip("onnxruntime")
+MODEL = str(pretrained_folder("quad-swarm-flight") / "model.zip")
+
+
+def test_the_command_writes_the_preset_of_the_training(tmp_path, capsys):
+    assert main([MODEL, "--n-robots", "2", "--world", "noise.wind=0", "--out", str(tmp_path / "robots")]) == 0
+    assert "2 robots in 'flight', 63 columns, 2 bits" in capsys.readouterr().out
+    assert load(tmp_path / "robots").config == make_config("flight", {"noise": {"wind": 0.0}}, n_robots=2)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none", "--out", "x"], "'none' is no model"),
+        ([MODEL, "--world", "neighbourhood.max_others=2", "--out", "x"], "perceives all others"),
+    ],
+)
+def test_the_command_refuses_what_cannot_be_exported(words, message):
+    with pytest.raises(ValueError, match=message):
+        main(words)
+
+
+def test_programs_answer_as_the_model_without_what_critics_see(tmp_path):
+    config = make_config("flight", n_robots=3)
+    actor, model = export(MODEL, config, tmp_path).actor(), load_model(MODEL, "sb3_maddpg:MADDPG")
+    predictor, observation, n_bits = fitted(model, MODEL, config)
+    swarm, rng = Swarm(config), np.random.default_rng(0)
+    _, starts, goals = ScenarioSampler("symmetric_swap", 3, config.space, config).sample(rng)
+    swarm.reset(0, starts, goals, 1)
+    asked = 0
+    for _ in range(20):
+        bits = predictor.predict(observation(swarm), deterministic=True)[0].reshape(3, 2, n_bits) > 0
+        mine = actor._run(actor.observation(swarm)[0]).reshape(3, 2, n_bits) > 0
+        assert np.array_equal(mine, bits)
+        asked += bits.sum()
+        swarm.step(bits[None, ..., 0])
+    assert asked

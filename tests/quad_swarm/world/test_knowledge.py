@@ -1,0 +1,49 @@
+"""Swarms and robots know the same things under the same names, and plan the same problems."""
+
+import inspect
+
+import numpy as np
+import pytest
+
+from quad_swarm.robot import Robot
+from quad_swarm.world.beliefs import BeliefSource
+from quad_swarm.world.knowledge import Knowledge, make_beliefs, make_problems
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.swarm import Swarm
+
+CONFIG = make_config("flight", n_robots=3)
+
+
+@pytest.mark.parametrize("source", [Swarm, Robot])
+def test_swarms_and_robots_are_sources_of_knowledge(source):
+    for name, member in vars(Knowledge).items():
+        if name.startswith("_") or name in ("config", "goal", "beliefs", "neighbours"):
+            continue
+        assert inspect.signature(getattr(source, name)) == inspect.signature(member), name
+
+
+def test_beliefs_begin_without_plans():
+    beliefs = make_beliefs(CONFIG, 2, 3)
+    assert beliefs.age.shape == (2, 3, 2)
+    assert (beliefs.age == CONFIG.planner.horizon).all()
+    assert beliefs.misfit == pytest.approx(0.5 * CONFIG.planner.separation)
+
+
+@pytest.mark.parametrize("late", [None, 0.5])
+def test_problems_start_when_inputs_take_effect(late):
+    swarm = Swarm(CONFIG)
+    estimate = np.zeros((1, 3, 9))
+    estimate[..., 3] = 2.0  # m/s
+    believed = np.zeros((1, 3, 2, CONFIG.planner.horizon, 3))
+    believed[..., 0] = np.arange(CONFIG.planner.horizon)
+    source = np.full((1, 3, 2), BeliefSource.CONSTANT_VELOCITY)
+    source[0, 1, 0] = BeliefSource.REMEMBERED
+    shares = None if late is None else np.full((1, 3), late)
+    arguments = (estimate, np.ones((1, 3, 3)), believed, source, np.zeros((1, 3, 4)), shares)
+    problems = make_problems(CONFIG, swarm.planner.model, *arguments)
+    moved = 0.0 if late is None else late * CONFIG.planner.dt * 2.0
+    np.testing.assert_allclose(problems.x[:, 0], moved, rtol=0.02)
+    np.testing.assert_allclose(problems.others[..., 0, 0], late or 0.0)
+    assert problems.announced.tolist() == [[False, False], [True, False], [False, False]]
+    problems.goal[:] = 7.0
+    assert (arguments[1] == 1).all(), "solvers get copies"
