@@ -1,5 +1,7 @@
 """Small teams for the tests: every kind of action, and one whose members look at each other."""
 
+import inspect
+
 import gymnasium
 import numpy as np
 from gymnasium import spaces
@@ -8,6 +10,8 @@ from pettingzoo import ParallelEnv
 from sb3_maddpg.team.pettingzoo import TeamEnv
 from sb3_maddpg.team.spaces import heads_of
 
+# Arguments of Discrete for a dtype other than int64, which Gymnasium 1.1 does not have
+INT32 = {"dtype": np.int32} if "dtype" in inspect.signature(spaces.Discrete).parameters else {}
 # The agents of a team act alike in all but "mixed", but never in spaces of one size
 AGENT_SPACES: dict[str, tuple[spaces.Space, ...]] = {
     "binary": (spaces.MultiBinary(2), spaces.MultiBinary(2), spaces.MultiBinary(2)),

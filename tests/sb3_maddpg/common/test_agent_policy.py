@@ -17,7 +17,7 @@ from sb3_maddpg.common.agent_policy import AgentPolicy
 from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.team.pettingzoo import TeamEnv
 from sb3_maddpg.team.spaces import heads_of
-from toys import AGENT_SPACES, SMALL, Neighbours, Toy
+from toys import AGENT_SPACES, INT32, SMALL, Neighbours, Toy
 
 pytestmark = pytest.mark.filterwarnings("error::DeprecationWarning", "error::torch.jit.TracerWarning")
 
@@ -242,7 +242,7 @@ class Alike(Toy):
         spaces.MultiDiscrete([[2, 3], [4, 5]]),
         spaces.MultiDiscrete([2, 3], start=[1, -4], dtype=np.int32),
         spaces.Discrete(4, start=-2),
-        spaces.Discrete(4, dtype=np.int32),
+        spaces.Discrete(4, **INT32),
     ],
     ids=str,
 )

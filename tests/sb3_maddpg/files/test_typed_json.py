@@ -16,6 +16,7 @@ from sb3_maddpg import PairPolicy
 from sb3_maddpg.common.buffers import PrioritizedTeamReplayBuffer
 from sb3_maddpg.files.typed_json import decode, encode
 from sb3_maddpg.team.spaces import CategoricalActions, MixedActions, TeamObservation
+from toys import INT32
 
 BOX = spaces.Box(-np.arange(1, 4, dtype=np.float32), np.float32(np.inf), (3,))
 AGENTS = {"a": BOX, "b": spaces.Box(-1, 1, (5,))}
@@ -41,7 +42,7 @@ VALUES = [
     BOX,
     spaces.Box(0, 255, (4, 4, 3), np.uint8),
     spaces.Discrete(5, start=-2),
-    spaces.Discrete(3, dtype=np.int32),
+    spaces.Discrete(3, **INT32),
     spaces.MultiDiscrete([2, 3], start=[1, -1]),
     spaces.MultiDiscrete([2, 3], np.uint8, start=[1, 2]),
     spaces.MultiBinary(7),
