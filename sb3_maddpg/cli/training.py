@@ -268,7 +268,7 @@ class Training:
         buffer = Path(path).parent / "replay_buffer.pkl"
         if buffer.exists() and isinstance(model, OffPolicyAlgorithm):
             if not trusts and not isinstance(model, TeamAlgorithm):
-                raise not_ours(buffer, "a replay buffer")
+                raise not_ours(buffer, "is not a replay buffer")
             # The second argument is for HerReplayBuffer only
             model.load_replay_buffer(buffer, truncate_last_traj=self.args.truncate_last_trajectory)
         print(f"Continuing at step {model.num_timesteps}")

@@ -89,7 +89,7 @@ class SavesReplayBuffer(OffPolicyAlgorithm):
                     file.seek(0)
                     super().load_replay_buffer(file, truncate_last_traj)
                 else:
-                    raise not_ours(path, "a replay buffer")
+                    raise not_ours(path, "is not a replay buffer")
             self._check_replay_buffer(self.replay_buffer, path)
             self.replay_buffer.gamma = self.gamma
             self.replay_buffer.handle_timeout_termination = present.handle_timeout_termination

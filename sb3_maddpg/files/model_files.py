@@ -218,11 +218,11 @@ def refuse_pickled(path: Any, given: Mapping[str, Any]) -> None:
 def not_ours(path: Any, what: str) -> UntrustedFileError:
     """
     :param path: path of a file that was not written by this version
-    :param what: what it should hold
+    :param what: e.g. "is not a replay buffer"
     :return: the error that it may be a pickle
     """
     return UntrustedFileError(
-        f"{path} does not hold {what} that this version writes. If it is pickled, it may run any code when it is "
+        f"{path} {what} that this version writes. If it is pickled, it may run any code when it is "
         "loaded: if you trust its author, load it with `trust=True` (on the command line `--trust`)."
     )
 

@@ -265,7 +265,7 @@ class SafeVecNormalize(TeamVecNormalize):
             if file.read(1) != b"{":
                 if trusted(trust):
                     return VecNormalize.load(str(path), venv)
-                raise not_ours(path, "statistics")
+                raise not_ours(path, "does not hold statistics")
             data = _read(file, path)
             settings = decode(data["settings"], f"{path}: settings")
             given = validated_as(NormalizationArguments, settings, lambda name: f"{path}: {name}")

@@ -324,7 +324,7 @@ def test_a_truncated_replay_buffer_is_refused(tmp_path):
     content = (tmp_path / "buffer.pkl").read_bytes()
     (tmp_path / "buffer.pkl").write_bytes(content[: len(content) // 2])
     present = model.replay_buffer
-    with pytest.raises(ValueError, match=r"buffer\.pkl does not hold a replay buffer that this version writes"):
+    with pytest.raises(ValueError, match=r"buffer\.pkl is not a replay buffer that this version writes"):
         model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert model.replay_buffer is present
 
