@@ -15,6 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+tomllib = pytest.importorskip("tomllib")  # in Python from 3.11 on
 ROOT = Path(__file__).parents[2]
 SOURCES = {"sb3_maddpg": "sb3_maddpg", "envs/quad_swarm": "quad_swarm", "zoo_configs": "sb3_maddpg/zoo_configs"}
 HOOK = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
@@ -70,6 +71,15 @@ def dependencies(name: str) -> set[str]:
     return {key for key, *_ in found} - {canonicalize_name(name)}
 
 
+def link(names: set[str], site: Path) -> None:
+    """Let an environment have distributions of this one, and what they depend on."""
+    for name in names.union(*map(dependencies, names)):
+        found = distribution(name)
+        for top in {file.parts[0] for file in found.files or []} - {"..", "__pycache__"}:
+            if not (site / top).exists():
+                (site / top).symlink_to(Path(found.locate_file(top)).resolve())
+
+
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory) -> Path:
     """The programs of an environment with the wheel and what it depends on, without extras: links to what is here."""
@@ -77,11 +87,7 @@ def installed(wheel, tmp_path_factory) -> Path:
     run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
     python = folder / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
     site = Path(run(python, "-c", "import site; print(site.getsitepackages()[0])", cwd=folder).strip())
-    for name in dependencies("sb3-maddpg"):
-        found = distribution(name)
-        for top in {file.parts[0] for file in found.files or []} - {"..", "__pycache__"}:
-            if not (site / top).exists():
-                (site / top).symlink_to(Path(found.locate_file(top)).resolve())
+    link(dependencies("sb3-maddpg"), site)
     run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel, cwd=folder)
     return python.parent
 
@@ -147,3 +153,27 @@ def test_the_command_works_without_extras(installed, tmp_path):
     assert "<canvas" in (tmp_path / "page.html").read_text(encoding="utf-8")
     for words, extra in ((["train", "--env", "OwnBit-v0"], "zoo"), (["identify", "--plant", "crazyflow"], "plants")):
         assert f"pip install -e '.[{extra}]'" in run(command, *words, cwd=tmp_path, status=1)
+
+
+def test_the_swarm_alone_needs_a_part_of_what_the_package_needs():
+    whole, alone = (tomllib.loads((ROOT / path / "pyproject.toml").read_text())["project"] for path in ("", "envs"))
+    assert alone["version"] == whole["version"]
+    assert alone["requires-python"] == whole["requires-python"]
+    assert set(alone["dependencies"]) < set(whole["dependencies"])
+
+
+@pytest.mark.slow
+def test_a_robot_flies_from_the_swarm_alone(tmp_path):
+    checkout = tmp_path / "envs"
+    shutil.copytree(ROOT / "envs", checkout, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info", "build"))
+    run(sys.executable, "-c", HOOK, "build_wheel", tmp_path, cwd=checkout)
+    (wheel,) = tmp_path.glob("quad_swarm-*.whl")
+    run(sys.executable, "-m", "venv", "--without-pip", "venv", cwd=tmp_path)
+    python = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    requirements = tomllib.loads((checkout / "pyproject.toml").read_text())["project"]["dependencies"]
+    site = Path(run(python, "-c", "import site; print(site.getsitepackages()[0])", cwd=tmp_path).strip())
+    link({Requirement(one).name for one in requirements}, site)
+    run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel, cwd=tmp_path)
+    assert "never closer than" in run(python, ROOT / "examples" / "one_robot.py", "--quick", cwd=tmp_path)
+    missing = "import importlib.util as u; print(*(u.find_spec(n) for n in ('torch', 'gymnasium', 'pettingzoo')))"
+    assert run(python, "-c", missing, cwd=tmp_path).split() == ["None"] * 3

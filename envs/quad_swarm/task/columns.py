@@ -184,3 +184,15 @@ def of_numbers(n_others: int) -> list[Column]:
     """Return the last columns of robots that perceive only some of the others."""
     meaning = "number of the other, counted from 1, or 0 for an empty slot"
     return [Column(f"other{k}.number", "", "", meaning) for k in range(1, n_others + 1)]
+
+
+def as_table() -> str:
+    """Return a Markdown table of the columns of all groups, which `docs/robots.md` shows."""
+    lines = ["| column | unit | frame | meaning |", "|---|---|---|---|"]
+    for group, columns in {"own": OWN, **COLUMNS}.items():
+        lines += [f"| `{group}.{name}` | {unit} | {frame} | {meaning} |" for name, unit, frame, meaning in columns]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(as_table())

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -41,3 +43,7 @@ def test_units_say_what_a_value_of_one_is():
     scaled = make_observation(config, "paper", scale_observation=True)
     assert [column.unit for column in scaled.columns[:4]] == ["4 m/s", "4 m/s", "4 m/s", "4 m"]
     assert scaled(swarm)[0, 0, 4] == pytest.approx(2.0 / 4.0)
+
+
+def test_the_table_in_the_docs_is_the_present_one():
+    assert columns.as_table() in (Path(__file__).parents[3] / "docs" / "robots.md").read_text()
