@@ -99,7 +99,7 @@ def _merged(written: Mapping[str, Any], words: list[str], path: Path) -> argpars
             before += [f"{name}={one}" for one in value]
         elif value is True:
             before.append(name)
-        elif value not in (None, False, ""):
+        elif value is not None and value is not False and value != "":  # 0 is a value
             before.append(f"{name}={value}")
     try:
         return parsed([*before, *words])

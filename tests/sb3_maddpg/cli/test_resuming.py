@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.main import main
+from sb3_maddpg.cli.resuming import _merged
 from sb3_maddpg.cli.safety import RunLoader
 
 SWARM = {
@@ -345,3 +346,10 @@ def test_what_a_run_imports_and_writes_elsewhere_is_named_again(tmp_path):
     output = process.communicate()[0]
     assert process.returncode == 0, output
     assert "Resuming logs/maddpg" in output
+
+
+def test_zeros_of_a_run_stay_zeros():
+    written = {"seed": 0, "verbose": 0, "checkpoint_every": 0, "progress": False, "conf_file": None}
+    args = _merged(written, ["--resume", "run"], Path("args.yml"))
+    assert [getattr(args, name) for name in ("seed", "verbose", "checkpoint_every")] == [0, 0, 0]
+    assert args.progress is False
