@@ -357,6 +357,7 @@ def test_the_papers_asymmetric_swap_has_a_robot_in_each_quadrant():
         assert (np.sign(goals[:, :2]) == -np.sign(starts[:, :2])).all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), reason="no Chromium")
 def test_hero_is_an_animation_in_two_themes(tmp_path):
     # A process of its own: Playwright allows one driver in a process, and other tests have one

@@ -15,6 +15,7 @@ pytest.importorskip("onnxruntime")
 MODEL = str(pretrained_folder("quad-swarm-flight") / "model.zip")
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_preset_of_the_training(tmp_path, capsys):
     assert main([MODEL, "--n-robots", "2", "--world", "noise.wind=0", "--out", str(tmp_path / "robots")]) == 0
     assert "2 robots in 'flight', 63 columns, 2 bits" in capsys.readouterr().out
@@ -33,6 +34,7 @@ def test_the_command_refuses_what_cannot_be_exported(words, message):
         main(words)
 
 
+@pytest.mark.slow
 def test_programs_answer_as_the_model_without_what_critics_see(tmp_path):
     config = make_config("flight", n_robots=3)
     actor, model = export(MODEL, config, tmp_path).actor(), load_model(MODEL, "sb3_maddpg:MADDPG")

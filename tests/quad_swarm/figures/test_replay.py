@@ -173,6 +173,7 @@ def number(text: str) -> int:
     return int(re.sub(r"\D", "", text))
 
 
+@pytest.mark.slow
 def test_counters_are_the_sums_of_what_was_asked(view, pages):
     data = data_of(pages["four"].read_text())
     page = view("four", "step=12")
@@ -233,6 +234,7 @@ def test_axis_tells_a_contact_from_a_near_miss(view, pages):
     assert plot.locator("path.clipped").count() == 1, "robots begin farther apart than the axis reaches"
 
 
+@pytest.mark.slow
 def test_collision_is_shown_when_it_happens(view, pages):
     none = data_of(pages["eight"].read_text())["flights"][0]
     step = none["collision"]
@@ -253,6 +255,7 @@ def reddish(picture: np.ndarray) -> int:
     return int(((red > 150) & (green < 90) & (blue < 90)).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "sizes"), [("dark", ("phone", "wide")), ("light", ("desktop", "tablet"))])
 def test_page_fits_and_is_not_blank(view, scheme, sizes):
     page = view("four", "step=20", sizes[0], scheme)
@@ -320,6 +323,7 @@ def test_step_in_the_address(view):
     assert len(set(cursors)) == 1, "all plots show the same time"
 
 
+@pytest.mark.slow
 def test_every_listed_key_works_wherever_the_focus_is(view):
     page = view("four", "step=7")
     listed = page.locator("#about dt").all_text_contents()
@@ -368,6 +372,7 @@ def test_no_two_things_have_the_same_sign_in_the_legend(view, size, scheme):
     assert len(set(signs)) == len(signs) == len(texts)
 
 
+@pytest.mark.slow
 def test_announced_plans_are_drawn_and_counted_apart_from_requests(view, pages):
     data = data_of(pages["told"].read_text())
     steps = data["flights"][1]["requests"]
@@ -390,6 +395,7 @@ def test_the_page_says_what_differs_from_the_preset(view):
     assert "held-out episode 0 (set 0), noise.wind=1.5, plant=model" in header
 
 
+@pytest.mark.slow
 def test_plays_by_itself_once_and_loops_on_request(view):
     page = view("four", hash_="", size="phone")
     page.wait_for_function("Number(document.body.dataset.drawn) > 1")
@@ -410,6 +416,7 @@ def test_plays_by_itself_once_and_loops_on_request(view):
     assert still.locator("#play").get_attribute("aria-label") == "Play"
 
 
+@pytest.mark.slow
 def test_camera_turns_follows_and_has_presets(view, pages):
     page = view("four", "step=0", reduced_motion="reduce")
     seen = [pixels(page)]
@@ -471,6 +478,7 @@ def test_fingers_zoom(view):
     assert page.evaluate("[visualViewport.scale, scrollY]") == [1, 0], "the page itself stays"
 
 
+@pytest.mark.slow
 def test_pictures_and_videos_can_be_saved(view):
     page = view("four", "step=20", "wide")
     page.add_style_tag(content="#stage { grid-auto-rows: 200px !important }")

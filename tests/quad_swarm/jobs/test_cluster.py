@@ -135,6 +135,7 @@ def test_processes_may_be_killed_at_random(tmp_path):
     assert len(killed) >= 2
 
 
+@pytest.mark.slow
 def test_machines_of_another_kind_are_refused_unless_asked_for(monkeypatch):
     monkeypatch.setattr(cluster, "machine", lambda: "a processor of its own")
     with (

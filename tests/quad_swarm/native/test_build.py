@@ -134,6 +134,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 def test_a_fork_solves_the_same(filled):
     # In a process of its own: a fork of this one could wait for locks of threads that other tests have left.

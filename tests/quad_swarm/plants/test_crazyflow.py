@@ -16,6 +16,7 @@ def test_hovers_tilts_and_climbs_as_commanded(vehicle):
     check_hovers_tilts_and_climbs(f"crazyflow:{vehicle}", climb=0.5)
 
 
+@pytest.mark.slow
 def test_wind_pushes():
     plant, start = placed("crazyflow:cf21B_500")
     state = fly(plant, start, np.zeros((2, 3, 4)), 100, air=1.0)

@@ -21,6 +21,7 @@ def test_wind_drags_the_rotors():
     np.testing.assert_allclose(state[..., 3:5], 0.35, atol=0.1)
 
 
+@pytest.mark.slow
 def test_dropped_swarms_and_forks_do_not_touch_the_others():
     plant, start = placed("rotorpy:crazyflie")
     u = np.random.default_rng(1).uniform(-0.2, 0.2, (2, 3, 4))

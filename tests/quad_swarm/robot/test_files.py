@@ -11,6 +11,7 @@ from quad_swarm.world.presets import make_config
 from sb3_maddpg.hub.pretrained import pretrained_folder
 
 pytest.importorskip("onnxruntime")
+pytestmark = pytest.mark.slow  # PyTorch takes its time to export
 MODEL = str(pretrained_folder("quad-swarm-flight") / "model.zip")
 CONFIG = make_config("flight", {"noise": {"wind": 0.5}}, n_robots=3)
 

@@ -39,7 +39,7 @@ def test_times_are_the_nearest(time, now, expected):
     assert nearest(time, now) == expected
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     points=st.lists(st.tuples(*[st.integers(-4000, 4000)] * 3), min_size=3, max_size=63),
     milliseconds=st.integers(1, 255),

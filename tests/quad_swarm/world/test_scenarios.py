@@ -192,6 +192,7 @@ def test_the_number_and_the_room_that_are_named_fit(name, n_robots):
         ScenarioSampler(name, 2 * int(found[1]) + 4, space)
 
 
+@pytest.mark.slow
 def test_about_sixteen_robots_fit_on_the_circle_of_the_paper():
     for n_robots in (20, 40):
         with pytest.raises(DoesNotFit, match=r"about 1[5-8] do\..* space\.circle_radius="):

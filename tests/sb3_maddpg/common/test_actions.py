@@ -191,6 +191,7 @@ def played(kind: str, steps: int = 1500, **kwargs) -> tuple[MADDPG, np.ndarray, 
     return model, model.policy.actions.scale(sent), best.numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.1, (0.2, 0.05), (0.0, 0.1)])
 def test_numbers_reach_the_environment_with_noise_of_the_given_size(noise):
     model, sent, best = played("continuous", exploration_noise=noise)
@@ -211,6 +212,7 @@ def test_much_noise_is_clipped_at_the_bounds():
     assert np.abs(model.replay_buffer.actions).max() == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["binary", "mixed"])
 def test_bits_and_categories_reach_the_environment_as_they_are_drawn(kind):
     model, sent, best = played(kind, 1000)
@@ -239,6 +241,7 @@ def test_action_noise_takes_the_place_of_exploration_noise(kind):
     assert np.corrcoef(noise[1:], noise[:-1])[0, 1] > 0.7
 
 
+@pytest.mark.slow
 def test_warm_up_is_uniform():
     model, sent, _ = played("mixed", 2000, learning_starts=2000)
     assert np.allclose(model.replay_buffer.actions[:, 0], sent, atol=1e-5)

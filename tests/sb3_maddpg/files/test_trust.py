@@ -80,6 +80,7 @@ def test_another_file_is_refused(content):
         untrusted("file")
 
 
+@pytest.mark.slow
 def test_the_classes_of_this_package_are_known_before_they_are_imported(model):
     IDDPG("MlpPolicy", OwnBit(), buffer_size=100, batch_size=8).save("iddpg.zip")
     code = "from sb3_maddpg import untrusted; print(untrusted('iddpg.zip'))"

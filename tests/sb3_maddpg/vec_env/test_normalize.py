@@ -173,6 +173,7 @@ class Fragile(ParallelEnv):
 FAST = {"learning_starts": 20, "batch_size": 16, "train_freq": 10, "buffer_size": 1000, "seed": 0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [VecNormalize, SafeVecNormalize])
 @pytest.mark.parametrize("truncates", [False, True])
 @pytest.mark.parametrize("n_steps", [1, 3])
