@@ -14,7 +14,7 @@ TEAM_FAMILIES ?= "distance" "event" "cpa" "cpa and stale" "cpa and event" "plan 
 POLICIES ?= none full distance:4 "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
 PEERS := agilerl benchmarl xuance
 
-.PHONY: help install train test quick test-all lint docs page bench bench-peers check-peers results results-quick clean
+.PHONY: help install train test quick test-all test-lowest lint docs page bench bench-peers check-peers results results-quick clean
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
@@ -41,6 +41,9 @@ quick: install
 
 test-all: install  ## the tests that take long: kills, simulators, other engines, releases, studies
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow
+
+test-lowest:  ## tests with the lowest versions that pyproject.toml declares, in .venv-lowest (TORCH=2.10: PyTorch's, too)
+	PYTHON=$(PYTHON) JOBS=$(JOBS) TORCH=$(TORCH) bash .ci/lowest
 
 lint: install  ## ruff, mypy and spelling
 	$(BIN)/ruff check .

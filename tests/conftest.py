@@ -13,6 +13,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# What imports register is there before the first test, so that tests which put registries back do not drop it for good
+import quad_swarm  # noqa: F401
+import sb3_maddpg.team.toys  # noqa: F401
 
 _OF_PETTINGZOO = "sb3_maddpg.team.pettingzoo:make"
 _REGISTRIES = (
