@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from quad_swarm.errors import shown
-from quad_swarm.planner import Planner
+from quad_swarm.planner import base
 from quad_swarm.robot.policies import Actor
 from quad_swarm.robot.robot import Robot
 from quad_swarm.validation import replaced
@@ -63,7 +63,7 @@ class RobotFiles:
         """
         return Actor(self.folder / ACTOR, self.config, self.observation, self.n_bits, self.scaled)
 
-    def robot(self, index: int, planner: Planner | None = None) -> Robot:
+    def robot(self, index: int, planner: base.Planner | None = None) -> Robot:
         """Create a robot of the team with a policy of its own, see `Robot`."""
         return Robot(self.config, index, self.actor(), planner)
 

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.native.pairs import advance
-from quad_swarm.planner import Planner, Plans, make_planner
-from quad_swarm.planner.base import shift
+from quad_swarm.planner import Plans, base, make_planner
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, resampled
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
@@ -65,7 +64,7 @@ class Robot:
     :raises ValueError: if there is no such robot, or the world limits whom robots perceive
     """
 
-    def __init__(self, config: SwarmConfig, index: int, policy: Policy, planner: Planner | None = None):
+    def __init__(self, config: SwarmConfig, index: int, policy: Policy, planner: base.Planner | None = None):
         if not 0 <= index < config.n_robots:
             raise ValueError(f"index={index}: a team of {config.n_robots} has the robots 0 to {config.n_robots - 1}.")
         if config.is_limited:
@@ -194,7 +193,7 @@ class Robot:
         self.presumed.receive(*self._message({}, *self._own_motion()))
         self.beliefs.receive(*self._message({}, self._pos, self._vel))
         plans = self._plans
-        self._plans = plans._replace(x=shift(plans.x), u=shift(plans.u), age=plans.age + 1)
+        self._plans = plans._replace(x=base.shift(plans.x), u=base.shift(plans.u), age=plans.age + 1)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
 
     def _place(self, other: int) -> int:

@@ -299,8 +299,8 @@ class Swarm(SwarmState):
             sent = self._radio.answers(requests, others)
             self._other_beliefs.receive(requests, *self._seen_by_all(), *sent)
         answered, lateness = self.disturbances.arrivals(requests, others)
-        arriving, *received = self._radio.deliver(answered, others, lateness)
-        return self.beliefs.update(arriving, *self.observe(), *received)
+        arriving, received, age = self._radio.deliver(answered, others, lateness)
+        return self.beliefs.update(arriving, *self.observe(), received, age)
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""
