@@ -21,7 +21,16 @@ ROOT = Path(__file__).parents[2]
 TRIED = "benchmarks/results/action_spaces.json"
 LEARNER = ("maddpg", "matd3", "pettingzoo", "relational", "migration", "support", "integrations")
 SITE = ("quickstart", "tensorboard", "resuming", "clusters", "tutorials/swarm", "tutorials/pettingzoo")
-NO_LEARNING = ("tutorials/scenario", "tutorials/rule", "tutorials/reading", "planner", "index", "faq", "files")
+NO_LEARNING = (
+    "tutorials/scenario",
+    "tutorials/rule",
+    "tutorials/reading",
+    "planner",
+    "index",
+    "faq",
+    "files",
+    "robots",
+)
 PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (*LEARNER, *SITE, *NO_LEARNING)))
 STEPS, LEARNING_STARTS, BATCH_SIZE = 300, 100, 64
 FENCED = re.compile(r"^```(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)  # also ```{eval-rst}
