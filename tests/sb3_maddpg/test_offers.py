@@ -60,7 +60,8 @@ def refused(argv: list[str], capsys) -> str:
     ],
 )
 @pytest.mark.parametrize(
-    ("group", "command"), [("evaluators", "evaluate"), ("replays", "replay"), ("identifiers", "identify")]
+    ("group", "command"),
+    [("evaluators", "evaluate"), ("replays", "replay"), ("identifiers", "identify"), ("exporters", "export")],
 )
 def test_a_command_that_cannot_be_called_is_refused(group, command, code, value, problem, install, capsys):
     install("their-package", group, f"Their-v0 = {value}", code)
