@@ -12,7 +12,7 @@ from pathlib import Path
 
 from quad_swarm.errors import needs_extra, shown
 from quad_swarm.evaluation.command import parse_world, preset_of
-from quad_swarm.evaluation.policies import OBSERVATION_ARGUMENTS, fitted, is_model, load_model, trained_in
+from quad_swarm.evaluation.policies import OBSERVATION_ARGUMENTS, fitted, is_model, load_model, short_name, trained_in
 from quad_swarm.parsing import Parser
 from quad_swarm.robot import files
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
@@ -37,6 +37,8 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
     predictor, observation, n_bits = fitted(loaded, model, config)
     if not hasattr(predictor, "agent_policy"):
         raise ValueError(f"{model}: {type(loaded).__name__} has no policies of single agents to export.")
+    if getattr(getattr(predictor, "policy", predictor), "share_actor", None) is not True:
+        raise ValueError(f"{model}: its robots have different actors, but load one; train with share_actor=True.")
     actor = predictor.agent_policy(0)
     known = [k for k, column in enumerate(observation.columns) if ".critic." not in column.name]
     folder.mkdir(parents=True, exist_ok=True)
@@ -50,7 +52,7 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
         bool(given.get("scale_observation", False)),
         n_bits,
         getattr(getattr(loaded, "policy", None), "threshold", None),
-        Path(model).name if "quad-swarm" not in model else Path(model).parent.name,
+        short_name(model.partition("@")[0]),
     )
     versions = {name: version(name) for name in ("sb3-maddpg", "torch", "onnx")}
     files.write(written, [observation.columns[k].name for k in known], versions)

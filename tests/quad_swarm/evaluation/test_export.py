@@ -1,5 +1,6 @@
 """Models for robots: for which world, and what cannot be exported. `robot.test_files` reads what is written."""
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from quad_swarm.robot.files import load
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
+from sb3_maddpg import MADDPG
 from sb3_maddpg.hub.pretrained import pretrained_folder
 
 pytest.importorskip("onnxruntime")
@@ -32,6 +34,16 @@ def test_the_command_writes_the_preset_of_the_training(tmp_path, capsys):
 def test_the_command_refuses_what_cannot_be_exported(words, message):
     with pytest.raises(ValueError, match=message):
         main(words)
+
+
+@pytest.mark.parametrize("share", [False, [["robot_0", "robot_1"], ["robot_2"]]])
+def test_teams_whose_robots_have_different_actors_are_refused(share, tmp_path):
+    env = gymnasium.make("QuadSwarm-v0", preset="paper", n_robots=3)
+    path = tmp_path / "model.zip"
+    MADDPG("MlpPolicy", env, policy_kwargs={"net_arch": [8], "share_actor": share}, buffer_size=2000).save(path)
+    with pytest.raises(ValueError, match="its robots have different actors"):
+        export(str(path), make_config("paper", n_robots=3), tmp_path / "robots")
+    assert not (tmp_path / "robots").exists()
 
 
 @pytest.mark.slow
