@@ -1,10 +1,12 @@
-"""Ctrl-C while the command ``sb3-maddpg`` is still importing its modules, before it can handle it."""
+"""Ctrl-C where it must not raise: while ``sb3-maddpg`` still imports its modules, and in what must not be cut short."""
 
 import multiprocessing
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -34,3 +36,20 @@ def interruptible() -> None:
     """Let Ctrl-C raise ``KeyboardInterrupt`` again."""
     if signal.getsignal(signal.SIGINT) is _end:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C raise ``KeyboardInterrupt`` only after the block. In other threads it raises nothing anyway."""
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        yield
+        return
+    interrupts: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: interrupts.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if interrupts:
+            signal.raise_signal(signal.SIGINT)

@@ -20,6 +20,7 @@ from sb3_maddpg.cli.options import PROG
 from sb3_maddpg.cli.processes import run_all, without_processes
 from sb3_maddpg.cli.runs import name_of
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
+from sb3_maddpg.starting import uninterrupted
 from sb3_maddpg.utils import process_runs, told
 
 STUDY = "search"
@@ -58,7 +59,7 @@ def open_storage(storage: str) -> BaseStorage | str:
             elif not first.startswith(_BEGINS) and not _BEGINS.startswith(first):
                 raise ValueError("its first line is no entry")
             _end_last_line(as_absolute(storage))
-        return JournalStorage(JournalFileBackend(as_absolute(storage)))
+        return JournalStorage(_Journal(as_absolute(storage)))
     except (
         ValueError,
         LookupError,
@@ -71,6 +72,14 @@ def open_storage(storage: str) -> BaseStorage | str:
         raise InvalidFileError(
             f"--storage {storage} is not a journal of Optuna ({told(error)}): name another file."
         ) from error
+
+
+class _Journal(JournalFileBackend):
+    """A journal whose entries Ctrl-C does not cut short. Optuna's lock cannot be released after that."""
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        with uninterrupted():
+            super().append_logs(logs)
 
 
 def _end_last_line(path: str) -> None:

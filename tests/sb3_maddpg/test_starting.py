@@ -1,4 +1,4 @@
-"""Ctrl-C while the command imports its modules."""
+"""Ctrl-C while the command imports its modules, and in what must not be cut short."""
 
 import signal
 import subprocess
@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from sb3_maddpg.starting import uninterrupted
 
 # Stands for an import that takes long: it sends Ctrl-C to itself
 SLOW = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nimport time\ntime.sleep(60)\n"
@@ -44,6 +46,22 @@ def test_background_jobs_keep_ignoring_it(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     )
     assert done.stdout == "goes on\n", done.stderr
+
+
+def test_what_must_not_be_cut_short_is_finished_first():
+    done = []
+
+    @uninterrupted()
+    def work():
+        signal.raise_signal(signal.SIGINT)
+        done.append("all")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done == ["all"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with uninterrupted():
+        pass  # without an interrupt, nothing is raised
 
 
 def trap(folder: Path, code: str) -> None:

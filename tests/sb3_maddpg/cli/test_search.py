@@ -70,6 +70,26 @@ def test_a_search_goes_on_after_kills(tmp_path, monkeypatch):
     assert Path("logs/maddpg/OwnBit-v0_best.yml").exists()
 
 
+@pytest.mark.parametrize("function", ["symlink", "fsync", "rename", "unlink"])
+def test_an_interrupt_leaves_a_whole_journal(function, tmp_path, monkeypatch):
+    """Ctrl-C while Optuna takes its lock, writes an entry, and releases the lock."""
+    path = tmp_path / "s.log"
+    study = optuna.create_study(storage=open_storage(str(path)), study_name="s")
+    before = getattr(os, function)
+
+    def interrupted(*args):
+        before(*args)
+        monkeypatch.setattr(os, function, before)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(os, function, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        study.set_user_attr("note", 1)
+    assert [one.name for one in tmp_path.iterdir()] == ["s.log"], "no lock is left"
+    assert optuna.load_study(storage=open_storage(str(path)), study_name="s").user_attrs == {"note": 1}
+    assert study.user_attrs == {"note": 1}
+
+
 @pytest.mark.slow
 def test_an_interrupted_search_is_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
