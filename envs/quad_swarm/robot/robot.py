@@ -130,6 +130,11 @@ class Robot:
         return self._plans
 
     @property
+    def inbox(self) -> Mapping[int, Plan]:
+        """The plans that arrived in this period, by places among the others."""
+        return self._inbox
+
+    @property
     def newest(self) -> Plan:
         """The plan of the last period, which answers and announcements contain."""
         return self._own[-1]
@@ -165,7 +170,7 @@ class Robot:
         """Take a plan that arrived. Of several plans of one robot the one with the latest stamp counts.
 
         :param sender: number of the robot whose plan it is
-        :param plan: its plan, not from the future
+        :param plan: its plan; its stamp may be later than the start of the period, by less than a period
         """
         place = self._place(sender)
         if place not in self._inbox or self._inbox[place].stamp < plan.stamp:
@@ -212,7 +217,8 @@ class Robot:
         horizon = self.config.planner.horizon
         positions, ages = np.empty((len(plans), horizon + 1, 3)), np.empty(len(plans), dtype=np.int64)
         for row, place in enumerate(sorted(plans)):
-            ages[row], rest = divmod(max(self.now - plans[place].stamp, 0), self.period)
+            age = max(self.now - plans[place].stamp, 1 - self.period)
+            ages[row], rest = divmod(age, self.period) if age > 0 else (0, age)
             positions[row] = plans[place].positions
             for _ in range(min(ages[row], horizon)):
                 positions[row] = advance(positions[row])

@@ -1,0 +1,22 @@
+"""Robots in real time: links, the loop, its supervisor, and simulated vehicles to try them on.
+
+Imports what `quad_swarm.robot` does, neither PyTorch nor Gymnasium.
+"""
+
+from quad_swarm.realtime.link import Conditions, Handler, Link, Sensed, Vehicle, WireLink
+from quad_swarm.realtime.loop import Loop
+from quad_swarm.realtime.supervisor import Mode, SafetyLimits, Supervisor, Watchdog
+
+__all__ = [
+    "Conditions",
+    "Handler",
+    "Link",
+    "Loop",
+    "Mode",
+    "SafetyLimits",
+    "Sensed",
+    "Supervisor",
+    "Vehicle",
+    "Watchdog",
+    "WireLink",
+]

@@ -1,0 +1,328 @@
+"""A simulated world in real time, with a process for each robot."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quad_swarm.realtime.link import Sensed, Traffic, monotonic
+from quad_swarm.realtime.process import (
+    COMMAND,
+    IS_COMMAND,
+    IS_REPORT,
+    Report,
+    pack_sensed,
+    unpack_report,
+)
+from quad_swarm.realtime.statistics import Statistics, total
+from quad_swarm.realtime.team import Team
+from quad_swarm.realtime.udp import Address, open_socket
+from quad_swarm.realtime.vehicles import Vehicles
+
+_US = 1_000_000
+_MOST_BYTES = 65535
+_READY = 90.0  # s that robots have to start; the first start on a machine compiles the planner
+_LEAD = 0.3  # s between the order to fly and the first period
+_PAUSE = 0.1  # s of delay from which on the world itself stood still, and goes on from there
+_SAYS_STOP = 0.2  # s
+_ENDS = 10.0  # s that robots have to report, and to end
+
+
+class RobotEndedError(RuntimeError):
+    """Raised if the process of a robot ended, or did not start."""
+
+
+@dataclass
+class Sample:
+    """The world after a period.
+
+    :param time: time since the start of the flight (s)
+    :param state: true states, (n, 9)
+    :param reports: what the robots reported since the last sample
+    """
+
+    time: float
+    state: np.ndarray
+    reports: list[Report]
+
+
+@dataclass
+class Flight:
+    """What happened in a flight.
+
+    :param collisions: pairs of robots that collided
+    :param closest: smallest distance of two robots (m)
+    :param arrived: when each robot was at its goal for the first time (s); NaN if it never was
+    :param at_goal: which robots were at their goals at the end, (n,) bool
+    :param seconds: duration (s)
+    :param statistics: statistics of each robot's loop; None of one whose process ended
+    :param traffic: what each robot sent and received
+    :param pauses: how often the world itself stood still, as busy machines let it
+    :param killed: robots whose processes were ended
+    """
+
+    collisions: list[tuple[int, int]]
+    closest: float
+    arrived: np.ndarray
+    at_goal: np.ndarray
+    seconds: float
+    statistics: list[Statistics | None]
+    traffic: list[Traffic | None]
+    pauses: int
+    killed: list[int] = field(default_factory=list)
+
+    @property
+    def total(self) -> Statistics:
+        """The statistics of all robots together."""
+        return total(one for one in self.statistics if one is not None)
+
+
+class Arena:
+    """The world of a team, and a process for each robot. Use it as a context, which ends the processes.
+
+    :ivar vehicles: the vehicles
+    :ivar pids: the robots' processes
+
+    :param team: the team
+    :param log: folder for what the robots' processes print; by default it is shown
+    :raises RobotEndedError: if a robot's process does not start
+    """
+
+    def __init__(self, team: Team, log: Path | None = None):
+        self.team, self.vehicles = team, Vehicles(team.config)
+        self._socket = open_socket("127.0.0.1", 0)
+        self._senses: dict[int, Sensed] = {}
+        self._addresses: dict[int, Address] = {}  # of the robots' vehicles
+        self._ports: dict[int, int] = {}  # of their links
+        self._done: dict[int, dict[str, Any]] = {}
+        self._reports: list[Report] = []
+        self._frozen: set[int] = set()
+        self._wanted: set[int] = set()  # robots whose processes were ended on purpose
+        self._flight, self._pauses = 0, 0
+        self._folder = tempfile.TemporaryDirectory(prefix="quad-swarm-")
+        self._processes: list[subprocess.Popen[bytes]] = []
+        try:
+            self._start(Path(self._folder.name) / "team.json", log)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Arena:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def pids(self) -> list[int]:
+        return [process.pid for process in self._processes]
+
+    def fly(
+        self,
+        starts: np.ndarray,
+        goals: np.ndarray,
+        noise_seed: int = 0,
+        most: float = 20.0,
+        linger: float = 1.0,
+        events: Sequence[tuple[float, Callable[[Arena], None]]] = (),
+        sees: Callable[[Sample], None] | None = None,
+    ) -> Flight:
+        """Fly until everybody who lives is at its goal and some time has passed.
+
+        :param starts: starts, (n, 3), world frame (m)
+        :param goals: goals, (n, 3), world frame (m)
+        :param noise_seed: seed of the disturbances
+        :param most: time limit (s)
+        :param linger: time to fly on after that (s)
+        :param events: what else happens, and when (s)
+        :param sees: called after each period
+        :raises RobotEndedError: if a process ends that nobody ended
+        """
+        team, vehicles, n = self.team, self.vehicles, self.team.config.n_robots
+        self._flight += 1
+        self._done, self._reports, self._frozen, self._pauses = {}, [], set(), 0
+        killed = self._ended()
+        begins = monotonic() + round(_LEAD * _US)
+        vehicles.reset(starts, goals, noise_seed, begins)
+        ports = [self._ports[k] for k in range(n)]
+        for k in range(n):
+            self._say(
+                k, says="fly", flight=self._flight, ports=ports, start=list(starts[k]), goal=list(goals[k]),
+                first=self._of_day(begins),
+            )  # fmt: skip
+        todo, period = sorted(events, key=lambda event: event[0]), team.config.substeps
+        steps, there, slipped = 0, None, 0
+        while vehicles.now - begins < most * _US:
+            for k in range(n):
+                if k not in self._frozen:
+                    self._senses[k] = vehicles.sensed(k)
+                seen = self._senses[k]._replace(stamp=self._of_day(vehicles.now + slipped))
+                self._send(k, pack_sensed(seen))
+            while todo and todo[0][0] * _US <= vehicles.now - begins:
+                todo.pop(0)[1](self)
+            due = vehicles.now + vehicles.step_us + slipped
+            self._receive(due)
+            if monotonic() - due > _PAUSE * _US:
+                slipped += monotonic() - due
+                self._pauses += 1
+            vehicles.advance()
+            steps += 1
+            if steps % period:
+                continue
+            killed = self._ended()
+            if sees is not None:
+                sees(Sample((vehicles.now - begins) / _US, vehicles.state.copy(), self._reports))
+            self._reports = []
+            lives = np.array([k not in killed for k in range(n)])
+            there = None if not vehicles.at_goal[lives].all() else there or vehicles.now
+            if there is not None and vehicles.now - there >= linger * _US and not todo:
+                break
+        return self._land(begins, killed)
+
+    def signal(self, robot: int, number: int) -> None:
+        """Send a signal to a robot's process."""
+        os.kill(self._processes[robot].pid, number)
+
+    def kill(self, robot: int) -> None:
+        """End a robot's process."""
+        self._wanted.add(robot)
+        self._processes[robot].kill()
+        self._processes[robot].wait()
+
+    def halt(self, robot: int) -> None:
+        """Stop a robot's process until `go_on`."""
+        self.signal(robot, signal.SIGSTOP)
+
+    def go_on(self, robot: int) -> None:
+        """Let a robot's process go on."""
+        self.signal(robot, signal.SIGCONT)
+
+    def part(self, robots: Collection[int]) -> None:
+        """Let no message through between some robots and the others; none of them ends that."""
+        n = self.team.config.n_robots
+        for k in range(n):
+            others = [j for j in range(n) if (j in robots) != (k in robots)]
+            self._say(k, says="part", **{"from": others})
+
+    def freeze(self, robot: int) -> None:
+        """Let a robot perceive the same state again and again."""
+        self._frozen.add(robot)
+
+    def thaw(self, robot: int) -> None:
+        """End `freeze`."""
+        self._frozen.discard(robot)
+
+    def close(self) -> None:
+        """End the processes."""
+        for k, process in enumerate(self._processes):
+            if process.poll() is None:
+                with contextlib.suppress(OSError):
+                    self._say(k, says="bye")
+        ends = time.monotonic() + _ENDS
+        for process in self._processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(max(ends - time.monotonic(), 0.01))
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        self._socket.close()
+        self._folder.cleanup()
+
+    def _start(self, path: Path, log: Path | None) -> None:
+        """Start the processes, and wait until all are ready."""
+        self.team.write(path)
+        host, port = self._socket.getsockname()
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        for k in range(self.team.config.n_robots):
+            with contextlib.ExitStack() as stack:
+                output = None if log is None else stack.enter_context((log / f"robot_{k}.log").open("wb"))
+                command = [sys.executable, "-m", "quad_swarm.realtime.process", str(path), str(k), f"{host}:{port}"]
+                self._processes.append(subprocess.Popen(command, env=environment, stdout=output, stderr=output))
+        ends = time.monotonic() + _READY
+        while len(self._addresses) < len(self._processes):
+            self._receive(monotonic() + _US // 10)
+            self._ended()
+            if time.monotonic() > ends:
+                missing = [k for k in range(len(self._processes)) if k not in self._addresses]
+                raise RobotEndedError(f"The robots {missing} were not ready within {_READY:g} s.")
+
+    def _ended(self) -> set[int]:
+        """Return the robots whose processes have been ended on purpose."""
+        for k, process in enumerate(self._processes):
+            if process.poll() is not None and k not in self._wanted:
+                raise RobotEndedError(f"The process of robot {k} ended with exit status {process.returncode}.")
+        return set(self._wanted)
+
+    def _receive(self, until: int) -> None:
+        """Take what robots send until some time (us), at least what is there already."""
+        while True:
+            left = max(until - monotonic(), 0)
+            if select.select([self._socket], [], [], left / _US)[0]:
+                with contextlib.suppress(OSError):
+                    self._take(*self._socket.recvfrom(_MOST_BYTES))
+            elif left == 0:
+                return
+
+    def _take(self, message: bytes, sender: Address) -> None:
+        kind = message[:1]
+        if kind == bytes([IS_COMMAND]) and len(message) == COMMAND.size:
+            _, robot, *setpoint = COMMAND.unpack(message)
+            self.vehicles.command(robot, np.array(setpoint))
+        elif kind == bytes([IS_REPORT]):
+            self._reports.append(unpack_report(message))
+        elif kind == b"{":
+            words = json.loads(message)
+            if words["says"] == "hello":
+                self._addresses[words["robot"]], self._ports[words["robot"]] = sender, words["port"]
+            elif words["says"] == "done" and words["flight"] == self._flight:
+                self._done[words["robot"]] = words
+
+    def _land(self, begins: int, killed: set[int]) -> Flight:
+        """Let everybody stop, and return what happened."""
+        vehicles, n = self.vehicles, self.team.config.n_robots
+        ends, says = time.monotonic() + _ENDS, 0.0
+        while len(self._done.keys() | killed) < n and time.monotonic() < ends:
+            if time.monotonic() >= says:
+                says = time.monotonic() + _SAYS_STOP
+                for k in set(range(n)) - self._done.keys() - killed:
+                    self._say(k, says="stop")
+            self._receive(monotonic() + _US // 20)
+        if missing := set(range(n)) - self._done.keys() - killed:
+            raise RobotEndedError(f"The robots {sorted(missing)} did not report within {_ENDS:g} s.")
+        done = [self._done.get(k) for k in range(n)]
+        arrived = np.where(vehicles.arrived < 0, np.nan, (vehicles.arrived - begins) / _US)
+        return Flight(
+            collisions=vehicles.collisions(),
+            closest=float(vehicles.closest.min()),
+            arrived=arrived,
+            at_goal=vehicles.at_goal,
+            seconds=(vehicles.now - begins) / _US,
+            statistics=[None if one is None else Statistics.from_json(one["statistics"]) for one in done],
+            traffic=[None if one is None else Traffic(**one["traffic"]) for one in done],
+            pauses=self._pauses,
+            killed=sorted(killed),
+        )
+
+    def _say(self, robot: int, **words: Any) -> None:
+        self._send(robot, json.dumps(words).encode())
+
+    def _send(self, robot: int, message: bytes) -> None:
+        with contextlib.suppress(OSError):  # a robot whose process ended
+            self._socket.sendto(message, self._addresses[robot])
+
+    def _of_day(self, at: int) -> int:
+        """Return a time on the clock of the day (us)."""
+        return at + time.time_ns() // 1000 - monotonic()

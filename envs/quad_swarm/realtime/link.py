@@ -1,0 +1,233 @@
+"""What connects one robot with the others and with its vehicle."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from quad_swarm.robot import Plan, wire
+
+
+class Sensed(NamedTuple):
+    """What a robot perceives.
+
+    :param stamp: when it was so (us, on the robot's clock)
+    :param state: estimate of the own state, (9,)
+    :param pos: positions of the others in ascending order, (n - 1, 3), world frame (m)
+    :param vel: velocities of the others, (n - 1, 3), world frame (m/s)
+    """
+
+    stamp: int
+    state: np.ndarray
+    pos: np.ndarray
+    vel: np.ndarray
+
+
+class Handler(Protocol):
+    """What is done with messages that arrive. It raises nothing."""
+
+    def on_request(self, sender: int) -> None:
+        """Answer a request."""
+
+    def on_plan(self, sender: int, plan: Plan, sent: int, period: int) -> None:
+        """Take a plan.
+
+        :param sender: robot whose plan it is
+        :param plan: the plan
+        :param sent: when it was sent (us)
+        :param period: length of its stages (us)
+        """
+
+
+class Link(Protocol):
+    """The way to the other robots. Times are those of the robot's own clock (us)."""
+
+    def now(self) -> int:
+        """Return the time."""
+
+    def request(self, other: int) -> None:
+        """Ask another robot for its plan."""
+
+    def send(self, other: int, plan: Plan, period: int, asked: bool) -> None:
+        """Send a plan to another robot.
+
+        :param other: number of the other robot
+        :param plan: the plan
+        :param period: length of its stages (us)
+        :param asked: whether the other robot asked for it
+        """
+
+    def wait(self, until: int, handler: Handler, done: Callable[[], bool] = lambda: False) -> None:
+        """Handle messages until some time, at least those that are there already.
+
+        :param until: the time
+        :param handler: what to do with messages
+        :param done: tells that it need not wait any longer
+        """
+
+
+class Vehicle(Protocol):
+    """What a robot's loop flies: an autopilot, or a simulated vehicle. Other threads may call it, too."""
+
+    def sense(self) -> Sensed | None:
+        """Return the newest that is perceived, None before there is any."""
+
+    def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
+        """Fly a set-point from now on.
+
+        :param setpoint: roll, pitch (rad), climb rate (m/s) and yaw rate (rad/s), (4,)
+        :param plan: the plan that it begins, for autopilots that follow trajectories; None if there is none
+        """
+
+    def disarm(self) -> None:
+        """Stop the motors, on the ground."""
+
+
+def monotonic() -> int:
+    """Return the time of a clock that nobody sets (us)."""
+    return time.monotonic_ns() // 1000
+
+
+@dataclass
+class Traffic:
+    """What a robot sent and received.
+
+    :param requests: requests that it sent
+    :param answers: plans that it sent because they were asked for
+    :param announcements: plans that it sent unasked
+    :param bytes: size of all that, without the headers of the network
+    :param received: messages that arrived for it
+    :param refused: messages that were none: damaged, of another version or session
+    """
+
+    requests: int = 0
+    answers: int = 0
+    announcements: int = 0
+    bytes: int = 0
+    received: int = 0
+    refused: int = 0
+
+
+class WireLink:
+    """A link whose messages are those of `quad_swarm.robot.wire`.
+
+    :ivar traffic: what has been sent and received
+    :ivar clock_error: error of the clock that all robots share (us), for trials
+
+    :param index: number of the robot
+    :param session: tells apart teams and flights on one channel, 0 to 255
+    :param checked: whether messages carry a checksum, for radios that have none
+    """
+
+    def __init__(self, index: int, session: int = 0, checked: bool = False):
+        self.index, self.session, self.checked = index, session, checked
+        self.traffic, self.clock_error = Traffic(), 0
+
+    def now(self) -> int:
+        """See `Link`."""
+        return monotonic()
+
+    def shared(self, at: int) -> int:
+        """Return a time of the robot's clock on the clock that all robots share (us). Clocks that only count up differ
+        between machines; those of the day are kept together by PTP or NTP."""
+        return at + self._offset()
+
+    def own(self, at: int) -> int:
+        """Return a time of the clock that all robots share on the robot's own (us)."""
+        return at - self._offset()
+
+    def _offset(self) -> int:
+        return time.time_ns() // 1000 - monotonic() + self.clock_error
+
+    def request(self, other: int) -> None:
+        """See `Link`."""
+        self.traffic.requests += 1
+        self._transmit(other, wire.pack_request(self.session, self.index, other, self.shared(self.now()), self.checked))
+
+    def send(self, other: int, plan: Plan, period: int, asked: bool) -> None:
+        """See `Link`."""
+        now, stamp = self.shared(self.now()), self.shared(plan.stamp)
+        head = (self.session, self.index, other, now, stamp, period)
+        message = wire.pack_plan(*head, plan.positions, asked, self.checked)
+        if asked:
+            self.traffic.answers += 1
+        else:
+            self.traffic.announcements += 1
+        self._transmit(other, message)
+
+    def deliver(self, data: bytes, handler: Handler) -> None:
+        """Take bytes that arrived."""
+        try:
+            message = wire.unpack(data, self.session)
+        except wire.WireError:
+            self.traffic.refused += 1
+            return
+        if message.receiver not in (self.index, wire.EVERYBODY) or message.sender == self.index:
+            return
+        self.traffic.received += 1
+        if message.positions is None:
+            handler.on_request(message.sender)
+            return
+        now = self.now()
+        sent, stamp = (self.own(wire.nearest(one, self.shared(now))) for one in (message.sent, message.stamp))
+        handler.on_plan(message.sender, Plan(stamp, message.positions), sent, message.period)
+
+    def _transmit(self, other: int, message: bytes) -> None:
+        self.traffic.bytes += len(message)
+        self.transmit(other, message)
+
+    def transmit(self, other: int, message: bytes) -> None:
+        """Send bytes to another robot."""
+        raise NotImplementedError
+
+
+@dataclass
+class Conditions:
+    """How messages fare that a robot receives, for trials.
+
+    :param loss: share of messages that are lost
+    :param duplicates: share of messages that arrive twice
+    :param malformed: share of messages of which a byte is changed
+    :param reordered: share of messages that arrive after the next one
+    """
+
+    loss: float = 0.0
+    duplicates: float = 0.0
+    malformed: float = 0.0
+    reordered: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("loss", "duplicates", "malformed", "reordered"):
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name}={value}: it must be a share from 0 to 1.")
+        self.reseed(0)
+
+    def reseed(self, seed: int | Sequence[int]) -> None:
+        """Begin again."""
+        self._rng, self._held = np.random.default_rng(seed), []
+
+    def arriving(self, message: bytes) -> list[bytes]:
+        """Return what arrives when a message does, in this order."""
+        lost, twice, changed, late = self._rng.random(4) < (
+            self.loss,
+            self.duplicates,
+            self.malformed,
+            self.reordered,
+        )
+        if lost:
+            return []
+        if changed:
+            damaged = bytearray(message)
+            damaged[self._rng.integers(len(message))] ^= int(self._rng.integers(1, 256))
+            message = bytes(damaged)
+        arrived = [message] * (1 + twice)
+        if late and not self._held:
+            self._held = arrived
+            return []
+        arrived, self._held = arrived + self._held, []
+        return arrived

@@ -1,0 +1,200 @@
+"""Supervision of one robot: what makes it hover or land instead of flying to its goal."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, PositiveFloat
+
+from quad_swarm.quadrotor import N_INPUTS, POSITION, VELOCITY
+from quad_swarm.realtime.link import Sensed, Vehicle, monotonic
+from quad_swarm.validation import checked
+from quad_swarm.world.presets import SwarmConfig
+
+HOVERING = np.zeros(N_INPUTS)
+_US = 1e6
+_AT_REST = 0.01  # m/s, rad
+
+
+class Mode(IntEnum):
+    """What a robot does, in the order of precedence."""
+
+    FLY = 0
+    HOVER = 1
+    LAND = 2
+    OFF = 3
+
+
+@checked
+@dataclass(frozen=True)
+class SafetyLimits:
+    """When a robot hovers, and when it lands. Times are in seconds, lengths in metres.
+
+    :param stale: age of the perceived state from which on it hovers
+    :param lost: age of the perceived state from which on it lands; also for a state that is frozen
+    :param frozen: time after which a state that stays the same to the last bit is none, unless the robot is at rest
+    :param unanswered: time without any message in spite of requests after which the robot hovers, and asks everybody
+    :param silence: the same, after which it lands
+    :param separation: distance to another robot below which it hovers; None for that of a collision
+    :param fence: how far it may leave the workspace to the sides and upwards, before it lands
+    :param hung: time without a sign of life of the loop after which the watchdog hovers
+    :param landing: climb rate of a landing (m/s), negative
+    :param ground: height at which it has landed
+    :param landing_time: longest duration of a landing
+    :raises ValueError: if a value is out of range, or a state would be lost before it is stale
+    """
+
+    stale: PositiveFloat = 0.2
+    lost: PositiveFloat = 1.0
+    frozen: PositiveFloat = 0.2
+    unanswered: PositiveFloat = 1.0
+    silence: PositiveFloat = 10.0
+    separation: Annotated[float, Field(ge=0)] | None = None
+    fence: Annotated[float, Field(ge=0)] = 1.0
+    hung: PositiveFloat = 0.3
+    landing: Annotated[float, Field(lt=0, ge=-2)] = -0.5
+    ground: float = 0.1
+    landing_time: PositiveFloat = 20.0
+
+    def __post_init__(self) -> None:
+        if not self.stale <= self.lost or not self.unanswered <= self.silence:
+            raise ValueError(
+                f"stale={self.stale}, lost={self.lost}, unanswered={self.unanswered}, silence={self.silence}: a robot "
+                "hovers before it lands, so the first of each two must not be the larger one"
+            )
+
+
+class Supervisor:
+    """The guards of one robot.
+
+    :ivar mode: what the robot does; landing is final until `reset`
+    :ivar sees: whether what is perceived can be planned with
+    :ivar reasons: how often each guard stepped in
+    :ivar why: the guards that step in now
+
+    :param config: the world
+    :param limits: when to hover and when to land
+    """
+
+    def __init__(self, config: SwarmConfig, limits: SafetyLimits):
+        self.limits = limits
+        contact = 2 * config.radius - config.collision_tolerance
+        self._apart = contact if limits.separation is None else limits.separation
+        low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
+        self._low, self._high = low - limits.fence, high + limits.fence
+        self._low[2] = -np.inf
+        self.reasons: Counter[str] = Counter()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin to fly."""
+        self.mode, self.why, self.sees = Mode.FLY, frozenset[str](), False
+        self._state: np.ndarray | None = None
+        self._changed = self._landing_since = 0
+        self._is_frozen = False
+
+    def check(self, now: int, sensed: Sensed | None, setpoint: np.ndarray, unanswered: float = 0.0) -> Mode:
+        """Check everything once a period.
+
+        :param now: the time (us)
+        :param sensed: what is perceived; None before there is anything
+        :param setpoint: the last set-point, (4,)
+        :param unanswered: time without any message in spite of requests (s)
+        """
+        if self.mode is Mode.OFF:
+            return self.mode
+        limits, why = self.limits, dict[str, Mode]()
+        if sensed is None:
+            why["no state yet"] = Mode.HOVER
+        elif (age := (now - sensed.stamp) / _US) > limits.stale:
+            why["state is stale"] = Mode.LAND if age > limits.lost else Mode.HOVER
+        if sensed is not None:
+            same = self._unchanged(sensed, setpoint)
+            if self._is_frozen:
+                why["state is frozen"] = Mode.LAND if same > limits.lost else Mode.HOVER
+            own = sensed.state[POSITION]
+            if (own < self._low).any() or (own > self._high).any():
+                why["outside the fence"] = Mode.LAND
+            if len(sensed.pos) and np.linalg.norm(sensed.pos - own, axis=1).min() < self._apart:
+                why["too close"] = Mode.HOVER
+        if unanswered > limits.unanswered:
+            why["no answers"] = Mode.LAND if unanswered > limits.silence else Mode.HOVER
+        self.sees = why.keys().isdisjoint(("no state yet", "state is stale", "state is frozen"))
+        self.reasons.update(why.keys() - self.why)
+        self.why = frozenset(why)
+        mode = max(why.values(), default=Mode.FLY)
+        if self.mode is Mode.LAND or mode is Mode.LAND:
+            mode = self._land(now, sensed)
+        self.mode = mode
+        return mode
+
+    def _unchanged(self, sensed: Sensed, setpoint: np.ndarray) -> float:
+        """Return how long the state has been the same (s)."""
+        if self._state is None or not np.array_equal(sensed.state, self._state):
+            self._state, self._changed, self._is_frozen = sensed.state.copy(), sensed.stamp, False
+            return 0.0
+        same = (sensed.stamp - self._changed) / _US
+        at_rest = np.abs(sensed.state[VELOCITY]).max() < _AT_REST and np.abs(setpoint).max() < _AT_REST
+        self._is_frozen |= same > self.limits.frozen and not at_rest
+        return same
+
+    def _land(self, now: int, sensed: Sensed | None) -> Mode:
+        if self.mode is not Mode.LAND:
+            self._landing_since = now
+        is_down = self.sees and sensed is not None and sensed.state[2] <= self.limits.ground
+        timed_out = now - self._landing_since > self.limits.landing_time * _US
+        return Mode.OFF if is_down or timed_out else Mode.LAND
+
+    def setpoint(self, mode: Mode) -> np.ndarray:
+        """Return the set-point of a robot that does not plan, (4,).
+
+        :param mode: `Mode.HOVER` or `Mode.LAND`
+        """
+        return HOVERING if mode is Mode.HOVER else np.array([0.0, 0.0, self.limits.landing, 0.0])
+
+
+class Watchdog:
+    """A thread that hovers, and later lands, if the loop hangs. An autopilot's link may repeat the last set-point for
+    ever.
+
+    :ivar barks: how often it stepped in
+
+    :param vehicle: the vehicle
+    :param limits: when to hover and when to land
+    """
+
+    def __init__(self, vehicle: Vehicle, limits: SafetyLimits):
+        self._vehicle, self._limits, self.barks = vehicle, limits, 0
+        self._beaten, self._ended = monotonic(), threading.Event()
+        self._armed = False
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._thread.start()
+
+    def beat(self, armed: bool = True) -> None:
+        """Show that the loop is alive.
+
+        :param armed: whether to step in if this is the last sign of life
+        """
+        self._beaten, self._armed = monotonic(), armed
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        barking = False
+        while not self._ended.wait(self._limits.hung / 4):
+            silent = (monotonic() - self._beaten) / _US
+            if not self._armed or silent < self._limits.hung:
+                barking = False
+                continue
+            self.barks += not barking
+            barking = True
+            lands = silent > self._limits.hung + self._limits.lost
+            self._vehicle.command(np.array([0.0, 0.0, self._limits.landing, 0.0]) if lands else HOVERING, None)

@@ -1,0 +1,102 @@
+"""What all robots of a flight have in common, as a file that their processes read."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from quad_swarm.errors import shown
+from quad_swarm.planner import base
+from quad_swarm.realtime.link import Conditions
+from quad_swarm.realtime.supervisor import SafetyLimits
+from quad_swarm.robot import Robot, RulePolicy, files
+from quad_swarm.validation import replaced
+from quad_swarm.world.presets import SwarmConfig
+
+_MOST_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class Team:
+    """Robots that fly together.
+
+    :param config: the world
+    :param policy: a rule, or the folder of an exported model
+    :param limits: when robots hover and land
+    :param wait: see `quad_swarm.realtime.Loop` (s)
+    :param late: see `quad_swarm.realtime.Loop` (periods)
+    :param session: see `quad_swarm.realtime.WireLink`
+    :param checked: see `quad_swarm.realtime.WireLink`
+    :param group: address and port of a multicast group; None to send to each robot's own
+    :param conditions: how messages fare, for trials
+    :param priority: real-time priority (SCHED_FIFO) of the robots' processes, 1 to 99; 0 for none
+    :param clock_errors: errors of the robots' clocks (s), for trials; none if empty
+    :raises ValueError: if the policy does not fit the world
+    """
+
+    config: SwarmConfig
+    policy: str
+    limits: SafetyLimits = field(default_factory=SafetyLimits)
+    wait: float = 0.005
+    late: float = 0.25
+    session: int = 0
+    checked: bool = False
+    group: tuple[str, int] | None = None
+    conditions: Conditions = field(default_factory=Conditions)
+    priority: int = 0
+    clock_errors: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.priority <= 99:
+            raise ValueError(f"priority={self.priority}: it must be from 1 to 99, or 0 for none.")
+        if self.clock_errors and len(self.clock_errors) != self.config.n_robots:
+            raise ValueError(f"clock_errors={self.clock_errors}: there are {self.config.n_robots} robots.")
+        if self.is_learned:
+            exported = files.load(self.policy).config
+            if dataclasses.replace(exported, plant=self.config.plant) != self.config:
+                raise ValueError(f"{self.policy} was exported for another world: export it for this one.")
+        else:
+            RulePolicy(self.policy)
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the policy is the folder of a model."""
+        return (Path(self.policy) / files.DESCRIPTION).is_file()
+
+    def robot(self, index: int, planner: base.Planner | None = None) -> Robot:
+        """Create one of the robots."""
+        if not self.is_learned:
+            return Robot(self.config, index, RulePolicy(self.policy, [self.session, index]), planner)
+        return files.load(self.policy).robot(index, planner)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the team as JSON."""
+        content = dataclasses.asdict(self)
+        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def load(path: str | os.PathLike[str]) -> Team:
+    """Read a team that `Team.write` wrote.
+
+    :raises ValueError: if the file describes no team
+    """
+    path = Path(path)
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"{path} is larger than {_MOST_BYTES} bytes, so it describes no team.")
+    try:
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
+        known = {one.name for one in dataclasses.fields(Team)}
+        if not isinstance(content, dict) or content.keys() - known or not {"config", "policy"} <= content.keys():
+            raise ValueError(f"a team has the fields {', '.join(sorted(known))}, of which config and policy are needed")
+        content["config"] = replaced(SwarmConfig(), content["config"], "config")
+        content["limits"] = replaced(SafetyLimits(), content.get("limits", {}), "limits")
+        content["conditions"] = Conditions(**content.get("conditions", {}))
+        content["group"] = None if content.get("group") is None else tuple(content["group"])
+        content["clock_errors"] = tuple(content.get("clock_errors", ()))
+        return Team(**content)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} describes no team: {shown(str(error))}.") from None

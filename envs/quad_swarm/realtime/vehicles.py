@@ -1,0 +1,136 @@
+"""Simulated vehicles in real or virtual time: physics, sensors, failsafe, and who collides."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quad_swarm.geometry import closest_approach
+from quad_swarm.plants import make_plant
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
+from quad_swarm.realtime.link import Sensed
+from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.realisation import Realisation
+
+_US = 1_000_000
+# Seconds without commands after which an autopilot levels, and after which it lands
+LEVELS_AFTER, LANDS_AFTER = 0.5, 1.0
+_LANDING = np.array([0.0, 0.0, -0.5, 0.0])
+
+
+class Vehicles:
+    """One team's vehicles. They fly the last command until they get another, as autopilots do, and level and land by
+    themselves without any.
+
+    :ivar now: time (us)
+    :ivar step_us: length of a sub-step (us)
+    :ivar state: true states, (n, 9)
+    :ivar closest: smallest distance of each pair of robots while both were flying, (n, n) (m)
+    :ivar flying: which robots are in the air, (n,) bool
+
+    :param config: the world; its clock skew is not used, since commands take effect when they arrive
+    :raises ValueError: if a sub-step is no whole number of microseconds
+    """
+
+    def __init__(self, config: SwarmConfig):
+        n, step = config.n_robots, config.planner.dt / config.substeps
+        self.config, self.step_us = config, round(step * _US)
+        if abs(self.step_us - step * _US) > 1e-6:
+            raise ValueError(f"planner.dt / substeps = {step} s: in real time, it must be whole microseconds.")
+        self._realisation = Realisation(config, 1)
+        self._plant = make_plant(config.plant, config.quadrotor, step, 1, n)
+        self._others = other_indices(n)
+        self._state = np.zeros((1, n, N_STATES))
+
+    @property
+    def state(self) -> np.ndarray:
+        return self._state[0]
+
+    def reset(self, starts: np.ndarray, goals: np.ndarray, noise_seed: int, now: int) -> None:
+        """Begin a flight.
+
+        :param starts: starts, where robots hover, (n, 3), world frame (m)
+        :param goals: goals, (n, 3), world frame (m)
+        :param noise_seed: seed of the disturbances
+        :param now: the time (us)
+        """
+        n = self.config.n_robots
+        self.now, self._steps, self.goals = now, 0, np.array(goals, float)
+        self._state = np.zeros((1, n, N_STATES))
+        self.state[:, POSITION] = starts
+        self._plant.place(0, self._state[0])
+        if self.config.is_random:
+            self._realisation.reset(0, noise_seed)
+        self._u = np.zeros((1, n, N_INPUTS))
+        self._commanded = np.full(n, now)
+        self.flying = np.ones(n, dtype=bool)
+        self.closest = np.full((n, n), np.inf)
+        self.arrived = np.full(n, -1)
+        self._sense()
+
+    def command(self, robot: int, setpoint: np.ndarray) -> None:
+        """Take a robot's command.
+
+        :param robot: number of the robot
+        :param setpoint: roll, pitch (rad), climb rate (m/s), yaw rate (rad/s), (4,)
+        """
+        if np.isfinite(setpoint).all():
+            self._u[0, robot], self._commanded[robot] = setpoint, self.now
+
+    def sensed(self, robot: int) -> Sensed:
+        """Return what a robot perceives of the last sub-step."""
+        own, pos, vel = self._perceived
+        return Sensed(self.now, own[robot].copy(), pos[robot].copy(), vel[robot].copy())
+
+    def advance(self) -> None:
+        """Fly for a sub-step."""
+        silent = (self.now - self._commanded) / _US
+        u = np.where((silent > LEVELS_AFTER)[:, None], 0.0, self._u[0])
+        u = np.where((silent > LANDS_AFTER)[:, None], _LANDING, u)
+        before, realisation = self.state[:, POSITION].copy(), self._realisation
+        landed = self.state[~self.flying].copy()
+        self._state = self._plant.step(self._state, u[None], realisation.air, realisation.factors)
+        self._steps += 1
+        if self._steps % self.config.substeps == 0 and self.config.is_random:
+            kicks = realisation.advance()
+            if kicks is not None:
+                self._state = self._state + kicks
+        self.state[~self.flying] = landed
+        self.now += self.step_us
+        self._meet(before)
+        self.flying &= self.state[:, 2] > 0.0
+        distance = np.linalg.norm(self.state[:, POSITION] - self.goals, axis=1)
+        self.arrived[(distance <= self.config.goal_radius) & (self.arrived < 0)] = self.now
+        self._sense()
+
+    @property
+    def at_goal(self) -> np.ndarray:
+        """Which robots are within the goal radius, (n,) bool."""
+        return np.linalg.norm(self.state[:, POSITION] - self.goals, axis=1) <= self.config.goal_radius
+
+    def collisions(self, among: np.ndarray | None = None) -> list[tuple[int, int]]:
+        """Return the pairs of robots that have collided.
+
+        :param among: only pairs of these robots, (n,) bool
+        """
+        contact = 2 * self.config.radius - self.config.collision_tolerance
+        met = np.triu(self.closest < contact, 1)
+        if among is not None:
+            met &= among[:, None] & among
+        return [(int(i), int(j)) for i, j in np.argwhere(met)]
+
+    def _meet(self, before: np.ndarray) -> None:
+        """Update the smallest distances with straight motion during the sub-step."""
+        after = self.state[:, POSITION]
+        start, end = before[:, None] - before, after[:, None] - after
+        between, _ = closest_approach(start, end - start, 1.0)
+        distance = np.linalg.norm(between, axis=-1)
+        both = self.flying[:, None] & self.flying
+        np.fill_diagonal(both, False)
+        self.closest[both] = np.minimum(self.closest, distance)[both]
+
+    def _sense(self) -> None:
+        estimate = self._realisation.estimate(self._state)
+        seen = estimate.take(self._others, axis=1)
+        pos, vel = self._realisation.observe(seen[..., POSITION], seen[..., VELOCITY])
+        self._perceived = estimate[0], pos[0], vel[0]

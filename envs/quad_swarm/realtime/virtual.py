@@ -1,0 +1,275 @@
+"""Robots that run in real time, in virtual time: loops, messages as they travel, clocks and faults in one process.
+
+It flies what processes on a network fly, as fast as the machine can and the same each time, so that outcomes do not
+depend on how busy the machine is. Each robot has its own clock and its own grid of periods.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from quad_swarm.planner import make_planner
+from quad_swarm.realtime.link import Conditions, Handler, Sensed, WireLink
+from quad_swarm.realtime.loop import Loop
+from quad_swarm.realtime.statistics import Statistics
+from quad_swarm.realtime.supervisor import SafetyLimits
+from quad_swarm.realtime.vehicles import Vehicles
+from quad_swarm.robot import Plan, Policy, Robot
+from quad_swarm.world.presets import SwarmConfig
+
+_US = 1e6
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Delays, in seconds. Each is drawn uniformly from its range.
+
+    :param message: from sending a message until it arrives
+    :param sensing: age of what is perceived when it arrives
+    :param compute: from the last answer until the command acts
+    :param phase: start of a robot's periods after those of the world
+    :param clock: error of a robot's clock
+    """
+
+    message: tuple[float, float] = (0.0003, 0.002)
+    sensing: tuple[float, float] = (0.005, 0.015)
+    compute: tuple[float, float] = (0.002, 0.006)
+    phase: tuple[float, float] = (0.05, 0.1)
+    clock: tuple[float, float] = (0.0, 0.0)
+
+
+class VirtualFlight:
+    """A team in virtual time.
+
+    :ivar vehicles: the vehicles
+    :ivar loops: the robots' loops
+    :ivar now: the time (us)
+
+    :param config: the world
+    :param policies: a policy for each robot
+    :param conditions: how messages fare
+    :param timing: delays and clocks
+    :param limits: when robots hover and land
+    :param wait: see `Loop`
+    :param late: see `Loop`
+    """
+
+    def __init__(
+        self,
+        config: SwarmConfig,
+        policies: Sequence[Policy],
+        conditions: Conditions | None = None,
+        timing: Timing | None = None,
+        limits: SafetyLimits | None = None,
+        wait: float = 0.005,
+        late: float = 0.25,
+        checked: bool = False,
+    ):
+        self.config, self.vehicles = config, Vehicles(config)
+        self.conditions, self.timing = conditions or Conditions(), timing or Timing()
+        self.now, self._events, self._count = 0, list[tuple[int, bool, int, Callable[[], None]]](), 0
+        planner = make_planner(config.planner, config.quadrotor, config.n_robots)
+        self.links = [_VirtualLink(self, k, checked) for k in range(config.n_robots)]
+        self.loops = [
+            Loop(Robot(config, k, policy, planner), self.links[k], _VirtualVehicle(self, k), limits, wait, late)
+            for k, policy in enumerate(policies)
+        ]
+
+    def reset(self, starts: np.ndarray, goals: np.ndarray, seed: int = 0) -> None:
+        """Begin a flight.
+
+        :param starts: starts, (n, 3), world frame (m)
+        :param goals: goals, (n, 3), world frame (m)
+        :param seed: seed of everything that is drawn
+        """
+        n = self.config.n_robots
+        self._rng = np.random.default_rng(seed)
+        self.conditions.reseed([seed, 1])
+        self.now, self._events = 0, []
+        self.dead, self.frozen = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        self._until = np.zeros(n, dtype=np.int64)  # robots whose processes stand still
+        self._apart: tuple[int, ...] | None = None
+        self._mailbox: list[list[bytes]] = [[] for _ in range(n)]
+        self._seen: list[Sensed | None] = [None] * n
+        self._waits = np.zeros(n, dtype=bool)
+        self.vehicles.reset(starts, goals, seed, 0)
+        self._look()
+        for k, (loop, link) in enumerate(zip(self.loops, self.links, strict=True)):
+            link.error = round(self._draw(self.timing.clock))
+            first = round(self._draw(self.timing.phase))
+            loop.start(starts[k], goals[k], first + link.error)
+            self.at(first, partial(self._begin, k))
+        self.at(self.vehicles.step_us, self._advance, first=True)
+
+    def at(self, time: int, happens: Callable[[], None], first: bool = False) -> None:
+        """Let something happen.
+
+        :param time: when (us)
+        :param happens: what
+        :param first: whether it happens before what else happens then
+        """
+        self._count += 1
+        heapq.heappush(self._events, (time, not first, self._count, happens))
+
+    def run(self, until: float) -> None:
+        """Fly until some time (s)."""
+        while self._events and self._events[0][0] <= until * _US:
+            self.now, _, _, happens = heapq.heappop(self._events)
+            happens()
+
+    def fly(self, most: float, linger: float = 1.0) -> None:
+        """Fly until everybody who lives is at its goal and some time has passed.
+
+        :param most: time limit (s)
+        :param linger: time to fly on after that (s)
+        """
+        while self.now < most * _US:
+            self.run(min(self.now / _US + 0.1, most))
+            if self.vehicles.at_goal[~self.dead].all():
+                self.run(min(self.now / _US + linger, most))
+                return
+
+    def statistics(self) -> list[Statistics]:
+        """End the flight, and return the robots' statistics."""
+        return [loop.stop() for loop in self.loops]
+
+    def kill(self, robot: int) -> None:
+        """End a robot's process."""
+        self.dead[robot] = True
+
+    def halt(self, robot: int, seconds: float) -> None:
+        """Let a robot's process stand still; messages for it wait."""
+        self._until[robot] = self.now + round(seconds * _US)
+        self.at(int(self._until[robot]), partial(self._deliver, robot))
+
+    def part(self, robots: Collection[int], seconds: float) -> None:
+        """Let no message through between some robots and the others."""
+        self._apart = tuple(robots)
+        self.at(self.now + round(seconds * _US), self._join)
+
+    def freeze(self, robot: int, seconds: float) -> None:
+        """Let a robot perceive the same state again and again, with new stamps."""
+        self.frozen[robot] = True
+        self.at(self.now + round(seconds * _US), partial(self._thaw, robot))
+
+    def transmit(self, sender: int, receiver: int, message: bytes) -> None:
+        """Let a message travel."""
+        if self._apart is not None and (sender in self._apart) != (receiver in self._apart):
+            return
+        for arriving in self.conditions.arriving(message):
+            self.at(self.now + round(self._draw(self.timing.message)), partial(self._arrive, receiver, arriving))
+
+    def command(self, robot: int, setpoint: np.ndarray) -> None:
+        """Let a command take effect when it has been computed."""
+        u = setpoint.copy()
+        self.at(self.now + round(self._draw(self.timing.compute)), partial(self.vehicles.command, robot, u))
+
+    def perceived(self, robot: int) -> Sensed | None:
+        """Return what a robot perceives, with its own clock."""
+        seen = self._seen[robot]
+        return None if seen is None else seen._replace(stamp=seen.stamp + self.links[robot].error)
+
+    def _join(self) -> None:
+        self._apart = None
+
+    def _thaw(self, robot: int) -> None:
+        self.frozen[robot] = False
+
+    def _draw(self, span: tuple[float, float]) -> float:
+        return float(self._rng.uniform(*span)) * _US
+
+    def _advance(self) -> None:
+        self.vehicles.advance()
+        self._look()
+        self.at(self.vehicles.now + self.vehicles.step_us, self._advance, first=True)
+
+    def _look(self) -> None:
+        for k in range(self.config.n_robots):
+            arrival = self.now + round(self._draw(self.timing.sensing))
+            self.at(arrival, partial(self._see, k, self.vehicles.sensed(k)), first=True)
+
+    def _see(self, robot: int, sensed: Sensed) -> None:
+        before = self._seen[robot]
+        if before is not None and before.stamp > sensed.stamp:
+            return
+        if self.frozen[robot] and before is not None:
+            sensed = before._replace(stamp=sensed.stamp)
+        self._seen[robot] = sensed
+
+    def _begin(self, robot: int) -> None:
+        if self.dead[robot]:
+            return
+        if self.now < self._until[robot]:
+            self.at(int(self._until[robot]), partial(self._begin, robot))
+            return
+        loop = self.loops[robot]
+        self._waits[robot] = loop.begin()
+        if self._waits[robot]:
+            self.at(loop.deadline - self.links[robot].error, partial(self._expire, robot, loop.next_period))
+        else:
+            self._finish(robot)
+
+    def _expire(self, robot: int, period: int) -> None:
+        if self._waits[robot] and self.loops[robot].next_period == period:
+            self._finish(robot)
+
+    def _finish(self, robot: int) -> None:
+        if self.dead[robot]:
+            return
+        if self.now < self._until[robot]:
+            self.at(int(self._until[robot]), partial(self._finish, robot))
+            return
+        self._waits[robot] = False
+        loop = self.loops[robot]
+        loop.finish()
+        self.at(max(loop.next_period - self.links[robot].error, self.now), partial(self._begin, robot))
+
+    def _arrive(self, robot: int, message: bytes) -> None:
+        self._mailbox[robot].append(message)
+        self._deliver(robot)
+
+    def _deliver(self, robot: int) -> None:
+        if self.dead[robot] or self.now < self._until[robot]:
+            return
+        messages, self._mailbox[robot] = self._mailbox[robot], []
+        for message in messages:
+            self.links[robot].deliver(message, self.loops[robot])
+        if self._waits[robot] and not self.loops[robot].waits:
+            self._finish(robot)
+
+
+class _VirtualLink(WireLink):
+    def __init__(self, flight: VirtualFlight, index: int, checked: bool):
+        super().__init__(index, checked=checked)
+        self._flight, self.error = flight, 0
+
+    def now(self) -> int:
+        return self._flight.now + self.error
+
+    def _offset(self) -> int:
+        return 0
+
+    def transmit(self, other: int, message: bytes) -> None:
+        self._flight.transmit(self.index, other, message)
+
+    def wait(self, until: int, handler: Handler, done: Callable[[], bool] = lambda: False) -> None:
+        raise NotImplementedError("the events of a virtual flight tell loops what happens")
+
+
+class _VirtualVehicle:
+    def __init__(self, flight: VirtualFlight, index: int):
+        self._flight, self._index = flight, index
+
+    def sense(self) -> Sensed | None:
+        return self._flight.perceived(self._index)
+
+    def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
+        self._flight.command(self._index, setpoint)
+
+    def disarm(self) -> None:
+        pass

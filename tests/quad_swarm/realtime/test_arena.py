@@ -1,0 +1,69 @@
+"""Processes that fly together in real time. How fast they are is not tested: machines may be busy."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from quad_swarm.realtime import Conditions, Mode
+from quad_swarm.realtime.arena import Arena, RobotEndedError
+from quad_swarm.realtime.team import Team
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import ScenarioSampler
+
+# On a busy machine, the whole flight takes place in slow motion, see `Arena.pauses`: nothing here depends on time
+CONFIG = make_config("flight", n_robots=4)
+
+
+def places(config, episode=0):
+    rng = np.random.default_rng([4, episode])
+    return ScenarioSampler("symmetric_swap", config.n_robots, config.space, config).sample(rng)[1:]
+
+
+@pytest.mark.slow
+def test_four_processes_swap_places():
+    samples = []
+    with Arena(Team(CONFIG, "full", conditions=Conditions(loss=0.1))) as arena:
+        pids = arena.pids
+        for episode in range(2):
+            flight = arena.fly(*places(CONFIG, episode), episode, sees=samples.append)
+            assert flight.seconds > 2
+            assert len(flight.statistics) == len(flight.traffic) == 4
+            counts = flight.total.counts
+            assert counts["periods"] > 4 * 20
+            assert 0 < counts["plans received"] < counts["requests"]
+            assert not [name for name in counts if name.startswith("errors")]
+            assert all(traffic.bytes > 100 and not traffic.refused for traffic in flight.traffic)
+            assert not flight.killed
+    assert not [pid for pid in pids if os.path.exists(f"/proc/{pid}")]
+    reports = [report for sample in samples for report in sample.reports]
+    assert {report.robot for report in reports} == {0, 1, 2, 3}
+    assert {report.mode for report in reports} <= set(Mode)
+    assert any(report.asked for report in reports)
+    assert any(report.arrived for report in reports)
+    assert reports[-1].plan.shape == (CONFIG.planner.horizon + 1, 3)
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_on_purpose_ends_no_flight():
+    with Arena(Team(CONFIG, "none")) as arena:
+        starts, goals = places(CONFIG)
+        flight = arena.fly(starts, goals, most=4.0, events=[(1.0, lambda arena: arena.kill(2))])
+        assert flight.killed == [2]
+        assert [one is None for one in flight.statistics] == [False, False, True, False]
+        assert arena.vehicles.state[2, 2] < starts[2, 2] - 0.5, "its vehicle lands"
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_by_itself_ends_the_flight():
+    with Arena(Team(CONFIG, "none")) as arena, pytest.raises(RobotEndedError, match="robot 1 ended .* -9"):
+        arena.fly(*places(CONFIG), events=[(0.5, lambda arena: arena.signal(1, signal.SIGKILL))])
+    assert not [pid for pid in arena.pids if os.path.exists(f"/proc/{pid}")]
+
+
+@pytest.mark.slow
+def test_processes_end_with_their_world(tmp_path):
+    with pytest.raises(RobotEndedError, match="robot 0 ended with exit status 1"):
+        Arena(Team(CONFIG, "none", session=0, group=("10.0.0.1", 4000)), log=tmp_path)
+    assert "multicast" in (tmp_path / "robot_0.log").read_text()

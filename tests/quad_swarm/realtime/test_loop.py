@@ -1,0 +1,299 @@
+"""The loop of one robot, on a clock, a link and a vehicle that a test moves by hand."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed
+from quad_swarm.robot import Plan, Robot, RulePolicy
+from quad_swarm.world.presets import make_config
+
+CONFIG = make_config("flight", n_robots=3)
+PERIOD = 50_000
+HORIZON = CONFIG.planner.horizon
+OTHERS = np.array([[2.0, 0.3, 1.5], [-2.0, 1.0, 1.5]])
+
+
+class Link:
+    def __init__(self):
+        self.time, self.requests, self.plans, self.broken = 0, [], [], False
+
+    def now(self):
+        return self.time
+
+    def request(self, other):
+        if self.broken:
+            raise OSError("no network")
+        self.requests.append(other)
+
+    def send(self, other, plan, period, asked):
+        if self.broken:
+            raise OSError("no network")
+        self.plans.append((other, plan.stamp, asked))
+
+    def wait(self, until, handler, done=lambda: False):
+        self.time = max(self.time, until)
+
+
+class Vehicle:
+    def __init__(self, link):
+        self.link, self.commands, self.disarmed = link, [], 0
+        self.state = np.zeros(9)
+        self.state[2] = 1.5
+        self.perceived = lambda: Sensed(self.link.time - 5_000, self.state, OTHERS, np.zeros((2, 3)))
+
+    def sense(self):
+        self.state = self.state + 1e-9
+        return self.perceived()
+
+    def command(self, setpoint, plan):
+        self.commands.append((self.link.time, setpoint, plan))
+
+    def disarm(self):
+        self.disarmed += 1
+
+
+def make(rule="full", limits=None, **options):
+    link = Link()
+    vehicle = Vehicle(link)
+    policy = rule if callable(rule) else RulePolicy(rule)
+    loop = Loop(Robot(CONFIG, 0, policy), link, vehicle, limits, **options)
+    loop.start(np.array([0, 0, 1.5]), np.array([3.0, 0, 1.5]), 0)
+    return loop, link, vehicle
+
+
+def periods(loop, count):
+    """The modes of periods one after another."""
+    modes = []
+    for _ in range(count):
+        loop.link.wait(loop.next_period, loop)
+        loop.begin()
+        loop.finish()
+        modes.append(loop.supervisor.mode)
+    return modes
+
+
+def plan_of(place, stamp, velocity=(0.0, 0.0, 0.0)):
+    steps = np.arange(HORIZON + 1)[:, None] * PERIOD * 1e-6
+    return Plan(stamp, OTHERS[place] + steps * np.array(velocity))
+
+
+def test_a_period():
+    loop, link, vehicle = make("cpa:9s:9|push:0")
+    assert loop.begin()
+    assert loop.waits
+    assert loop.deadline == 5_000
+    assert link.requests == [1, 2]
+    assert link.plans == [(1, -PERIOD, False), (2, -PERIOD, False)], "the plan of the last period"
+    link.time = 700
+    loop.on_plan(1, plan_of(0, -20_000), 400, PERIOD)
+    assert loop.waits
+    loop.on_plan(2, plan_of(1, -20_000), 500, PERIOD)
+    assert not loop.waits
+    loop.on_request(2)
+    assert link.plans[-1] == (2, -PERIOD, True)
+    loop.finish()
+    ((at, setpoint, plan),) = vehicle.commands
+    assert at == 700
+    assert setpoint[1] > 0.05, "towards the goal"
+    assert plan.stamp == 0
+    statistics = loop.stop()
+    assert dict(statistics.counts) == {
+        "periods": 1, "missed": 0, "late commands": 0, "requests": 2, "announcements": 2, "plans received": 2,
+        "requests received": 1, "answers": 1,
+    }  # fmt: skip
+    assert statistics.durations["round_trip"].total == 2
+    assert statistics.durations["one_way"].quantile(0.5) == pytest.approx(250, rel=0.3)
+    assert statistics.durations["plan_age"].quantile(0.5) == pytest.approx(20_000, rel=0.05)
+    assert statistics.durations["sensed"].quantile(0.5) == pytest.approx(5_000, rel=0.05)
+
+
+def test_periods_lie_on_a_grid_and_missed_ones_are_counted():
+    loop, link, vehicle = make("none")
+    started = []
+    for now in (0, 50_900, 100_000, 299_999, 300_000):
+        link.time = now
+        loop.begin()
+        started.append(loop.next_period - PERIOD)
+        loop.finish()
+    assert started == [0, PERIOD, 2 * PERIOD, 5 * PERIOD, 6 * PERIOD]
+    statistics = loop.stop()
+    assert statistics.counts["missed"] == 2
+    assert statistics.share("missed") == 2 / 7
+    assert statistics.counts["late commands"] == 1
+    assert statistics.durations["jitter"].quantile(1.0) == pytest.approx(49_999, rel=0.05)
+
+
+def test_the_state_is_moved_to_the_start_of_the_period():
+    seen = []
+
+    def policy(robot):
+        seen.append((robot.estimate()[0, 0, :3].copy(), robot.observe()[0][0, 0].copy()))
+        return np.zeros((2, 1), bool)
+
+    loop, link, vehicle = make(policy)
+    vel = np.array([[1.0, 0, 0], [0, -2.0, 0]])
+    state = np.array([0, 0, 1.5, 1.0, 0.5, 0, 0, 0, 0])
+    vehicle.perceived = lambda: Sensed(link.time - 20_000, state, OTHERS, vel)
+    loop.begin()
+    np.testing.assert_allclose(seen[0][0], [0.02, 0.01, 1.5])
+    np.testing.assert_allclose(seen[0][1], OTHERS + 0.02 * vel)
+
+
+REFUSED = {
+    "other periods": lambda: (plan_of(0, 0), PERIOD + 1000),
+    "from the future": lambda: (plan_of(0, 90_000), PERIOD),
+    "too old": lambda: (plan_of(0, -HORIZON * PERIOD), PERIOD),
+    "not where its robot is": lambda: (plan_of(1, 0), PERIOD),
+    "not finite": lambda: (Plan(0, plan_of(0, 0).positions * np.nan), PERIOD),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_a_plan_that_cannot_be_is_refused(reason):
+    loop, link, _ = make()
+    periods(loop, 1)
+    plan, period = REFUSED[reason]()
+    loop.on_plan(1, plan, 0, period)
+    assert loop.statistics.counts[f"refused: {reason}"] == 1
+    assert not loop.robot.inbox
+    loop.on_plan(1, plan_of(0, 0), 0, PERIOD)
+    assert list(loop.robot.inbox) == [0]
+
+
+def test_plans_of_another_length_are_refused():
+    loop, _, _ = make()
+    periods(loop, 1)
+    loop.on_plan(1, Plan(0, plan_of(0, 0).positions[:-1]), 0, PERIOD)
+    assert loop.statistics.counts["refused: other periods"] == 1
+
+
+@pytest.mark.parametrize("sender", [0, 3, 200])
+def test_only_the_team_is_heard(sender):
+    loop, link, _ = make("none")
+    periods(loop, 1)
+    loop.on_plan(sender, plan_of(0, 0), 0, PERIOD)
+    loop.on_request(sender)
+    assert loop.statistics.counts["refused: not of the team"] == 2
+    assert not link.plans
+
+
+def test_a_plan_of_the_past_is_compared_with_where_its_robot_is_now():
+    loop, link, vehicle = make()
+    vel = np.array([[4.0, 0, 0], [0, 0, 0]])
+    moved = OTHERS + 0.3 * vel
+    vehicle.perceived = lambda: Sensed(link.time, vehicle.state, moved, vel)
+    link.time = 300_000
+    periods(loop, 1)
+    loop.on_plan(1, plan_of(0, 0, (4.0, 0, 0)), 0, PERIOD)
+    assert loop.statistics.counts["plans received"] == 1
+
+
+def test_who_gets_no_answers_hovers_and_asks_everybody():
+    loop, link, vehicle = make(lambda robot: np.array([[True], [False]]))
+    modes = periods(loop, 30)
+    assert modes[:20] == [Mode.FLY] * 20
+    assert modes[-8:] == [Mode.HOVER] * 8
+    assert link.requests[:3] == [1, 1, 1]
+    assert link.requests[-2:] == [1, 2]
+    assert np.linalg.norm(loop.robot.goal[0, 0] - [0, 0, 1.5]) < 0.01, "it holds its place"
+    loop.on_request(2)
+    assert periods(loop, 1) == [Mode.FLY]
+    np.testing.assert_array_equal(loop.robot.goal[0, 0], [3.0, 0, 1.5])
+
+
+def test_silence_that_nobody_broke_is_no_fault():
+    loop, _, _ = make("none")
+    assert periods(loop, 60) == [Mode.FLY] * 60
+
+
+@pytest.mark.parametrize("bad", [None, np.full(9, np.nan), np.zeros(8)])
+def test_a_robot_without_a_state_hovers_and_then_lands(bad):
+    loop, link, vehicle = make("none")
+    periods(loop, 2)
+    vehicle.perceived = lambda: None if bad is None else Sensed(link.time, bad, OTHERS, np.zeros((2, 3)))
+    modes = periods(loop, 40)
+    assert modes[-1] is Mode.LAND
+    assert Mode.HOVER in modes
+    at, setpoint, plan = vehicle.commands[-1]
+    assert (setpoint.tolist(), plan) == ([0, 0, -0.5, 0], None)
+    counts = loop.stop().counts
+    assert counts["state is stale"] == 1
+    assert counts["errors: sensing"] == (0 if bad is None else 40)
+
+
+def test_after_landing_the_motors_stop():
+    loop, link, vehicle = make("none", SafetyLimits(fence=0.0))
+    vehicle.state[0] = 50.0
+    assert periods(loop, 2) == [Mode.LAND] * 2
+    vehicle.state[2] = 0.0
+    assert periods(loop, 2) == [Mode.OFF] * 2
+    assert vehicle.disarmed == 2
+    assert len(vehicle.commands) == 2
+
+
+def test_errors_of_policies_planners_links_and_vehicles_do_not_end_the_loop():
+    def policy(robot):
+        raise RuntimeError("of a stranger")
+
+    loop, link, vehicle = make(policy)
+    periods(loop, 1)
+    assert link.requests == [1, 2], "then everybody is asked"
+    assert loop.statistics.last_error == "policy: RuntimeError: of a stranger"
+    link.broken = True
+    periods(loop, 1)
+    loop.on_request(1)
+    loop.robot.plan = lambda: np.full(4, np.nan)
+    periods(loop, 1)
+    assert vehicle.commands[-1][1].tolist() == [0, 0, 0, 0]
+    vehicle.command = None
+    periods(loop, 1)
+    counts = loop.stop().counts
+    assert counts["errors: policy"] == 4
+    assert counts["errors: link"] == 3 * 2 + 1
+    assert counts["errors: planner"] == 2
+    assert counts["errors: vehicle"] == 1
+
+
+def test_a_policy_of_another_shape_asks_everybody():
+    loop, link, _ = make(lambda robot: np.zeros((5, 1), bool))
+    periods(loop, 1)
+    assert link.requests == [1, 2]
+
+
+def test_what_was_not_sent_is_not_presumed_to_be_known():
+    loop, link, _ = make("none")
+    periods(loop, 1)
+    link.broken = True
+    loop.on_request(1)
+    assert not loop.robot._sent
+    link.broken = False
+    loop.on_request(1)
+    assert list(loop.robot._sent) == [0]
+
+
+def test_run_flies_until_it_ends_and_can_begin_again():
+    loop, link, vehicle = make("none")
+    beats = []
+    statistics = loop.run(lambda: link.time >= 10 * PERIOD, beats.append)
+    assert (statistics.counts["periods"], len(beats)) == (10, 10)
+    loop.start(np.zeros(3), np.ones(3), 20 * PERIOD)
+    assert loop.run(lambda: link.time >= 22 * PERIOD).counts["periods"] == 2
+    assert vehicle.commands[-1][0] == 21 * PERIOD
+
+
+def test_warming_up_leaves_no_trace():
+    loop, link, vehicle = make("full")
+    first = periods(loop, 3) and [setpoint for _, setpoint, _ in vehicle.commands]
+    loop, link, vehicle = make("full")
+    loop.warm_up()
+    assert not link.requests
+    assert not vehicle.commands
+    loop.start(np.array([0, 0, 1.5]), np.array([3.0, 0, 1.5]), 0)
+    periods(loop, 3)
+    np.testing.assert_array_equal([setpoint for _, setpoint, _ in vehicle.commands], first)
+
+
+@pytest.mark.parametrize("times", [{"wait": 0.05}, {"wait": -1}, {"late": 1.0}, {"late": -0.1}, {"wait": np.nan}])
+def test_times_that_do_not_fit_are_refused(times):
+    with pytest.raises(ValueError, match=next(iter(times))):
+        make(**times)

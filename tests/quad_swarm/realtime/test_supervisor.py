@@ -1,0 +1,145 @@
+"""What makes a robot hover or land."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from quad_swarm.realtime import Mode, SafetyLimits, Sensed, Supervisor, Watchdog
+from quad_swarm.world.presets import make_config
+
+CONFIG = make_config("flight", n_robots=3)
+PERIOD = 50_000
+FAR = np.array([[3.0, 0, 1], [0, 3.0, 1]])
+
+
+def sensed(now, pos=(0.0, 0.0, 1.5), others=FAR, age=10_000):
+    state = np.zeros(9)
+    state[:3] = pos
+    state[3] = 0.5 + 1e-9 * now  # a real estimate is never the same twice
+    return Sensed(now - age, state, others, np.zeros((2, 3)))
+
+
+def modes(supervisor, states, setpoint=(0.1, 0, 0, 0), unanswered=0.0):
+    """The modes of consecutive periods."""
+    return [
+        supervisor.check(k * PERIOD, None if one is None else one(k * PERIOD), np.array(setpoint), unanswered)
+        for k, one in enumerate(states)
+    ]
+
+
+def test_a_robot_that_sees_flies():
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    assert modes(supervisor, [sensed] * 10) == [Mode.FLY] * 10
+    assert supervisor.sees
+    assert not supervisor.reasons
+
+
+def test_a_state_that_does_not_come_any_more():
+    supervisor, last = Supervisor(CONFIG, SafetyLimits()), sensed(0)
+    flown = modes(supervisor, [lambda now: last] * 30)
+    assert flown == [Mode.FLY] * 4 + [Mode.HOVER] * 16 + [Mode.LAND] * 10
+    assert supervisor.reasons == {"state is stale": 1}
+    assert not supervisor.sees
+
+
+def test_a_robot_goes_on_when_it_sees_again():
+    supervisor, last = Supervisor(CONFIG, SafetyLimits()), sensed(0)
+    flown = modes(supervisor, [None] + [sensed] * 2 + [lambda now: last] * 5 + [sensed] * 2)
+    assert flown == [Mode.HOVER] + [Mode.FLY] * 3 + [Mode.HOVER] * 4 + [Mode.FLY] * 2
+
+
+def test_a_state_that_is_repeated():
+    supervisor, first = Supervisor(CONFIG, SafetyLimits()), sensed(0)
+    flown = modes(supervisor, [lambda now: first._replace(stamp=now)] * 30)
+    assert flown == [Mode.FLY] * 5 + [Mode.HOVER] * 16 + [Mode.LAND] * 9
+    assert supervisor.reasons == {"state is frozen": 1}
+
+
+def test_a_robot_at_rest_may_have_the_same_state():
+    state = np.zeros(9)
+    state[2] = 1.0
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    rests = [lambda now: Sensed(now, state, FAR, np.zeros((2, 3)))] * 40
+    assert modes(supervisor, rests, setpoint=np.zeros(4)) == [Mode.FLY] * 40
+    assert Mode.HOVER in modes(supervisor, rests), "unless it is told to move"
+
+
+def test_landing_is_final_and_ends_on_the_ground():
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    high = CONFIG.planner.workspace_high
+    out = (high[0] + 1.1, 0.0, 1.5)
+    flight = [sensed, lambda now: sensed(now, out), sensed, sensed, lambda now: sensed(now, (0, 0, 0.05)), sensed]
+    assert modes(supervisor, flight) == [Mode.FLY, Mode.LAND, Mode.LAND, Mode.LAND, Mode.OFF, Mode.OFF]
+    assert supervisor.reasons == {"outside the fence": 1}
+    assert supervisor.setpoint(Mode.LAND).tolist() == [0, 0, -0.5, 0]
+    supervisor.reset()
+    assert modes(supervisor, [sensed]) == [Mode.FLY]
+
+
+def test_a_landing_without_a_state_ends_some_time():
+    supervisor = Supervisor(CONFIG, SafetyLimits(landing_time=1.0))
+    last = sensed(0)
+    flown = modes(supervisor, [lambda now: last] * 50)
+    assert flown.count(Mode.LAND) == 21
+    assert flown[-1] is Mode.OFF
+
+
+@pytest.mark.parametrize(("pos", "outside"), [((0, 0, -0.2), False), ((-9, 0, 1), True), ((0, 0, 9), True)])
+def test_the_fence_is_open_to_the_ground(pos, outside):
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    modes(supervisor, [lambda now: sensed(now, pos)])
+    assert ("outside the fence" in supervisor.why) is outside
+
+
+def test_robots_that_touch_hover():
+    contact = 2 * CONFIG.radius - CONFIG.collision_tolerance
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    for gap, mode in ((0.01, Mode.FLY), (-0.01, Mode.HOVER)):
+        others = np.array([[0, contact + gap, 1.5], [3, 0, 1.5]])
+        assert modes(supervisor, [lambda now, others=others: sensed(now, others=others)]) == [mode]
+    supervisor = Supervisor(CONFIG, SafetyLimits(separation=2.0))
+    assert modes(supervisor, [lambda now: sensed(now, others=np.array([[1.9, 0, 1.5], [3, 0, 1.5]]))]) == [Mode.HOVER]
+
+
+@pytest.mark.parametrize(("unanswered", "mode"), [(0.9, Mode.FLY), (1.1, Mode.HOVER), (10.1, Mode.LAND)])
+def test_nobody_answers(unanswered, mode):
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    assert modes(supervisor, [sensed], unanswered=unanswered) == [mode]
+    assert supervisor.sees
+
+
+def test_limits_that_contradict_each_other_are_refused():
+    with pytest.raises(ValueError, match="hovers before it lands"):
+        SafetyLimits(stale=2.0)
+    with pytest.raises(ValueError, match="hung"):
+        SafetyLimits(hung=0.0)
+    with pytest.raises(ValueError, match="landing"):
+        SafetyLimits(landing=0.5)
+
+
+class Recorder:
+    def __init__(self):
+        self.commands, self.levelled, self.lands = [], threading.Event(), threading.Event()
+
+    def command(self, setpoint, plan):
+        self.commands.append(setpoint)
+        (self.levelled if setpoint[2] == 0 else self.lands).set()
+
+
+def test_a_loop_that_hangs_is_noticed():
+    vehicle = Recorder()
+    watchdog = Watchdog(vehicle, SafetyLimits(hung=0.05, stale=0.1, lost=0.2))
+    try:
+        assert not vehicle.levelled.wait(0.2), "before it is armed"
+        watchdog.beat()
+        assert vehicle.levelled.wait(60)
+        assert vehicle.lands.wait(60)
+        assert watchdog.barks == 1
+        assert not any(setpoint[2] for setpoint in vehicle.commands[:1]), "it levels first"
+    finally:
+        watchdog.close()
+    before = len(vehicle.commands)
+    time.sleep(0.1)
+    assert len(vehicle.commands) == before

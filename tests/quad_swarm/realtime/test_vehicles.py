@@ -1,0 +1,97 @@
+"""Simulated vehicles."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.quadrotor import POSITION
+from quad_swarm.realtime.vehicles import Vehicles
+from quad_swarm.world.presets import make_config
+
+CALM = {
+    "noise": {"pos": 0.0, "vel": 0.0, "attitude": 0.0, "wind": 0.0, "gust": 0.0},
+    "sensing": dict.fromkeys(("pos", "vel", "attitude", "others_pos", "others_vel"), 0.0),
+    "mismatch": 0.0,
+}
+CONFIG = make_config("flight", CALM, n_robots=2)
+STARTS, GOALS = np.array([[-2.0, 0, 1.5], [2.0, 0, 1.5]]), np.array([[2.0, 0, 1.5], [-2.0, 0, 1.5]])
+
+
+def flown(seconds, command=lambda vehicles: None, config=CONFIG, starts=STARTS):
+    vehicles = Vehicles(config)
+    vehicles.reset(starts, GOALS, 3, now=0)
+    while vehicles.now < seconds * 1e6:
+        command(vehicles)
+        vehicles.advance()
+    return vehicles
+
+
+def test_the_last_command_is_flown_until_the_autopilot_misses_it():
+    def once(vehicles):
+        if vehicles.now == 0:
+            vehicles.command(0, np.array([0.0, 0.2, 0.0, 0.0]))
+
+    half = flown(0.5, once)
+    assert half.state[0, 7] > 0.15, "it pitches"
+    level = flown(1.0, once)
+    assert abs(level.state[0, 7]) < 0.05, "it has levelled"
+    assert level.state[0, 2] == pytest.approx(1.5, abs=0.1)
+    landed = flown(6.0, once)
+    assert not landed.flying.any()
+    assert landed.state[0, 2] <= 0
+    assert landed.state[0, 2] == flown(7.0, once).state[0, 2], "on the ground, nothing moves any more"
+
+
+def test_robots_that_meet_between_two_states_collide():
+    def towards(vehicles):
+        for robot, pitch in ((0, 0.3), (1, -0.3)):
+            vehicles.command(robot, np.array([0.0, pitch, 0.0, 0.0]))
+
+    vehicles = flown(2.5, towards)
+    assert vehicles.collisions() == [(0, 1)]
+    assert vehicles.collisions(np.array([True, False])) == []
+    assert vehicles.closest[0, 1] == pytest.approx(0.0, abs=1e-9), "they passed through each other"
+    assert (vehicles.state[0, 0] - vehicles.state[1, 0]) > 0
+
+
+def test_what_is_not_finite_is_no_command():
+    def broken(vehicles):
+        vehicles.command(0, np.full(4, np.nan))
+
+    assert np.isfinite(flown(0.2, broken).state).all()
+
+
+def test_arrivals_are_the_first_ones():
+    vehicles = flown(0.1, starts=GOALS)
+    assert vehicles.arrived.tolist() == [vehicles.step_us] * 2
+    assert vehicles.at_goal.all()
+    assert (flown(0.1).arrived == -1).all()
+
+
+def test_it_flies_as_the_swarm_does():
+    """With commands from the start of each period on, disturbances are those of a swarm."""
+    from quad_swarm.robot import Robot, RulePolicy
+    from quad_swarm.robot.lockstep import LockstepWorld
+
+    config = make_config("flight", {"clock_skew": 0.0, "radio": {"loss": 0.0, "jitter": 0}}, n_robots=2)
+    robots = [Robot(config, k, RulePolicy("none")) for k in range(2)]
+    world = LockstepWorld(config, robots)
+    world.reset(STARTS, GOALS, 3)
+    vehicles = Vehicles(config)
+    vehicles.reset(STARTS, GOALS, 3, now=0)
+    for _ in range(20):
+        world.step()
+        for k, robot in enumerate(robots):
+            vehicles.command(k, robot.plans.u[0, 0])
+        for _ in range(config.substeps):
+            vehicles.advance()
+        assert vehicles.state[:, POSITION].tobytes() == world.state[0, :, POSITION].tobytes()
+    own, pos, vel = world._perceived()
+    for k in range(2):
+        seen = vehicles.sensed(k)
+        assert seen.state.tobytes() == own[k].tobytes()
+        assert (seen.pos.tobytes(), seen.vel.tobytes()) == (pos[k].tobytes(), vel[k].tobytes())
+
+
+def test_steps_of_no_whole_microseconds_are_refused():
+    with pytest.raises(ValueError, match="whole microseconds"):
+        Vehicles(make_config("flight", {"substeps": 7}))

@@ -1,0 +1,126 @@
+"""Robots with clocks and messages of their own fly safely, whatever befalls them."""
+
+import numpy as np
+import pytest
+
+from quad_swarm.quadrotor import POSITION
+from quad_swarm.realtime import Conditions
+from quad_swarm.realtime.statistics import total
+from quad_swarm.realtime.virtual import Timing, VirtualFlight
+from quad_swarm.robot import Plan, Robot, RulePolicy
+from quad_swarm.robot.lockstep import LockstepWorld
+from quad_swarm.world.presets import make_config
+from quad_swarm.world.scenarios import ScenarioSampler
+
+RULE = "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
+S = 1_000_000
+
+
+def flight_of(n=8, rule=RULE, **options):
+    config = make_config("flight", n_robots=n)
+    return VirtualFlight(config, [RulePolicy(rule) for _ in range(n)], **options)
+
+
+def begin(flight, episode, scenario="symmetric_swap"):
+    config = flight.config
+    rng = np.random.default_rng([12, episode])
+    _, starts, goals = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
+    flight.reset(starts, goals, episode)
+
+
+class Rounding(Robot):
+    """Receives plans as messages round them."""
+
+    def receive(self, sender, plan):
+        super().receive(sender, Plan(plan.stamp, np.rint(plan.positions * 1e3) * 1e-3))
+
+
+@pytest.mark.parametrize("n", [2, 4, 8])
+def test_without_delays_it_is_the_flight_in_lock_step(n):
+    """If everybody asks; a robot that asks nobody plans at once, and its answer is then the newer plan."""
+    world = {"clock_skew": 0.0, "radio": {"loss": 0.0, "delay": 0, "jitter": 0, "round_trip": 0}}
+    config = make_config("flight", world, n_robots=n)
+    full = RulePolicy("full")
+    flight = VirtualFlight(config, [full] * n, timing=Timing(*[(0.0, 0.0)] * 5), late=0.0)
+    lockstep = LockstepWorld(config, [Rounding(config, k, full) for k in range(n)])
+    _, starts, goals = ScenarioSampler("symmetric_swap", n, config.space, config).sample(np.random.default_rng(3))
+    lockstep.reset(starts, goals, 7)
+    flight.reset(starts, goals, 7)
+    for k in range(1, 61):
+        lockstep.step()
+        flight.run(k * config.planner.dt)
+        assert flight.vehicles.state.tobytes() == lockstep.state[0].tobytes()
+    assert np.linalg.norm(lockstep.state[0, :, POSITION] - starts, axis=1).min() > 1.0, "they flew"
+    assert total(flight.statistics()).counts["plans received"] >= 60 * n * (n - 1)
+
+
+FAULTS = {
+    "messages lost": (lambda flight: None, {}),
+    "a process dies": (lambda flight: flight.at(int(1.5 * S), lambda: flight.kill(2)), {}),
+    "a process stands still": (lambda flight: flight.at(int(1.3 * S), lambda: flight.halt(2, 0.3)), {}),
+    "two halves": (lambda flight: flight.at(S, lambda: flight.part(range(4), 1.0)), {}),
+    "clocks": (lambda flight: None, {"timing": Timing(clock=(-0.02, 0.02))}),
+    "twice, late, in another order": (
+        lambda flight: None,
+        {"conditions": Conditions(0.1, 0.3, 0.0, 0.3), "timing": Timing(message=(0.0003, 0.03))},
+    ),
+    "malformed": (lambda flight: None, {"conditions": Conditions(0.1, malformed=0.05)}),
+    "a frozen state": (lambda flight: flight.at(int(1.3 * S), lambda: flight.freeze(2, 0.3)), {}),
+    "a state frozen for good": (lambda flight: flight.at(int(1.3 * S), lambda: flight.freeze(2, 9.0)), {}),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_living_do_not_collide(fault):
+    happens, options = FAULTS[fault]
+    flight = flight_of(**{"conditions": Conditions(0.1), **options})
+    for episode in range(2):
+        begin(flight, episode)
+        happens(flight)
+        flight.fly(8.0)
+        lives = ~flight.dead
+        assert flight.vehicles.collisions(lives) == []
+        counts = total(flight.statistics()).counts
+        assert counts["periods"] > 8 * 50
+        assert counts["plans received"] > 20
+        noticed = {
+            "a process stands still": "missed",
+            "malformed": "refused: not of the team",
+            "a frozen state": "state is frozen",
+            "a state frozen for good": "state is frozen",
+        }.get(fault)
+        if noticed == "state is frozen":
+            assert counts[noticed] == 1
+        if noticed == "missed":
+            assert counts[noticed] in (5, 6)
+        assert not [name for name in counts if name.startswith("errors")]
+
+
+def test_without_messages_they_collide():
+    flight = flight_of(rule="none")
+    met = []
+    for episode in range(3):
+        begin(flight, episode)
+        flight.fly(8.0)
+        met.append(bool(flight.vehicles.collisions()))
+    assert any(met)
+    assert total(flight.statistics()).counts["requests"] == 0
+
+
+def test_the_same_seed_is_the_same_flight():
+    flight, ends = flight_of(4, conditions=Conditions(0.2, 0.1, 0.1, 0.1)), []
+    for _ in range(2):
+        begin(flight, 5)
+        flight.run(2.0)
+        ends.append(flight.vehicles.state.tobytes())
+    assert ends[0] == ends[1]
+
+
+def test_a_robot_that_gets_no_state_lands():
+    flight = flight_of(4)
+    begin(flight, 0)
+    flight.at(S, lambda: flight.freeze(1, 20.0))
+    flight.run(8.0)
+    assert not flight.vehicles.flying[1]
+    assert flight.vehicles.flying[[0, 2, 3]].all()
+    assert flight.vehicles.collisions() == []
