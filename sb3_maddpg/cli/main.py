@@ -120,6 +120,12 @@ COMMANDS: dict[str, Command] = {
         None,
         f"  {PROG} export --env ENV pretrained:NAME --out FOLDER",
     ),
+    "fly": Command(
+        "fly the robots of an environment in real time, a process each",
+        "offered:run",
+        None,
+        f"  {PROG} fly --env ENV --policy latest:logs",
+    ),
     "bench": Command(
         "measure how fast a recipe trains on this machine and where the time goes",
         "bench:bench",

@@ -1,4 +1,4 @@
-"""``sb3-maddpg evaluate``, ``replay``, ``identify`` and ``export``: what packages provide for their environments."""
+"""``sb3-maddpg evaluate``, ``replay``, ``identify``, ``export``, ``fly``: what packages provide for environments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,13 @@ from sb3_maddpg.hub.pretrained import pretrained_models
 from sb3_maddpg.offers import broken, load_offer, offer_named, offers
 from sb3_maddpg.utils import shown, suggest, told
 
-GROUPS = {"evaluate": "evaluators", "replay": "replays", "identify": "identifiers", "export": "exporters"}
+GROUPS = {
+    "evaluate": "evaluators",
+    "replay": "replays",
+    "identify": "identifiers",
+    "export": "exporters",
+    "fly": "flyers",
+}
 
 
 def run(args: argparse.Namespace, words: list[str], example: str, user_errors: tuple[type[Exception], ...]) -> int:

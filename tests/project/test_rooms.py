@@ -44,7 +44,8 @@ ROOMS = {
     "task": {"", "native", "planner", "world"},
     "interfaces": {"", "planner", "world", "task"},
     "robot": {"", "native", "planner", "plants", "world", "task"},
-    "evaluation": {"", "jobs", "planner", "plants", "world", "task", "robot"},
+    "realtime": {"", "native", "planner", "plants", "world", "robot"},
+    "evaluation": {"", "jobs", "planner", "plants", "world", "task", "robot", "realtime"},
     "figures": {"", "planner", "world", "task", "evaluation"},
     "models": set(),
 }

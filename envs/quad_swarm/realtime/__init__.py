@@ -3,11 +3,12 @@
 Imports what `quad_swarm.robot` does, neither PyTorch nor Gymnasium.
 """
 
-from quad_swarm.realtime.link import Conditions, Handler, Link, Sensed, Vehicle, WireLink
+from quad_swarm.realtime.link import Channel, Conditions, Handler, Link, Sensed, Vehicle, WireLink
 from quad_swarm.realtime.loop import Loop
 from quad_swarm.realtime.supervisor import Mode, SafetyLimits, Supervisor, Watchdog
 
 __all__ = [
+    "Channel",
     "Conditions",
     "Handler",
     "Link",

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,10 @@ from quad_swarm.realtime.process import (
     pack_sensed,
     unpack_report,
 )
-from quad_swarm.realtime.statistics import Statistics, total
+from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.team import Team
 from quad_swarm.realtime.udp import Address, open_socket
-from quad_swarm.realtime.vehicles import Vehicles
+from quad_swarm.realtime.vehicles import Flight, Vehicles
 
 _US = 1_000_000
 _MOST_BYTES = 65535
@@ -57,37 +57,6 @@ class Sample:
     time: float
     state: np.ndarray
     reports: list[Report]
-
-
-@dataclass
-class Flight:
-    """What happened in a flight.
-
-    :param collisions: pairs of robots that collided
-    :param closest: smallest distance of two robots (m)
-    :param arrived: when each robot was at its goal for the first time (s); NaN if it never was
-    :param at_goal: which robots were at their goals at the end, (n,) bool
-    :param seconds: duration (s)
-    :param statistics: statistics of each robot's loop; None of one whose process ended
-    :param traffic: what each robot sent and received
-    :param pauses: how often the world itself stood still, as busy machines let it
-    :param killed: robots whose processes were ended
-    """
-
-    collisions: list[tuple[int, int]]
-    closest: float
-    arrived: np.ndarray
-    at_goal: np.ndarray
-    seconds: float
-    statistics: list[Statistics | None]
-    traffic: list[Traffic | None]
-    pauses: int
-    killed: list[int] = field(default_factory=list)
-
-    @property
-    def total(self) -> Statistics:
-        """The statistics of all robots together."""
-        return total(one for one in self.statistics if one is not None)
 
 
 class Arena:
@@ -229,8 +198,7 @@ class Arena:
         """End the processes."""
         for k, process in enumerate(self._processes):
             if process.poll() is None:
-                with contextlib.suppress(OSError):
-                    self._say(k, says="bye")
+                self._say(k, says="bye")
         ends = time.monotonic() + _ENDS
         for process in self._processes:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -303,24 +271,15 @@ class Arena:
         if missing := set(range(n)) - self._done.keys() - killed:
             raise RobotEndedError(f"The robots {sorted(missing)} did not report within {_ENDS:g} s.")
         done = [self._done.get(k) for k in range(n)]
-        arrived = np.where(vehicles.arrived < 0, np.nan, (vehicles.arrived - begins) / _US)
-        return Flight(
-            collisions=vehicles.collisions(),
-            closest=float(vehicles.closest.min()),
-            arrived=arrived,
-            at_goal=vehicles.at_goal,
-            seconds=(vehicles.now - begins) / _US,
-            statistics=[None if one is None else Statistics.from_json(one["statistics"]) for one in done],
-            traffic=[None if one is None else Traffic(**one["traffic"]) for one in done],
-            pauses=self._pauses,
-            killed=sorted(killed),
-        )
+        statistics = [None if one is None else Statistics.from_json(one["statistics"]) for one in done]
+        traffic = [None if one is None else Traffic(**one["traffic"]) for one in done]
+        return vehicles.flight(begins, statistics, traffic, sorted(killed), self._pauses)
 
     def _say(self, robot: int, **words: Any) -> None:
         self._send(robot, json.dumps(words).encode())
 
     def _send(self, robot: int, message: bytes) -> None:
-        with contextlib.suppress(OSError):  # a robot whose process ended
+        with contextlib.suppress(OSError, KeyError):  # a robot whose process ended, or has not begun
             self._socket.sendto(message, self._addresses[robot])
 
     def _of_day(self, at: int) -> int:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol
 
 import numpy as np
+from pydantic import Field
 
 from quad_swarm.robot import Plan, wire
+from quad_swarm.validation import checked
 
 
 class Sensed(NamedTuple):
@@ -185,7 +187,11 @@ class WireLink:
         raise NotImplementedError
 
 
-@dataclass
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+@checked
+@dataclass(frozen=True)
 class Conditions:
     """How messages fare that a robot receives, for trials.
 
@@ -193,31 +199,33 @@ class Conditions:
     :param duplicates: share of messages that arrive twice
     :param malformed: share of messages of which a byte is changed
     :param reordered: share of messages that arrive after the next one
+    :raises ValueError: if a value is no share
     """
 
-    loss: float = 0.0
-    duplicates: float = 0.0
-    malformed: float = 0.0
-    reordered: float = 0.0
+    loss: Share = 0.0
+    duplicates: Share = 0.0
+    malformed: Share = 0.0
+    reordered: Share = 0.0
 
-    def __post_init__(self) -> None:
-        for name in ("loss", "duplicates", "malformed", "reordered"):
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name}={value}: it must be a share from 0 to 1.")
-        self.reseed(0)
 
-    def reseed(self, seed: int | Sequence[int]) -> None:
-        """Begin again."""
-        self._rng, self._held = np.random.default_rng(seed), []
+class Channel:
+    """Draws what becomes of messages.
+
+    :param conditions: how they fare
+    :param seed: seed of the draws
+    """
+
+    def __init__(self, conditions: Conditions, seed: int | Sequence[int] = 0):
+        self._conditions, self._rng, self._held = conditions, np.random.default_rng(seed), list[bytes]()
 
     def arriving(self, message: bytes) -> list[bytes]:
         """Return what arrives when a message does, in this order."""
+        shares = self._conditions
         lost, twice, changed, late = self._rng.random(4) < (
-            self.loss,
-            self.duplicates,
-            self.malformed,
-            self.reordered,
+            shares.loss,
+            shares.duplicates,
+            shares.malformed,
+            shares.reordered,
         )
         if lost:
             return []

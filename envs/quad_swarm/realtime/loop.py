@@ -1,8 +1,8 @@
 """The loop of one robot in real time, the same on every link and vehicle.
 
-A period begins on a grid of the robot's clock. The robot perceives, decides, asks, waits a few milliseconds for answers,
-plans and commands, and answers requests until the next period. Nothing that other robots send, and no error of a policy
-or a planner, ends the loop.
+A period begins on a grid of the robot's clock. The robot perceives, decides, asks, waits a few milliseconds for
+answers, plans and commands, and answers requests until the next period. Nothing that other robots send, and no error of
+a policy or a planner, ends the loop.
 """
 
 from __future__ import annotations
@@ -35,6 +35,21 @@ def freeze_garbage() -> None:
     gc.disable()
 
 
+def check_times(wait: float, late: float, period: float) -> None:
+    """Check the times of a loop.
+
+    :param wait: time to wait for answers (s)
+    :param late: when commands take effect (periods)
+    :param period: length of a period (s)
+    :raises ValueError: if they do not fit into a period
+    """
+    if not 0 <= wait < period or not 0 <= late < 1:
+        raise ValueError(
+            f"wait={wait}, late={late}: waiting must end within the period of {period:g} s, and late is a share of it, "
+            "less than 1"
+        )
+
+
 class Loop:
     """Flies one robot.
 
@@ -65,12 +80,7 @@ class Loop:
         wait: float = 0.005,
         late: float = 0.25,
     ):
-        period = robot.period / _US
-        if not 0 <= wait < period or not 0 <= late < 1:
-            raise ValueError(
-                f"wait={wait}, late={late}: waiting must end within the period of {period:g} s, and late is a share of "
-                "it, less than 1"
-            )
+        check_times(wait, late, robot.config.planner.dt)
         self.robot, self.link, self.vehicle, self.late = robot, link, vehicle, late
         self.supervisor = Supervisor(robot.config, limits or SafetyLimits())
         self.statistics = Statistics()

@@ -18,7 +18,7 @@ import numpy as np
 
 from quad_swarm.quadrotor import N_STATES
 from quad_swarm.realtime import team
-from quad_swarm.realtime.link import Handler, Sensed
+from quad_swarm.realtime.link import Channel, Handler, Sensed
 from quad_swarm.realtime.loop import Loop, freeze_garbage
 from quad_swarm.realtime.supervisor import Watchdog
 from quad_swarm.realtime.udp import Address, UdpLink, open_socket
@@ -153,11 +153,8 @@ class RobotProcess:
 
     def __init__(self, flown: team.Team, index: int, world: Address):
         robot = flown.robot(index)
-        conditions = flown.conditions
-        conditions.reseed([flown.session, index])
-        self.link = UdpLink(
-            index, group=flown.group, session=flown.session, checked=flown.checked, conditions=conditions
-        )
+        channel = Channel(flown.conditions, [flown.session, index])
+        self.link = UdpLink(index, group=flown.group, session=flown.session, checked=flown.checked, channel=channel)
         self.link.clock_error = round(flown.clock_errors[index] * _US) if flown.clock_errors else 0
         self.vehicle = SimulatedVehicle(self.link, world, robot.config.n_others)
         self.loop = Loop(robot, self.link, self.vehicle, flown.limits, flown.wait, flown.late)

@@ -7,19 +7,24 @@ import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from quad_swarm.errors import shown
 from quad_swarm.planner import base
 from quad_swarm.realtime.link import Conditions
+from quad_swarm.realtime.loop import check_times
 from quad_swarm.realtime.supervisor import SafetyLimits
+from quad_swarm.realtime.udp import check_group
 from quad_swarm.robot import Robot, RulePolicy, files
-from quad_swarm.validation import replaced
+from quad_swarm.validation import checked
 from quad_swarm.world.presets import SwarmConfig
 
 _MOST_BYTES = 2**20
 
 
+@checked
 @dataclass(frozen=True)
 class Team:
     """Robots that fly together.
@@ -35,30 +40,31 @@ class Team:
     :param conditions: how messages fare, for trials
     :param priority: real-time priority (SCHED_FIFO) of the robots' processes, 1 to 99; 0 for none
     :param clock_errors: errors of the robots' clocks (s), for trials; none if empty
-    :raises ValueError: if the policy does not fit the world
+    :raises ValueError: if a value is out of range, or the policy does not fit the world
     """
 
     config: SwarmConfig
     policy: str
     limits: SafetyLimits = field(default_factory=SafetyLimits)
-    wait: float = 0.005
-    late: float = 0.25
-    session: int = 0
+    wait: Annotated[float, Field(ge=0)] = 0.005
+    late: Annotated[float, Field(ge=0, lt=1)] = 0.25
+    session: Annotated[int, Field(ge=0, le=255)] = 0
     checked: bool = False
-    group: tuple[str, int] | None = None
+    group: tuple[str, Annotated[int, Field(ge=1, le=65535)]] | None = None
     conditions: Conditions = field(default_factory=Conditions)
-    priority: int = 0
-    clock_errors: tuple[float, ...] = ()
+    priority: Annotated[int, Field(ge=0, le=99)] = 0
+    clock_errors: tuple[Annotated[float, Field(ge=-10, le=10)], ...] = ()
 
     def __post_init__(self) -> None:
-        if not 0 <= self.priority <= 99:
-            raise ValueError(f"priority={self.priority}: it must be from 1 to 99, or 0 for none.")
+        check_times(self.wait, self.late, self.config.planner.dt)
+        if self.group is not None:
+            check_group(self.group[0])
         if self.clock_errors and len(self.clock_errors) != self.config.n_robots:
-            raise ValueError(f"clock_errors={self.clock_errors}: there are {self.config.n_robots} robots.")
+            raise ValueError(f"clock_errors={self.clock_errors}: there are {self.config.n_robots} robots")
         if self.is_learned:
             exported = files.load(self.policy).config
             if dataclasses.replace(exported, plant=self.config.plant) != self.config:
-                raise ValueError(f"{self.policy} was exported for another world: export it for this one.")
+                raise ValueError(f"{self.policy} was exported for another world: export it for this one")
         else:
             RulePolicy(self.policy)
 
@@ -92,11 +98,6 @@ def load(path: str | os.PathLike[str]) -> Team:
         known = {one.name for one in dataclasses.fields(Team)}
         if not isinstance(content, dict) or content.keys() - known or not {"config", "policy"} <= content.keys():
             raise ValueError(f"a team has the fields {', '.join(sorted(known))}, of which config and policy are needed")
-        content["config"] = replaced(SwarmConfig(), content["config"], "config")
-        content["limits"] = replaced(SafetyLimits(), content.get("limits", {}), "limits")
-        content["conditions"] = Conditions(**content.get("conditions", {}))
-        content["group"] = None if content.get("group") is None else tuple(content["group"])
-        content["clock_errors"] = tuple(content.get("clock_errors", ()))
         return Team(**content)
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} describes no team: {shown(str(error))}.") from None

@@ -7,7 +7,7 @@ import selectors
 import socket
 from collections.abc import Callable, Mapping
 
-from quad_swarm.realtime.link import Conditions, Handler, WireLink
+from quad_swarm.realtime.link import Channel, Handler, WireLink
 
 Address = tuple[str, int]
 _MOST_BYTES = 65535
@@ -19,7 +19,7 @@ class UdpLink(WireLink):
 
     :ivar address: where this robot receives
     :ivar addresses: where the other robots receive, by their numbers; not needed with a group
-    :ivar conditions: how messages fare, for trials
+    :ivar channel: what becomes of messages that arrive, for trials
     :ivar deaf_to: robots whose messages do not arrive, for trials
 
     :param index: number of the robot
@@ -29,7 +29,7 @@ class UdpLink(WireLink):
     :param group: address and port of a multicast group, to which everything is sent
     :param session: see `WireLink`
     :param checked: see `WireLink`
-    :param conditions: how messages fare, for trials
+    :param channel: what becomes of messages that arrive, for trials
     :param hops: most networks that multicast messages cross
     :raises ValueError: if the group is no multicast address
     :raises OSError: if the address is not this machine's, or taken
@@ -44,14 +44,14 @@ class UdpLink(WireLink):
         group: Address | None = None,
         session: int = 0,
         checked: bool = False,
-        conditions: Conditions | None = None,
+        channel: Channel | None = None,
         hops: int = 0,
     ):
-        if group is not None and not ipaddress.ip_address(group[0]).is_multicast:
-            raise ValueError(f"group={group}: {group[0]} is no multicast address, such as 239.255.77.77.")
+        if group is not None:
+            check_group(group[0])
         super().__init__(index, session, checked)
         self.addresses, self.group = dict(addresses or {}), group
-        self.conditions = conditions
+        self.channel = channel
         self.deaf_to: frozenset[int] = frozenset()
         self._selector, self._sockets = selectors.DefaultSelector(), list[socket.socket]()
         self._socket = open_socket(host, port)
@@ -109,10 +109,19 @@ class UdpLink(WireLink):
             opened.close()
 
     def _take(self, data: bytes, handler: Handler) -> None:
-        for message in [data] if self.conditions is None else self.conditions.arriving(data):
+        for message in [data] if self.channel is None else self.channel.arriving(data):
             if self.deaf_to and len(message) > 2 and message[2] in self.deaf_to:  # the sender
                 continue
             self.deliver(message, handler)
+
+
+def check_group(address: str) -> None:
+    """Check the address of a group.
+
+    :raises ValueError: if it is no multicast address
+    """
+    if not ipaddress.ip_address(address).is_multicast:
+        raise ValueError(f"group: {address} is no multicast address, such as 239.255.77.77")
 
 
 def open_socket(host: str, port: int, shared: bool = False) -> socket.socket:

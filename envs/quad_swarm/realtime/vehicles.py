@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from quad_swarm.geometry import closest_approach
 from quad_swarm.plants import make_plant
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
-from quad_swarm.realtime.link import Sensed
+from quad_swarm.realtime.link import Sensed, Traffic
+from quad_swarm.realtime.statistics import Statistics, total
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
@@ -16,6 +19,37 @@ _US = 1_000_000
 # Seconds without commands after which an autopilot levels, and after which it lands
 LEVELS_AFTER, LANDS_AFTER = 0.5, 1.0
 _LANDING = np.array([0.0, 0.0, -0.5, 0.0])
+
+
+@dataclass
+class Flight:
+    """What happened in a flight.
+
+    :param collisions: pairs of robots that collided
+    :param closest: smallest distance of two robots (m)
+    :param arrived: when each robot was at its goal for the first time (s); NaN if it never was
+    :param at_goal: which robots were at their goals at the end, (n,) bool
+    :param seconds: duration (s)
+    :param statistics: statistics of each robot's loop; None of one whose process ended
+    :param traffic: what each robot sent and received
+    :param killed: robots whose processes were ended
+    :param pauses: how often the world itself stood still, as busy machines let it
+    """
+
+    collisions: list[tuple[int, int]]
+    closest: float
+    arrived: np.ndarray
+    at_goal: np.ndarray
+    seconds: float
+    statistics: list[Statistics | None]
+    traffic: list[Traffic | None]
+    killed: list[int]
+    pauses: int = 0
+
+    @property
+    def total(self) -> Statistics:
+        """The statistics of all robots together."""
+        return total(one for one in self.statistics if one is not None)
 
 
 class Vehicles:
@@ -118,6 +152,20 @@ class Vehicles:
         if among is not None:
             met &= among[:, None] & among
         return [(int(i), int(j)) for i, j in np.argwhere(met)]
+
+    def flight(
+        self,
+        began: int,
+        statistics: list[Statistics | None],
+        traffic: list[Traffic | None],
+        killed: list[int],
+        pauses: int = 0,
+    ) -> Flight:
+        """Return what happened since some time (us). The other parameters are those of `Flight`."""
+        arrived = np.where(self.arrived < 0, np.nan, (self.arrived - began) / _US)
+        closest = float(self.closest.min())
+        seconds = (self.now - began) / _US
+        return Flight(self.collisions(), closest, arrived, self.at_goal, seconds, statistics, traffic, killed, pauses)
 
     def _meet(self, before: np.ndarray) -> None:
         """Update the smallest distances with straight motion during the sub-step."""

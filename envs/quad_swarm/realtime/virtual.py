@@ -13,12 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from quad_swarm.planner import make_planner
-from quad_swarm.realtime.link import Conditions, Handler, Sensed, WireLink
+from quad_swarm.planner import Planner, make_planner
+from quad_swarm.realtime.link import Channel, Conditions, Handler, Sensed, Traffic, WireLink
 from quad_swarm.realtime.loop import Loop
-from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.supervisor import SafetyLimits
-from quad_swarm.realtime.vehicles import Vehicles
+from quad_swarm.realtime.vehicles import Flight, Vehicles
 from quad_swarm.robot import Plan, Policy, Robot
 from quad_swarm.world.presets import SwarmConfig
 
@@ -57,6 +56,8 @@ class VirtualFlight:
     :param limits: when robots hover and land
     :param wait: see `Loop`
     :param late: see `Loop`
+    :param checked: see `WireLink`
+    :param planner: the planner that all robots share; by default a new one
     """
 
     def __init__(
@@ -69,11 +70,12 @@ class VirtualFlight:
         wait: float = 0.005,
         late: float = 0.25,
         checked: bool = False,
+        planner: Planner | None = None,
     ):
         self.config, self.vehicles = config, Vehicles(config)
         self.conditions, self.timing = conditions or Conditions(), timing or Timing()
         self.now, self._events, self._count = 0, list[tuple[int, bool, int, Callable[[], None]]](), 0
-        planner = make_planner(config.planner, config.quadrotor, config.n_robots)
+        planner = planner or make_planner(config.planner, config.quadrotor, config.n_robots)
         self.links = [_VirtualLink(self, k, checked) for k in range(config.n_robots)]
         self.loops = [
             Loop(Robot(config, k, policy, planner), self.links[k], _VirtualVehicle(self, k), limits, wait, late)
@@ -89,7 +91,7 @@ class VirtualFlight:
         """
         n = self.config.n_robots
         self._rng = np.random.default_rng(seed)
-        self.conditions.reseed([seed, 1])
+        self._channel = Channel(self.conditions, [seed, 1])
         self.now, self._events = 0, []
         self.dead, self.frozen = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self._until = np.zeros(n, dtype=np.int64)  # robots whose processes stand still
@@ -100,6 +102,7 @@ class VirtualFlight:
         self.vehicles.reset(starts, goals, seed, 0)
         self._look()
         for k, (loop, link) in enumerate(zip(self.loops, self.links, strict=True)):
+            link.traffic = Traffic()
             link.error = round(self._draw(self.timing.clock))
             first = round(self._draw(self.timing.phase))
             loop.start(starts[k], goals[k], first + link.error)
@@ -134,9 +137,12 @@ class VirtualFlight:
                 self.run(min(self.now / _US + linger, most))
                 return
 
-    def statistics(self) -> list[Statistics]:
-        """End the flight, and return the robots' statistics."""
-        return [loop.stop() for loop in self.loops]
+    def result(self) -> Flight:
+        """End the flight, and return what happened."""
+        dead = self.dead
+        statistics = [None if dead[k] else loop.stop() for k, loop in enumerate(self.loops)]
+        traffic = [None if dead[k] else link.traffic for k, link in enumerate(self.links)]
+        return self.vehicles.flight(0, statistics, traffic, np.flatnonzero(dead).tolist())
 
     def kill(self, robot: int) -> None:
         """End a robot's process."""
@@ -161,7 +167,7 @@ class VirtualFlight:
         """Let a message travel."""
         if self._apart is not None and (sender in self._apart) != (receiver in self._apart):
             return
-        for arriving in self.conditions.arriving(message):
+        for arriving in self._channel.arriving(message):
             self.at(self.now + round(self._draw(self.timing.message)), partial(self._arrive, receiver, arriving))
 
     def command(self, robot: int, setpoint: np.ndarray) -> None:

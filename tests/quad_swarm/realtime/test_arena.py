@@ -57,13 +57,25 @@ def test_a_process_that_dies_on_purpose_ends_no_flight():
 
 @pytest.mark.slow
 def test_a_process_that_dies_by_itself_ends_the_flight():
-    with Arena(Team(CONFIG, "none")) as arena, pytest.raises(RobotEndedError, match="robot 1 ended .* -9"):
+    with Arena(Team(CONFIG, "none")) as arena, pytest.raises(RobotEndedError, match=r"robot 1 ended .* -9"):
         arena.fly(*places(CONFIG), events=[(0.5, lambda arena: arena.signal(1, signal.SIGKILL))])
     assert not [pid for pid in arena.pids if os.path.exists(f"/proc/{pid}")]
 
 
 @pytest.mark.slow
-def test_processes_end_with_their_world(tmp_path):
-    with pytest.raises(RobotEndedError, match="robot 0 ended with exit status 1"):
-        Arena(Team(CONFIG, "none", session=0, group=("10.0.0.1", 4000)), log=tmp_path)
-    assert "multicast" in (tmp_path / "robot_0.log").read_text()
+def test_a_process_that_does_not_start_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(Team, "write", lambda team, path: path.write_text("{}"))
+    with pytest.raises(RobotEndedError, match=r"robot \d ended with exit status 1"):
+        Arena(Team(CONFIG, "none"), log=tmp_path)
+    assert "describes no team" in (tmp_path / "robot_0.log").read_text()
+
+
+@pytest.mark.slow
+def test_in_a_group_everybody_hears_everything():
+    config = make_config("flight", n_robots=3)
+    try:
+        with Arena(Team(config, "full", group=("239.255.77.77", 41877))) as arena:
+            flight = arena.fly(*places(config), most=2.0)
+    except RobotEndedError as error:
+        pytest.skip(f"no multicast here: {error}")
+    assert flight.total.counts["plans received"] > 100

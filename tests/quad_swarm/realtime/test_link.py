@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_swarm.realtime import Conditions, WireLink
+from quad_swarm.realtime import Channel, Conditions, WireLink
 from quad_swarm.realtime.link import Traffic
 from quad_swarm.robot import Plan, wire
 
@@ -84,8 +84,8 @@ def test_what_is_not_for_a_robot_is_not_handled():
 
 
 def test_conditions_are_met_on_average():
-    conditions, message = Conditions(0.1, 0.2, 0.3, 0.0), bytes(60)
-    arrived = [conditions.arriving(message) for _ in range(5000)]
+    channel, message = Channel(Conditions(0.1, 0.2, 0.3, 0.0)), bytes(60)
+    arrived = [channel.arriving(message) for _ in range(5000)]
     assert np.mean([not one for one in arrived]) == pytest.approx(0.1, abs=0.02)
     assert np.mean([len(one) == 2 for one in arrived if one]) == pytest.approx(0.2, abs=0.02)
     changed = [one[0] != message for one in arrived if one]
@@ -95,10 +95,10 @@ def test_conditions_are_met_on_average():
 
 
 def test_reordered_messages_arrive_after_the_next_one():
-    conditions = Conditions(reordered=1.0)
-    assert conditions.arriving(b"a") == []
-    assert conditions.arriving(b"b") == [b"b", b"a"]
-    assert Conditions().arriving(b"a") == [b"a"]
+    channel = Channel(Conditions(reordered=1.0))
+    assert channel.arriving(b"a") == []
+    assert channel.arriving(b"b") == [b"b", b"a"]
+    assert Channel(Conditions()).arriving(b"a") == [b"a"]
 
 
 @pytest.mark.parametrize("conditions", [{"loss": 1.1}, {"malformed": -0.1}, {"duplicates": np.nan}])

@@ -108,7 +108,7 @@ def test_a_period():
 
 
 def test_periods_lie_on_a_grid_and_missed_ones_are_counted():
-    loop, link, vehicle = make("none")
+    loop, link, _vehicle = make("none")
     started = []
     for now in (0, 50_900, 100_000, 299_999, 300_000):
         link.time = now
@@ -150,7 +150,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("reason", REFUSED)
 def test_a_plan_that_cannot_be_is_refused(reason):
-    loop, link, _ = make()
+    loop, _link, _ = make()
     periods(loop, 1)
     plan, period = REFUSED[reason]()
     loop.on_plan(1, plan, 0, period)
@@ -189,7 +189,7 @@ def test_a_plan_of_the_past_is_compared_with_where_its_robot_is_now():
 
 
 def test_who_gets_no_answers_hovers_and_asks_everybody():
-    loop, link, vehicle = make(lambda robot: np.array([[True], [False]]))
+    loop, link, _vehicle = make(lambda robot: np.array([[True], [False]]))
     modes = periods(loop, 30)
     assert modes[:20] == [Mode.FLY] * 20
     assert modes[-8:] == [Mode.HOVER] * 8
@@ -214,7 +214,7 @@ def test_a_robot_without_a_state_hovers_and_then_lands(bad):
     modes = periods(loop, 40)
     assert modes[-1] is Mode.LAND
     assert Mode.HOVER in modes
-    at, setpoint, plan = vehicle.commands[-1]
+    _at, setpoint, plan = vehicle.commands[-1]
     assert (setpoint.tolist(), plan) == ([0, 0, -0.5, 0], None)
     counts = loop.stop().counts
     assert counts["state is stale"] == 1
@@ -222,7 +222,7 @@ def test_a_robot_without_a_state_hovers_and_then_lands(bad):
 
 
 def test_after_landing_the_motors_stop():
-    loop, link, vehicle = make("none", SafetyLimits(fence=0.0))
+    loop, _link, vehicle = make("none", SafetyLimits(fence=0.0))
     vehicle.state[0] = 50.0
     assert periods(loop, 2) == [Mode.LAND] * 2
     vehicle.state[2] = 0.0

@@ -40,6 +40,7 @@ def test_what_is_written_is_read(tmp_path):
         ({"conditions": {"loss": 2}}, "loss"),
         ({"colour": "red"}, "a team has the fields"),
         ({"policy": None}, "policy"),
+        ({"group": ["10.0.0.1", 4000]}, "multicast"),
         ({"session": 256}, "session"),
     ],
 )
@@ -67,7 +68,7 @@ def test_a_model_flies_in_the_world_that_it_was_exported_for(tmp_path):
     export(str(pretrained_folder("quad-swarm-flight") / "model.zip"), CONFIG, tmp_path)
     team = Team(CONFIG, str(tmp_path))
     assert team.is_learned
-    assert team.robot(1).policy.n_bits == 1
+    assert team.robot(1).policy.n_bits == 2
     Team(dataclasses.replace(CONFIG, plant="crazyflow:cf21B_500"), str(tmp_path))  # the robots do not know the plant
     with pytest.raises(ValueError, match="another world"):
         Team(dataclasses.replace(CONFIG, goal_radius=0.4), str(tmp_path))

@@ -5,7 +5,7 @@ import socket
 import numpy as np
 import pytest
 
-from quad_swarm.realtime import Conditions
+from quad_swarm.realtime import Channel, Conditions
 from quad_swarm.realtime.link import monotonic
 from quad_swarm.realtime.udp import UdpLink, open_socket
 from quad_swarm.robot import Plan
@@ -114,11 +114,11 @@ def test_a_robot_that_is_gone_stops_nobody(links):
 def test_conditions_and_partitions(links):
     one, two = links(2)
     handler = Handler()
-    two.conditions = Conditions(loss=1.0)
+    two.channel = Channel(Conditions(loss=1.0))
     one.request(1)
     two.wait(two.now() + 50_000, handler)
     assert two.traffic == type(two.traffic)()
-    two.conditions = None
+    two.channel = None
     two.deaf_to = frozenset([0])
     one.request(1)
     two.wait(two.now() + 50_000, handler)
@@ -139,5 +139,5 @@ def test_a_group_is_a_multicast_address():
 
 
 def test_an_address_of_another_machine_is_refused():
-    with pytest.raises(OSError):
+    with pytest.raises(OSError, match="assign"):
         UdpLink(0, host="192.0.2.1")

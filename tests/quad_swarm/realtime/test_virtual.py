@@ -5,7 +5,6 @@ import pytest
 
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime import Conditions
-from quad_swarm.realtime.statistics import total
 from quad_swarm.realtime.virtual import Timing, VirtualFlight
 from quad_swarm.robot import Plan, Robot, RulePolicy
 from quad_swarm.robot.lockstep import LockstepWorld
@@ -51,7 +50,7 @@ def test_without_delays_it_is_the_flight_in_lock_step(n):
         flight.run(k * config.planner.dt)
         assert flight.vehicles.state.tobytes() == lockstep.state[0].tobytes()
     assert np.linalg.norm(lockstep.state[0, :, POSITION] - starts, axis=1).min() > 1.0, "they flew"
-    assert total(flight.statistics()).counts["plans received"] >= 60 * n * (n - 1)
+    assert flight.result().total.counts["plans received"] >= 60 * n * (n - 1)
 
 
 FAULTS = {
@@ -80,7 +79,7 @@ def test_the_living_do_not_collide(fault):
         flight.fly(8.0)
         lives = ~flight.dead
         assert flight.vehicles.collisions(lives) == []
-        counts = total(flight.statistics()).counts
+        counts = flight.result().total.counts
         assert counts["periods"] > 8 * 50
         assert counts["plans received"] > 20
         noticed = {
@@ -104,7 +103,7 @@ def test_without_messages_they_collide():
         flight.fly(8.0)
         met.append(bool(flight.vehicles.collisions()))
     assert any(met)
-    assert total(flight.statistics()).counts["requests"] == 0
+    assert flight.result().total.counts["requests"] == 0
 
 
 def test_the_same_seed_is_the_same_flight():

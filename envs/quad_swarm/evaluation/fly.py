@@ -1,0 +1,250 @@
+"""Fly robots in real time, a process each: ``sb3-maddpg fly --n-robots 8 --policy none full pretrained:NAME``.
+
+They talk over UDP on this machine (``--link udp``), or in virtual time in one process (``--link virtual``), where
+flights are the same each time and outcomes do not depend on how busy the machine is. Each policy flies the same
+episodes, whose messages are lost with the probability ``--loss``, requests as well as plans.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quad_swarm.evaluation.command import parse_world, preset_of, run
+from quad_swarm.evaluation.export import export
+from quad_swarm.evaluation.flight import first_episode
+from quad_swarm.evaluation.inference import wilson_interval
+from quad_swarm.evaluation.policies import is_model, load_model, short_names, trained_in
+from quad_swarm.evaluation.rows import check_writable, write_rows
+from quad_swarm.parsing import Parser
+from quad_swarm.planner import make_planner
+from quad_swarm.realtime.arena import Arena
+from quad_swarm.realtime.link import Conditions
+from quad_swarm.realtime.statistics import total
+from quad_swarm.realtime.team import Team
+from quad_swarm.realtime.vehicles import Flight
+from quad_swarm.realtime.virtual import VirtualFlight
+from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+
+EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
+LINKS = ("udp", "virtual")
+_LINGER = 1.0  # s
+
+
+@dataclass
+class Flown:
+    """What a policy flew.
+
+    :param n_robots: number of robots
+    :param flights: the flights
+    """
+
+    n_robots: int
+    flights: list[Flight] = field(default_factory=list)
+
+    def row(self) -> dict[str, Any]:
+        """Return its statistics by name. Durations are in milliseconds, as medians and as quantiles that one in a
+        thousand exceeds."""
+        flights, n = self.flights, len(self.flights)
+        done = total(flight.total for flight in flights)
+        counts, durations = done.counts, done.durations
+        traffic = [one for flight in flights for one in flight.traffic if one is not None]
+        collided = sum(bool(flight.collisions) for flight in flights)
+        low, high = wilson_interval(collided, n)
+        arrived = np.array([flight.arrived.max() for flight in flights])
+        periods = counts["periods"] + counts["missed"]
+        seconds = sum(flight.seconds * self.n_robots for flight in flights)
+        row = {
+            "flights": n,
+            "collided": collided,
+            "collision_low": low,
+            "collision_high": high,
+            "closest": min(flight.closest for flight in flights),
+            "arrived": int(np.isfinite(arrived).sum()),
+            "seconds_to_arrival": float(np.nanmean(arrived)) if np.isfinite(arrived).any() else None,
+            "periods": periods,
+            "plans_sent": counts["answers"] + counts["announcements"],
+            "plan_share": (counts["answers"] + counts["announcements"]) / max(periods * (self.n_robots - 1), 1),
+            "bytes_per_second": sum(one.bytes for one in traffic) / seconds,
+            "missed": done.share("missed"),
+            "late": done.share("late commands"),
+            "cpu": done.cpu_seconds / done.seconds if done.seconds else None,
+            "pauses": sum(flight.pauses for flight in flights),
+            "counts": dict(sorted(counts.items())),
+        }
+        for name, histogram in durations.items():
+            quantiles = [histogram.quantile(share) * 1e-3 for share in (0.5, 0.999)]
+            row[f"{name}_ms"] = quantiles if histogram.total else [None, None]
+        return row
+
+
+class Column(NamedTuple):
+    """A column of the table."""
+
+    title: str
+    text: Callable[[dict[str, Any]], str]
+
+
+def _pair(key: str) -> Callable[[dict[str, Any]], str]:
+    return lambda row: "-" if row[key][0] is None else " / ".join(f"{value:.3g}" for value in row[key])
+
+
+def _share(key: str) -> Callable[[dict[str, Any]], str]:
+    return lambda row: "-" if row[key] is None else f"{row[key]:.2%}"
+
+
+COLUMNS = [
+    Column("policy", lambda row: row["policy"]),
+    Column("collided", lambda row: f"{row['collided']}/{row['flights']}"),
+    Column("95 % interval", lambda row: f"{100 * row['collision_low']:.1f} - {row['collision_high']:.1%}"),
+    Column("arrived", lambda row: f"{row['arrived']}/{row['flights']}"),
+    Column("after (s)", lambda row: "-" if row["seconds_to_arrival"] is None else f"{row['seconds_to_arrival']:.2f}"),
+    Column("plans", _share("plan_share")),
+    Column("B/s", lambda row: f"{row['bytes_per_second']:.0f}"),
+    Column("age (ms)", _pair("plan_age_ms")),
+    Column("missed", _share("missed")),
+    Column("late", _share("late")),
+    Column("CPU", _share("cpu")),
+]
+LEGEND = (
+    "plans: sent, of all that could be; B/s: sent by a robot in a second; age: of plans when used, median / 99.9 %;\n"
+    "missed, late: periods skipped, commands later than assumed; CPU: of a core, by a robot's process"
+)
+
+
+def format_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Format rows as a table."""
+    texts = [[column.title for column in COLUMNS], *([column.text(row) for column in COLUMNS] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    texts.insert(1, ["-" * width for width in widths])
+    lines = (
+        "  ".join(t.rjust(w) if k else t.ljust(w) for k, (t, w) in enumerate(zip(line, widths, strict=True)))
+        for line in texts
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
+    """Return starts and goals, (n, 3) each, and the seed of the disturbances of episodes, as `evaluate` flies them.
+
+    :param config: the world
+    :param scenario: a name of `SCENARIOS`
+    :param seeds: seeds, see `first_episode`
+    """
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        _, starts, goals = sampler.sample(rng)
+        yield starts, goals, int(rng.integers(2**63)) if config.is_random else 0
+
+
+def fly(team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], link: str, most: float) -> Iterator[Flight]:
+    """Fly episodes.
+
+    :param team: the team
+    :param flown: episodes, see `episodes`
+    :param link: one of `LINKS`
+    :param most: time limit of a flight (s)
+    """
+    if link == "virtual":
+        yield from _virtual(team, flown, most)
+        return
+    with Arena(team) as arena:
+        for starts, goals, seed in flown:
+            yield arena.fly(starts, goals, seed, most, _LINGER)
+
+
+def _virtual(team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], most: float) -> Iterator[Flight]:
+    config = team.config
+    planner = make_planner(config.planner, config.quadrotor, config.n_robots)
+    policies = [team.robot(k, planner).policy for k in range(config.n_robots)]
+    flight = VirtualFlight(
+        config, policies, team.conditions, None, team.limits, team.wait, team.late, team.checked, planner
+    )
+    for starts, goals, seed in flown:
+        flight.reset(starts, goals, seed)
+        flight.fly(most, _LINGER)
+        yield flight.result()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    parser = Parser("sb3-maddpg fly", description=__doc__)
+    parser.add_argument(
+        "--policy", nargs="+", required=True, metavar="POLICY", help="rules and models, as for `sb3-maddpg evaluate`"
+    )
+    parser.add_argument("--n-robots", type=int, help="number of robots (default: the preset's)")
+    parser.add_argument("--preset", help=f"{', '.join(PRESETS)} (default: that of the models, otherwise flight)")
+    parser.add_argument(
+        "--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="fields of the preset"
+    )
+    parser.add_argument("--plant", help="simulated vehicle, such as crazyflow:cf21B_500 (default: the preset's)")
+    parser.add_argument("--scenario", choices=list(SCENARIOS), default="symmetric_swap", help="(default %(default)s)")
+    parser.add_argument("--episodes", type=int, default=1, help="number of flights of each policy (default 1)")
+    parser.add_argument("--seed", type=int, default=0, help="set of episodes, see `sb3-maddpg evaluate` (default 0)")
+    parser.add_argument("--link", choices=LINKS, default="udp", help="how robots talk (default %(default)s)")
+    parser.add_argument("--loss", type=float, default=0.0, help="share of messages that are lost (default 0)")
+    parser.add_argument("--most", type=float, default=15.0, metavar="SECONDS", help="longest flight (default 15)")
+    parser.add_argument("--wait", type=float, default=0.005, metavar="SECONDS", help="for answers (default 0.005)")
+    parser.add_argument("--late", type=float, default=0.25, help="when commands act, in periods (default 0.25)")
+    parser.add_argument(
+        "--priority", type=int, default=0, help="real-time priority of the robots (SCHED_FIFO), 1 to 99"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows")
+    parser.add_argument("--gym-packages", nargs="+", action="extend", metavar="MODULE", help="modules to import first")
+    parser.add_argument("--algo", default="sb3_maddpg:MADDPG", metavar="MODULE:CLASS", help="class that loads models")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    return run(_main, parser.parse_args(argv))
+
+
+def _main(args: argparse.Namespace) -> None:
+    if args.episodes < 1:
+        raise ValueError(f"--episodes {args.episodes}: fly at least one.")
+    if args.json is not None:
+        check_writable(args.json, "--json")
+    models = {one: trained_in(load_model(one, args.algo)) for one in args.policy if is_model(one)}
+    preset = args.preset or (preset_of(models) if models else "flight")
+    config = make_config(preset, parse_world(args.world), n_robots=args.n_robots)
+    if args.plant is not None:
+        # Parameters of another simulator's vehicle are not drawn
+        config = dataclasses.replace(config, plant=args.plant, mismatch=0.0)
+    names, rows = short_names(args.policy), []
+    first = first_episode(args.seed)
+    with contextlib.ExitStack() as stack:
+        for policy in args.policy:
+            flown_as = policy
+            if policy in models:
+                flown_as = stack.enter_context(tempfile.TemporaryDirectory(prefix="quad-swarm-"))
+                export(policy, config, Path(flown_as), args.algo)
+            options = {"wait": args.wait, "late": args.late, "priority": args.priority}
+            team = Team(config, flown_as, conditions=Conditions(args.loss), **options)
+            flown = Flown(config.n_robots)
+            seeds = range(first, first + args.episodes)
+            for flight in fly(team, episodes(config, args.scenario, seeds), args.link, args.most):
+                flown.flights.append(flight)
+                print(_line(names[policy], len(flown.flights), flight), file=sys.stderr, flush=True)
+            about = {"scenario": args.scenario, "n_robots": config.n_robots, "preset": preset, "plant": config.plant}
+            about |= {"link": args.link, "loss": args.loss, "wait": args.wait, "late": args.late, "seed": args.seed}
+            rows.append({"policy": names[policy], **about, **flown.row()})
+    print(format_table(rows))
+    print(LEGEND)
+    if args.json is not None:
+        write_rows(args.json, rows)
+
+
+def _line(policy: str, number: int, flight: Flight) -> str:
+    met = f"collided: {flight.collisions}" if flight.collisions else "no collision"
+    there = np.isfinite(flight.arrived)
+    when = f"all arrived after {flight.arrived.max():.2f} s" if there.all() else f"{there.sum()} arrived"
+    paused = f", the machine stood still {flight.pauses} times" if flight.pauses else ""
+    return f"{policy}, flight {number}: {met}, closest {flight.closest:.2f} m, {when}{paused}"

@@ -1,0 +1,73 @@
+"""The command that flies robots in real time."""
+
+import json
+
+import numpy as np
+import pytest
+
+from quad_swarm.evaluation.flight import Condition, begin, first_episode
+from quad_swarm.evaluation.fly import episodes, main
+from quad_swarm.world.presets import make_config
+
+MODEL = "pretrained:quad-swarm-flight"
+
+
+def test_episodes_are_those_of_evaluate():
+    config = make_config("flight", n_robots=3)
+    seeds = [first_episode(2) + k for k in range(2)]
+    _, task, _ = begin(Condition("none", "asymmetric_swap", config), seeds)
+    for k, (starts, goals, _) in enumerate(episodes(config, "asymmetric_swap", seeds)):
+        np.testing.assert_array_equal(task.swarm.pos[k], starts)
+        np.testing.assert_array_equal(task.swarm.goal[k], goals)
+
+
+def test_flights_in_virtual_time(tmp_path, capsys):
+    words = ["--policy", "none", "full", "--n-robots", "4", "--link", "virtual", "--loss", "0.1", "--episodes", "2"]
+    assert main([*words, "--json", str(tmp_path / "rows.json")]) == 0
+    shown = capsys.readouterr()
+    none, full = json.loads((tmp_path / "rows.json").read_text())
+    assert shown.out.splitlines()[0].split()[:3] == ["policy", "collided", "95"]
+    assert len(shown.err.splitlines()) == 4
+    assert "flight 2: " in shown.err
+    assert (none["policy"], none["flights"], none["plans_sent"], none["plan_age_ms"]) == ("none", 2, 0, [None, None])
+    assert none["bytes_per_second"] == 0
+    assert full["collided"] == 0
+    assert full["plan_share"] == pytest.approx(0.9, abs=0.03), "requests that are lost are not answered"
+    assert 15 < full["plan_age_ms"][0] < 60
+    assert full["counts"]["requests"] == full["periods"] * 3
+    assert full["bytes_per_second"] > 1000
+    assert full["loss"] == 0.1
+
+
+@pytest.mark.slow
+def test_a_learned_policy_flies_over_udp(tmp_path, capsys):
+    pytest.importorskip("onnxruntime")
+    from sb3_maddpg.hub.pretrained import pretrained_folder
+
+    model = str(pretrained_folder("quad-swarm-flight") / "model.zip")
+    assert main(["--policy", model, "--n-robots", "3", "--json", str(tmp_path / "rows.json")]) == 0
+    (row,) = json.loads((tmp_path / "rows.json").read_text())
+    assert (row["flights"], row["preset"], row["link"]) == (1, "flight", "udp")
+    assert row["periods"] > 100
+    assert not [name for name in row["counts"] if name.startswith("errors")]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--policy", "sometimes"], "sometimes"),
+        (["--policy", "cpa:0.7:1.5&push:0.1"], "joins"),
+        (["--policy", "none", "--loss", "2"], "loss=2.0"),
+        (["--policy", "none", "--episodes", "0"], "--episodes 0"),
+        (["--policy", "none", "--wait", "0.06"], "wait=0.06"),
+        (["--policy", "none", "--priority", "100"], "priority=100"),
+        (["--policy", "none", "--plant", "gazebo"], "gazebo"),
+        (["--policy", "none", "--world", "substeps=7"], "whole microseconds"),
+    ],
+)
+def test_wrong_words_are_one_line(words, told, capsys):
+    assert main([*words, "--n-robots", "2", "--link", "virtual"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert told in error
+    assert len(error.splitlines()) == 1
