@@ -25,6 +25,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[zoo,plot,render,plants,ray,onnx,docs,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[ros]" || \
+		echo "ROS 2 cannot be installed: what needs it is skipped"
 	@touch $@
 
 train: install  ## train MADDPG on the swarm, then print the table of policies (STEPS=20000 for a short run)

@@ -45,7 +45,8 @@ ROOMS = {
     "interfaces": {"", "planner", "world", "task"},
     "robot": {"", "native", "planner", "plants", "world", "task"},
     "realtime": {"", "native", "planner", "plants", "world", "robot"},
-    "evaluation": {"", "jobs", "planner", "plants", "world", "task", "robot", "realtime"},
+    "ros": {"", "robot", "realtime"},
+    "evaluation": {"", "jobs", "planner", "plants", "world", "task", "robot", "realtime", "ros"},
     "figures": {"", "planner", "world", "task", "evaluation"},
     "models": set(),
 }
@@ -57,6 +58,9 @@ DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command"}
 NEED_NO_TEST = {"sb3_maddpg.__main__", "sb3_maddpg.callbacks", "quad_swarm.figures.colours"}
 # Modules that are tested through what is built on them
 TESTED_WITH = {
+    "quad_swarm.realtime.udp_process": "quad_swarm.realtime.process",
+    "quad_swarm.ros.link": "quad_swarm.ros.world",
+    "quad_swarm.ros.process": "quad_swarm.ros.world",
     "sb3_maddpg.cli.algorithms": "sb3_maddpg.cli.experiment",
     "sb3_maddpg.cli.environments": "sb3_maddpg.cli.experiment",
     "sb3_maddpg.cli.models": "sb3_maddpg.cli.main",

@@ -1,8 +1,8 @@
 """Fly robots in real time, a process each: ``sb3-maddpg fly --n-robots 8 --policy none full pretrained:NAME``.
 
-They talk over UDP on this machine (``--link udp``), or in virtual time in one process (``--link virtual``), where
-flights are the same each time and outcomes do not depend on how busy the machine is. Each policy flies the same
-episodes, whose messages are lost with the probability ``--loss``, requests as well as plans.
+They talk over UDP or ROS 2 on this machine (``--link udp``, ``--link ros2``), or in virtual time in one process
+(``--link virtual``), where flights are the same each time and outcomes do not depend on how busy the machine is. Each
+policy flies the same episodes, whose messages are lost with the probability ``--loss``, requests as well as plans.
 """
 
 from __future__ import annotations
@@ -27,17 +27,19 @@ from quad_swarm.evaluation.policies import is_model, load_model, short_names, tr
 from quad_swarm.evaluation.rows import check_writable, write_rows
 from quad_swarm.parsing import Parser
 from quad_swarm.planner import make_planner
-from quad_swarm.realtime.arena import Arena
+from quad_swarm.realtime.arena import Arena, Exchange
 from quad_swarm.realtime.link import Conditions
 from quad_swarm.realtime.statistics import total
 from quad_swarm.realtime.team import Team
+from quad_swarm.realtime.udp_world import UdpWorld
 from quad_swarm.realtime.vehicles import Flight
 from quad_swarm.realtime.virtual import VirtualFlight
+from quad_swarm.ros.world import RosWorld
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 
 EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
-LINKS = ("udp", "virtual")
+LINKS = ("udp", "ros2", "virtual")
 _LINGER = 1.0  # s
 
 
@@ -159,7 +161,8 @@ def fly(team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], link: s
     if link == "virtual":
         yield from _virtual(team, flown, most)
         return
-    with Arena(team) as arena:
+    exchange: Exchange = RosWorld(team.config.n_robots) if link == "ros2" else UdpWorld()
+    with Arena(team, exchange) as arena:
         for starts, goals, seed in flown:
             yield arena.fly(starts, goals, seed, most, _LINGER)
 

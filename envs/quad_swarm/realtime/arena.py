@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import select
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from quad_swarm.realtime.link import Sensed, Traffic, monotonic
-from quad_swarm.realtime.process import (
-    COMMAND,
-    IS_COMMAND,
-    IS_REPORT,
-    Report,
-    pack_sensed,
-    unpack_report,
-)
+from quad_swarm.realtime.process import Hears, Report
 from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.team import Team
-from quad_swarm.realtime.udp import Address, open_socket
+from quad_swarm.realtime.udp_world import UdpWorld
 from quad_swarm.realtime.vehicles import Flight, Vehicles
 
 _US = 1_000_000
-_MOST_BYTES = 65535
 _READY = 90.0  # s that robots have to start; the first start on a machine compiles the planner
 _LEAD = 0.3  # s between the order to fly and the first period
 _PAUSE = 0.1  # s of delay from which on the world itself stood still, and goes on from there
@@ -59,6 +48,29 @@ class Sample:
     reports: list[Report]
 
 
+class Exchange(Protocol):
+    """How a world talks with its robots. Times are those of the clock of the day."""
+
+    def process(self, team: Path, robot: int) -> list[str]:
+        """Return the command line of a robot's process.
+
+        :param team: file of the team
+        :param robot: number of the robot
+        """
+
+    def tell(self, robot: int, sensed: Sensed) -> None:
+        """Tell a robot what it perceives."""
+
+    def say(self, robot: int, **words: Any) -> None:
+        """Say something to a robot. It may get lost."""
+
+    def receive(self, until: int, hears: Hears) -> None:
+        """Take what robots send until some time (us), at least what is there already."""
+
+    def close(self) -> None:
+        """Release everything."""
+
+
 class Arena:
     """The world of a team, and a process for each robot. Use it as a context, which ends the processes.
 
@@ -66,16 +78,16 @@ class Arena:
     :ivar pids: the robots' processes
 
     :param team: the team
+    :param exchange: how the world and the robots talk, by default over UDP
     :param log: folder for what the robots' processes print; by default it is shown
     :raises RobotEndedError: if a robot's process does not start
     """
 
-    def __init__(self, team: Team, log: Path | None = None):
+    def __init__(self, team: Team, exchange: Exchange | None = None, log: Path | None = None):
         self.team, self.vehicles = team, Vehicles(team.config)
-        self._socket = open_socket("127.0.0.1", 0)
+        self._exchange = exchange or UdpWorld()
         self._senses: dict[int, Sensed] = {}
-        self._addresses: dict[int, Address] = {}  # of the robots' vehicles
-        self._ports: dict[int, int] = {}  # of their links
+        self._ready: set[int] = set()
         self._done: dict[int, dict[str, Any]] = {}
         self._reports: list[Report] = []
         self._frozen: set[int] = set()
@@ -126,12 +138,9 @@ class Arena:
         killed = self._ended()
         begins = monotonic() + round(_LEAD * _US)
         vehicles.reset(starts, goals, noise_seed, begins)
-        ports = [self._ports[k] for k in range(n)]
         for k in range(n):
-            self._say(
-                k, says="fly", flight=self._flight, ports=ports, start=list(starts[k]), goal=list(goals[k]),
-                first=self._of_day(begins),
-            )  # fmt: skip
+            places = {"start": list(starts[k]), "goal": list(goals[k])}
+            self._exchange.say(k, says="fly", flight=self._flight, first=self._of_day(begins), **places)
         todo, period = sorted(events, key=lambda event: event[0]), team.config.substeps
         steps, there, slipped = 0, None, 0
         while vehicles.now - begins < most * _US:
@@ -139,11 +148,11 @@ class Arena:
                 if k not in self._frozen:
                     self._senses[k] = vehicles.sensed(k)
                 seen = self._senses[k]._replace(stamp=self._of_day(vehicles.now + slipped))
-                self._send(k, pack_sensed(seen))
+                self._exchange.tell(k, seen)
             while todo and todo[0][0] * _US <= vehicles.now - begins:
                 todo.pop(0)[1](self)
             due = vehicles.now + vehicles.step_us + slipped
-            self._receive(due)
+            self._exchange.receive(due, self)
             if monotonic() - due > _PAUSE * _US:
                 slipped += monotonic() - due
                 self._pauses += 1
@@ -184,7 +193,7 @@ class Arena:
         n = self.team.config.n_robots
         for k in range(n):
             others = [j for j in range(n) if (j in robots) != (k in robots)]
-            self._say(k, says="part", **{"from": others})
+            self._exchange.say(k, says="part", **{"from": others})
 
     def freeze(self, robot: int) -> None:
         """Let a robot perceive the same state again and again."""
@@ -198,7 +207,7 @@ class Arena:
         """End the processes."""
         for k, process in enumerate(self._processes):
             if process.poll() is None:
-                self._say(k, says="bye")
+                self._exchange.say(k, says="bye")
         ends = time.monotonic() + _ENDS
         for process in self._processes:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -206,25 +215,24 @@ class Arena:
             if process.poll() is None:
                 process.kill()
                 process.wait()
-        self._socket.close()
+        self._exchange.close()
         self._folder.cleanup()
 
     def _start(self, path: Path, log: Path | None) -> None:
         """Start the processes, and wait until all are ready."""
         self.team.write(path)
-        host, port = self._socket.getsockname()
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         for k in range(self.team.config.n_robots):
             with contextlib.ExitStack() as stack:
                 output = None if log is None else stack.enter_context((log / f"robot_{k}.log").open("wb"))
-                command = [sys.executable, "-m", "quad_swarm.realtime.process", str(path), str(k), f"{host}:{port}"]
+                command = self._exchange.process(path, k)
                 self._processes.append(subprocess.Popen(command, env=environment, stdout=output, stderr=output))
         ends = time.monotonic() + _READY
-        while len(self._addresses) < len(self._processes):
-            self._receive(monotonic() + _US // 10)
+        while len(self._ready) < len(self._processes):
+            self._exchange.receive(monotonic() + _US // 10, self)
             self._ended()
             if time.monotonic() > ends:
-                missing = [k for k in range(len(self._processes)) if k not in self._addresses]
+                missing = [k for k in range(len(self._processes)) if k not in self._ready]
                 raise RobotEndedError(f"The robots {missing} were not ready within {_READY:g} s.")
 
     def _ended(self) -> set[int]:
@@ -234,29 +242,20 @@ class Arena:
                 raise RobotEndedError(f"The process of robot {k} ended with exit status {process.returncode}.")
         return set(self._wanted)
 
-    def _receive(self, until: int) -> None:
-        """Take what robots send until some time (us), at least what is there already."""
-        while True:
-            left = max(until - monotonic(), 0)
-            if select.select([self._socket], [], [], left / _US)[0]:
-                with contextlib.suppress(OSError):
-                    self._take(*self._socket.recvfrom(_MOST_BYTES))
-            elif left == 0:
-                return
+    def on_command(self, robot: int, setpoint: np.ndarray) -> None:
+        """See `Hears`."""
+        self.vehicles.command(robot, setpoint)
 
-    def _take(self, message: bytes, sender: Address) -> None:
-        kind = message[:1]
-        if kind == bytes([IS_COMMAND]) and len(message) == COMMAND.size:
-            _, robot, *setpoint = COMMAND.unpack(message)
-            self.vehicles.command(robot, np.array(setpoint))
-        elif kind == bytes([IS_REPORT]):
-            self._reports.append(unpack_report(message))
-        elif kind == b"{":
-            words = json.loads(message)
-            if words["says"] == "hello":
-                self._addresses[words["robot"]], self._ports[words["robot"]] = sender, words["port"]
-            elif words["says"] == "done" and words["flight"] == self._flight:
-                self._done[words["robot"]] = words
+    def on_report(self, report: Report) -> None:
+        """See `Hears`."""
+        self._reports.append(report)
+
+    def on_words(self, words: dict[str, Any]) -> None:
+        """See `Hears`."""
+        if words["says"] == "hello":
+            self._ready.add(words["robot"])
+        elif words["says"] == "done" and words["flight"] == self._flight:
+            self._done[words["robot"]] = words
 
     def _land(self, begins: int, killed: set[int]) -> Flight:
         """Let everybody stop, and return what happened."""
@@ -266,21 +265,14 @@ class Arena:
             if time.monotonic() >= says:
                 says = time.monotonic() + _SAYS_STOP
                 for k in set(range(n)) - self._done.keys() - killed:
-                    self._say(k, says="stop")
-            self._receive(monotonic() + _US // 20)
+                    self._exchange.say(k, says="stop")
+            self._exchange.receive(monotonic() + _US // 20, self)
         if missing := set(range(n)) - self._done.keys() - killed:
             raise RobotEndedError(f"The robots {sorted(missing)} did not report within {_ENDS:g} s.")
         done = [self._done.get(k) for k in range(n)]
         statistics = [None if one is None else Statistics.from_json(one["statistics"]) for one in done]
         traffic = [None if one is None else Traffic(**one["traffic"]) for one in done]
         return vehicles.flight(begins, statistics, traffic, sorted(killed), self._pauses)
-
-    def _say(self, robot: int, **words: Any) -> None:
-        self._send(robot, json.dumps(words).encode())
-
-    def _send(self, robot: int, message: bytes) -> None:
-        with contextlib.suppress(OSError, KeyError):  # a robot whose process ended, or has not begun
-            self._socket.sendto(message, self._addresses[robot])
 
     def _of_day(self, at: int) -> int:
         """Return a time on the clock of the day (us)."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
 from pydantic import Field
 
 from quad_swarm.robot import Plan, wire
 from quad_swarm.validation import checked
+
+T = TypeVar("T")
 
 
 class Sensed(NamedTuple):
@@ -35,12 +37,12 @@ class Handler(Protocol):
     def on_request(self, sender: int) -> None:
         """Answer a request."""
 
-    def on_plan(self, sender: int, plan: Plan, sent: int, period: int) -> None:
+    def on_plan(self, sender: int, plan: Plan, sent: int | None, period: int) -> None:
         """Take a plan.
 
         :param sender: robot whose plan it is
         :param plan: the plan
-        :param sent: when it was sent (us)
+        :param sent: when it was sent (us), None if the link does not tell
         :param period: length of its stages (us)
         """
 
@@ -114,20 +116,21 @@ class Traffic:
     refused: int = 0
 
 
-class WireLink:
-    """A link whose messages are those of `quad_swarm.robot.wire`.
+class BaseLink:
+    """What all links have: a clock, counts, and what trials change.
 
     :ivar traffic: what has been sent and received
     :ivar clock_error: error of the clock that all robots share (us), for trials
+    :ivar deaf_to: robots whose messages do not arrive, for trials
+    :ivar channel: what becomes of messages that arrive, for trials
 
     :param index: number of the robot
-    :param session: tells apart teams and flights on one channel, 0 to 255
-    :param checked: whether messages carry a checksum, for radios that have none
     """
 
-    def __init__(self, index: int, session: int = 0, checked: bool = False):
-        self.index, self.session, self.checked = index, session, checked
-        self.traffic, self.clock_error = Traffic(), 0
+    def __init__(self, index: int):
+        self.index, self.traffic, self.clock_error = index, Traffic(), 0
+        self.deaf_to: frozenset[int] = frozenset()
+        self.channel: Channel | None = None
 
     def now(self) -> int:
         """See `Link`."""
@@ -144,6 +147,19 @@ class WireLink:
 
     def _offset(self) -> int:
         return time.time_ns() // 1000 - monotonic() + self.clock_error
+
+
+class WireLink(BaseLink):
+    """A link whose messages are those of `quad_swarm.robot.wire`.
+
+    :param index: number of the robot
+    :param session: tells apart teams and flights on one channel, 0 to 255
+    :param checked: whether messages carry a checksum, for radios that have none
+    """
+
+    def __init__(self, index: int, session: int = 0, checked: bool = False):
+        super().__init__(index)
+        self.session, self.checked = session, checked
 
     def request(self, other: int) -> None:
         """See `Link`."""
@@ -216,10 +232,10 @@ class Channel:
     """
 
     def __init__(self, conditions: Conditions, seed: int | Sequence[int] = 0):
-        self._conditions, self._rng, self._held = conditions, np.random.default_rng(seed), list[bytes]()
+        self._conditions, self._rng, self._held = conditions, np.random.default_rng(seed), list[Any]()
 
-    def arriving(self, message: bytes) -> list[bytes]:
-        """Return what arrives when a message does, in this order."""
+    def arriving(self, message: T) -> list[T]:
+        """Return what arrives when a message does, in this order. Only bytes can be malformed."""
         shares = self._conditions
         lost, twice, changed, late = self._rng.random(4) < (
             shares.loss,
@@ -229,10 +245,10 @@ class Channel:
         )
         if lost:
             return []
-        if changed:
+        if changed and isinstance(message, bytes):
             damaged = bytearray(message)
             damaged[self._rng.integers(len(message))] ^= int(self._rng.integers(1, 256))
-            message = bytes(damaged)
+            message = cast(T, bytes(damaged))
         arrived = [message] * (1 + twice)
         if late and not self._held:
             self._held = arrived

@@ -217,13 +217,14 @@ class Loop:
         if self._flying and self.link.now() - self.robot.newest.stamp <= 2 * self.robot.period:
             self._send(sender, asked=True)
 
-    def on_plan(self, sender: int, plan: Plan, sent: int, period: int) -> None:
+    def on_plan(self, sender: int, plan: Plan, sent: int | None, period: int) -> None:
         """See `Handler`."""
         if not self._is_teammate(sender):
             return
         now, durations = self.link.now(), self.statistics.durations
         self._unheard = 0
-        durations["one_way"].add(now - sent)
+        if sent is not None:
+            durations["one_way"].add(now - sent)
         if sender in self._pending:
             durations["round_trip"].add(now - self._pending.pop(sender))
         if self._flying and (reason := self._objection(sender, plan, period, now)) is None:

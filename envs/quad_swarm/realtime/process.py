@@ -1,36 +1,24 @@
-"""The process of one robot in a simulated world: ``python -m quad_swarm.realtime.process TEAM.json INDEX HOST:PORT``.
+"""The process of one robot in a simulated world, on any link.
 
 The world tells it when to fly and what it perceives, and takes its commands; plans travel between the robots alone.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import struct
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quad_swarm.quadrotor import N_STATES
-from quad_swarm.realtime import team
-from quad_swarm.realtime.link import Channel, Handler, Sensed
+from quad_swarm.realtime.link import Channel, Link, Traffic, Vehicle
 from quad_swarm.realtime.loop import Loop, freeze_garbage
 from quad_swarm.realtime.supervisor import Watchdog
-from quad_swarm.realtime.udp import Address, UdpLink, open_socket
-from quad_swarm.robot import Plan
+from quad_swarm.realtime.team import Team, load
 
-# Kind and time of the day (us); the numbers of a state follow
-SENSED = struct.Struct("<Bq")
-# Kind, robot and set-point
-COMMAND = struct.Struct("<BB4d")
-# Kind, robot, mode, whom it asked, whom it told, whose plans arrived (bits by robots); the plan follows
-REPORT = struct.Struct("<BBB3Q")
-IS_SENSED, IS_COMMAND, IS_REPORT = 1, 2, 3
 _SAYS_HELLO = 0.2  # s
 _GIVES_UP = 15.0  # s without any word of the world
 _US = 1_000_000
@@ -55,117 +43,76 @@ class Report(NamedTuple):
     plan: np.ndarray
 
 
-def pack_sensed(sensed: Sensed) -> bytes:
-    """Pack what a robot perceives, with a time of the day."""
-    return SENSED.pack(IS_SENSED, sensed.stamp) + np.concatenate([one.ravel() for one in sensed[1:]]).tobytes()
+class Hears(Protocol):
+    """What the world does with what robots send."""
+
+    def on_command(self, robot: int, setpoint: np.ndarray) -> None:
+        """Take a robot's set-point."""
+
+    def on_report(self, report: Report) -> None:
+        """Take what a robot did in a period."""
+
+    def on_words(self, words: dict[str, Any]) -> None:
+        """Take what a robot said: "hello", or "done"."""
 
 
-def unpack_sensed(message: bytes, n_others: int) -> Sensed:
-    """Unpack `pack_sensed`.
+class SimulatedLink(Link, Protocol):
+    """A link that trials can disturb, see `quad_swarm.realtime.link.BaseLink`."""
 
-    :raises ValueError: if it is another message
-    """
-    numbers = np.frombuffer(message, float, offset=SENSED.size)
-    if len(numbers) != N_STATES + 6 * n_others:
-        raise ValueError(f"{len(numbers)} numbers are no state with {n_others} others")
-    own, pos, vel = np.split(numbers, (N_STATES, N_STATES + 3 * n_others))
-    return Sensed(SENSED.unpack_from(message)[1], own, pos.reshape(-1, 3), vel.reshape(-1, 3))
+    index: int
+    traffic: Traffic
+    clock_error: int
+    deaf_to: frozenset[int]
+    channel: Channel | None
 
-
-def pack_report(report: Report) -> bytes:
-    """Pack what a robot did."""
-    return REPORT.pack(IS_REPORT, *report[:5]) + report.plan.astype(np.float32).tobytes()
+    def own(self, at: int) -> int:
+        """Return a time of the clock that all robots share on the robot's own (us)."""
 
 
-def unpack_report(message: bytes) -> Report:
-    """Unpack `pack_report`.
-
-    :raises ValueError: if it is another message
-    """
-    if len(message) < REPORT.size or (len(message) - REPORT.size) % 12:
-        raise ValueError(f"{len(message)} bytes are no report")
-    plan = np.frombuffer(message, np.float32, offset=REPORT.size).reshape(-1, 3)
-    return Report(*REPORT.unpack_from(message)[1:], plan.astype(float))
-
-
-class SimulatedVehicle:
-    """A robot's vehicle in a simulated world.
+class SimulatedVehicle(Vehicle, Protocol):
+    """A vehicle whose world also says when to fly.
 
     :ivar control: what the world said and nobody has done yet
     :ivar heard: when the world was heard last (us)
-
-    :param link: the robot's link, which receives for the vehicle, too
-    :param world: address of the world
-    :param n_others: number of other robots
     """
 
-    def __init__(self, link: UdpLink, world: Address, n_others: int):
-        self._link, self._world, self._n_others = link, world, n_others
-        self._socket = open_socket(link.address[0], 0)
-        link.watch(self._socket, self._take)
-        self.control: list[dict[str, Any]] = []
-        self.heard = link.now()
-        self.sensed: Sensed | None = None
-
-    def sense(self) -> Sensed | None:
-        """See `quad_swarm.realtime.Vehicle`."""
-        return self.sensed
-
-    def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
-        """See `quad_swarm.realtime.Vehicle`."""
-        self._socket.sendto(COMMAND.pack(IS_COMMAND, self._link.index, *setpoint), self._world)
-
-    def disarm(self) -> None:
-        """See `quad_swarm.realtime.Vehicle`. The world stops the motors of what lies on the ground."""
-
-    def report(self, loop: Loop) -> None:
-        """Tell the world what the robot did in a period, for pictures and recordings."""
-        words = (_bits(loop.asked), _bits(loop.told), _bits(loop.arrived))
-        report = Report(self._link.index, loop.supervisor.mode, *words, loop.robot.newest.positions)
-        self._socket.sendto(pack_report(report), self._world)
+    control: list[dict[str, Any]]
+    heard: int
 
     def say(self, **words: Any) -> None:
-        """Say something to the world."""
-        self._socket.sendto(json.dumps({**words, "robot": self._link.index}).encode(), self._world)
+        """Say something to the world. It may get lost."""
 
-    def _take(self, message: bytes, handler: Handler) -> None:
-        self.heard = self._link.now()
-        if message[:1] == b"{":
-            self.control.append(json.loads(message))
-        elif message[:1] == bytes([IS_SENSED]):
-            sensed = unpack_sensed(message, self._n_others)
-            sensed = sensed._replace(stamp=self._link.own(sensed.stamp) + self._link.clock_error)
-            if self.sensed is None or sensed.stamp > self.sensed.stamp:
-                self.sensed = sensed
+    def report(self, report: Report) -> None:
+        """Tell the world what the robot did in a period, for pictures and recordings."""
 
+    def begin(self, words: dict[str, Any]) -> None:
+        """Forget the last flight.
 
-def _bits(robots: Iterable[int]) -> int:
-    return sum(1 << robot for robot in robots)
+        :param words: what the world said of the next
+        """
 
 
 class RobotProcess:
     """Flies one robot as often as the world says so.
 
-    :param flown: the team
-    :param index: number of the robot
-    :param world: address of the world
+    :param team: the team
+    :param link: the robot's link
+    :param vehicle: the robot's vehicle
     """
 
-    def __init__(self, flown: team.Team, index: int, world: Address):
-        robot = flown.robot(index)
-        channel = Channel(flown.conditions, [flown.session, index])
-        self.link = UdpLink(index, group=flown.group, session=flown.session, checked=flown.checked, channel=channel)
-        self.link.clock_error = round(flown.clock_errors[index] * _US) if flown.clock_errors else 0
-        self.vehicle = SimulatedVehicle(self.link, world, robot.config.n_others)
-        self.loop = Loop(robot, self.link, self.vehicle, flown.limits, flown.wait, flown.late)
-        self.watchdog = Watchdog(self.vehicle, flown.limits)
+    def __init__(self, team: Team, link: SimulatedLink, vehicle: SimulatedVehicle):
+        self.link, self.vehicle = link, vehicle
+        link.channel = Channel(team.conditions, [team.session, link.index])
+        link.clock_error = round(team.clock_errors[link.index] * _US) if team.clock_errors else 0
+        self.loop = Loop(team.robot(link.index), link, vehicle, team.limits, team.wait, team.late)
+        self.watchdog = Watchdog(vehicle, team.limits)
         self.loop.warm_up()
 
     def run(self) -> None:
         """Fly until the world says goodbye, or nothing any more."""
         freeze_garbage()
         while not self._is_forsaken():
-            self.vehicle.say(says="hello", port=self.link.address[1])
+            self.vehicle.say(says="hello")
             self.link.wait(self.link.now() + round(_SAYS_HELLO * _US), self.loop, lambda: bool(self.vehicle.control))
             while self.vehicle.control:
                 words = self.vehicle.control.pop(0)
@@ -175,10 +122,9 @@ class RobotProcess:
                     self._fly(words)
 
     def _fly(self, words: dict[str, Any]) -> None:
-        index, link, loop, vehicle = self.link.index, self.link, self.loop, self.vehicle
-        link.addresses = {k: ("127.0.0.1", port) for k, port in enumerate(words["ports"]) if k != index}
+        link, loop, vehicle = self.link, self.loop, self.vehicle
         before = replace(link.traffic)
-        vehicle.sensed = None
+        vehicle.begin(words)
         loop.start(np.array(words["start"]), np.array(words["goal"]), link.own(words["first"]) + link.clock_error)
         statistics = loop.run(self._is_ended, self._after_period)
         self.watchdog.beat(armed=False)
@@ -202,7 +148,9 @@ class RobotProcess:
 
     def _after_period(self, loop: Loop) -> None:
         self.watchdog.beat()
-        self.vehicle.report(loop)
+        robots = (_bits(loop.asked), _bits(loop.told), _bits(loop.arrived))
+        mode, plan = loop.supervisor.mode, loop.robot.newest.positions
+        self.vehicle.report(Report(self.link.index, mode, *robots, plan))
 
     def _is_forsaken(self) -> bool:
         return self.link.now() - self.vehicle.heard > _GIVES_UP * _US
@@ -223,25 +171,24 @@ def set_priority(priority: int) -> bool:
     return True
 
 
-def main() -> int:
-    """Run the process."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("team", help="file of the team")
-    parser.add_argument("index", type=int, help="number of the robot")
-    parser.add_argument("world", help="address of the world, HOST:PORT")
-    args = parser.parse_args()
-    host, _, port = args.world.rpartition(":")
+def run(path: str, make: Callable[[Team], tuple[SimulatedLink, SimulatedVehicle]]) -> int:
+    """Run the process of a robot.
+
+    :param path: file of the team
+    :param make: creates link and vehicle
+    :return: exit status
+    """
     try:
-        flown = team.load(args.team)
-        process = RobotProcess(flown, args.index, (host, int(port)))
-    except (ValueError, OSError) as error:
+        team = load(Path(path))
+        process = RobotProcess(team, *make(team))
+    except (ValueError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    if not set_priority(flown.priority):
-        print(f"robot {args.index}: no real-time priority, since the system does not allow it", file=sys.stderr)
+    if not set_priority(team.priority):
+        print("no real-time priority: the system does not allow it", file=sys.stderr)
     process.run()
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _bits(robots: Iterable[int]) -> int:
+    return sum(1 << robot for robot in robots)

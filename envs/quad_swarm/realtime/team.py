@@ -63,7 +63,9 @@ class Team:
             raise ValueError(f"clock_errors={self.clock_errors}: there are {self.config.n_robots} robots")
         if self.is_learned:
             exported = files.load(self.policy).config
-            if dataclasses.replace(exported, plant=self.config.plant) != self.config:
+            # Robots know neither the plant nor how far vehicles are from their model
+            known = {"plant": self.config.plant, "mismatch": self.config.mismatch}
+            if dataclasses.replace(exported, **known) != self.config:
                 raise ValueError(f"{self.policy} was exported for another world: export it for this one")
         else:
             RulePolicy(self.policy)

@@ -7,7 +7,7 @@ import selectors
 import socket
 from collections.abc import Callable, Mapping
 
-from quad_swarm.realtime.link import Channel, Handler, WireLink
+from quad_swarm.realtime.link import Handler, WireLink
 
 Address = tuple[str, int]
 _MOST_BYTES = 65535
@@ -19,8 +19,6 @@ class UdpLink(WireLink):
 
     :ivar address: where this robot receives
     :ivar addresses: where the other robots receive, by their numbers; not needed with a group
-    :ivar channel: what becomes of messages that arrive, for trials
-    :ivar deaf_to: robots whose messages do not arrive, for trials
 
     :param index: number of the robot
     :param addresses: where the other robots receive
@@ -29,7 +27,6 @@ class UdpLink(WireLink):
     :param group: address and port of a multicast group, to which everything is sent
     :param session: see `WireLink`
     :param checked: see `WireLink`
-    :param channel: what becomes of messages that arrive, for trials
     :param hops: most networks that multicast messages cross
     :raises ValueError: if the group is no multicast address
     :raises OSError: if the address is not this machine's, or taken
@@ -44,15 +41,12 @@ class UdpLink(WireLink):
         group: Address | None = None,
         session: int = 0,
         checked: bool = False,
-        channel: Channel | None = None,
         hops: int = 0,
     ):
         if group is not None:
             check_group(group[0])
         super().__init__(index, session, checked)
         self.addresses, self.group = dict(addresses or {}), group
-        self.channel = channel
-        self.deaf_to: frozenset[int] = frozenset()
         self._selector, self._sockets = selectors.DefaultSelector(), list[socket.socket]()
         self._socket = open_socket(host, port)
         self.address: Address = self._socket.getsockname()

@@ -69,6 +69,6 @@ def test_a_model_flies_in_the_world_that_it_was_exported_for(tmp_path):
     team = Team(CONFIG, str(tmp_path))
     assert team.is_learned
     assert team.robot(1).policy.n_bits == 2
-    Team(dataclasses.replace(CONFIG, plant="crazyflow:cf21B_500"), str(tmp_path))  # the robots do not know the plant
+    Team(dataclasses.replace(CONFIG, plant="crazyflow:cf21B_500", mismatch=0.0), str(tmp_path))
     with pytest.raises(ValueError, match="another world"):
         Team(dataclasses.replace(CONFIG, goal_radius=0.4), str(tmp_path))

@@ -1,0 +1,179 @@
+"""Conversion between a robot's arrays and standard messages of ROS 2 (REP 103 and 147: x forward, y left, z up; frame
+"map").
+
+Only `msgs()` imports ROS, so that the conversions are the same with wheels and with a distribution.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
+from quad_swarm.robot import Plan
+
+FRAME = "map"
+_S = 1_000_000  # us
+
+
+@functools.cache
+def msgs() -> SimpleNamespace:
+    """Return the classes of the messages.
+
+    :raises ImportError: if ROS 2 is not there
+    """
+    names = {
+        "builtin_interfaces": "Duration Time",
+        "geometry_msgs": "Quaternion Transform Twist TwistStamped Vector3",
+        "nav_msgs": "Odometry",
+        "std_msgs": "Header String",
+        "trajectory_msgs": "MultiDOFJointTrajectory MultiDOFJointTrajectoryPoint",
+    }
+    modules = {package: importlib.import_module(f"{package}.msg") for package in names}
+    return SimpleNamespace(**{name: getattr(modules[one], name) for one in names for name in names[one].split()})
+
+
+def to_time(us: int) -> Any:
+    """Return a time (us) as a message."""
+    return msgs().Time(sec=us // _S, nanosec=us % _S * 1000)
+
+
+def from_time(time: Any) -> int:
+    """Return a message's time (us)."""
+    return int(time.sec) * _S + int(time.nanosec) // 1000
+
+
+def to_quaternion(attitude: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw (rad), (3,), as a quaternion x, y, z, w, (4,)."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(attitude / 2), np.cos(attitude / 2)
+    return np.array([
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ])  # fmt: skip
+
+
+def from_quaternion(q: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw (rad), (3,), of a quaternion x, y, z, w, (4,).
+
+    :raises ValueError: if it is no rotation
+    """
+    norm = np.linalg.norm(q)
+    if not 0.9 < norm < 1.1:
+        raise ValueError(f"the quaternion {np.asarray(q).tolist()} is no rotation")
+    x, y, z, w = q / norm
+    return np.array([
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    ])  # fmt: skip
+
+
+def rotation(attitude: np.ndarray) -> np.ndarray:
+    """Return the matrix that turns vectors of the body into those of the world, (3, 3).
+
+    :param attitude: roll, pitch and yaw (rad), (3,)
+    """
+    (sr, sp, sy), (cr, cp, cy) = np.sin(attitude), np.cos(attitude)
+    return np.array([
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ])  # fmt: skip
+
+
+def to_odometry(state: np.ndarray, stamp: int, child: str) -> Any:
+    """Return a state, (9,), as ``nav_msgs/Odometry``, whose twist is in the frame of the body.
+
+    :param state: position (m), velocity (m/s), roll, pitch and yaw (rad), (9,)
+    :param stamp: when it was so (us)
+    :param child: name of the body's frame
+    """
+    message = msgs().Odometry()
+    message.header.frame_id, message.child_frame_id = FRAME, child
+    message.header.stamp = to_time(stamp)
+    pose, twist = message.pose.pose, message.twist.twist
+    pose.position.x, pose.position.y, pose.position.z = map(float, state[POSITION])
+    q = to_quaternion(state[6:9])
+    pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = map(float, q)
+    twist.linear.x, twist.linear.y, twist.linear.z = map(float, rotation(state[6:9]).T @ state[VELOCITY])
+    return message
+
+
+def from_odometry(message: Any) -> tuple[int, np.ndarray]:
+    """Return stamp (us) and state, (9,), of ``nav_msgs/Odometry``.
+
+    :raises ValueError: if the orientation is no rotation
+    """
+    pose, linear = message.pose.pose, message.twist.twist.linear
+    state = np.empty(N_STATES)
+    state[POSITION] = pose.position.x, pose.position.y, pose.position.z
+    q = pose.orientation
+    state[6:9] = from_quaternion(np.array([q.x, q.y, q.z, q.w]))
+    state[VELOCITY] = rotation(state[6:9]) @ (linear.x, linear.y, linear.z)
+    return from_time(message.header.stamp), state
+
+
+def to_trajectory(plan: Plan, period: int, sender: str) -> Any:
+    """Return a plan as ``trajectory_msgs/MultiDOFJointTrajectory``: positions, and velocities between them.
+
+    :param plan: the plan, stamped with the time of the day
+    :param period: length of its stages (us)
+    :param sender: name of the robot
+    """
+    names = msgs()
+    message = names.MultiDOFJointTrajectory()
+    message.header.frame_id, message.header.stamp, message.joint_names = FRAME, to_time(plan.stamp), [sender]
+    velocities = np.gradient(plan.positions, period / _S, axis=0)
+    for k, (position, velocity) in enumerate(zip(plan.positions.tolist(), velocities.tolist(), strict=True)):
+        at = k * period
+        message.points.append(
+            names.MultiDOFJointTrajectoryPoint(
+                transforms=[names.Transform(translation=names.Vector3(**dict(zip("xyz", position, strict=True))))],
+                velocities=[names.Twist(linear=names.Vector3(**dict(zip("xyz", velocity, strict=True))))],
+                time_from_start=names.Duration(sec=at // _S, nanosec=at % _S * 1000),
+            )
+        )
+    return message
+
+
+def from_trajectory(message: Any) -> tuple[str, Plan, int]:
+    """Return sender, plan and length of its stages (us) of ``trajectory_msgs/MultiDOFJointTrajectory``.
+
+    :raises ValueError: if it is no plan of one robot at equal intervals
+    """
+    points = message.points
+    if len(message.joint_names) != 1 or len(points) < 2 or any(len(point.transforms) != 1 for point in points):
+        raise ValueError("a plan has the name of one robot, and two or more points with one transform each")
+    times = np.array([from_time(point.time_from_start) for point in points])
+    period = int(times[1] - times[0])
+    if times[0] or period <= 0 or (np.diff(times) != period).any():
+        raise ValueError("the points of a plan begin at its stamp and follow each other at equal intervals")
+    translations = (point.transforms[0].translation for point in points)
+    positions = np.array([(one.x, one.y, one.z) for one in translations])
+    return message.joint_names[0], Plan(from_time(message.header.stamp), positions), period
+
+
+def to_command(setpoint: np.ndarray, stamp: int) -> Any:
+    """Return a set-point as ``geometry_msgs/TwistStamped``: angular x and y are roll and pitch (rad), linear z is the
+    climb rate (m/s), and angular z the yaw rate (rad/s).
+
+    :param setpoint: roll, pitch, climb rate and yaw rate, (4,)
+    :param stamp: the time (us)
+    """
+    message = msgs().TwistStamped()
+    message.header.frame_id, message.header.stamp = FRAME, to_time(stamp)
+    message.twist.angular.x, message.twist.angular.y = map(float, setpoint[:2])
+    message.twist.linear.z, message.twist.angular.z = map(float, setpoint[2:])
+    return message
+
+
+def from_command(message: Any) -> np.ndarray:
+    """Return the set-point of `to_command`, (4,)."""
+    twist = message.twist
+    return np.array([twist.angular.x, twist.angular.y, twist.linear.z, twist.angular.z])

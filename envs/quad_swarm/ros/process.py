@@ -1,0 +1,34 @@
+"""A robot in a simulated world over ROS 2: ``python -m quad_swarm.ros.process TEAM.json INDEX``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from quad_swarm.realtime.process import run
+from quad_swarm.realtime.team import Team
+from quad_swarm.ros.link import RosLink
+from quad_swarm.ros.node import Mailbox, make_node
+from quad_swarm.ros.world import RosVehicle, names_of
+
+
+def main() -> int:
+    """Run the process."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("team", help="file of the team")
+    parser.add_argument("index", type=int, help="number of the robot")
+    args = parser.parse_args()
+
+    def make(team: Team) -> tuple[RosLink, RosVehicle]:
+        names = names_of(team.config.n_robots)
+        node = make_node("robot", names[args.index])
+        mailbox = Mailbox(node)
+        link = RosLink(node, mailbox, args.index, names)
+        vehicle = RosVehicle(node, mailbox, link, names)
+        return link, vehicle
+
+    return run(args.team, make)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
