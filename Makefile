@@ -24,7 +24,7 @@ install: $(VENV)/.installed  ## make .venv with the pinned dependencies
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[zoo,plot,render,plants,ray,onnx,docs,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[zoo,plot,render,plants,ray,onnx,record,docs,dev]"
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[ros]" || \
 		echo "ROS 2 cannot be installed: what needs it is skipped"
 	@touch $@

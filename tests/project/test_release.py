@@ -110,6 +110,7 @@ def test_the_wheel_holds_every_file_of_the_packages(wheel):
     )
 
 
+@pytest.mark.slow
 def test_the_description_is_the_readme(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))

@@ -24,11 +24,13 @@ from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model, load_model, short_names, trained_in
+from quad_swarm.evaluation.recordings import Recording, check_suffix, write
 from quad_swarm.evaluation.rows import check_writable, write_rows
 from quad_swarm.parsing import Parser
 from quad_swarm.planner import make_planner
 from quad_swarm.realtime.arena import Arena, Exchange
 from quad_swarm.realtime.link import Conditions
+from quad_swarm.realtime.process import Sample, set_priority
 from quad_swarm.realtime.statistics import total
 from quad_swarm.realtime.team import Team
 from quad_swarm.realtime.udp_world import UdpWorld
@@ -150,24 +152,36 @@ def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterat
         yield starts, goals, int(rng.integers(2**63)) if config.is_random else 0
 
 
-def fly(team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], link: str, most: float) -> Iterator[Flight]:
+Sees = Callable[[Sample], None]
+
+
+def fly(
+    team: Team,
+    flown: Iterable[tuple[np.ndarray, np.ndarray, int]],
+    link: str,
+    most: float,
+    sees: Sees | None = None,
+) -> Iterator[Flight]:
     """Fly episodes.
 
     :param team: the team
     :param flown: episodes, see `episodes`
     :param link: one of `LINKS`
     :param most: time limit of a flight (s)
+    :param sees: called after each period of a flight
     """
     if link == "virtual":
-        yield from _virtual(team, flown, most)
+        yield from _virtual(team, flown, most, sees)
         return
     exchange: Exchange = RosWorld(team.config.n_robots) if link == "ros2" else UdpWorld()
     with Arena(team, exchange) as arena:
         for starts, goals, seed in flown:
-            yield arena.fly(starts, goals, seed, most, _LINGER)
+            yield arena.fly(starts, goals, seed, most, _LINGER, sees=sees)
 
 
-def _virtual(team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], most: float) -> Iterator[Flight]:
+def _virtual(
+    team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], most: float, sees: Sees | None
+) -> Iterator[Flight]:
     config = team.config
     planner = make_planner(config.planner, config.quadrotor, config.n_robots)
     policies = [team.robot(k, planner).policy for k in range(config.n_robots)]
@@ -176,7 +190,7 @@ def _virtual(team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], mo
     )
     for starts, goals, seed in flown:
         flight.reset(starts, goals, seed)
-        flight.fly(most, _LINGER)
+        flight.fly(most, _LINGER, sees)
         yield flight.result()
 
 
@@ -201,9 +215,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--wait", type=float, default=0.005, metavar="SECONDS", help="for answers (default 0.005)")
     parser.add_argument("--late", type=float, default=0.25, help="when commands act, in periods (default 0.25)")
     parser.add_argument(
-        "--priority", type=int, default=0, help="real-time priority of the robots (SCHED_FIFO), 1 to 99"
+        "--priority", type=int, default=0, help="real-time priority of all processes (SCHED_FIFO), 1 to 99"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows")
+    parser.add_argument(
+        "--record", type=Path, metavar="FILE", help="record the flights as .npz, .csv or .mcap; several get numbers"
+    )
     parser.add_argument("--gym-packages", nargs="+", action="extend", metavar="MODULE", help="modules to import first")
     parser.add_argument("--algo", default="sb3_maddpg:MADDPG", metavar="MODULE:CLASS", help="class that loads models")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -221,7 +238,14 @@ def _main(args: argparse.Namespace) -> None:
     if args.plant is not None:
         # Parameters of another simulator's vehicle are not drawn
         config = dataclasses.replace(config, plant=args.plant, mismatch=0.0)
-    names, rows = short_names(args.policy), []
+    if not 0 <= args.priority <= 99:
+        raise ValueError(f"--priority {args.priority}: it must be from 1 to 99, or 0 for none.")
+    if not set_priority(args.priority):
+        print("no real-time priority: the system does not allow it", file=sys.stderr)
+    if args.record is not None:
+        check_suffix(args.record)
+        check_writable(args.record, "--record")
+    names, rows, n_flights = short_names(args.policy), [], len(args.policy) * args.episodes
     first = first_episode(args.seed)
     with contextlib.ExitStack() as stack:
         for policy in args.policy:
@@ -231,10 +255,16 @@ def _main(args: argparse.Namespace) -> None:
                 export(policy, config, Path(flown_as), args.algo)
             options = {"wait": args.wait, "late": args.late, "priority": args.priority}
             team = Team(config, flown_as, conditions=Conditions(args.loss), **options)
-            flown = Flown(config.n_robots)
-            seeds = range(first, first + args.episodes)
-            for flight in fly(team, episodes(config, args.scenario, seeds), args.link, args.most):
+            flown, samples = Flown(config.n_robots), list[Sample]()
+            places = list(episodes(config, args.scenario, range(first, first + args.episodes)))
+            sees = None if args.record is None else samples.append
+            for flight in fly(team, places, args.link, args.most, sees):
                 flown.flights.append(flight)
+                if args.record is not None:
+                    number = len(rows) * args.episodes + len(flown.flights)
+                    path = args.record if n_flights == 1 else _numbered(args.record, number)
+                    write(path, recorded(samples, config, places[len(flown.flights) - 1][1], names[policy]))
+                    samples.clear()
                 print(_line(names[policy], len(flown.flights), flight), file=sys.stderr, flush=True)
             about = {"scenario": args.scenario, "n_robots": config.n_robots, "preset": preset, "plant": config.plant}
             about |= {"link": args.link, "loss": args.loss, "wait": args.wait, "late": args.late, "seed": args.seed}
@@ -243,6 +273,32 @@ def _main(args: argparse.Namespace) -> None:
     print(LEGEND)
     if args.json is not None:
         write_rows(args.json, rows)
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_name(f"{path.stem}_{number}{path.suffix}")
+
+
+def recorded(samples: Sequence[Sample], config: SwarmConfig, goals: np.ndarray, policy: str) -> Recording:
+    """Return the recording of a flight.
+
+    :param samples: the flight
+    :param config: the world
+    :param goals: goals, (n, 3) (m)
+    :param policy: what flew
+    """
+    n, times = config.n_robots, len(samples)
+    plan = np.full((times, n, config.planner.horizon + 1, 3), np.nan)
+    asked, told = np.zeros((2, times, n, n), dtype=bool)
+    bits = 1 << np.arange(n, dtype=np.uint64)
+    for k, sample in enumerate(samples):
+        for report in sample.reports:
+            plan[k, report.robot] = report.plan
+            asked[k, report.robot] |= (np.uint64(report.asked) & bits) > 0
+            told[k, report.robot] |= (np.uint64(report.told) & bits) > 0
+    time, state, setpoint = map(np.array, zip(*((one.time, one.state, one.setpoint) for one in samples), strict=True))
+    world = dataclasses.asdict(config)
+    return Recording(time, state, setpoint, plan, asked, told, goals, world, policy)
 
 
 def _line(policy: str, number: int, flight: Flight) -> str:

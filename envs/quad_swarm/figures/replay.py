@@ -11,23 +11,25 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from quad_swarm.evaluation.command import add_policy_arguments, make_conditions, run
+from quad_swarm.evaluation.command import add_policy_arguments, make_conditions, parse_world, run
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import is_model, short_name
 from quad_swarm.evaluation.provenance import plant_name
+from quad_swarm.evaluation.recordings import Recording, read
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_text
 from quad_swarm.figures.colours import COLOURS
 from quad_swarm.geometry import closest_approach, length
 from quad_swarm.parsing import Parser
 from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.presets import SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS
 
 # Number of steps to show after all robots have arrived
@@ -54,22 +56,44 @@ def replay_page(
     :return: the page as HTML
     """
     config = conditions[0].config
+    about = {"scenario": conditions[0].scenario, "preset": preset, "world": list(world), "seed": seed}
+    flights = ((one.policy, fly(one, seed, episode)) for one in conditions)
+    return _page({**about, "episode": episode}, config, config.planner.dt, flights)
+
+
+def recorded_page(recordings: Sequence[tuple[str, Recording]], otherwise: SwarmConfig) -> str:
+    """Create the web page of recorded flights of the same robots.
+
+    :param recordings: names of files, and what they hold
+    :param otherwise: the world of recordings that do not tell
+    :return: the page as HTML
+    :raises ValueError: if they have different numbers of robots, or a recording does not fit its world
+    """
+    counts = {one.n_robots for _, one in recordings}
+    if len(counts) > 1:
+        raise ValueError(
+            f"The recordings have {', '.join(map(str, sorted(counts)))} robots: show one number at a time."
+        )
+    flights = [(one.policy or name, one.flight(otherwise)) for name, one in recordings]
+    step = float(np.median(np.diff(recordings[0][1].time)))
+    source = ", ".join(name for name, _ in recordings)
+    about = {"scenario": "recorded flight", "preset": "", "world": [], "seed": 0, "episode": 0, "source": source}
+    return _page(about, flights[0][1].config, step, flights)
+
+
+def _page(about: dict[str, Any], config: SwarmConfig, dt: float, flights: Iterable[tuple[str, Flight]]) -> str:
     data = {
-        "scenario": conditions[0].scenario,
-        "preset": preset,
-        "world": list(world),
-        "seed": seed,
-        "episode": episode,
-        "dt": config.planner.dt,
+        **about,
+        "dt": dt,
         "plan_stride": _PLAN_STRIDE,
         "radius": config.radius,
         "goal_radius": config.goal_radius,
         "collision_distance": 2 * config.radius,
         "colours": COLOURS,
-        "flights": [_describe(one.policy, fly(one, seed, episode)) for one in conditions],
+        "flights": [_describe(policy, flight) for policy, flight in flights],
     }
     # "</script>" in the name of a policy would end the data
-    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\u003c")
     return files("quad_swarm.figures").joinpath("replay.html").read_text(encoding="utf-8").replace("__DATA__", text)
 
 
@@ -142,7 +166,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         description="Fly a held-out episode with several policies and write a web page that replays it.",
         epilog=f"example:\n{EXAMPLES}",
     )
-    add_policy_arguments(parser)
+    add_policy_arguments(parser, required=False)
+    parser.add_argument(
+        "--flight",
+        nargs="+",
+        type=Path,
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="recorded flights, real or simulated (.npz, .csv, .mcap), instead of policies to fly",
+    )
     parser.add_argument("--scenario", default="symmetric_swap", help=f"one of {', '.join(SCENARIOS)} (%(default)s)")
     parser.add_argument("--episode", type=int, default=0, help="index of the episode in the set (default 0)")
     parser.add_argument(
@@ -155,12 +188,27 @@ def _write(args: argparse.Namespace) -> None:
     if args.episode < 0:
         raise ValueError(f"--episode {args.episode}: episodes count from 0.")
     check_writable(args.out, "--out")
+    if bool(args.flight) == bool(args.policy):
+        raise ValueError("pass either policies to fly (--policy) or recorded flights (--flight).")
+    if args.flight:
+        _finish(args.out, recorded_page(*_recordings(args)))
+        return
     conditions = make_conditions(args, [args.scenario])
     changes = [*args.world, *([f"plant={plant_name(conditions[0].config)}"] if args.plant else [])]
-    page = replay_page(conditions, args.seed, args.episode, args.preset, changes)
-    write_text(args.out, page)
-    if args.out != STDOUT:
-        print(f"wrote {args.out}, {len(page) / 1e6:.1f} MB: open it in a browser")
+    _finish(args.out, replay_page(conditions, args.seed, args.episode, args.preset, changes))
+
+
+def _recordings(args: argparse.Namespace) -> tuple[list[tuple[str, Recording]], SwarmConfig]:
+    """Return the recorded flights of a command line, and the world of those that do not tell."""
+    found = [(path.name, read(path)) for path in args.flight]
+    world = parse_world(args.world)
+    return found, make_config(args.preset or "flight", world, n_robots=found[0][1].n_robots)
+
+
+def _finish(out: Path, page: str) -> None:
+    write_text(out, page)
+    if out != STDOUT:
+        print(f"wrote {out}, {len(page) / 1e6:.1f} MB: open it in a browser")
 
 
 if __name__ == "__main__":

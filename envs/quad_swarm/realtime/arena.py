@@ -9,20 +9,20 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from quad_swarm.realtime.link import Sensed, Traffic, monotonic
-from quad_swarm.realtime.process import Hears, Report
+from quad_swarm.realtime.process import Hears, Report, Sample
 from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.team import Team
 from quad_swarm.realtime.udp_world import UdpWorld
 from quad_swarm.realtime.vehicles import Flight, Vehicles
 
 _US = 1_000_000
+_MOST_ROBOTS = 64  # which reports have bits for
 _READY = 90.0  # s that robots have to start; the first start on a machine compiles the planner
 _LEAD = 0.3  # s between the order to fly and the first period
 _PAUSE = 0.1  # s of delay from which on the world itself stood still, and goes on from there
@@ -32,20 +32,6 @@ _ENDS = 10.0  # s that robots have to report, and to end
 
 class RobotEndedError(RuntimeError):
     """Raised if the process of a robot ended, or did not start."""
-
-
-@dataclass
-class Sample:
-    """The world after a period.
-
-    :param time: time since the start of the flight (s)
-    :param state: true states, (n, 9)
-    :param reports: what the robots reported since the last sample
-    """
-
-    time: float
-    state: np.ndarray
-    reports: list[Report]
 
 
 class Exchange(Protocol):
@@ -81,9 +67,12 @@ class Arena:
     :param exchange: how the world and the robots talk, by default over UDP
     :param log: folder for what the robots' processes print; by default it is shown
     :raises RobotEndedError: if a robot's process does not start
+    :raises ValueError: if there are more than 64 robots
     """
 
     def __init__(self, team: Team, exchange: Exchange | None = None, log: Path | None = None):
+        if team.config.n_robots > _MOST_ROBOTS:
+            raise ValueError(f"n_robots={team.config.n_robots}: at most {_MOST_ROBOTS} fly in real time here.")
         self.team, self.vehicles = team, Vehicles(team.config)
         self._exchange = exchange or UdpWorld()
         self._senses: dict[int, Sensed] = {}
@@ -162,7 +151,8 @@ class Arena:
                 continue
             killed = self._ended()
             if sees is not None:
-                sees(Sample((vehicles.now - begins) / _US, vehicles.state.copy(), self._reports))
+                time_flown = (vehicles.now - begins) / _US
+                sees(Sample(time_flown, vehicles.state.copy(), vehicles.setpoint.copy(), self._reports))
             self._reports = []
             lives = np.array([k not in killed for k in range(n)])
             there = None if not vehicles.at_goal[lives].all() else there or vehicles.now

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -41,6 +41,22 @@ class Report(NamedTuple):
     told: int
     arrived: int
     plan: np.ndarray
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The world after a period.
+
+    :param time: time since the start of the flight (s)
+    :param state: true states, (n, 9)
+    :param setpoint: last commands, (n, 4)
+    :param reports: what the robots reported since the last sample
+    """
+
+    time: float
+    state: np.ndarray
+    setpoint: np.ndarray
+    reports: list[Report]
 
 
 class Hears(Protocol):
@@ -148,12 +164,16 @@ class RobotProcess:
 
     def _after_period(self, loop: Loop) -> None:
         self.watchdog.beat()
-        robots = (_bits(loop.asked), _bits(loop.told), _bits(loop.arrived))
-        mode, plan = loop.supervisor.mode, loop.robot.newest.positions
-        self.vehicle.report(Report(self.link.index, mode, *robots, plan))
+        self.vehicle.report(report_of(loop))
 
     def _is_forsaken(self) -> bool:
         return self.link.now() - self.vehicle.heard > _GIVES_UP * _US
+
+
+def report_of(loop: Loop) -> Report:
+    """Return what a robot did in its last period."""
+    robots = (_bits(loop.asked), _bits(loop.told), _bits(loop.arrived))
+    return Report(loop.robot.index, loop.supervisor.mode, *robots, loop.robot.newest.positions)
 
 
 def set_priority(priority: int) -> bool:

@@ -80,6 +80,11 @@ class Vehicles:
     def state(self) -> np.ndarray:
         return self._state[0]
 
+    @property
+    def setpoint(self) -> np.ndarray:
+        """The last commands, (n, 4)."""
+        return self._u[0]
+
     def reset(self, starts: np.ndarray, goals: np.ndarray, noise_seed: int, now: int) -> None:
         """Begin a flight.
 

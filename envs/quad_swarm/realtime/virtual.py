@@ -16,6 +16,7 @@ import numpy as np
 from quad_swarm.planner import Planner, make_planner
 from quad_swarm.realtime.link import Channel, Conditions, Handler, Sensed, Traffic, WireLink
 from quad_swarm.realtime.loop import Loop
+from quad_swarm.realtime.process import Sample, report_of
 from quad_swarm.realtime.supervisor import SafetyLimits
 from quad_swarm.realtime.vehicles import Flight, Vehicles
 from quad_swarm.robot import Plan, Policy, Robot
@@ -125,17 +126,22 @@ class VirtualFlight:
             self.now, _, _, happens = heapq.heappop(self._events)
             happens()
 
-    def fly(self, most: float, linger: float = 1.0) -> None:
+    def fly(self, most: float, linger: float = 1.0, sees: Callable[[Sample], None] | None = None) -> None:
         """Fly until everybody who lives is at its goal and some time has passed.
 
         :param most: time limit (s)
         :param linger: time to fly on after that (s)
+        :param sees: called after each period
         """
-        while self.now < most * _US:
-            self.run(min(self.now / _US + 0.1, most))
-            if self.vehicles.at_goal[~self.dead].all():
-                self.run(min(self.now / _US + linger, most))
-                return
+        time, ends = 0.0, most
+        while time < ends:
+            time += self.config.planner.dt
+            self.run(time)
+            if sees is not None:
+                reports = [report_of(loop) for loop in self.loops]
+                sees(Sample(time, self.vehicles.state.copy(), self.vehicles.setpoint.copy(), reports))
+            if ends == most and self.vehicles.at_goal[~self.dead].all():
+                ends = min(time + linger, most)
 
     def result(self) -> Flight:
         """End the flight, and return what happened."""

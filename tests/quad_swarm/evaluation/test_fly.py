@@ -7,6 +7,7 @@ import pytest
 
 from quad_swarm.evaluation.flight import Condition, begin, first_episode
 from quad_swarm.evaluation.fly import episodes, main
+from quad_swarm.evaluation.recordings import read
 from quad_swarm.world.presets import make_config
 
 MODEL = "pretrained:quad-swarm-flight"
@@ -22,7 +23,8 @@ def test_episodes_are_those_of_evaluate():
 
 
 def test_flights_in_virtual_time(tmp_path, capsys):
-    words = ["--policy", "none", "full", "--n-robots", "4", "--link", "virtual", "--loss", "0.1", "--episodes", "2"]
+    words = ["--policy", "none", "full", "--n-robots", "3", "--link", "virtual", "--loss", "0.1", "--episodes", "2"]
+    words += ["--most", "5", "--record", str(tmp_path / "flight.npz")]
     assert main([*words, "--json", str(tmp_path / "rows.json")]) == 0
     shown = capsys.readouterr()
     none, full = json.loads((tmp_path / "rows.json").read_text())
@@ -34,9 +36,19 @@ def test_flights_in_virtual_time(tmp_path, capsys):
     assert full["collided"] == 0
     assert full["plan_share"] == pytest.approx(0.9, abs=0.03), "requests that are lost are not answered"
     assert 15 < full["plan_age_ms"][0] < 60
-    assert full["counts"]["requests"] == full["periods"] * 3
+    assert full["counts"]["requests"] == full["periods"] * 2
     assert full["bytes_per_second"] > 1000
     assert full["loss"] == 0.1
+    names = sorted(path.name for path in tmp_path.glob("*.npz"))
+    assert names == [f"flight_{k}.npz" for k in range(1, 5)]
+    none, full = (read(tmp_path / f"flight_{k}.npz") for k in (1, 3))
+    assert (none.policy, full.policy) == ("none", "full")
+    assert not none.asked.any()
+    assert full.asked.sum() == pytest.approx(full.asked[..., 0].size * 2, rel=0.05)
+    assert full.config().n_robots == 3
+    assert np.isfinite(full.setpoint).all()
+    assert full.separation().min() > 0.5
+    assert np.abs(full.plan[20, :, 0] - full.state[20, :, :3]).max() < 0.2, "plans begin where robots are"
 
 
 @pytest.mark.slow
@@ -60,7 +72,7 @@ def test_a_learned_policy_flies_over_udp(tmp_path, capsys):
         (["--policy", "none", "--loss", "2"], "loss=2.0"),
         (["--policy", "none", "--episodes", "0"], "--episodes 0"),
         (["--policy", "none", "--wait", "0.06"], "wait=0.06"),
-        (["--policy", "none", "--priority", "100"], "priority=100"),
+        (["--policy", "none", "--priority", "100"], "--priority 100"),
         (["--policy", "none", "--plant", "gazebo"], "gazebo"),
         (["--policy", "none", "--world", "substeps=7"], "whole microseconds"),
     ],

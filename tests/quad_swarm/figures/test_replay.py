@@ -199,6 +199,7 @@ def test_counters_are_the_sums_of_what_was_asked(view, pages):
         assert sum(told) == total
 
 
+@pytest.mark.slow
 def test_every_pair_of_eight_has_a_lane_that_can_be_seen(view):
     page = view("eight", size="desktop")
     assert page.locator("svg.asks").first.locator("path.lane").count() == 0, "nobody asks"
@@ -219,6 +220,7 @@ def test_every_pair_of_eight_has_a_lane_that_can_be_seen(view):
     assert page.inner_text("#tooltip") == "step 12: robot 3 asks robot 5"
 
 
+@pytest.mark.slow
 def test_axis_tells_a_contact_from_a_near_miss(view, pages):
     page = view("four")
     closest = min(data_of(pages["four"].read_text())["flights"][0]["separation"])
@@ -360,6 +362,7 @@ def test_every_listed_key_works_wherever_the_focus_is(view):
         assert page.input_value("#time") == page.get_attribute("#time", "max")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", ["phone", "wide"])
 def test_no_two_things_have_the_same_sign_in_the_legend(view, size, scheme):
@@ -460,6 +463,7 @@ def test_camera_turns_follows_and_has_presets(view, pages):
     assert page.input_value("#follow") == "3"
 
 
+@pytest.mark.slow
 def test_fingers_zoom(view):
     page = view("four", size="phone", has_touch=True, reduced_motion="reduce")
     before = pixels(page)
@@ -514,6 +518,7 @@ def test_without_webgl_the_rest_works(view):
     assert page.is_disabled("#png")
 
 
+@pytest.mark.slow
 def test_frames_for_scripts_depend_on_their_time_alone(browser, pages):
     page = browser.new_page()
     page.goto(f"{pages['four'].as_uri()}#hero")
@@ -523,3 +528,23 @@ def test_frames_for_scripts_depend_on_their_time_alone(browser, pages):
     assert first == again != later
     assert page.evaluate("[document.querySelector('#stage canvas').width, innerWidth]")[0] == 480
     page.close()
+
+
+def test_recorded_flights_are_replayed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    flown = fly(Condition("full", "symmetric_swap", make_config("paper", n_robots=3), 20), 0)
+    write(Path("lab.csv"), Recording.of(flown))
+    write(Path("flight.npz"), Recording.of(flown, "full"))
+    assert main(["--flight", "lab.csv", "flight.npz", "--world", "goal_radius=0.2", "--out", "page.html"]) == 0
+    page = Path("page.html").read_text()
+    data = json.loads(page.split('<script id="data" type="application/json">')[1].split("</script>")[0])
+    assert data["source"] == "lab.csv, flight.npz"
+    assert data["dt"] == pytest.approx(0.1)
+    lab, full = data["flights"]
+    assert (lab["policy"], full["policy"]) == ("lab.csv", "full")
+    assert lab["positions"] == full["positions"] == flown.pos.round(3).tolist()
+    assert lab["requests"] == full["requests"]
+    assert len(full["requests"][0]) == 6
+    for words in ([], ["--flight", "lab.csv", "--policy", "full"]):
+        assert main([*words, "--out", "page.html"]) == 1
+        assert "--policy" in capsys.readouterr().err

@@ -25,6 +25,7 @@ def test_wind_pushes():
     assert (state[..., 4] > state[..., 3]).all()
 
 
+@pytest.mark.slow
 def test_dropped_swarms_and_forks_do_not_touch_the_others():
     plant, start = placed("crazyflow:cf21B_500")
     u = np.random.default_rng(1).uniform(-0.2, 0.2, (2, 3, 4))

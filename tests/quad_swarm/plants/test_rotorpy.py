@@ -36,6 +36,7 @@ def test_dropped_swarms_and_forks_do_not_touch_the_others():
     assert plant.step(both[:0], u[:0], np.zeros((0, 3, 2)), None).shape == (0, 3, 9)
 
 
+@pytest.mark.slow
 def test_a_swarm_that_begins_anew_has_forgotten_the_last_episode():
     plant, start = placed("rotorpy:crazyflie")
     u = np.full((2, 3, 4), 0.2)

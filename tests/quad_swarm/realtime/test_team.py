@@ -60,6 +60,7 @@ def test_files_of_something_else_are_refused(content, tmp_path):
         load(tmp_path / "team.json")
 
 
+@pytest.mark.slow
 def test_a_model_flies_in_the_world_that_it_was_exported_for(tmp_path):
     pytest.importorskip("onnxruntime")
     from quad_swarm.evaluation.export import export

@@ -73,28 +73,21 @@ FAULTS = {
 def test_the_living_do_not_collide(fault):
     happens, options = FAULTS[fault]
     flight = flight_of(**{"conditions": Conditions(0.1), **options})
-    for episode in range(2):
-        begin(flight, episode)
-        happens(flight)
-        flight.fly(8.0)
-        lives = ~flight.dead
-        assert flight.vehicles.collisions(lives) == []
-        counts = flight.result().total.counts
-        assert counts["periods"] > 8 * 50
-        assert counts["plans received"] > 20
-        noticed = {
-            "a process stands still": "missed",
-            "malformed": "refused: not of the team",
-            "a frozen state": "state is frozen",
-            "a state frozen for good": "state is frozen",
-        }.get(fault)
-        if noticed == "state is frozen":
-            assert counts[noticed] == 1
-        if noticed == "missed":
-            assert counts[noticed] in (5, 6)
-        assert not [name for name in counts if name.startswith("errors")]
+    begin(flight, 0)
+    happens(flight)
+    flight.fly(6.0)
+    assert flight.vehicles.collisions(~flight.dead) == []
+    counts = flight.result().total.counts
+    assert counts["periods"] > 8 * 50
+    assert counts["plans received"] > 20
+    if "frozen" in fault:
+        assert counts["state is frozen"] == 1
+    if fault == "a process stands still":
+        assert counts["missed"] in (5, 6)
+    assert not [name for name in counts if name.startswith("errors")]
 
 
+@pytest.mark.slow
 def test_without_messages_they_collide():
     flight = flight_of(rule="none")
     met = []

@@ -25,7 +25,8 @@ for (const flight of flights) {
 const capital = text => text[0].toUpperCase() + text.slice(1);
 export const scenario = capital(data.scenario.replaceAll("_", " "));
 export const title = `${scenario}, ${nRobots} robots`;
-export const subtitle = [`held-out episode ${data.episode} (set ${data.seed})`, ...data.world].join(", ");
+const source = data.source ?? `held-out episode ${data.episode} (set ${data.seed})`;
+export const subtitle = [source, ...data.world].join(", ");
 // Announced plans are counted, too
 const announcing = flights.some(flight => flight.announces);
 export const counted = number => announcing ? (number === 1 ? "plan sent" : "plans sent") : (number === 1 ? "request" : "requests");

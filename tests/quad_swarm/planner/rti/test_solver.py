@@ -117,6 +117,7 @@ def test_agrees_with_the_converged_optimum(recorded, precision, sqp_iterations):
         assert spread(values)[1] <= p99
 
 
+@pytest.mark.slow
 def test_no_quadratic_program_raises_the_cost(recorded):
     # A linearised distance never exceeds the distance, so full steps descend (docs/planner.md).
     costs = [recorded.cost(recorded.u_guess)]
