@@ -68,7 +68,7 @@ class Flown:
         arrived = np.array([flight.arrived.max() for flight in flights])
         periods = counts["periods"] + counts["missed"]
         seconds = sum(flight.seconds * self.n_robots for flight in flights)
-        row = {
+        row: dict[str, Any] = {
             "flights": n,
             "collided": collided,
             "collision_low": low,
@@ -234,10 +234,7 @@ def _main(args: argparse.Namespace) -> None:
         check_writable(args.json, "--json")
     models = {one: trained_in(load_model(one, args.algo)) for one in args.policy if is_model(one)}
     preset = args.preset or (preset_of(models) if models else "flight")
-    config = make_config(preset, parse_world(args.world), n_robots=args.n_robots)
-    if args.plant is not None:
-        # Parameters of another simulator's vehicle are not drawn
-        config = dataclasses.replace(config, plant=args.plant, mismatch=0.0)
+    config = make_config(preset, parse_world(args.world), n_robots=args.n_robots, plant=args.plant)
     if not 0 <= args.priority <= 99:
         raise ValueError(f"--priority {args.priority}: it must be from 1 to 99, or 0 for none.")
     if not set_priority(args.priority):
@@ -245,7 +242,8 @@ def _main(args: argparse.Namespace) -> None:
     if args.record is not None:
         check_suffix(args.record)
         check_writable(args.record, "--record")
-    names, rows, n_flights = short_names(args.policy), [], len(args.policy) * args.episodes
+    names, n_flights = short_names(args.policy), len(args.policy) * args.episodes
+    rows: list[dict[str, Any]] = []
     first = first_episode(args.seed)
     with contextlib.ExitStack() as stack:
         for policy in args.policy:

@@ -180,7 +180,7 @@ def read(path: Path) -> Recording:
             for pair in found.talk.get(time, {}).get(kind, ()):
                 marks[k, pair[0], pair[1]] = True
     goal = np.array(found.rest["goal"]) if found.rest else state[-1, :, POSITION]
-    known = {"world": dict(found.rest.get("world", {})), "policy": str(found.rest.get("policy", ""))}
+    known: dict[str, Any] = {"world": dict(found.rest.get("world", {})), "policy": str(found.rest.get("policy", ""))}
     return Recording(np.array(times) / _NS, state, setpoint, plan, asked, told, goal, **known)
 
 

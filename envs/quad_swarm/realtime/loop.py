@@ -85,9 +85,8 @@ class Loop:
         self.supervisor = Supervisor(robot.config, limits or SafetyLimits())
         self.statistics = Statistics()
         self._wait = round(wait * _US)
-        self._setpoint = HOVERING
         self._flying = False
-        self._reset_link()
+        self._forget()
 
     def warm_up(self) -> None:
         """Fly two periods without commands, so that what is loaded and compiled at first use is there."""
@@ -109,12 +108,24 @@ class Loop:
         self.robot.reset(start, goal, self.late, now=first)
         self.supervisor.reset()
         self.statistics = Statistics()
-        self._goal, self._hold = self.robot.goal.copy(), None
+        self._forget()
         self._first = self.next_period = first
-        self._setpoint = HOVERING
         self._flying = True
-        self._reset_link()
         self._began = time.perf_counter(), time.process_time()
+
+    def _forget(self) -> None:
+        self._goal, self._setpoint = self.robot.goal.copy(), HOVERING
+        self._hold: np.ndarray | None = None  # where it hovers
+        self._sensed: Sensed | None = None
+        self._pending: dict[int, int] = {}  # whom it asked in this period, and when
+        self._unheard = self._unheard_since = 0  # requests since the last message of anybody
+        self._first = self.next_period = 0
+        self._last: int | None = None  # start of the last period
+        self._tick = self._asked_at = self._computed = 0
+        self._plans = False
+        self.asked: list[int] = []
+        self.told: list[int] = []
+        self.arrived: list[int] = []
 
     def stop(self) -> Statistics:
         """End a flight, and return its statistics."""
@@ -168,7 +179,7 @@ class Loop:
         statistics.counts["missed"] += max((tick - self._last) // robot.period - 1, 0) if self._last is not None else 0
         self._last = tick
         statistics.durations["jitter"].add(now - tick)
-        self._pending: dict[int, int] = {}
+        self._pending = {}
         sensed = self._perceived()
         mode = self.supervisor.check(now, sensed, self._setpoint, self._unanswered(now))
         self._plans = mode in (Mode.FLY, Mode.HOVER) and self.supervisor.sees
@@ -340,9 +351,3 @@ class Loop:
     def _note(self, what: str, error: Exception) -> None:
         self.statistics.counts[f"errors: {what}"] += 1
         self.statistics.last_error = f"{what}: {type(error).__name__}: {error}"
-
-    def _reset_link(self) -> None:
-        self._pending, self._sensed, self._last = {}, None, None
-        self._unheard = self._unheard_since = 0
-        self._plans, self._tick, self._asked_at, self._computed = False, 0, 0, 0
-        self.asked, self.told, self.arrived = list[int](), list[int](), list[int]()

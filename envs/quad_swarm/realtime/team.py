@@ -64,7 +64,7 @@ class Team:
         if self.is_learned:
             exported = files.load(self.policy).config
             # Robots know neither the plant nor how far vehicles are from their model
-            known = {"plant": self.config.plant, "mismatch": self.config.mismatch}
+            known: dict[str, Any] = {"plant": self.config.plant, "mismatch": self.config.mismatch}
             if dataclasses.replace(exported, **known) != self.config:
                 raise ValueError(f"{self.policy} was exported for another world: export it for this one")
         else:

@@ -59,7 +59,8 @@ def unpack_report(message: bytes) -> Report:
     if len(message) < REPORT.size or (len(message) - REPORT.size) % 12:
         raise ValueError(f"{len(message)} bytes are no report")
     plan = np.frombuffer(message, np.float32, offset=REPORT.size).reshape(-1, 3)
-    return Report(*REPORT.unpack_from(message)[1:], plan.astype(float))
+    _, robot, mode, asked, told, arrived = REPORT.unpack_from(message)
+    return Report(robot, mode, asked, told, arrived, plan.astype(float))
 
 
 class UdpVehicle:

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from quad_swarm.planner import Planner, make_planner
+from quad_swarm.planner import base, make_planner
 from quad_swarm.realtime.link import Channel, Conditions, Handler, Sensed, Traffic, WireLink
 from quad_swarm.realtime.loop import Loop
 from quad_swarm.realtime.process import Sample, report_of
@@ -71,7 +71,7 @@ class VirtualFlight:
         wait: float = 0.005,
         late: float = 0.25,
         checked: bool = False,
-        planner: Planner | None = None,
+        planner: base.Planner | None = None,
     ):
         self.config, self.vehicles = config, Vehicles(config)
         self.conditions, self.timing = conditions or Conditions(), timing or Timing()

@@ -48,7 +48,7 @@ def make_node(name: str, namespace: str = "", context: Any = None) -> Any:
     if context is None:
         context = rclpy.Context()
         rclpy.init(context=context)
-    options = {"start_parameter_services": False, "enable_rosout": False}
+    options: Any = {"start_parameter_services": False, "enable_rosout": False}
     return rclpy.create_node(name, namespace=namespace, context=context, **options)
 
 
@@ -71,7 +71,8 @@ class Mailbox:
     """
 
     def __init__(self, node: Any):
-        self._node, self._handler = node, None
+        self._node = node
+        self._handler: Any = None
         self._executor = make_executor(node.context)
         self._executor.add_node(node)
 

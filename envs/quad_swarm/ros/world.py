@@ -169,8 +169,8 @@ class RosWorld:
         assert self._hears is not None
         words = json.loads(message.data)
         if words["says"] == "report":
-            *numbers, plan = words["report"]
-            self._hears.on_report(Report(words["robot"], *numbers, np.array(plan)))
+            mode, asked, told, arrived, plan = words["report"]
+            self._hears.on_report(Report(words["robot"], mode, asked, told, arrived, np.array(plan)))
         else:
             self._hears.on_words(words)
 

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from quad_swarm.evaluation.flight import Condition, fly
+from quad_swarm.evaluation.recordings import Recording, write
 from quad_swarm.figures import replay as replay_module
 from quad_swarm.figures.replay import _colliding, main
 from quad_swarm.world.presets import make_config
