@@ -43,6 +43,7 @@ from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
 LINKS = ("udp", "ros2", "virtual")
 _LINGER = 1.0  # s
+_ATTEMPTS = 3  # to fly an episode without the machine standing still
 
 
 @dataclass
@@ -51,10 +52,12 @@ class Flown:
 
     :param n_robots: number of robots
     :param flights: the flights
+    :param repeated: flights that did not count, since the machine, and the world with it, stood still meanwhile
     """
 
     n_robots: int
     flights: list[Flight] = field(default_factory=list)
+    repeated: int = 0
 
     def row(self) -> dict[str, Any]:
         """Return its statistics by name. Durations are in milliseconds, as medians and as quantiles that one in a
@@ -83,7 +86,7 @@ class Flown:
             "missed": done.share("missed"),
             "late": done.share("late commands"),
             "cpu": done.cpu_seconds / done.seconds if done.seconds else None,
-            "pauses": sum(flight.pauses for flight in flights),
+            "repeated": self.repeated,
             "counts": dict(sorted(counts.items())),
         }
         for name, histogram in durations.items():
@@ -100,7 +103,7 @@ class Column(NamedTuple):
 
 
 def _pair(key: str) -> Callable[[dict[str, Any]], str]:
-    return lambda row: "-" if row[key][0] is None else " / ".join(f"{value:.3g}" for value in row[key])
+    return lambda row: "-" if row[key][0] is None else " / ".join(f"{value:.0f}" for value in row[key])
 
 
 def _share(key: str) -> Callable[[dict[str, Any]], str]:
@@ -112,17 +115,19 @@ COLUMNS = [
     Column("collided", lambda row: f"{row['collided']}/{row['flights']}"),
     Column("95 % interval", lambda row: f"{100 * row['collision_low']:.1f} - {row['collision_high']:.1%}"),
     Column("arrived", lambda row: f"{row['arrived']}/{row['flights']}"),
-    Column("after (s)", lambda row: "-" if row["seconds_to_arrival"] is None else f"{row['seconds_to_arrival']:.2f}"),
+    Column("in (s)", lambda row: "-" if row["seconds_to_arrival"] is None else f"{row['seconds_to_arrival']:.2f}"),
     Column("plans", _share("plan_share")),
     Column("B/s", lambda row: f"{row['bytes_per_second']:.0f}"),
     Column("age (ms)", _pair("plan_age_ms")),
     Column("missed", _share("missed")),
     Column("late", _share("late")),
     Column("CPU", _share("cpu")),
+    Column("again", lambda row: str(row["repeated"])),
 ]
 LEGEND = (
     "plans: sent, of all that could be; B/s: sent by a robot in a second; age: of plans when used, median / 99.9 %;\n"
-    "missed, late: periods skipped, commands later than assumed; CPU: of a core, by a robot's process"
+    "missed, late: periods skipped, commands later than assumed; CPU: of a core, by a robot's process\n"
+    "again: flights that did not count, since the machine stood still meanwhile"
 )
 
 
@@ -161,8 +166,9 @@ def fly(
     link: str,
     most: float,
     sees: Sees | None = None,
-) -> Iterator[Flight]:
-    """Fly episodes.
+) -> Iterator[tuple[Flight, bool]]:
+    """Fly episodes. Yields each flight, and whether it counts: if the machine, and the world with it, stood still for
+    more than a tenth of a second, it is flown again, up to two times.
 
     :param team: the team
     :param flown: episodes, see `episodes`
@@ -171,12 +177,17 @@ def fly(
     :param sees: called after each period of a flight
     """
     if link == "virtual":
-        yield from _virtual(team, flown, most, sees)
+        yield from ((flight, True) for flight in _virtual(team, flown, most, sees))
         return
     exchange: Exchange = RosWorld(team.config.n_robots) if link == "ros2" else UdpWorld()
     with Arena(team, exchange) as arena:
         for starts, goals, seed in flown:
-            yield arena.fly(starts, goals, seed, most, _LINGER, sees=sees)
+            for attempt in range(_ATTEMPTS):
+                flight = arena.fly(starts, goals, seed, most, _LINGER, sees=sees)
+                counts = not flight.pauses or attempt == _ATTEMPTS - 1
+                yield flight, counts
+                if counts:
+                    break
 
 
 def _virtual(
@@ -242,39 +253,68 @@ def _main(args: argparse.Namespace) -> None:
     if args.record is not None:
         check_suffix(args.record)
         check_writable(args.record, "--record")
-    names, n_flights = short_names(args.policy), len(args.policy) * args.episodes
-    rows: list[dict[str, Any]] = []
-    first = first_episode(args.seed)
-    with contextlib.ExitStack() as stack:
-        for policy in args.policy:
+    rows, first = [], first_episode(args.seed)
+    places = list(episodes(config, args.scenario, range(first, first + args.episodes)))
+    about = {"scenario": args.scenario, "n_robots": config.n_robots, "preset": preset, "plant": config.plant}
+    about |= {"link": args.link, "loss": args.loss, "wait": args.wait, "late": args.late, "seed": args.seed}
+    names = short_names(args.policy)
+    recorder = None if args.record is None else _Recorder(args.record, config, len(places) * len(args.policy))
+    options = {"wait": args.wait, "late": args.late, "priority": args.priority}
+    for policy in args.policy:
+        with contextlib.ExitStack() as stack:
             flown_as = policy
             if policy in models:
                 flown_as = stack.enter_context(tempfile.TemporaryDirectory(prefix="quad-swarm-"))
                 export(policy, config, Path(flown_as), args.algo)
-            options = {"wait": args.wait, "late": args.late, "priority": args.priority}
             team = Team(config, flown_as, conditions=Conditions(args.loss), **options)
-            flown, samples = Flown(config.n_robots), list[Sample]()
-            places = list(episodes(config, args.scenario, range(first, first + args.episodes)))
-            sees = None if args.record is None else samples.append
-            for flight in fly(team, places, args.link, args.most, sees):
-                flown.flights.append(flight)
-                if args.record is not None:
-                    number = len(rows) * args.episodes + len(flown.flights)
-                    path = args.record if n_flights == 1 else _numbered(args.record, number)
-                    write(path, recorded(samples, config, places[len(flown.flights) - 1][1], names[policy]))
-                    samples.clear()
-                print(_line(names[policy], len(flown.flights), flight), file=sys.stderr, flush=True)
-            about = {"scenario": args.scenario, "n_robots": config.n_robots, "preset": preset, "plant": config.plant}
-            about |= {"link": args.link, "loss": args.loss, "wait": args.wait, "late": args.late, "seed": args.seed}
-            rows.append({"policy": names[policy], **about, **flown.row()})
+            flown = _fly(team, places, args.link, args.most, names[policy], recorder)
+        rows.append({"policy": names[policy], **about, **flown.row()})
     print(format_table(rows))
     print(LEGEND)
     if args.json is not None:
         write_rows(args.json, rows)
 
 
-def _numbered(path: Path, number: int) -> Path:
-    return path.with_name(f"{path.stem}_{number}{path.suffix}")
+def _fly(
+    team: Team,
+    places: Sequence[tuple[np.ndarray, np.ndarray, int]],
+    link: str,
+    most: float,
+    policy: str,
+    recorder: _Recorder | None,
+) -> Flown:
+    """Fly episodes, and tell how each ended."""
+    flown, samples = Flown(team.config.n_robots), list[Sample]()
+    for flight, counts in fly(team, places, link, most, None if recorder is None else samples.append):
+        if counts:
+            goals = places[len(flown.flights)][1]
+            flown.flights.append(flight)
+            print(_line(policy, len(flown.flights), flight), file=sys.stderr, flush=True)
+            if recorder is not None:
+                recorder.write(samples, goals, policy)
+        flown.repeated += not counts
+        samples.clear()
+    return flown
+
+
+class _Recorder:
+    """Writes recordings, with numbers if there are several.
+
+    :param path: path of a single one
+    :param config: the world
+    :param count: number of flights
+    """
+
+    def __init__(self, path: Path, config: SwarmConfig, count: int):
+        self._path, self._config, self._count, self._written = path, config, count, 0
+
+    def write(self, samples: Sequence[Sample], goals: np.ndarray, policy: str) -> None:
+        """Write a recording."""
+        self._written += 1
+        path = self._path
+        if self._count > 1:
+            path = path.with_name(f"{path.stem}_{self._written}{path.suffix}")
+        write(path, recorded(samples, self._config, goals, policy))
 
 
 def recorded(samples: Sequence[Sample], config: SwarmConfig, goals: np.ndarray, policy: str) -> Recording:
@@ -303,5 +343,5 @@ def _line(policy: str, number: int, flight: Flight) -> str:
     met = f"collided: {flight.collisions}" if flight.collisions else "no collision"
     there = np.isfinite(flight.arrived)
     when = f"all arrived after {flight.arrived.max():.2f} s" if there.all() else f"{there.sum()} arrived"
-    paused = f", the machine stood still {flight.pauses} times" if flight.pauses else ""
+    paused = ", the machine stood still meanwhile" if flight.pauses else ""
     return f"{policy}, flight {number}: {met}, closest {flight.closest:.2f} m, {when}{paused}"

@@ -107,6 +107,14 @@ class Vehicles:
         self.arrived = np.full(n, -1)
         self._sense()
 
+    def warm_up(self) -> None:
+        """Fly for a moment: simulators compile what they need at first use."""
+        n = self.config.n_robots
+        places = np.arange(1.0, n + 1)[:, None] * np.ones(3)
+        self.reset(places, places, 0, 0)
+        for _ in range(2 * self.config.substeps):
+            self.advance()
+
     def command(self, robot: int, setpoint: np.ndarray) -> None:
         """Take a robot's command.
 
