@@ -79,3 +79,13 @@ def test_large_swarms_are_measured_with_and_without_a_neighbourhood(tmp_path):
     rows = read_rows(tmp_path / "rows.json")
     assert [row["perceived"] for row in rows] == ["all", "planned", "limited"]
     assert rows[0].keys() == read_rows(DATA / "large_swarms_speed.json")[0].keys()
+
+
+@pytest.mark.slow
+def test_robots_fly_while_something_goes_wrong(tmp_path):
+    words = ["--fault", "nothing", "a process dies", "--episodes", "1", "--json", str(tmp_path / "rows.json")]
+    subprocess.run([sys.executable, "-m", "studies.robots", *words], check=True, cwd=ROOT, timeout=500)
+    rows = read_rows(tmp_path / "rows.json")
+    assert [row["fault"] for row in rows] == ["nothing"] * 3 + ["a process dies"] * 3
+    assert rows[0].keys() == read_rows(DATA / "robots.json")[0].keys()
+    assert all(row["counts"]["plans received"] > 0 for row in rows)
