@@ -47,13 +47,13 @@ ROOMS = {
     "realtime": {"", "native", "planner", "plants", "world", "robot"},
     "ros": {"", "robot", "realtime"},
     "evaluation": {"", "jobs", "planner", "plants", "world", "task", "robot", "realtime", "ros"},
-    "figures": {"", "planner", "world", "task", "evaluation"},
+    "figures": {"", "planner", "world", "task", "realtime", "evaluation"},
     "models": set(),
 }
 # Foundations that stand on compiled code
 ON_NATIVE = {"quad_swarm.quadrotor"}
 # Drawing is optional, so whoever draws imports figures inside a function, where it is asked for.
-DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command"}
+DRAW_ON_REQUEST = {"quad_swarm.interfaces.env", "quad_swarm.evaluation.command", "quad_swarm.evaluation.fly"}
 
 NEED_NO_TEST = {"sb3_maddpg.__main__", "sb3_maddpg.callbacks", "quad_swarm.figures.colours"}
 # Modules that are tested through what is built on them

@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -157,7 +157,21 @@ def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterat
         yield starts, goals, int(rng.integers(2**63)) if config.is_random else 0
 
 
-Sees = Callable[[Sample], None]
+class Watcher(Protocol):
+    """Follows flights."""
+
+    def begin(self, policy: str, goals: np.ndarray) -> None:
+        """Begin to follow a flight.
+
+        :param policy: what flies
+        :param goals: goals, (n, 3) (m)
+        """
+
+    def add(self, sample: Sample) -> None:
+        """Take the next period."""
+
+    def end(self) -> None:
+        """Take note that the flight is over."""
 
 
 def fly(
@@ -165,7 +179,8 @@ def fly(
     flown: Iterable[tuple[np.ndarray, np.ndarray, int]],
     link: str,
     most: float,
-    sees: Sees | None = None,
+    watchers: Sequence[Watcher] = (),
+    name: str = "",
 ) -> Iterator[tuple[Flight, bool]]:
     """Fly episodes. Yields each flight, and whether it counts: if the machine, and the world with it, stood still for
     more than a tenth of a second, it is flown again, up to two times.
@@ -174,35 +189,49 @@ def fly(
     :param flown: episodes, see `episodes`
     :param link: one of `LINKS`
     :param most: time limit of a flight (s)
-    :param sees: called after each period of a flight
+    :param watchers: what follows the flights
+    :param name: name of the policy for them
     """
+
+    def sees(sample: Sample) -> None:
+        for watcher in watchers:
+            watcher.add(sample)
+
+    def tell(goals: np.ndarray | None) -> None:
+        for watcher in watchers:
+            if goals is None:
+                watcher.end()
+            else:
+                watcher.begin(name, goals)
+
     if link == "virtual":
-        yield from ((flight, True) for flight in _virtual(team, flown, most, sees))
+        virtual = _virtual(team)
+        for starts, goals, seed in flown:
+            tell(goals)
+            virtual.reset(starts, goals, seed)
+            virtual.fly(most, _LINGER, sees if watchers else None)
+            tell(None)
+            yield virtual.result(), True
         return
     exchange: Exchange = RosWorld(team.config.n_robots) if link == "ros2" else UdpWorld()
     with Arena(team, exchange) as arena:
         for starts, goals, seed in flown:
             for attempt in range(_ATTEMPTS):
-                flight = arena.fly(starts, goals, seed, most, _LINGER, sees=sees)
+                tell(goals)
+                flight = arena.fly(starts, goals, seed, most, _LINGER, sees=sees if watchers else None)
+                tell(None)
                 counts = not flight.pauses or attempt == _ATTEMPTS - 1
                 yield flight, counts
                 if counts:
                     break
 
 
-def _virtual(
-    team: Team, flown: Iterable[tuple[np.ndarray, np.ndarray, int]], most: float, sees: Sees | None
-) -> Iterator[Flight]:
+def _virtual(team: Team) -> VirtualFlight:
     config = team.config
     planner = make_planner(config.planner, config.quadrotor, config.n_robots)
     policies = [team.robot(k, planner).policy for k in range(config.n_robots)]
-    flight = VirtualFlight(
-        config, policies, team.conditions, None, team.limits, team.wait, team.late, team.checked, planner
-    )
-    for starts, goals, seed in flown:
-        flight.reset(starts, goals, seed)
-        flight.fly(most, _LINGER, sees)
-        yield flight.result()
+    times = (team.wait, team.late)
+    return VirtualFlight(config, policies, team.conditions, None, team.limits, *times, team.checked, planner)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -229,6 +258,9 @@ def main(argv: list[str] | None = None) -> int:
         "--priority", type=int, default=0, help="real-time priority of all processes (SCHED_FIFO), 1 to 99"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows")
+    parser.add_argument(
+        "--live", type=int, nargs="?", const=0, metavar="PORT", help="show the flights on a web page of this machine"
+    )
     parser.add_argument(
         "--record", type=Path, metavar="FILE", help="record the flights as .npz, .csv or .mcap; several get numbers"
     )
@@ -260,15 +292,22 @@ def _main(args: argparse.Namespace) -> None:
     names = short_names(args.policy)
     recorder = None if args.record is None else _Recorder(args.record, config, len(places) * len(args.policy))
     options = {"wait": args.wait, "late": args.late, "priority": args.priority}
-    for policy in args.policy:
-        with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        watchers: list[Watcher] = [] if recorder is None else [recorder]
+        if args.live is not None:
+            from quad_swarm.figures.live import LivePage
+
+            page = stack.enter_context(LivePage(config, args.live))
+            print(f"The flights are shown at {page.url}", file=sys.stderr, flush=True)
+            watchers.append(page)
+        for policy in args.policy:
             flown_as = policy
             if policy in models:
                 flown_as = stack.enter_context(tempfile.TemporaryDirectory(prefix="quad-swarm-"))
                 export(policy, config, Path(flown_as), args.algo)
             team = Team(config, flown_as, conditions=Conditions(args.loss), **options)
-            flown = _fly(team, places, args.link, args.most, names[policy], recorder)
-        rows.append({"policy": names[policy], **about, **flown.row()})
+            flown = _fly(team, places, args, names[policy], recorder, watchers)
+            rows.append({"policy": names[policy], **about, **flown.row()})
     print(format_table(rows))
     print(LEGEND)
     if args.json is not None:
@@ -278,27 +317,25 @@ def _main(args: argparse.Namespace) -> None:
 def _fly(
     team: Team,
     places: Sequence[tuple[np.ndarray, np.ndarray, int]],
-    link: str,
-    most: float,
+    args: argparse.Namespace,
     policy: str,
     recorder: _Recorder | None,
+    watchers: Sequence[Watcher],
 ) -> Flown:
     """Fly episodes, and tell how each ended."""
-    flown, samples = Flown(team.config.n_robots), list[Sample]()
-    for flight, counts in fly(team, places, link, most, None if recorder is None else samples.append):
+    flown = Flown(team.config.n_robots)
+    for flight, counts in fly(team, places, args.link, args.most, watchers, policy):
         if counts:
-            goals = places[len(flown.flights)][1]
             flown.flights.append(flight)
             print(_line(policy, len(flown.flights), flight), file=sys.stderr, flush=True)
             if recorder is not None:
-                recorder.write(samples, goals, policy)
+                recorder.write()
         flown.repeated += not counts
-        samples.clear()
     return flown
 
 
 class _Recorder:
-    """Writes recordings, with numbers if there are several.
+    """A watcher that writes recordings, with numbers if there are several.
 
     :param path: path of a single one
     :param config: the world
@@ -308,13 +345,24 @@ class _Recorder:
     def __init__(self, path: Path, config: SwarmConfig, count: int):
         self._path, self._config, self._count, self._written = path, config, count, 0
 
-    def write(self, samples: Sequence[Sample], goals: np.ndarray, policy: str) -> None:
-        """Write a recording."""
+    def begin(self, policy: str, goals: np.ndarray) -> None:
+        """See `Watcher`."""
+        self._policy, self._goals, self._samples = policy, goals, list[Sample]()
+
+    def add(self, sample: Sample) -> None:
+        """See `Watcher`."""
+        self._samples.append(sample)
+
+    def end(self) -> None:
+        """See `Watcher`."""
+
+    def write(self) -> None:
+        """Write the recording of the last flight."""
         self._written += 1
         path = self._path
         if self._count > 1:
             path = path.with_name(f"{path.stem}_{self._written}{path.suffix}")
-        write(path, recorded(samples, self._config, goals, policy))
+        write(path, recorded(self._samples, self._config, self._goals, self._policy))
 
 
 def recorded(samples: Sequence[Sample], config: SwarmConfig, goals: np.ndarray, policy: str) -> Recording:

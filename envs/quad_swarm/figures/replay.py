@@ -28,6 +28,7 @@ from quad_swarm.figures.colours import COLOURS
 from quad_swarm.geometry import closest_approach, length
 from quad_swarm.parsing import Parser
 from quad_swarm.quadrotor import ATTITUDE, POSITION
+from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS
@@ -79,6 +80,32 @@ def recorded_page(recordings: Sequence[tuple[str, Recording]], otherwise: SwarmC
     source = ", ".join(name for name, _ in recordings)
     about = {"scenario": "recorded flight", "preset": "", "world": [], "seed": 0, "episode": 0, "source": source}
     return _page(about, flights[0][1].config, step, flights)
+
+
+def live_page(policy: str, flight: Flight, number: int) -> str:
+    """Create the web page of a flight that is under way, which asks its server for the rest.
+
+    :param policy: what flies
+    :param flight: the flight so far
+    :param number: number of the flight, from 1
+    :return: the page as HTML
+    """
+    about = {"scenario": "flight", "preset": "", "world": [], "seed": 0, "episode": 0}
+    about |= {"source": f"flight {number}", "live": number}
+    return _page(about, flight.config, flight.config.planner.dt, [(policy, flight)])
+
+
+def live_step(flight: Flight) -> dict[str, Any]:
+    """Return what the page of a flight under way is told of its last step.
+
+    :param flight: the flight between the last two times
+    """
+    step = _describe("", flight)
+    return {
+        **{name: step[name][-1] for name in ("positions", "attitudes", "plans", "requests", "separation")},
+        "colliding": [pair[1:] for pair in step["colliding"]],
+        "arrived": flight.arrival is not None,
+    }
 
 
 def _page(about: dict[str, Any], config: SwarmConfig, dt: float, flights: Iterable[tuple[str, Flight]]) -> str:
@@ -137,7 +164,13 @@ def _plain_name(policy: str) -> tuple[str, str]:
         return "No communication", "nobody asks"
     if policy == "full":
         return "Full communication", "everybody asks everybody"
-    return ("Learned policy" if is_model(policy) else "Rule"), short_name(policy)
+    if is_model(policy):
+        return "Learned policy", short_name(policy)
+    try:
+        parse_rule(policy)
+    except ValueError:  # a recording, or a policy of another process
+        return policy, ""
+    return "Rule", policy
 
 
 def _colliding(flight: Flight) -> list[list[int]]:

@@ -543,6 +543,7 @@ def test_recorded_flights_are_replayed(tmp_path, monkeypatch, capsys):
     assert data["dt"] == pytest.approx(0.1)
     lab, full = data["flights"]
     assert (lab["policy"], full["policy"]) == ("lab.csv", "full")
+    assert (lab["name"], full["name"]) == ("lab.csv", "Full communication")
     assert lab["positions"] == full["positions"] == flown.pos.round(3).tolist()
     assert lab["requests"] == full["requests"]
     assert len(full["requests"][0]) == 6

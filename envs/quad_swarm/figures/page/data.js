@@ -5,21 +5,39 @@ export const flights = data.flights;
 export const nRobots = flights[0].goals.length;
 export const nPairs = nRobots * (nRobots - 1);
 export const contact = data.collision_distance;
-export const last = Math.max(...flights.map(flight => flight.requests.length));
+export let last = 0;
 
 for (const flight of flights) {
-  flight.steps = flight.requests.length;
   // Requests made before each step
   flight.asked = [0];
   for (const step of flight.requests) flight.asked.push(flight.asked.at(-1) + step.length);
   flight.announces = flight.requests.some(step => step.some(pair => pair[2]));
+  flight.touching = new Map();
+  derive(flight, flight.colliding);
+}
+
+function derive(flight, colliding) {
+  flight.steps = flight.requests.length;
+  last = Math.max(last, flight.steps);
   flight.closest = Math.min(...flight.separation);
   flight.closestStep = flight.separation.indexOf(flight.closest);
-  flight.touching = new Map();
-  for (const [step, i, j] of flight.colliding) {
+  for (const [step, i, j] of colliding) {
     if (!flight.touching.has(step)) flight.touching.set(step, new Set());
     flight.touching.get(step).add(i).add(j);
   }
+}
+
+// A flight that is still under way grows by a step, see `quad_swarm.figures.live`.
+export function append(flight, step) {
+  flight.positions.push(step.positions);
+  flight.attitudes.push(step.attitudes);
+  flight.plans.push(step.plans);
+  flight.requests.push(step.requests);
+  flight.separation.push(step.separation);
+  flight.asked.push(flight.asked.at(-1) + step.requests.length);
+  flight.arrival ??= step.arrived ? flight.requests.length : null;
+  flight.collision ??= step.colliding.length ? flight.requests.length : null;
+  derive(flight, step.colliding.map(pair => [flight.requests.length, ...pair]));
 }
 
 const capital = text => text[0].toUpperCase() + text.slice(1);

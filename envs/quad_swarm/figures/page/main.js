@@ -1,13 +1,15 @@
 // The page: playback, controls, and what they change.
 
 import {Camera, presets} from "./camera.js";
-import {data, fileName, flights, last, nRobots, seconds, subtitle, title} from "./data.js";
+import {append, data, fileName, flights, last, nRobots, seconds, subtitle, title} from "./data.js";
 import {about, legend, Panel} from "./panels.js";
 import {download, Picture, record} from "./picture.js";
 import {framed, Views} from "./scene.js";
 import {onTheme, setTheme, toggleTheme} from "./theme.js";
 
 const HOLD = 1.5; // s at the end before a loop begins anew
+const BEHIND = 0.3; // s that a flight under way is shown late, so that it moves evenly
+const PLOTS = 500; // ms between two drawings of the plots of a flight under way
 const element = id => document.getElementById(id);
 const hash = new URLSearchParams(location.hash.slice(1));
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -64,7 +66,9 @@ function frame(time) {
 
 function advance(elapsed) {
   adapt(elapsed);
-  if (state.now >= last) {
+  if (state.live) {
+    state.now = Math.min(last, Math.max(state.now + elapsed / data.dt, last - BEHIND / data.dt));
+  } else if (state.now >= last) {
     state.held += elapsed;
     if (!state.looping) pause();
     else if (state.held >= HOLD) [state.now, state.held] = [0, 0];
@@ -117,7 +121,7 @@ function seek(step) {
 }
 
 function play() {
-  if (state.now >= last) state.now = 0;
+  if (state.now >= last && !state.live) state.now = 0;
   [state.playing, state.held, state.before] = [true, 0, null];
   label();
   resize();
@@ -329,9 +333,33 @@ function beginPage() {
     const wanted = new URLSearchParams(location.hash.slice(1)).get("step");
     if (wanted !== null) { pause(); seek(Number(wanted) || 0); }
   });
-  if (hash.has("step")) seek(Math.floor(Number(hash.get("step"))) || 0);
+  if (data.live) beginLive();
+  else if (hash.has("step")) seek(Math.floor(Number(hash.get("step"))) || 0);
   else if (!calm) play();
   redraw();
+}
+
+// A flight that is still under way: its steps come from the server that the page came from.
+function beginLive() {
+  state.live = true;
+  let drawn = 0;
+  const subtitle_ = element("subtitle"), source = new EventSource(`events?flight=${data.live}&from=${last}`);
+  const tell = text => { subtitle_.textContent = `${subtitle}, ${text}`; document.body.dataset.live = text; };
+  const plots = () => { for (const panel of panels) panel.draw(); };
+  source.addEventListener("open", () => tell("live"));
+  source.addEventListener("message", event => {
+    append(flights[0], JSON.parse(event.data));
+    element("time").max = last;
+    if (performance.now() - drawn > PLOTS) {
+      drawn = performance.now();
+      plots();
+    }
+    redraw();
+  });
+  source.addEventListener("end", () => { tell("landed"); state.live = false; plots(); redraw(); });
+  source.addEventListener("begin", () => location.reload());
+  source.addEventListener("error", () => { if (state.live) tell("no connection"); });
+  if (!state.playing) play();
 }
 
 function onKey(event) {

@@ -41,7 +41,6 @@ export class Panel {
     find("h2").textContent = this.details.querySelector("h2").textContent = flight.name;
     find(".detail").textContent = flight.detail;
     this.details.querySelector("h2").append(Object.assign(document.createElement("small"), {textContent: flight.detail}));
-    this.details.querySelector(".summary").textContent = summary(flight);
     const captions = [
       this.flight.announces
         ? "Who receives whose plan, requested or announced: one lane per pair, one block per receiving robot, in the colour of the robot whose plan it is"
@@ -74,6 +73,7 @@ export class Panel {
   // Draws timeline and plots anew, at the width that they have.
   draw() {
     const [asks, separation, requests] = this.svgs;
+    set(this.details.querySelector(".summary"), summary(this.flight));
     this.cursors = [drawTimeline(asks, this.flight), drawSeparation(separation, this.flight), drawRequests(requests, this.flight)];
   }
 

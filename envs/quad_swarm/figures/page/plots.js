@@ -4,7 +4,7 @@ import {contact, data, flights, grouped, last, metres as inMetres, nPairs, perce
 
 const LEFT = 46, RIGHT = 10;
 export const top = 2 * contact; // m, where the axis of separation ends: 2 cm must be seen beside the contact distance
-const most = Math.max(1, ...flights.map(flight => flight.asked.at(-1)));
+const mostAsked = () => Math.max(1, ...flights.map(flight => flight.asked.at(-1)));
 
 export const timeScale = width => step => LEFT + (width - LEFT - RIGHT) * step / Math.max(last, 1);
 export const stepUnder = (x, width) => (x - LEFT) / (width - LEFT - RIGHT) * Math.max(last, 1);
@@ -75,7 +75,7 @@ export function drawSeparation(svg, flight) {
 }
 
 export function drawRequests(svg, flight) {
-  const height = 116, low = 90, high = 14, width = begin(svg, height), x = timeScale(width);
+  const height = 116, low = 90, high = 14, width = begin(svg, height), x = timeScale(width), most = mostAsked();
   const y = count => low - (low - high) * count / most, total = flight.asked.at(-1);
   for (const count of [0, most]) {
     add(svg, "line", {class: "grid", x1: LEFT, x2: width - RIGHT, y1: y(count), y2: y(count)});
