@@ -25,7 +25,7 @@ RECIPE = "OwnBit-v0: {n_timesteps: 300, policy: MlpPolicy, learning_starts: 50, 
 def test_runs_in_its_short_form(name, tmp_path):
     (tmp_path / "r.yml").write_text(RECIPE)
     command = [sys.executable, str(EXAMPLES / name), *WORDS.get(name, ["--quick"])]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout
     assert f"]({name})" in (EXAMPLES / "README.md").read_text()
@@ -49,7 +49,7 @@ def test_both_zoos_show_and_plot_the_runs_of_each_other(by, tmp_path):
         plot,
     ):
         env = {**os.environ, "MPLBACKEND": "Agg"}
-        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=500, check=False)
         assert done.returncode == 0, (command, done.stderr)
         assert command is plot or "train" in command or command[:2] == zoo or "3 Episodes" in done.stdout
 

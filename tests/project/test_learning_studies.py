@@ -75,7 +75,7 @@ def test_the_recorded_trainings_and_games_are_printed(capsys):
 @pytest.mark.slow
 def test_large_swarms_are_measured_with_and_without_a_neighbourhood(tmp_path):
     words = ["--sizes", "4", "--envs", "2", "--seconds", "0.01", "--json", str(tmp_path / "rows.json")]
-    subprocess.run([sys.executable, "-m", "studies.large_swarms", *words], check=True, cwd=ROOT, timeout=300)
+    subprocess.run([sys.executable, "-m", "studies.large_swarms", *words], check=True, cwd=ROOT, timeout=500)
     rows = read_rows(tmp_path / "rows.json")
     assert [row["perceived"] for row in rows] == ["all", "planned", "limited"]
     assert rows[0].keys() == read_rows(DATA / "large_swarms_speed.json")[0].keys()

@@ -24,7 +24,7 @@ class HereKernelManager(AsyncKernelManager):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_from_top_to_bottom(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
-    client = NotebookClient(notebook, timeout=300, kernel_manager_class=HereKernelManager)
+    client = NotebookClient(notebook, timeout=500, kernel_manager_class=HereKernelManager)
     client.execute(cwd=str(tmp_path))
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(cell.execution_count for cell in cells)

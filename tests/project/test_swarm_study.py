@@ -363,7 +363,7 @@ def test_hero_is_an_animation_in_two_themes(tmp_path):
     # A process of its own: Playwright allows one driver in a process, and other tests have one
     words = ["-m", "studies.swarm.hero", "--policy", "none", "full", "--n-robots", "2", "--size", "300", "200"]
     words += ["--seconds", "0.4", "--speed", "0.5", "--fps", "5", "--format", "webp", "gif", "--out", str(tmp_path)]
-    subprocess.run([sys.executable, *words], check=True, cwd=protocol.ROOT, timeout=300)
+    subprocess.run([sys.executable, *words], check=True, cwd=protocol.ROOT, timeout=500)
     first = {}
     for theme, suffix in itertools.product(("light", "dark"), ("webp", "gif")):
         with Image.open(tmp_path / f"hero-{theme}.{suffix}") as film:

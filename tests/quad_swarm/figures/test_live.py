@@ -36,7 +36,7 @@ def samples(flight):
 
 
 def get(live, path=""):
-    with urllib.request.urlopen(live.url + path, timeout=60) as answer:
+    with urllib.request.urlopen(live.url + path, timeout=500) as answer:
         assert answer.headers["Content-Type"].startswith("text/html")
         return answer.read().decode()
 
@@ -85,7 +85,7 @@ def test_the_next_flight_begins_anew(live, flown):
 @pytest.mark.parametrize(("path", "status"), [("other", 404), ("events", 400), ("events?flight=one&from=0", 400)])
 def test_other_addresses_are_errors(live, path, status):
     with pytest.raises(urllib.error.HTTPError) as error:
-        urllib.request.urlopen(live.url + path, timeout=60)
+        urllib.request.urlopen(live.url + path, timeout=500)
     assert error.value.code == status
 
 
@@ -99,6 +99,7 @@ def test_a_browser_follows(live, flown, browser):
     for sample in every[:3]:
         live.add(sample)
     page = browser.new_page()
+    page.set_default_timeout(300_000)  # ms, on a busy machine
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(live.url)

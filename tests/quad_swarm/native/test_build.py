@@ -138,7 +138,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 def test_a_fork_solves_the_same(filled):
     # In a process of its own: a fork of this one could wait for locks of threads that other tests have left.
-    assert subprocess.run([sys.executable, "-c", FORK], timeout=120).returncode == 42
+    assert subprocess.run([sys.executable, "-c", FORK], timeout=500).returncode == 42
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def run_harness(folder: Path, main: str, *flags: str) -> str:
     command = [*build_module.compiler(), *build_module._FLAGS, build_module._native_flag(), "-DREAL=float", *flags]
     command += [f"-I{folder}", f"-I{SOURCES}", str(folder / "main.cpp"), "-o", str(folder / "main")]
     subprocess.run(command, check=True, capture_output=True, text=True)
-    done = subprocess.run([str(folder / "main")], check=False, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([str(folder / "main")], check=False, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -19,7 +19,7 @@ def test_errors_are_answers_and_the_end_of_the_connection_is_the_end():
     here.send(("step", 7))
     assert "no plant 7" in str(here.recv())
     here.close()
-    thread.join(timeout=10)
+    thread.join(timeout=500)
     assert not thread.is_alive()
 
 

@@ -52,7 +52,7 @@ def nodes(monkeypatch):
 
 def until(mailbox, handler, done, again=lambda: None):
     """Wait, and repeat what may get lost before the two have found each other."""
-    ends = monotonic() + 60 * SECOND
+    ends = monotonic() + 500 * SECOND
     while not done() and monotonic() < ends:
         again()
         mailbox.wait(monotonic() + 100_000, handler, done)

@@ -152,7 +152,7 @@ def test_short_episodes_are_doubtful_wherever_they_are_asked_for():
 def test_a_command_says_it_once_in_one_line():
     code = "import warnings; from quad_swarm.evaluation.command import main; main(); warnings.resetwarnings(); main()"
     command = ["--policy", "none", "full", "--scenario", "random", "--episodes", "2", "--world", "memory=30"]
-    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=500)
     assert done.returncode == 0
     (line,) = (line for line in done.stderr.splitlines() if "memory" in line)
     assert "DoubtfulWorld: memory=30: " in line

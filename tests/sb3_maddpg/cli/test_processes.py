@@ -102,7 +102,7 @@ def test_processes_of_a_training_import_only_what_the_user_named(words, tmp_path
     if not script.exists():
         pytest.skip("the command is not installed beside Python")
     command = [str(script), "train", "--env", "my_team", "--conf-file", "r.yml", "--eval-freq", "-1", *words]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=500)
     logs = "".join(path.read_text() for path in tmp_path.glob("logs/*.log"))
     assert done.returncode == 0, done.stdout + done.stderr + logs
     assert list(tmp_path.glob("logs/maddpg/my_team_1/my_team.zip"))

@@ -49,7 +49,7 @@ def checkpoints(folder: Path) -> list[Path]:
 
 def wait_for(process: subprocess.Popen, count: int, folder: Path, beyond: str = "") -> None:
     """Until there are so many checkpoints after a name."""
-    end = time.monotonic() + 120
+    end = time.monotonic() + 500
     while sum(path.name > beyond for path in checkpoints(folder)) < count:
         assert process.poll() is None, process.stdout.read()
         assert time.monotonic() < end

@@ -27,7 +27,7 @@ def _with_a_recipe(tmp_path, monkeypatch):
 
 
 def wait_until(condition, process: subprocess.Popen) -> None:
-    end = time.monotonic() + 300
+    end = time.monotonic() + 500
     while not condition():
         assert process.poll() is None
         assert time.monotonic() < end
@@ -59,7 +59,7 @@ def test_a_training_whose_terminal_is_closed_writes_its_checkpoint_and_ends_by_t
         wait_until(trains, process)
         assert checkpoints() == []
         os.close(ours)
-        process.wait(timeout=300)
+        process.wait(timeout=500)
     finally:
         process.kill()
     assert process.returncode == -signal.SIGHUP
@@ -81,7 +81,7 @@ def test_a_training_whose_tee_ends_with_the_terminal_writes_its_checkpoint_too()
         process.stdout.close()
         time.sleep(0.05)
         process.send_signal(signal.SIGHUP)
-        process.wait(timeout=300)
+        process.wait(timeout=500)
     finally:
         process.kill()
     assert process.returncode == -signal.SIGHUP
@@ -112,7 +112,7 @@ def test_ignored_signals_stay_ignored(words):
         process.send_signal(signal.SIGHUP)
         wait_until(lambda: checkpoints()[-1] > last, process)  # the training goes on
         process.send_signal(signal.SIGTERM)
-        process.wait(timeout=300)
+        process.wait(timeout=500)
     finally:
         process.kill()
     assert process.returncode == (-signal.SIGTERM if not words else 128 + signal.SIGTERM)
@@ -126,7 +126,7 @@ def test_a_reader_that_ends_is_no_error():
     )
     process.stdout.close()
     assert process.stderr.read() == b""
-    assert process.wait(timeout=300) == 128 + signal.SIGPIPE
+    assert process.wait(timeout=500) == 128 + signal.SIGPIPE
 
 
 @pytest.mark.slow

@@ -256,7 +256,7 @@ def test_workers_share_a_study(folder, storage):
     command += [*SEARCH, "--n-trials", "2", "--storage", storage, "--study-name", "s", "--seed", "1"]
     workers = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) for _ in range(2)]
     for worker in workers:
-        output, _ = worker.communicate(timeout=300)
+        output, _ = worker.communicate(timeout=500)
         assert worker.returncode == 0, output
     both = study(storage) if storage.endswith(".log") else optuna.load_study(study_name="s", storage=storage)
     assert [trial.state.name for trial in both.trials] == ["COMPLETE"] * 4

@@ -146,7 +146,7 @@ def test_exported_agents_run_without_this_package(tmp_path):
         policy.export(tmp_path / str(number))
         np.save(tmp_path / f"obs_{number}.npy", obs)
     assert th.equal(th.random.get_rng_state(), state)
-    subprocess.run([sys.executable, "-c", RUN, tmp_path, str(len(cases))], check=True, cwd=tmp_path, timeout=120)
+    subprocess.run([sys.executable, "-c", RUN, tmp_path, str(len(cases))], check=True, cwd=tmp_path, timeout=500)
     for number, (policy, obs, expected) in enumerate(cases):
         actions = np.load(tmp_path / f"actions_{number}.npy")
         assert actions.dtype == policy.predict(obs).dtype
