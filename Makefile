@@ -25,8 +25,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[zoo,plot,render,plants,ray,onnx,record,docs,dev]"
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[ros]" || \
-		echo "ROS 2 cannot be installed: what needs it is skipped"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[ros,mavlink]" || \
+		echo "ROS 2 or MAVLink cannot be installed: what needs them is skipped"
 	@touch $@
 
 train: install  ## train MADDPG on the swarm, then print the table of policies (STEPS=20000 for a short run)

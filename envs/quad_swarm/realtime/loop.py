@@ -21,6 +21,7 @@ from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.supervisor import HOVERING, Mode, SafetyLimits, Supervisor
 from quad_swarm.robot import Plan, Robot
 from quad_swarm.world.beliefs import resampled
+from quad_swarm.world.presets import points
 
 _US = 1e6
 _AHEAD = 0.05  # s by which clocks may differ before a plan comes from the future
@@ -112,6 +113,14 @@ class Loop:
         self._first = self.next_period = first
         self._flying = True
         self._began = time.perf_counter(), time.process_time()
+
+    def fly_to(self, goal: np.ndarray) -> None:
+        """Fly to another goal from the next period on.
+
+        :param goal: the goal, (3,), world frame (m)
+        :raises ValueError: if it is no finite point
+        """
+        self._goal = points("goal", np.asarray(goal, float).reshape(1, -1), 1).reshape(1, 1, 3)
 
     def _forget(self) -> None:
         self._goal, self._setpoint = self.robot.goal.copy(), HOVERING

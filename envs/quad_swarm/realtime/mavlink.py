@@ -1,0 +1,195 @@
+"""An autopilot that speaks MAVLink and flies attitudes offboard, as PX4 does. **Not tested on hardware.**
+
+Frames: robots have x forward, y left, z up, and a world with z up, whose x axis is taken for east and y for north;
+MAVLink has x forward, y right, z down, and north, east, down.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
+from quad_swarm.realtime.attitude import Attitude, AttitudeController
+from quad_swarm.realtime.link import Sensed, monotonic
+from quad_swarm.robot import Plan
+
+# When positions and velocities of the others were so (us), and these, (n - 1, 3) each
+Others = Callable[[], tuple[int, np.ndarray, np.ndarray] | None]
+_OFFBOARD = 6  # PX4's custom main mode
+_CUSTOM = 1  # flag of the base mode
+_IGNORE_RATES = 0b111
+_US = 1e-6
+
+
+class Port(Protocol):
+    """The way to an autopilot."""
+
+    def send(self, data: bytes) -> None:
+        """Send bytes."""
+
+    def receive(self) -> bytes:
+        """Return the bytes that arrived, none if there are none."""
+
+
+class UdpPort:
+    """A port over UDP.
+
+    :param local: address to receive at, such as ("127.0.0.1", 14540)
+    """
+
+    def __init__(self, local: tuple[str, int]):
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(local)
+        self._socket.setblocking(False)
+        self._autopilot: Any = None
+
+    def send(self, data: bytes) -> None:
+        """See `Port`. Nothing is sent before the autopilot has been heard."""
+        if self._autopilot is not None:
+            self._socket.sendto(data, self._autopilot)
+
+    def receive(self) -> bytes:
+        """See `Port`."""
+        received = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                data, self._autopilot = self._socket.recvfrom(65535)
+                received.append(data)
+        return b"".join(received)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def to_ned(vector: np.ndarray) -> np.ndarray:
+    """Return a vector of the world, (3,), east, north, up, as north, east, down; it is its own inverse."""
+    return np.array([vector[1], vector[0], -vector[2]])
+
+
+def to_frd(attitude: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw (rad), (3,), with y left and z up as those with y right and z down, with the yaw from
+    north; it is its own inverse."""
+    roll, pitch, yaw = attitude
+    return np.array([roll, -pitch, (np.pi / 2 - yaw + np.pi) % (2 * np.pi) - np.pi])
+
+
+def quaternion(attitude: np.ndarray) -> list[float]:
+    """Return roll, pitch and yaw (rad), (3,), as a quaternion w, x, y, z."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(attitude / 2), np.cos(attitude / 2)
+    return [
+        float(cr * cp * cy + sr * sp * sy),
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+    ]
+
+
+class MavlinkVehicle:
+    """A robot's vehicle, see `quad_swarm.realtime.Vehicle`. It needs ``LOCAL_POSITION_NED`` and ``ATTITUDE`` of the
+    autopilot, at the rate of the periods or faster.
+
+    :ivar armed: whether the autopilot says that the motors run
+    :ivar offboard: whether it says that it flies our set-points
+
+    :param port: the way to the autopilot
+    :param others: where the other robots are, such as from motion capture
+    :param controller: attitude and thrust for set-points
+    :param now: the robot's clock (us)
+    :param system: number of the autopilot
+    :raises ImportError: if pymavlink is not installed
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        others: Others,
+        controller: AttitudeController | None = None,
+        now: Callable[[], int] = monotonic,
+        system: int = 1,
+    ):
+        try:
+            from pymavlink.dialects.v20 import common
+        except ImportError:
+            raise ImportError("MAVLink needs pymavlink: pip install 'sb3-maddpg[mavlink]'.") from None
+        self._common, self._port, self._others, self._now = common, port, others, now
+        self.controller = controller or AttitudeController()
+        self._mav = common.MAVLink(None, srcSystem=system, srcComponent=common.MAV_COMP_ID_ONBOARD_COMPUTER)
+        self._mav.robust_parsing = True  # bytes that are no message are skipped
+        self._system, self._lock = system, threading.RLock()
+        self._state = np.zeros(N_STATES)
+        self._moved = self._turned = -1  # when position and attitude arrived
+        self._commanded = now()
+        self.armed = self.offboard = False
+
+    def sense(self) -> Sensed | None:
+        """See `Vehicle`. The older of position and attitude counts."""
+        with self._lock:
+            for message in self._mav.parse_buffer(self._port.receive()) or ():
+                self._take(message)
+            others = self._others()
+            if min(self._moved, self._turned) < 0 or others is None:
+                return None
+            stamp, then = min(self._moved, self._turned), others[0]
+            pos, vel = np.asarray(others[1], float), np.asarray(others[2], float)
+            return Sensed(stamp, self._state.copy(), pos + (stamp - then) * _US * vel, vel)
+
+    def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
+        """See `Vehicle`."""
+        with self._lock:
+            now = self._now()
+            attitude = self.controller(self._state, setpoint, (now - self._commanded) * _US)
+            self._commanded = now
+            self._send_attitude(attitude)
+
+    def disarm(self) -> None:
+        """See `Vehicle`."""
+        self._command(self._common.MAV_CMD_COMPONENT_ARM_DISARM, 0)
+
+    def arm(self) -> None:
+        """Ask the autopilot to start the motors."""
+        self._command(self._common.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+
+    def begin_offboard(self) -> None:
+        """Ask the autopilot to fly our set-points. PX4 wants to have had some for a second before."""
+        self._command(self._common.MAV_CMD_DO_SET_MODE, _CUSTOM, _OFFBOARD)
+
+    def _take(self, message: Any) -> None:
+        kind = message.get_type()
+        if kind != "BAD_DATA" and message.get_srcSystem() != self._system:
+            return
+        if kind == "LOCAL_POSITION_NED":
+            values = np.array([message.x, message.y, message.z, message.vx, message.vy, message.vz])
+            if np.isfinite(values).all():
+                self._state[POSITION], self._state[VELOCITY] = to_ned(values[:3]), to_ned(values[3:])
+                self._moved = self._now()
+        elif kind == "ATTITUDE":
+            values = np.array([message.roll, message.pitch, message.yaw])
+            if np.isfinite(values).all():
+                self._state[6:9] = to_frd(values)
+                self._turned = self._now()
+        elif kind == "HEARTBEAT":
+            self.armed = bool(message.base_mode & self._common.MAV_MODE_FLAG_SAFETY_ARMED)
+            self.offboard = message.custom_mode >> 16 & 0xFF == _OFFBOARD
+
+    def _send_attitude(self, attitude: Attitude) -> None:
+        q = quaternion(to_frd(np.array(attitude[:3])))
+        milliseconds = self._now() // 1000 % 2**32
+        target = (self._system, self._common.MAV_COMP_ID_AUTOPILOT1)
+        message = self._mav.set_attitude_target_encode(
+            milliseconds, *target, _IGNORE_RATES, q, 0.0, 0.0, 0.0, attitude.thrust
+        )
+        self._port.send(message.pack(self._mav))
+
+    def _command(self, command: int, *parameters: float) -> None:
+        with self._lock:
+            values = [*map(float, parameters), *[0.0] * (7 - len(parameters))]
+            target = (self._system, self._common.MAV_COMP_ID_AUTOPILOT1)
+            message = self._mav.command_long_encode(*target, command, 0, *values)
+            self._port.send(message.pack(self._mav))
