@@ -6,6 +6,7 @@ The world tells it when to fly and what it perceives, and takes its commands; pl
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -204,6 +205,7 @@ def run(path: str, make: Callable[[Team], tuple[SimulatedLink, SimulatedVehicle]
     except (ValueError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the world, which ends the robots
     if not set_priority(team.priority):
         print("no real-time priority: the system does not allow it", file=sys.stderr)
     process.run()

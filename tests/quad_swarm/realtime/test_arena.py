@@ -49,7 +49,8 @@ def test_four_processes_swap_places():
 def test_a_process_that_dies_on_purpose_ends_no_flight():
     with Arena(Team(CONFIG, "none")) as arena:
         starts, goals = places(CONFIG)
-        flight = arena.fly(starts, goals, most=4.0, events=[(1.0, lambda arena: arena.kill(2))])
+        interrupted = (0.5, lambda arena: arena.signal(1, signal.SIGINT))  # as by Ctrl-C, which is for the world
+        flight = arena.fly(starts, goals, most=4.0, events=[interrupted, (1.0, lambda arena: arena.kill(2))])
         assert flight.killed == [2]
         assert [one is None for one in flight.statistics] == [False, False, True, False]
         assert arena.vehicles.state[2, 2] < starts[2, 2] - 0.5, "its vehicle lands"
