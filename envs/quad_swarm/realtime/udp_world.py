@@ -111,8 +111,10 @@ class UdpVehicle:
 
     def _understand(self, message: bytes) -> None:
         if message[:1] == b"{":
-            self.heard = self._link.now()
-            self.control.append(json.loads(message))
+            words = json.loads(message)
+            if isinstance(words.get("says"), str):
+                self.heard = self._link.now()
+                self.control.append(words)
         elif message[:1] == bytes([IS_SENSED]):
             sensed = unpack_sensed(message, self._n_others)
             self.heard = self._link.now()
@@ -149,7 +151,7 @@ class UdpWorld:
         while True:
             left = max(until - monotonic(), 0)
             if select.select([self._socket], [], [], left / _US)[0]:
-                with contextlib.suppress(OSError, ValueError, KeyError, struct.error):  # of strangers
+                with contextlib.suppress(OSError, ValueError, KeyError, TypeError, struct.error):  # of strangers
                     self._take(*self._socket.recvfrom(_MOST_BYTES), hears)
             elif left == 0:
                 return

@@ -94,7 +94,7 @@ def test_a_robot_that_is_not_there_is_told_nothing():
     world.close()
 
 
-@pytest.mark.parametrize("message", [b"", bytes([9, 9]), bytes([1]), bytes([2, 0])])
+@pytest.mark.parametrize("message", [b"", bytes([9, 9]), bytes([1]), bytes([2, 0]), b"{", b"{}", b'{"says": 1}'])
 def test_messages_of_strangers_are_nothing(message):
     world, link, hears = UdpWorld(), UdpLink(0), Hears()
     try:
