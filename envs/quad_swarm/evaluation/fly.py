@@ -288,7 +288,7 @@ def _main(args: argparse.Namespace) -> None:
     rows, first = [], first_episode(args.seed)
     places = list(episodes(config, args.scenario, range(first, first + args.episodes)))
     about = {"scenario": args.scenario, "n_robots": config.n_robots, "preset": preset, "plant": config.plant}
-    about |= {"link": args.link, "loss": args.loss, "wait": args.wait, "late": args.late, "seed": args.seed}
+    about |= {"link": args.link, "loss": args.loss, "wait": args.wait, "acts_after": args.late, "seed": args.seed}
     names = short_names(args.policy)
     recorder = None if args.record is None else _Recorder(args.record, config, len(places) * len(args.policy))
     options = {"wait": args.wait, "late": args.late, "priority": args.priority}
