@@ -93,6 +93,7 @@ def test_only_this_machine_is_served(live):
     assert live.url.startswith("http://127.0.0.1:")
 
 
+@pytest.mark.slow
 def test_a_browser_follows(live, flown, browser):
     every = list(samples(flown))
     live.begin("full", flown.goal)

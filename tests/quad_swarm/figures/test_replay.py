@@ -394,6 +394,7 @@ def test_announced_plans_are_drawn_and_counted_apart_from_requests(view, pages):
     assert differ.sum() > 20, "announced plans are dashed"
 
 
+@pytest.mark.slow
 def test_the_page_says_what_differs_from_the_preset(view):
     header = view("told").inner_text("header")
     assert "held-out episode 0 (set 0), noise.wind=1.5, plant=model" in header

@@ -38,6 +38,7 @@ def test_dropped_swarms_and_forks_do_not_touch_the_others():
     assert np.array_equal(there, here)
 
 
+@pytest.mark.slow
 def test_refuses_sub_steps_between_its_own():
     with pytest.raises(ValueError, match=r"multiples of 2 ms, not 0\.003 s"):
         make_plant("crazyflow", QuadrotorParams(), 0.003, 1, 2)

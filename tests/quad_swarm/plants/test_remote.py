@@ -50,6 +50,7 @@ def test_all_plants_share_one_process_until_it_dies():
     assert np.isfinite(third.step(state, u, air, None)).all()
 
 
+@pytest.mark.slow
 @needs_crazyflow
 def test_plants_that_are_gone_are_dropped():
     plant = make()

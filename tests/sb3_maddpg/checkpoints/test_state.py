@@ -208,6 +208,7 @@ PASSING = {"model", "parent", "locals", "globals", "num_timesteps", "pbar", "_is
 PASSING |= {"_total_max_episodes", "n_levels"}  # follow from arguments and the environment
 
 
+@pytest.mark.slow
 def test_the_table_of_callbacks_holds_all_that_training_changes_in_them(tmp_path):
     env = DummyVecEnv([lambda: Monitor(curriculum())])
     evaluation = EvalCallback(
@@ -254,6 +255,7 @@ def test_the_window_of_a_curriculum_is_the_one_passed_now(tmp_path):
     assert (curriculum.success_threshold, curriculum.successes.maxlen) == (0.5, 3)
 
 
+@pytest.mark.slow
 def test_checkpoints_without_the_values_at_the_start_are_read(tmp_path):
     make("replayed").learn(250, callback=[RunCheckpoint(tmp_path, EVERY, keep=1), StopTrainingOnMaxEpisodes(90)])
 
