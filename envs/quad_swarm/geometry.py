@@ -41,3 +41,14 @@ def closest_approach(
     closing = -(product(position, velocity) + 0.0)  # at rest, the sign of zero is always the same
     time = np.clip(closing / np.maximum(product(velocity, velocity), _STILL), 0.0, until)
     return position + time[..., None] * velocity, time
+
+
+def to_quaternion(attitude: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw (rad), (3,), as a quaternion x, y, z, w, (4,)."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(attitude / 2), np.cos(attitude / 2)
+    return np.array([
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ])  # fmt: skip

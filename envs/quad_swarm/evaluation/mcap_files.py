@@ -28,8 +28,9 @@ from mcap_ros2.reader import read_ros2_messages
 from mcap_ros2.writer import Writer
 
 from quad_swarm.evaluation.recordings import Recording, about
+from quad_swarm.geometry import to_quaternion
 from quad_swarm.quadrotor import POSITION, VELOCITY
-from quad_swarm.ros.messages import FRAME, from_command, from_odometry, rotation, to_quaternion
+from quad_swarm.ros.messages import FRAME, from_command, from_odometry, rotation
 
 _NS = 1_000_000_000
 _HEADER = "std_msgs/Header header"

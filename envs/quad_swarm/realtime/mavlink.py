@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from quad_swarm.geometry import to_quaternion
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.attitude import Attitude, AttitudeController
 from quad_swarm.realtime.link import Sensed, monotonic
@@ -78,17 +79,6 @@ def to_frd(attitude: np.ndarray) -> np.ndarray:
     north; it is its own inverse."""
     roll, pitch, yaw = attitude
     return np.array([roll, -pitch, (np.pi / 2 - yaw + np.pi) % (2 * np.pi) - np.pi])
-
-
-def quaternion(attitude: np.ndarray) -> list[float]:
-    """Return roll, pitch and yaw (rad), (3,), as a quaternion w, x, y, z."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(attitude / 2), np.cos(attitude / 2)
-    return [
-        float(cr * cp * cy + sr * sp * sy),
-        float(sr * cp * cy - cr * sp * sy),
-        float(cr * sp * cy + sr * cp * sy),
-        float(cr * cp * sy - sr * sp * cy),
-    ]
 
 
 class MavlinkVehicle:
@@ -179,7 +169,7 @@ class MavlinkVehicle:
             self.offboard = message.custom_mode >> 16 & 0xFF == _OFFBOARD
 
     def _send_attitude(self, attitude: Attitude) -> None:
-        q = quaternion(to_frd(np.array(attitude[:3])))
+        q = np.roll(to_quaternion(to_frd(np.array(attitude[:3]))), 1).tolist()  # w comes first
         milliseconds = self._now() // 1000 % 2**32
         target = (self._system, self._common.MAV_COMP_ID_AUTOPILOT1)
         message = self._mav.set_attitude_target_encode(

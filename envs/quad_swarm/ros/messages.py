@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from quad_swarm.geometry import to_quaternion
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.robot import Plan
 
@@ -45,17 +46,6 @@ def to_time(us: int) -> Any:
 def from_time(time: Any) -> int:
     """Return a message's time (us)."""
     return int(time.sec) * _S + int(time.nanosec) // 1000
-
-
-def to_quaternion(attitude: np.ndarray) -> np.ndarray:
-    """Return roll, pitch and yaw (rad), (3,), as a quaternion x, y, z, w, (4,)."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(attitude / 2), np.cos(attitude / 2)
-    return np.array([
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    ])  # fmt: skip
 
 
 def from_quaternion(q: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 
 from quad_swarm.realtime import Loop, SafetyLimits
 from quad_swarm.realtime.attitude import GRAVITY, AttitudeController, AttitudeGains
-from quad_swarm.realtime.mavlink import MavlinkVehicle, UdpPort, quaternion, to_frd, to_ned
+from quad_swarm.realtime.mavlink import MavlinkVehicle, UdpPort, to_frd, to_ned
 from quad_swarm.robot import Robot, RulePolicy
 from quad_swarm.world.presets import make_config
 
@@ -143,7 +143,6 @@ def test_frames():
     np.testing.assert_array_equal(to_ned(np.array([1.0, 2.0, 3.0])), [2, 1, -3])
     np.testing.assert_allclose(to_frd(np.array([0.1, 0.2, 0.0])), [0.1, -0.2, np.pi / 2])
     np.testing.assert_allclose(to_frd(to_frd(np.array([0.1, 0.2, 3.0]))), [0.1, 0.2, 3.0])
-    np.testing.assert_allclose(quaternion(np.array([0, 0, np.pi])), [0, 0, 0, 1], atol=1e-12)
 
 
 def test_what_is_no_message_or_not_finite_is_nothing():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from quad_swarm.geometry import to_quaternion
 from quad_swarm.robot import Plan
 from quad_swarm.ros import messages
 
@@ -10,7 +11,7 @@ from quad_swarm.ros import messages
 def test_quaternions_are_rotations():
     rng = np.random.default_rng(0)
     for attitude in rng.uniform(-1.4, 1.4, (100, 3)):
-        q = messages.to_quaternion(attitude)
+        q = to_quaternion(attitude)
         np.testing.assert_allclose(messages.from_quaternion(q), attitude, atol=1e-12)
         np.testing.assert_allclose(messages.from_quaternion(-q), attitude, atol=1e-12)
         x, y, z, w = q
