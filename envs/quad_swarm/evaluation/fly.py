@@ -308,6 +308,8 @@ def _main(args: argparse.Namespace) -> None:
             team = Team(config, flown_as, conditions=Conditions(args.loss), **options)
             flown = _fly(team, places, args, names[policy], recorder, watchers)
             rows.append({"policy": names[policy], **about, **flown.row()})
+            if args.link == "virtual":  # one process flies all robots
+                rows[-1]["cpu"] = None
     print(format_table(rows))
     print(LEGEND)
     if args.json is not None:

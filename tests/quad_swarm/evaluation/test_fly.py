@@ -38,6 +38,7 @@ def test_flights_in_virtual_time(tmp_path, capsys):
     assert 15 < full["plan_age_ms"][0] < 60
     assert full["counts"]["requests"] == full["periods"] * 2
     assert full["bytes_per_second"] > 1000
+    assert full["cpu"] is None, "one process flies all robots"
     assert (full["loss"], full["acts_after"]) == (0.1, 0.25)
     names = sorted(path.name for path in tmp_path.glob("*.npz"))
     assert names == [f"flight_{k}.npz" for k in range(1, 5)]
