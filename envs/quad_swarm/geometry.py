@@ -1,4 +1,4 @@
-"""Lengths of vectors, and the closest approach of straight motion."""
+"""Lengths of vectors, attitudes and frames, and the closest approach of straight motion."""
 
 from __future__ import annotations
 
@@ -52,3 +52,31 @@ def to_quaternion(attitude: np.ndarray) -> np.ndarray:
         cr * cp * sy - sr * sp * cy,
         cr * cp * cy + sr * sp * sy,
     ])  # fmt: skip
+
+
+def from_quaternion(q: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw (rad), (3,), of a quaternion x, y, z, w, (4,).
+
+    :raises ValueError: if it is no rotation
+    """
+    norm = np.linalg.norm(q)
+    if not 0.9 < norm < 1.1:
+        raise ValueError(f"the quaternion {np.asarray(q).tolist()} is no rotation")
+    x, y, z, w = q / norm
+    return np.array([
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    ])  # fmt: skip
+
+
+def to_ned(vector: np.ndarray) -> np.ndarray:
+    """Return a vector of the world, (3,), east, north, up, as north, east, down; it is its own inverse."""
+    return np.array([vector[1], vector[0], -vector[2]])
+
+
+def to_frd(attitude: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw (rad), (3,), with y left and z up as those with y right and z down, with the yaw from
+    north; it is its own inverse."""
+    roll, pitch, yaw = attitude
+    return np.array([roll, -pitch, (np.pi / 2 - yaw + np.pi) % (2 * np.pi) - np.pi])

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from quad_swarm.geometry import to_quaternion
+from quad_swarm.geometry import to_frd, to_ned, to_quaternion
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.attitude import Attitude, AttitudeController
 from quad_swarm.realtime.link import Sensed, monotonic
@@ -67,18 +67,6 @@ class UdpPort:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-def to_ned(vector: np.ndarray) -> np.ndarray:
-    """Return a vector of the world, (3,), east, north, up, as north, east, down; it is its own inverse."""
-    return np.array([vector[1], vector[0], -vector[2]])
-
-
-def to_frd(attitude: np.ndarray) -> np.ndarray:
-    """Return roll, pitch and yaw (rad), (3,), with y left and z up as those with y right and z down, with the yaw from
-    north; it is its own inverse."""
-    roll, pitch, yaw = attitude
-    return np.array([roll, -pitch, (np.pi / 2 - yaw + np.pi) % (2 * np.pi) - np.pi])
 
 
 class MavlinkVehicle:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.geometry import to_quaternion
+from quad_swarm.geometry import from_quaternion, to_quaternion
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.robot import Plan
 
@@ -29,7 +29,7 @@ def msgs() -> SimpleNamespace:
     """
     names = {
         "builtin_interfaces": "Duration Time",
-        "geometry_msgs": "Quaternion Transform Twist TwistStamped Vector3",
+        "geometry_msgs": "PoseStamped Quaternion Transform Twist TwistStamped Vector3",
         "nav_msgs": "Odometry",
         "std_msgs": "Header String",
         "trajectory_msgs": "MultiDOFJointTrajectory MultiDOFJointTrajectoryPoint",
@@ -46,22 +46,6 @@ def to_time(us: int) -> Any:
 def from_time(time: Any) -> int:
     """Return a message's time (us)."""
     return int(time.sec) * _S + int(time.nanosec) // 1000
-
-
-def from_quaternion(q: np.ndarray) -> np.ndarray:
-    """Return roll, pitch and yaw (rad), (3,), of a quaternion x, y, z, w, (4,).
-
-    :raises ValueError: if it is no rotation
-    """
-    norm = np.linalg.norm(q)
-    if not 0.9 < norm < 1.1:
-        raise ValueError(f"the quaternion {np.asarray(q).tolist()} is no rotation")
-    x, y, z, w = q / norm
-    return np.array([
-        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)),
-        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    ])  # fmt: skip
 
 
 def rotation(attitude: np.ndarray) -> np.ndarray:
@@ -95,9 +79,11 @@ def to_odometry(state: np.ndarray, stamp: int, child: str) -> Any:
     return message
 
 
-def from_odometry(message: Any) -> tuple[int, np.ndarray]:
+def from_odometry(message: Any, world_twist: bool = False) -> tuple[int, np.ndarray]:
     """Return stamp (us) and state, (9,), of ``nav_msgs/Odometry``.
 
+    :param message: the message
+    :param world_twist: whether its twist is in the frame of the world instead of that of the body
     :raises ValueError: if the orientation is no rotation
     """
     pose, linear = message.pose.pose, message.twist.twist.linear
@@ -105,7 +91,8 @@ def from_odometry(message: Any) -> tuple[int, np.ndarray]:
     state[POSITION] = pose.position.x, pose.position.y, pose.position.z
     q = pose.orientation
     state[6:9] = from_quaternion(np.array([q.x, q.y, q.z, q.w]))
-    state[VELOCITY] = rotation(state[6:9]) @ (linear.x, linear.y, linear.z)
+    velocity = np.array([linear.x, linear.y, linear.z])
+    state[VELOCITY] = velocity if world_twist else rotation(state[6:9]) @ velocity
     return from_time(message.header.stamp), state
 
 

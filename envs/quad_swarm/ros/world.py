@@ -22,74 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.realtime.link import Handler, Sensed
 from quad_swarm.realtime.process import Hears, Report
 from quad_swarm.robot import Plan
 from quad_swarm.ros.link import RosLink
-from quad_swarm.ros.messages import from_command, from_odometry, msgs, to_command, to_odometry
+from quad_swarm.ros.messages import from_command, msgs, to_odometry
 from quad_swarm.ros.node import Mailbox, make_node, quality
-
-_STALE = 200_000  # us between two robots' odometry from which on the older one counts as everybody's
-_US = 1e-6
+from quad_swarm.ros.vehicles import OdometryVehicle
 
 
 def names_of(n_robots: int) -> list[str]:
     """Return the names of robots."""
     return [f"robot_{k}" for k in range(n_robots)]
-
-
-class OdometryVehicle:
-    """Perceives by odometry, and is commanded by ``/NAME/cmd``.
-
-    :param node: the robot's node
-    :param mailbox: receives for it
-    :param link: the robot's link, whose clock it uses
-    :param names: names of all robots
-    """
-
-    def __init__(self, node: Any, mailbox: Mailbox, link: RosLink, names: Sequence[str]):
-        self._link, own = link, names[link.index]
-        self._states: dict[int, tuple[int, np.ndarray]] = {}
-        self._commands = node.create_publisher(msgs().TwistStamped, f"/{own}/cmd", quality(1))
-        for number, name in enumerate(names):
-
-            def take(message: Any, handler: Handler, number: int = number) -> None:
-                self._see(number, message)
-
-            mailbox.subscribe(msgs().Odometry, f"/{name}/odom", quality(1), take)
-        self._others = [number for number in range(len(names)) if number != link.index]
-
-    def sense(self) -> Sensed | None:
-        """See `quad_swarm.realtime.Vehicle`. The others are moved to the time of the robot's own state."""
-        states = self._states
-        if len(states) < len(self._others) + 1:
-            return None
-        stamp, own = states[self._link.index]
-        oldest = min(one for one, _ in states.values())
-        pos, vel = np.empty((len(self._others), 3)), np.empty((len(self._others), 3))
-        for place, other in enumerate(self._others):
-            then, state = states[other]
-            vel[place] = state[VELOCITY]
-            pos[place] = state[POSITION] + (stamp - then) * _US * vel[place]
-        return Sensed(stamp if stamp - oldest < _STALE else oldest, own, pos, vel)
-
-    def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
-        """See `quad_swarm.realtime.Vehicle`."""
-        self._commands.publish(to_command(setpoint, self._link.shared(self._link.now())))
-
-    def disarm(self) -> None:
-        """See `quad_swarm.realtime.Vehicle`. The world stops the motors of what lies on the ground."""
-
-    def _see(self, number: int, message: Any) -> None:
-        try:
-            stamp, state = from_odometry(message)
-        except ValueError:
-            self._link.traffic.refused += 1
-            return
-        stamp = self._link.own(stamp) + self._link.clock_error
-        if number not in self._states or stamp > self._states[number][0]:
-            self._states[number] = stamp, state
 
 
 class RosVehicle(OdometryVehicle):
@@ -114,9 +58,9 @@ class RosVehicle(OdometryVehicle):
         """See `SimulatedVehicle`."""
         self._states.clear()
 
-    def _see(self, number: int, message: Any) -> None:
+    def _see(self, number: int, stamp: int, state: np.ndarray) -> None:
         self.heard = self._link.now()
-        super()._see(number, message)
+        super()._see(number, stamp, state)
 
     def _hear(self, message: Any, handler: Handler) -> None:
         self.heard = self._link.now()

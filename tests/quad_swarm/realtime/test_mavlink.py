@@ -5,9 +5,10 @@ import socket
 import numpy as np
 import pytest
 
+from quad_swarm.geometry import to_frd, to_ned
 from quad_swarm.realtime import Loop, SafetyLimits
 from quad_swarm.realtime.attitude import GRAVITY, AttitudeController, AttitudeGains
-from quad_swarm.realtime.mavlink import MavlinkVehicle, UdpPort, to_frd, to_ned
+from quad_swarm.realtime.mavlink import MavlinkVehicle, UdpPort
 from quad_swarm.robot import Robot, RulePolicy
 from quad_swarm.world.presets import make_config
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from quad_swarm.geometry import to_quaternion
+from quad_swarm.geometry import from_quaternion, to_quaternion
 from quad_swarm.robot import Plan
 from quad_swarm.ros import messages
 
@@ -12,8 +12,8 @@ def test_quaternions_are_rotations():
     rng = np.random.default_rng(0)
     for attitude in rng.uniform(-1.4, 1.4, (100, 3)):
         q = to_quaternion(attitude)
-        np.testing.assert_allclose(messages.from_quaternion(q), attitude, atol=1e-12)
-        np.testing.assert_allclose(messages.from_quaternion(-q), attitude, atol=1e-12)
+        np.testing.assert_allclose(from_quaternion(q), attitude, atol=1e-12)
+        np.testing.assert_allclose(from_quaternion(-q), attitude, atol=1e-12)
         x, y, z, w = q
         vector = rng.normal(size=3)
         turned = vector + 2 * np.cross((x, y, z), np.cross((x, y, z), vector) + w * vector)
@@ -30,7 +30,7 @@ def test_a_robot_that_pitches_down_accelerates_forwards():
 def test_what_is_no_rotation_is_refused():
     for q in (np.zeros(4), np.full(4, np.nan), np.ones(4)):
         with pytest.raises(ValueError, match="no rotation"):
-            messages.from_quaternion(q)
+            from_quaternion(q)
 
 
 def test_odometry_and_back():
