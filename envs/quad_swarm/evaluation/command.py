@@ -1,4 +1,4 @@
-"""``sb3-maddpg evaluate``: compare policies over the same held-out episodes."""
+"""``sb3-maddpg evaluate``: compare policies over the same held-out episodes, or judge recorded flights."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
 from quad_swarm.errors import needs_extra, shown, unknown_name
-from quad_swarm.evaluation.evaluation import evaluate, make_pool
-from quad_swarm.evaluation.flight import Condition
+from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise_all
+from quad_swarm.evaluation.flight import Condition, fly
+from quad_swarm.evaluation.judging import flat, format_flights, judge, legend, totals
 from quad_swarm.evaluation.policies import is_model, load_model, short_name, short_names, trained_in
 from quad_swarm.evaluation.provenance import provenance
-from quad_swarm.evaluation.rows import STDOUT, check_writable, write_csv, write_rows, write_text
+from quad_swarm.evaluation.recordings import Recording, check_suffix, numbered, read_flights, write
+from quad_swarm.evaluation.rows import STDOUT, aligned, check_writable, write_csv, write_rows, write_text
 from quad_swarm.jobs import ENGINES
 from quad_swarm.jobs.journal import default_folder
 from quad_swarm.parsing import Parser
@@ -31,7 +33,10 @@ from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
 # Shown by `sb3-maddpg --help`
-EXAMPLES = "  sb3-maddpg evaluate --policy none full cpa:0.7:1.5 pretrained:quad-swarm-paper --scenario all --jobs 2"
+EXAMPLES = """\
+  sb3-maddpg evaluate --policy none full cpa:0.7:1.5 pretrained:quad-swarm-paper --scenario all --jobs 2
+  sb3-maddpg evaluate --policy none --scenario symmetric_swap --record flight.mcap --record-collided
+  sb3-maddpg evaluate --flight flight.npz lab.csv --world radius=0.15 goal_radius=0.2 --json -"""
 
 
 class Column(NamedTuple):
@@ -65,6 +70,7 @@ COLUMNS = [
 ]
 WIDTH = 100
 SHORTEST_NAME = 12
+_MOST_RECORDED = 1000  # episodes, each a file
 
 
 def table_texts(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> list[list[str]]:
@@ -89,13 +95,7 @@ def format_table(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> str:
     if not wide:
         taken = sum(max(map(len, column)) + 2 for k, column in enumerate(zip(*texts, strict=True)) if k != 1)
         texts = [line for text in texts for line in _wrapped(text, max(WIDTH - taken, SHORTEST_NAME))]
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    texts.insert(1, ["-" * width for width in widths])
-    lines = (
-        "  ".join(t.rjust(w) if k > 1 else t.ljust(w) for k, (t, w) in enumerate(zip(line, widths, strict=True)))
-        for line in texts
-    )
-    return "\n".join(line.rstrip() for line in lines)
+    return aligned(texts, 2)
 
 
 def _wrapped(texts: list[str], most: int) -> list[list[str]]:
@@ -266,8 +266,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         "sb3-maddpg evaluate",
         description="Fly the same held-out episodes with several policies and compare them. Without options, this "
-        "prints the paper's table: four policies in all scenarios.",
-        epilog=f"example:\n{EXAMPLES}",
+        "prints the paper's table: four policies in all scenarios. With --flight, recorded flights are judged instead.",
+        epilog=f"examples:\n{EXAMPLES}",
     )
     add_policy_arguments(parser, required=False)
     parser.add_argument(
@@ -279,6 +279,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
     add_worker_arguments(parser, jobs=1)
+    parser.add_argument(
+        "--flight",
+        nargs="+",
+        type=Path,
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="recorded flights, real or simulated (.npz, .csv, .mcap), instead of policies to fly; --preset (otherwise "
+        "that of the file, or flight) and --world tell the rest, such as radius and goal_radius",
+    )
+    parser.add_argument(
+        "--record",
+        type=Path,
+        metavar="FILE",
+        help="record the episodes as .npz, .csv or .mcap; several get numbers, so choose few (--episodes)",
+    )
+    parser.add_argument("--record-collided", action="store_true", help="record only episodes with a collision")
     parser.add_argument("--wide", action="store_true", help="print all columns, in long lines")
     parser.add_argument(
         "--json",
@@ -318,7 +335,26 @@ def workers(args: argparse.Namespace) -> Executor:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return run(_compare, _parser().parse_args(argv))
+    args = _parser().parse_args(argv)
+    return run(_judge if args.flight else _compare, args)
+
+
+def _judge(args: argparse.Namespace) -> None:
+    """Judge recorded flights."""
+    for name in ("policy", "scenario", "latex", "plot", "record"):
+        if getattr(args, name):
+            raise ValueError(f"--{name} is for policies to fly, --flight for recorded flights: leave one of them out.")
+    printed = _check_files(args)
+    flights = read_flights(args.flight, args.preset, parse_world(args.world))
+    rows = [judge(str(path), recording) for path, recording in flights]
+    sums = totals(rows)
+    try:
+        if args.json:
+            write_rows(args.json, flat([*rows, *sums]))
+        if args.csv:
+            write_csv(args.csv, flat([*rows, *sums]))
+    finally:
+        print(format_flights(rows, sums), "", *legend(rows), sep="\n", file=printed)
 
 
 def _compare(args: argparse.Namespace) -> None:
@@ -328,14 +364,18 @@ def _compare(args: argparse.Namespace) -> None:
     args.policy = args.policy or paper_policies()
     conditions = make_conditions(args, list(SCENARIOS) if args.scenario == ["all"] else args.scenario)
     printed = _check_files(args)
+    _check_record(args, len(conditions))
     solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name  # fails here if a simulator is missing
     elsewhere = args.engine != "local" or args.address is not None
     try:
         with workers(args) if elsewhere else nullcontext() as executor:
-            rows = evaluate(conditions, args.episodes, args.seed, args.jobs, default_folder(), executor)
+            flown = fly_all(
+                conditions, args.episodes, args.seed, args.jobs, journal=default_folder(), executor=executor
+            )
     except KeyboardInterrupt:
         print("interrupted; repeat the command to continue", file=sys.stderr)
         raise
+    rows = summarise_all(flown)
     rows = [
         row | provenance(condition, args.preset, args.seed, solver)
         for row, condition in zip(rows, conditions, strict=True)
@@ -355,6 +395,8 @@ def _compare(args: argparse.Namespace) -> None:
     for path in filter(None, (args.json, args.csv, args.latex)):
         if path != STDOUT:
             print(f"wrote {path}", file=printed)
+    if args.record:
+        _record(args, flown, printed)
     if args.plot:
         from quad_swarm.figures.plots import draw_all  # matplotlib is only needed here
 
@@ -362,12 +404,54 @@ def _compare(args: argparse.Namespace) -> None:
             print(f"drew {path}", file=printed)
 
 
+def _record(
+    args: argparse.Namespace, flown: Mapping[Condition, Sequence[Mapping[str, float]]], printed: TextIO
+) -> None:
+    """Fly the chosen episodes again, one by one, and write their recordings."""
+    chosen = [
+        (condition, number)
+        for condition, rows in flown.items()
+        for number, row in enumerate(rows)
+        if row["collided"] or not args.record_collided
+    ]
+    if not chosen:
+        print(f"no episode had a collision: {args.record} is not written", file=printed)
+    if len(chosen) > _MOST_RECORDED:
+        print(f"only the first {_MOST_RECORDED} of {len(chosen)} episodes are recorded", file=printed)
+        chosen = chosen[:_MOST_RECORDED]
+    names = short_names(condition.policy for condition in flown)
+    for k, (condition, number) in enumerate(chosen, 1):
+        path = numbered(args.record, k, len(chosen))
+        write(path, Recording.of(fly(condition, args.seed, number), names[condition.policy]))
+        print(f"recorded {path}: {condition.scenario}, {names[condition.policy]}, episode {number}", file=printed)
+
+
+def _check_record(args: argparse.Namespace, conditions: int) -> None:
+    """Check before the flights that they can be recorded.
+
+    :param conditions: number of conditions
+    """
+    if args.record is None:
+        if args.record_collided:
+            raise ValueError("--record-collided needs --record FILE.")
+        return
+    check_suffix(args.record)
+    if args.record.suffix == ".mcap":
+        with needs_extra(args.record.name, "record"):
+            import quad_swarm.evaluation.mcap_files  # noqa: F401
+    if (count := conditions * args.episodes) > _MOST_RECORDED and not args.record_collided:
+        raise ValueError(
+            f"--record {args.record}: {count} episodes would be {count} files, more than {_MOST_RECORDED}; choose "
+            "fewer policies, scenarios or --episodes, or --record-collided."
+        )
+
+
 def _check_files(args: argparse.Namespace) -> TextIO:
     """Check before the flights that everything can be written and drawn after them.
 
     :return: where the table goes: the standard output, unless a file is written there
     """
-    paths = {f"--{name}": path for name in ("json", "csv", "latex", "plot") if (path := getattr(args, name))}
+    paths = {f"--{name}": path for name in ("json", "csv", "latex", "plot", "record") if (path := getattr(args, name))}
     for option, path in paths.items():
         same = [other for other, its in paths.items() if its.absolute() == path.absolute()]
         if len(same) > 1:

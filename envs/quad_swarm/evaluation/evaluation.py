@@ -120,7 +120,14 @@ def evaluate(
     :param executor: executor that flies the pieces, such as a `Cluster`; by default ``jobs`` processes of this machine
     :return: one row per condition, see `summarise` and, if full communication is among the policies, `lost_against`
     """
-    flown = fly_all(conditions, episodes, seed, jobs, journal=journal, executor=executor)
+    return summarise_all(fly_all(conditions, episodes, seed, jobs, journal=journal, executor=executor))
+
+
+def summarise_all(flown: Mapping[Condition, Rows]) -> list[dict[str, Any]]:
+    """Return the rows of `evaluate`.
+
+    :param flown: statistics of the episodes of each condition, see `fly_all`
+    """
     table = []
     for condition, rows in flown.items():
         row = {"policy": name_of(condition.policy), "scenario": condition.scenario, **summarise(rows, condition.config)}

@@ -198,6 +198,7 @@ class Flight:
     :param other_requests: requests of a second rule in each step, which were not executed, (T, n, n - 1) bool
     :param min_separation: smallest distance between two robots at the start and in each step, (T + 1,) (m): at any time
         of the step if the world's collisions are continuous, otherwise after the step
+    :param inputs: inputs that the robots chose in each step, (T, n, 4); None if they are not known
     """
 
     config: SwarmConfig
@@ -208,6 +209,7 @@ class Flight:
     announced: np.ndarray
     other_requests: np.ndarray
     min_separation: np.ndarray
+    inputs: np.ndarray | None = None
 
     @property
     def n_robots(self) -> int:
@@ -273,7 +275,7 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     episode = first_episode(seed) + number
     policy, task, rngs = begin(condition, [episode], model)
     rule, other_rngs = parse_rule(other_rule), [np.random.default_rng([episode, 2])]
-    state, plans = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()]
+    state, plans, inputs = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], list[np.ndarray]()
     requests: list[np.ndarray] = []
     announced: list[np.ndarray] = []
     other_requests: list[np.ndarray] = []
@@ -292,8 +294,9 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         announced.append(step.announced[0])
         state.append(task.swarm.state[0].copy())
         plans.append(task.swarm.plans[0].copy())
+        inputs.append(task.swarm.inputs[0].copy())
         goal = task.swarm.goal[0].copy()
     start = state[0][:, POSITION]
     closest.insert(0, length(start[other_indices(len(start))] - start[:, None]).min())
-    arrays = map(np.array, (state, plans, goal, requests, announced, other_requests, closest))
+    arrays = map(np.array, (state, plans, goal, requests, announced, other_requests, closest, inputs))
     return Flight(condition.config, *arrays)

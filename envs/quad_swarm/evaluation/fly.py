@@ -24,8 +24,8 @@ from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model, load_model, short_names, trained_in
-from quad_swarm.evaluation.recordings import Recording, check_suffix, write
-from quad_swarm.evaluation.rows import check_writable, write_rows
+from quad_swarm.evaluation.recordings import MEASURED, Recording, check_suffix, numbered, write
+from quad_swarm.evaluation.rows import aligned, check_writable, write_rows
 from quad_swarm.parsing import Parser
 from quad_swarm.planner import make_planner
 from quad_swarm.realtime.arena import Arena, Exchange
@@ -134,13 +134,7 @@ LEGEND = (
 def format_table(rows: Sequence[dict[str, Any]]) -> str:
     """Format rows as a table."""
     texts = [[column.title for column in COLUMNS], *([column.text(row) for column in COLUMNS] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    texts.insert(1, ["-" * width for width in widths])
-    lines = (
-        "  ".join(t.rjust(w) if k else t.ljust(w) for k, (t, w) in enumerate(zip(line, widths, strict=True)))
-        for line in texts
-    )
-    return "\n".join(line.rstrip() for line in lines)
+    return aligned(texts, 1)
 
 
 def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
@@ -331,7 +325,7 @@ def _fly(
             flown.flights.append(flight)
             print(_line(policy, len(flown.flights), flight), file=sys.stderr, flush=True)
             if recorder is not None:
-                recorder.write()
+                recorder.write(flight)
         flown.repeated += not counts
     return flown
 
@@ -358,13 +352,16 @@ class _Recorder:
     def end(self) -> None:
         """See `Watcher`."""
 
-    def write(self) -> None:
-        """Write the recording of the last flight."""
+    def write(self, flight: Flight) -> None:
+        """Write the recording of the last flight.
+
+        :param flight: how it ended
+        """
         self._written += 1
-        path = self._path
-        if self._count > 1:
-            path = path.with_name(f"{path.stem}_{self._written}{path.suffix}")
-        write(path, recorded(self._samples, self._config, self._goals, self._policy))
+        recording = recorded(self._samples, self._config, self._goals, self._policy)
+        row = Flown(self._config.n_robots, [flight]).row()
+        recording = dataclasses.replace(recording, measured={name: row[name] for name in MEASURED})
+        write(numbered(self._path, self._written, self._count), recording)
 
 
 def recorded(samples: Sequence[Sample], config: SwarmConfig, goals: np.ndarray, policy: str) -> Recording:

@@ -12,10 +12,12 @@ topic                     type                         content
 ========================= ============================ ======================================================
 
 Other recordings need ``/NAME/odom`` of each robot only, at any times: these are interpolated at those of the first.
+Set-points of other recordings, ``/NAME/cmd`` as above, hold until the next.
 """
 
 from __future__ import annotations
 
+import bisect
 import io
 import json
 import re
@@ -27,7 +29,7 @@ import numpy as np
 from mcap_ros2.reader import read_ros2_messages
 from mcap_ros2.writer import Writer
 
-from quad_swarm.evaluation.recordings import Recording, about
+from quad_swarm.evaluation.recordings import Recording, about, from_about
 from quad_swarm.geometry import to_quaternion
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.ros.messages import FRAME, from_command, from_odometry, rotation
@@ -73,7 +75,8 @@ def write(path: Path, recording: Recording) -> None:
     separation = recording.separation()
     writer.put(recording.time[0], "/swarm/about", "std_msgs/String", {"data": about(recording)})
     for k, time in enumerate(recording.time):
-        writer.put(time, "/swarm/separation", "std_msgs/Float64", {"data": float(separation[k])})
+        if recording.n_robots > 1:
+            writer.put(time, "/swarm/separation", "std_msgs/Float64", {"data": float(separation[k])})
         for robot in range(recording.n_robots):
             _put_robot(writer, recording, k, robot)
         talk = {name: np.argwhere(getattr(recording, name)[k]).tolist() for name in ("asked", "told")}
@@ -164,25 +167,27 @@ def read(path: Path) -> Recording:
         raise ValueError(str(error) or type(error).__name__) from None
     # robot_10 comes after robot_9
     names = sorted(found.states, key=lambda name: [one.zfill(9) for one in re.split(r"(\d+)", name)])
-    if len(names) < 2:
-        raise ValueError("it needs /NAME/odom of two or more robots")
+    if not names:
+        raise ValueError("it needs /NAME/odom of each robot")
     begin, end = _common(found, names)
     times = [time for time in sorted(found.states[names[0]]) if begin <= time <= end]
     state = np.stack([_at(found.states[name], times) for name in names], axis=1)
     horizon = max((len(plan) for plans in found.plans.values() for plan in plans.values()), default=0)
     shape = (len(times), len(names))
-    setpoint, plan = np.full((*shape, 4), np.nan), np.full((*shape, horizon, 3), np.nan)
+    setpoint = np.stack([_held(found.setpoints[name], times, not found.rest) for name in names], axis=1)
+    plan = np.full((*shape, horizon, 3), np.nan)
     asked, told = np.zeros((2, *shape, len(names)), dtype=bool)
     for k, time in enumerate(times):
         for robot, name in enumerate(names):
-            setpoint[k, robot] = found.setpoints[name].get(time, np.nan)
             plan[k, robot] = found.plans[name].get(time, np.nan)
         for kind, marks in (("asked", asked), ("told", told)):
             for pair in found.talk.get(time, {}).get(kind, ()):
                 marks[k, pair[0], pair[1]] = True
     goal = np.array(found.rest["goal"]) if found.rest else state[-1, :, POSITION]
-    known: dict[str, Any] = {"world": dict(found.rest.get("world", {})), "policy": str(found.rest.get("policy", ""))}
-    return Recording(np.array(times) / _NS, state, setpoint, plan, asked, told, goal, **known)
+    rest = (
+        from_about(found.rest) if found.rest else {"guessed": frozenset({"goal"} if found.talk else {"goal", "talk"})}
+    )
+    return Recording(np.array(times) / _NS, state, setpoint, plan, asked, told, goal, **rest)
 
 
 def _common(found: _Found, names: list[str]) -> tuple[int, int]:
@@ -198,3 +203,17 @@ def _at(states: dict[int, np.ndarray], times: list[int]) -> np.ndarray:
     values = np.array([states[time] for time in known])
     values[:, 6:9] = np.unwrap(values[:, 6:9], axis=0)
     return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
+
+
+def _held(setpoints: dict[int, np.ndarray], times: list[int], hold: bool) -> np.ndarray:
+    """Return the set-points of a robot at some times (ns), NaN where there are none, (T, 4).
+
+    :param hold: whether each holds until the next, otherwise at its time only
+    """
+    found = np.full((len(times), 4), np.nan)
+    known = sorted(setpoints)
+    for k, time in enumerate(times):
+        before = bisect.bisect_right(known, time) - 1
+        if before >= 0 and (hold or known[before] == time):
+            found[k] = setpoints[known[before]]
+    return found

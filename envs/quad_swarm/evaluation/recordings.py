@@ -1,6 +1,7 @@
 """Recordings of flights, simulated and real: ``.npz``, ``.csv``, and ``.mcap`` for Foxglove and Lichtblick.
 
-A table (``.csv``) has a row for each robot at each time, and these columns; only the first five are needed:
+A table (``.csv``) has a row for each robot at each time, and these columns. Only the first five are needed to see a
+flight and to count its collisions; ``sb3-maddpg identify --log`` also needs attitudes and set-points:
 
 ================================== =========================================================
 ``time``, ``robot``                time (s), number of the robot, from 0
@@ -9,9 +10,11 @@ A table (``.csv``) has a row for each robot at each time, and these columns; onl
 ``roll``, ``pitch``, ``yaw``       attitude (rad), otherwise 0
 ``roll_set``, ``pitch_set``,       set-point from then on (rad, rad, m/s, rad/s)
 ``climb_set``, ``yaw_rate_set``
-``goal_x``, ``goal_y``, ``goal_z`` goal (m), otherwise where the robot ends
+``goal_x``, ``goal_y``, ``goal_z`` goal (m), otherwise unknown
 ``asked``, ``told``                robots whose plan it asked for, and to whom it sent its own unasked, as in ``2 5``
 ================================== =========================================================
+
+A table does not hold the world, the policy and the plans, which the other two formats do.
 """
 
 from __future__ import annotations
@@ -20,10 +23,10 @@ import csv
 import dataclasses
 import json
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,14 +36,19 @@ from quad_swarm.geometry import closest_approach, length
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.validation import replaced
 from quad_swarm.world.beliefs import other_indices
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, make_config
 
 SUFFIXES = (".npz", ".csv", ".mcap")
 _STATE = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw")
 _SET = ("roll_set", "pitch_set", "climb_set", "yaw_rate_set")
 _GOAL = ("goal_x", "goal_y", "goal_z")
 _MOST_ROBOTS, _MOST_TIMES = 1000, 10**6
-_NS = 1_000_000_000
+_MOST_DISTANCES = 10**6  # at once
+# What a file need not tell: velocities are then differences, attitudes 0, goals where robots end, and nobody talks
+GUESSES = ("velocity", "attitude", "goal", "talk")
+# What robots that fly in real time measure in a flight: their periods, missed ones included; plans that all sent; bytes
+# that a robot sent in a second; shares of the periods that were missed, and whose commands were late
+MEASURED = ("periods", "plans_sent", "bytes_per_second", "missed", "late")
 # Members of .npz files: axes after the times
 _ARRAYS: dict[str, Callable[[int, int], tuple[int, ...]]] = {
     "state": lambda n, horizon: (n, 9),
@@ -49,6 +57,19 @@ _ARRAYS: dict[str, Callable[[int, int], tuple[int, ...]]] = {
     "asked": lambda n, horizon: (n, n),
     "told": lambda n, horizon: (n, n),
 }
+
+
+class Meetings(NamedTuple):
+    """How close the pairs of robots came.
+
+    :param pairs: numbers of the robots of each pair, (P, 2)
+    :param closest: smallest distance of each pair, (P,) (m)
+    :param when: when that was (s), (P,)
+    """
+
+    pairs: np.ndarray
+    closest: np.ndarray
+    when: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -64,6 +85,8 @@ class Recording:
     :param goal: goals, (n, 3) (m)
     :param world: fields of the world, see `SwarmConfig`; empty if unknown
     :param policy: what flew
+    :param guessed: some of `GUESSES`, which the file did not tell
+    :param measured: values of `MEASURED`; empty if unknown
     :raises ValueError: if the arrays do not belong together, or times, states or goals are not finite
     """
 
@@ -76,11 +99,15 @@ class Recording:
     goal: np.ndarray
     world: dict[str, Any] = dataclasses.field(default_factory=dict)
     policy: str = ""
+    guessed: frozenset[str] = frozenset()
+    measured: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         times, n = len(self.time), len(self.goal)
-        if not 1 < times <= _MOST_TIMES or not 2 <= n <= _MOST_ROBOTS:
-            raise ValueError(f"a flight has two or more times and robots, not {times} and {n}")
+        if not 1 < times <= _MOST_TIMES or not 1 <= n <= _MOST_ROBOTS:
+            raise ValueError(
+                f"a flight has 2 to {_MOST_TIMES} times and 1 to {_MOST_ROBOTS} robots, not {times} and {n}"
+            )
         horizon = self.plan.shape[2] if self.plan.ndim == 4 else 0
         for name, shape in _ARRAYS.items():
             expected = (times, *shape(n, horizon))
@@ -92,6 +119,10 @@ class Recording:
             raise ValueError("times must be finite and ascending")
         if not np.isfinite(self.state).all():
             raise ValueError("states must be finite")
+        if not self.guessed <= set(GUESSES):
+            raise ValueError(f"guessed must be some of {', '.join(GUESSES)}, not {', '.join(sorted(self.guessed))}")
+        if self.measured and (set(self.measured) != set(MEASURED) or not all(map(_is_amount, self.measured.values()))):
+            raise ValueError(f"measured must be finite numbers from 0: {', '.join(MEASURED)}")
 
     @property
     def n_robots(self) -> int:
@@ -99,17 +130,43 @@ class Recording:
         return len(self.goal)
 
     def separation(self, continuous: bool = True) -> np.ndarray:
-        """Return the smallest distance of two robots at each time, (T,) (m).
+        """Return the smallest distance of two robots at each time, (T,) (m); infinity for a single robot.
 
         :param continuous: whether also since the time before, if robots moved in straight lines
         """
-        others = other_indices(self.n_robots)
-        between = self.state[:, others, POSITION] - self.state[:, :, None, POSITION]
-        apart = length(between).min(axis=(1, 2))
-        if continuous:
-            closest, _ = closest_approach(between[:-1], np.diff(between, axis=0), 1.0)
-            apart[1:] = length(closest).min(axis=(1, 2))
-        return apart
+        return np.concatenate([apart.min(axis=1, initial=np.inf) for _, apart, _ in self._apart(continuous)])
+
+    def meetings(self, continuous: bool = True) -> Meetings:
+        """Return how close each pair of robots came, and when.
+
+        :param continuous: see `separation`
+        """
+        pairs = np.transpose(np.triu_indices(self.n_robots, k=1))
+        closest, when = np.full((2, len(pairs)), np.inf)
+        for first, apart, back in self._apart(continuous):
+            least = apart.argmin(axis=0)
+            nearest, rows = apart[least, np.arange(len(pairs))], first + least
+            shorter = nearest < closest
+            steps = self.time[rows] - self.time[np.maximum(rows - 1, 0)]
+            met = self.time[rows] - back[least, np.arange(len(pairs))] * steps
+            closest, when = np.where(shorter, nearest, closest), np.where(shorter, met, when)
+        return Meetings(pairs, closest, when)
+
+    def _apart(self, continuous: bool) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Yield some times after the other: the index of the first, the distances of the pairs at and since the time
+        before (m), and how long before each time they were so close, as a share of the step, both (times, P)."""
+        one, other = np.triu_indices(self.n_robots, k=1)
+        size = max(_MOST_DISTANCES // max(len(one), 1), 1)
+        for first in range(0, len(self.time), size):
+            pos = self.state[max(first - 1, 0) : first + size, :, POSITION]
+            between = pos[:, other] - pos[:, one]
+            if first == 0:
+                between = np.concatenate([between[:1], between])
+            nearest, back = between[1:], np.zeros(between[1:].shape[:2])
+            if continuous:
+                nearest, share = closest_approach(between[:-1], np.diff(between, axis=0), 1.0)
+                back = 1.0 - share
+            yield first, length(nearest), back
 
     def config(self, otherwise: SwarmConfig | None = None) -> SwarmConfig:
         """Return the world.
@@ -151,9 +208,15 @@ class Recording:
         asked[:-1, rows, others] = flight.requests & ~flight.announced
         told[:-1, others, rows] = flight.announced
         time = np.arange(times) * flight.config.planner.dt
-        unknown = np.full((times, n, 4), np.nan)
+        setpoint = np.full((times, n, 4), np.nan)
+        if flight.inputs is not None:
+            setpoint[:-1] = flight.inputs
         world = dataclasses.asdict(flight.config)
-        return cls(time, flight.state, unknown, flight.plans[..., POSITION], asked, told, flight.goal, world, policy)
+        return cls(time, flight.state, setpoint, flight.plans[..., POSITION], asked, told, flight.goal, world, policy)
+
+
+def _is_amount(value: object) -> bool:
+    return isinstance(value, (int, float)) and 0 <= value < np.inf
 
 
 def check_suffix(path: Path) -> None:
@@ -199,9 +262,51 @@ def read(path: Path) -> Recording:
         raise ValueError(f"{path} is no recording of a flight: {shown(str(error))}.") from None
 
 
+def read_flights(
+    paths: Sequence[Path], preset: str | None = None, changes: Mapping[str, Any] | None = None
+) -> list[tuple[Path, Recording]]:
+    """Read recordings of swarms, each with its file. All get a world.
+
+    :param paths: files
+    :param preset: name of a preset, which replaces recorded worlds; it is "flight" for those that do not tell
+    :param changes: fields that replace those of the worlds, see `make_config`
+    :raises ValueError: if a file is no recording of two or more robots, or does not fit its world
+    """
+    found = []
+    for path in paths:
+        recording = read(path)
+        if recording.n_robots < 2:
+            raise ValueError(f"{path} holds one robot, which cannot meet another: name a flight of two or more.")
+        base = preset or (recording.config() if recording.world else "flight")
+        world = make_config(base, changes, n_robots=recording.n_robots)
+        found.append((path, dataclasses.replace(recording, world=dataclasses.asdict(world))))
+    return found
+
+
+def numbered(path: Path, number: int, count: int) -> Path:
+    """Return the path of one of several recordings.
+
+    :param path: path of a single one
+    :param number: its number, from 1
+    :param count: how many there are
+    """
+    return path if count == 1 else path.with_name(f"{path.stem}_{number}{path.suffix}")
+
+
 def about(recording: Recording) -> str:
-    """Return as JSON what is no array: world, policy, and goals."""
-    return json.dumps({"world": recording.world, "policy": recording.policy, "goal": recording.goal.tolist()})
+    """Return as JSON what is no array, see `from_about`, and goals."""
+    rest = {"guessed": sorted(recording.guessed), "measured": recording.measured, "goal": recording.goal.tolist()}
+    return json.dumps({"world": recording.world, "policy": recording.policy, **rest})
+
+
+def from_about(rest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of `Recording` that are no arrays from what `about` returned."""
+    return {
+        "world": dict(rest["world"]),
+        "policy": str(rest["policy"]),
+        "guessed": frozenset(rest.get("guessed", ())),
+        "measured": dict(rest.get("measured", {})),
+    }
 
 
 def _write_npz(path: Path, recording: Recording) -> None:
@@ -214,58 +319,64 @@ def _read_npz(path: Path) -> Recording:
     with np.load(path, allow_pickle=False) as content:
         rest = json.loads(str(content["about"]))
         arrays = {name: content[name] for name in ("time", "goal", *_ARRAYS)}
-    return Recording(world=dict(rest["world"]), policy=str(rest["policy"]), **arrays)
+    return Recording(**from_about(rest), **arrays)
 
 
 def _write_csv(path: Path, recording: Recording) -> None:
+    known = {name: name not in recording.guessed for name in GUESSES}
+    shown = [True] * 3 + [known["velocity"]] * 3 + [known["attitude"]] * 3 + [True] * 4 + [known["goal"]] * 3
+    titles = [name for name, wanted in zip((*_STATE, *_SET, *_GOAL), shown, strict=True) if wanted]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time", "robot", *_STATE, *_SET, *_GOAL, "asked", "told"])
+        writer.writerow(["time", "robot", *titles, *(["asked", "told"] if known["talk"] else [])])
         for k, time in enumerate(recording.time):
             for robot in range(recording.n_robots):
                 numbers = (*recording.state[k, robot], *recording.setpoint[k, robot], *recording.goal[robot])
-                texts = ("" if np.isnan(one) else repr(float(one)) for one in numbers)
-                lists = (" ".join(map(str, np.flatnonzero(one[k, robot]))) for one in (recording.asked, recording.told))
+                wanted = (one for one, wanted in zip(numbers, shown, strict=True) if wanted)
+                texts = ("" if np.isnan(one) else repr(float(one)) for one in wanted)
+                talk = (recording.asked, recording.told) if known["talk"] else ()
+                lists = (" ".join(map(str, np.flatnonzero(one[k, robot]))) for one in talk)
                 writer.writerow([repr(float(time)), robot, *texts, *lists])
 
 
 def _read_csv(path: Path) -> Recording:
-    with path.open(encoding="utf-8", newline="") as file:
+    with path.open(encoding="utf-8-sig", newline="") as file:
         rows = list(csv.DictReader(file))
-    if not rows or not {"time", "robot", "x", "y", "z"} <= rows[0].keys():
-        raise ValueError("it needs the columns time, robot, x, y and z")
+    needed = ("time", "robot", *_STATE[:3])
+    if not rows or not set(needed) <= rows[0].keys():
+        missing = [name for name in needed if not rows or name not in rows[0]]
+        raise ValueError(f"it needs the columns time, robot, x, y and z, and has no {', '.join(missing)}")
     times = sorted({float(row["time"]) for row in rows})
     robots = sorted({int(row["robot"]) for row in rows})
     if robots != list(range(len(robots))) or len(rows) != len(times) * len(robots):
         raise ValueError("it needs one row for each time and each robot, whose numbers count from 0")
     rows.sort(key=lambda row: (float(row["time"]), int(row["robot"])))
+    shape, time, guessed = (len(times), len(robots)), np.array(times), set()
 
-    def column(name: str) -> np.ndarray | None:
-        if name not in rows[0]:
-            return None
-        return np.array([float(row[name] or "nan") for row in rows]).reshape(len(times), len(robots))
+    def column(name: str) -> np.ndarray:
+        return np.array([float(row.get(name) or "nan") for row in rows]).reshape(shape)
 
-    def columns(names: Sequence[str], otherwise: np.ndarray) -> np.ndarray:
-        found = [column(name) for name in names]
-        return otherwise if any(one is None for one in found) else np.stack(found, axis=-1)  # type: ignore[arg-type]
+    def columns(names: Sequence[str]) -> np.ndarray:
+        return np.stack([column(name) for name in names], axis=-1)
+
+    def columns_or(kind: str, names: Sequence[str], otherwise: np.ndarray) -> np.ndarray:
+        if set(names) <= rows[0].keys():
+            return columns(names)
+        guessed.add(kind)
+        return otherwise
 
     def sets(name: str) -> np.ndarray:
         marks = np.zeros((len(rows), len(robots)), dtype=bool)
         for row, mark in zip(rows, marks, strict=True):
             mark[[int(one) for one in (row.get(name) or "").split()]] = True
-        return marks.reshape(len(times), len(robots), len(robots))
+        return marks.reshape(*shape, len(robots))
 
-    shape, time = (len(times), len(robots)), np.array(times)
-    pos = columns(_STATE[:3], np.zeros((*shape, 3)))
-    vel = columns(_STATE[3:6], np.gradient(pos, time, axis=0) if len(times) > 1 else np.zeros_like(pos))
-    attitude = columns(_STATE[6:], np.zeros((*shape, 3)))
-    goal = columns(_GOAL, np.broadcast_to(pos[-1], pos.shape))[-1]
-    return Recording(
-        time,
-        np.concatenate([pos, vel, attitude], axis=-1),
-        columns(_SET, np.full((*shape, 4), np.nan)),
-        np.zeros((*shape, 0, 3)),
-        sets("asked"),
-        sets("told"),
-        goal,
-    )
+    pos = columns(_STATE[:3])
+    vel = columns_or("velocity", _STATE[3:6], np.gradient(pos, time, axis=0) if len(times) > 1 else np.zeros_like(pos))
+    attitude = columns_or("attitude", _STATE[6:], np.zeros((*shape, 3)))
+    goal = columns_or("goal", _GOAL, np.broadcast_to(pos[-1], pos.shape))[-1]
+    if rows[0].keys().isdisjoint({"asked", "told"}):
+        guessed.add("talk")
+    state, plan = np.concatenate([pos, vel, attitude], axis=-1), np.zeros((*shape, 0, 3))
+    talk = (sets("asked"), sets("told"))
+    return Recording(time, state, columns(_SET), plan, *talk, goal, guessed=frozenset(guessed))

@@ -24,6 +24,21 @@ STDOUT = Path("-")
 _LEFT_OVER = 3600  # seconds, after which a temporary file belongs to a process that was killed
 
 
+def aligned(texts: Sequence[Sequence[str]], left: int) -> str:
+    """Format texts as a table.
+
+    :param texts: titles, and the cells of each row
+    :param left: number of the first columns that are aligned to the left, the others are to the right
+    """
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    lines = [texts[0], ["-" * width for width in widths], *texts[1:]]
+    cells = (
+        (t.ljust(w) if k < left else t.rjust(w) for k, (t, w) in enumerate(zip(line, widths, strict=True)))
+        for line in lines
+    )
+    return "\n".join("  ".join(line).rstrip() for line in cells)
+
+
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """Read the rows of a file, none if it does not exist. Files of earlier versions, JSON Lines, are read as well."""
     data = path.read_bytes() if path.is_file() else b""

@@ -22,7 +22,7 @@ from quad_swarm.evaluation.command import add_policy_arguments, make_conditions,
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import is_model, short_name
 from quad_swarm.evaluation.provenance import plant_name
-from quad_swarm.evaluation.recordings import Recording, read
+from quad_swarm.evaluation.recordings import Recording, read_flights
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_text
 from quad_swarm.figures.colours import COLOURS
 from quad_swarm.geometry import closest_approach, length
@@ -30,7 +30,7 @@ from quad_swarm.parsing import Parser
 from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.beliefs import other_indices
-from quad_swarm.world.presets import SwarmConfig, make_config
+from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
 # Number of steps to show after all robots have arrived
@@ -62,11 +62,10 @@ def replay_page(
     return _page({**about, "episode": episode}, config, config.planner.dt, flights)
 
 
-def recorded_page(recordings: Sequence[tuple[str, Recording]], otherwise: SwarmConfig) -> str:
+def recorded_page(recordings: Sequence[tuple[Path, Recording]]) -> str:
     """Create the web page of recorded flights of the same robots.
 
-    :param recordings: names of files, and what they hold
-    :param otherwise: the world of recordings that do not tell
+    :param recordings: files, and what they hold, see `read_flights`
     :return: the page as HTML
     :raises ValueError: if they have different numbers of robots, or a recording does not fit its world
     """
@@ -75,9 +74,9 @@ def recorded_page(recordings: Sequence[tuple[str, Recording]], otherwise: SwarmC
         raise ValueError(
             f"The recordings have {', '.join(map(str, sorted(counts)))} robots: show one number at a time."
         )
-    flights = [(one.policy or name, one.flight(otherwise)) for name, one in recordings]
+    flights = [(one.policy or path.name, one.flight()) for path, one in recordings]
     step = float(np.median(np.diff(recordings[0][1].time)))
-    source = ", ".join(name for name, _ in recordings)
+    source = ", ".join(path.name for path, _ in recordings)
     about = {"scenario": "recorded flight", "preset": "", "world": [], "seed": 0, "episode": 0, "source": source}
     return _page(about, flights[0][1].config, step, flights)
 
@@ -224,18 +223,11 @@ def _write(args: argparse.Namespace) -> None:
     if bool(args.flight) == bool(args.policy):
         raise ValueError("pass either policies to fly (--policy) or recorded flights (--flight).")
     if args.flight:
-        _finish(args.out, recorded_page(*_recordings(args)))
+        _finish(args.out, recorded_page(read_flights(args.flight, args.preset, parse_world(args.world))))
         return
     conditions = make_conditions(args, [args.scenario])
     changes = [*args.world, *([f"plant={plant_name(conditions[0].config)}"] if args.plant else [])]
     _finish(args.out, replay_page(conditions, args.seed, args.episode, args.preset, changes))
-
-
-def _recordings(args: argparse.Namespace) -> tuple[list[tuple[str, Recording]], SwarmConfig]:
-    """Return the recorded flights of a command line, and the world of those that do not tell."""
-    found = [(path.name, read(path)) for path in args.flight]
-    world = parse_world(args.world)
-    return found, make_config(args.preset or "flight", world, n_robots=found[0][1].n_robots)
 
 
 def _finish(out: Path, page: str) -> None:

@@ -269,7 +269,9 @@ PRESETS: dict[str, SwarmConfig] = {
 }
 
 
-def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, **overrides: Any) -> SwarmConfig:
+def make_config(
+    preset: str | SwarmConfig = "paper", world: Mapping[str, Any] | None = None, **overrides: Any
+) -> SwarmConfig:
     """Create a preset with some of its fields replaced.
 
     What depends on other fields follows them, unless it is given: the planner's separation keeps the preset's margin
@@ -277,15 +279,15 @@ def make_config(preset: str = "paper", world: Mapping[str, Any] | None = None, *
     would start closer than that; and the workspace grows with a room that exceeds it. ``quadrotor`` may also be a name
     of `VEHICLES` or the path of a vehicle file. With another ``plant`` than the model, ``mismatch`` defaults to 0.
 
-    :param preset: a name of `PRESETS`
+    :param preset: a name of `PRESETS`, or a world
     :param world: fields of `SwarmConfig` to replace, nested ones as mappings
     :param overrides: further fields by name; None keeps the preset's value
     :raises ValueError: if the preset or a field is unknown, a value is out of range, or a field is given twice
     """
-    if not isinstance(preset, str) or preset not in PRESETS:
+    if not isinstance(preset, SwarmConfig) and (not isinstance(preset, str) or preset not in PRESETS):
         raise unknown_name("preset", preset, PRESETS)
     changes = _joined(world or {}, {name: value for name, value in overrides.items() if value is not None})
-    base = PRESETS[preset]
+    base = preset if isinstance(preset, SwarmConfig) else PRESETS[preset]
     if isinstance(vehicle := changes.get("quadrotor"), (str, os.PathLike)):
         changes = {**changes, "quadrotor": load_vehicle(vehicle)}
     if changes.get("plant", MODEL) != MODEL:

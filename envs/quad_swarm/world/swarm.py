@@ -178,6 +178,11 @@ class Swarm(SwarmState):
         """Planned states at stages 0..N, (E, n, N + 1, 9), as of the last step."""
         return self._plans.x.reshape(*self.state.shape[:2], *self._plans.x.shape[1:])
 
+    @property
+    def inputs(self) -> np.ndarray:
+        """Inputs that the robots chose in the last step, (E, n, 4). With clock skew, they take effect during it."""
+        return self._plans.u[:, 0].reshape(self._u.shape)
+
     def planned_positions(self) -> np.ndarray:
         """Planned positions at the start of the last step and of the N steps after it, (E, n, N + 1, 3) (m). With clock
         skew, `plans` start when the robot's input takes effect and are resampled here."""
@@ -312,7 +317,7 @@ class Swarm(SwarmState):
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""
         disturbances, start = self.disturbances, self.disturbances.start
-        before, planned = self._u, self._plans.u[:, 0].reshape(self._u.shape)
+        before, planned = self._u, self.inputs
         positions = np.empty((self.config.substeps + 1, *self.pos.shape))
         positions[0] = self.pos
         for k in range(self.config.substeps):

@@ -228,7 +228,7 @@ def test_figures_without_their_packages_fail_before_the_flights(missing, tmp_pat
     for name in [name for name in sys.modules if name.startswith(("quad_swarm.figures", missing))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
-    monkeypatch.setattr("quad_swarm.evaluation.command.evaluate", lambda *_: pytest.fail("it flew"))
+    monkeypatch.setattr("quad_swarm.evaluation.command.fly_all", lambda *_, **__: pytest.fail("it flew"))
     assert main([*FEW, "--plot", str(tmp_path / "plots"), "--json", str(tmp_path / "a.json")]) == 1
     error = capsys.readouterr().err
     assert "--plot needs the extra 'plot': in the clone, pip install -e '.[plot]'" in error
@@ -240,7 +240,7 @@ def test_a_missing_simulator_is_told_before_the_flights(tmp_path, monkeypatch, c
     (tmp_path / "crazyflow.py").write_text("raise ModuleNotFoundError('no crazyflow here')")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(remote, "_servers", {})
-    monkeypatch.setattr("quad_swarm.evaluation.command.evaluate", lambda *_: pytest.fail("it flew"))
+    monkeypatch.setattr("quad_swarm.evaluation.command.fly_all", lambda *_, **__: pytest.fail("it flew"))
     assert main([*FEW, "--plant", "crazyflow"]) == 1
     error = capsys.readouterr().err
     assert "needs the extra 'plants': in the clone, pip install -e '.[plants]' (no crazyflow here)" in error

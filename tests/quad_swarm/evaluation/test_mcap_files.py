@@ -85,5 +85,5 @@ def test_a_file_without_robots_is_no_flight(tmp_path):
     writer.write_message("/chatter", writer.register_msgdef("std_msgs/msg/String", "string data"), {"data": "hello"})
     writer.finish()
     path.write_bytes(data.getvalue())
-    with pytest.raises(ValueError, match="odom of two or more robots"):
+    with pytest.raises(ValueError, match="/NAME/odom of each robot"):
         read(path)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quad_swarm.evaluation.flight import Condition, fly
-from quad_swarm.evaluation.recordings import SUFFIXES, Recording, read, write
+from quad_swarm.evaluation.recordings import MEASURED, SUFFIXES, Recording, read, write
 from quad_swarm.world.presets import make_config
 
 
@@ -78,8 +78,8 @@ def test_a_laboratory_needs_five_columns(tmp_path):
     ("content", "told"),
     [
         ("", "columns"),
-        ("time,robot,x,y\n0,0,0,0\n", "columns"),
-        ("time,robot,x,y,z\n0,0,0,0,0\n1,0,0,0,0\n", "two or more times and robots"),
+        ("time,robot,x,y\n0,0,0,0\n", "has no z"),
+        ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,0\n", "2 to 1000000 times"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,2,0,0,0\n1,0,0,0,0\n1,2,0,0,0\n", "count from 0"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,0\n1,0,0,0,0\n", "one row for each"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,nan\n1,0,0,0,0\n1,1,0,0,0\n", "finite"),
@@ -128,10 +128,13 @@ def test_a_format_that_does_not_exist(tmp_path, recording):
         {"state": np.zeros((26, 3, 8))},
         {"asked": np.zeros((26, 3, 2), bool)},
         {"goal": np.full((3, 3), np.inf)},
+        {"guessed": frozenset({"all"})},
+        {"measured": {"missed": 0.1}},
+        {"measured": dict.fromkeys(MEASURED, float("nan"))},
     ],
 )
 def test_arrays_that_do_not_belong_together_are_refused(change, recording):
-    with pytest.raises(ValueError, match="|".join(("times", "state", "asked", "goals"))):
+    with pytest.raises(ValueError, match=r"times|state|asked|goals|guessed|measured"):
         dataclasses.replace(recording, **change)
 
 
