@@ -279,16 +279,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
     add_worker_arguments(parser, jobs=1)
-    parser.add_argument(
-        "--flight",
-        nargs="+",
-        type=Path,
-        action="extend",
-        default=[],
-        metavar="FILE",
-        help="recorded flights, real or simulated (.npz, .csv, .mcap), instead of policies to fly; --preset (otherwise "
-        "that of the file, or flight) and --world tell the rest, such as radius and goal_radius",
-    )
+    add_flight_argument(parser)
     parser.add_argument(
         "--record",
         type=Path,
@@ -310,6 +301,20 @@ def _parser() -> argparse.ArgumentParser:
         "--plot", type=Path, metavar="DIR", help="write figures of collisions, requests and flights to this folder"
     )
     return parser
+
+
+def add_flight_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the argument that names recorded flights, see `quad_swarm.evaluation.recordings`."""
+    parser.add_argument(
+        "--flight",
+        nargs="+",
+        type=Path,
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="recorded flights, real or simulated (.npz, .csv, .mcap), instead of policies to fly; --preset (otherwise "
+        "that of the file, or flight) and --world tell the rest, such as radius and goal_radius",
+    )
 
 
 def add_worker_arguments(parser: argparse.ArgumentParser, jobs: int) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.evaluation.command import add_policy_arguments, make_conditions, parse_world, run
+from quad_swarm.evaluation.command import add_flight_argument, add_policy_arguments, make_conditions, parse_world, run
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import is_model, short_name
 from quad_swarm.evaluation.provenance import plant_name
@@ -199,15 +199,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog=f"example:\n{EXAMPLES}",
     )
     add_policy_arguments(parser, required=False)
-    parser.add_argument(
-        "--flight",
-        nargs="+",
-        type=Path,
-        action="extend",
-        default=[],
-        metavar="FILE",
-        help="recorded flights, real or simulated (.npz, .csv, .mcap), instead of policies to fly",
-    )
+    add_flight_argument(parser)
     parser.add_argument("--scenario", default="symmetric_swap", help=f"one of {', '.join(SCENARIOS)} (%(default)s)")
     parser.add_argument("--episode", type=int, default=0, help="index of the episode in the set (default 0)")
     parser.add_argument(

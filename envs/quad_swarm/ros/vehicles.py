@@ -120,8 +120,8 @@ class TeamVehicle:
     def _stamp(self) -> int:
         return self._link.shared(self._link.now())
 
-    def _publisher(self, kind: type, topic: str, depth: int = 1) -> Any:
-        return self._node.create_publisher(kind, f"/{self._name}/{topic}", quality(depth))
+    def _publisher(self, kind: type, topic: str) -> Any:
+        return self._node.create_publisher(kind, f"/{self._name}/{topic}", quality(1))
 
 
 class OdometryVehicle(TeamVehicle):
@@ -133,7 +133,7 @@ class OdometryVehicle(TeamVehicle):
     :param names: names of all robots
     :param topic: topic of the odometry below ``/NAME/``
     :param twist: whose axes the odometry's twist has, "body" (REP 147) or "world"
-    :param controller: attitude and thrust for set-points, for subclasses
+    :param controller: attitude and thrust for set-points, of subclasses that need them
     :raises ValueError: if the axes are unknown
     """
 
@@ -143,6 +143,7 @@ class OdometryVehicle(TeamVehicle):
         mailbox: Mailbox,
         link: RosLink,
         names: Sequence[str],
+        *,
         topic: str = "odom",
         twist: str = "body",
         controller: AttitudeController | None = None,
@@ -170,24 +171,19 @@ class CrazyswarmVehicle(OdometryVehicle):
     **Not tested on hardware.** Crazyswarm2 must log ``odom`` of each Crazyflie at the rate of the periods or faster,
     and take off and land before and after (services ``takeoff``, ``notify_setpoints_stop``, ``land``).
 
-    :param period: length of a plan's stages (us)
-    :param lead: time ahead of now that is commanded (us), about half of a period. The other parameters are those of
-        `OdometryVehicle`
+    :param robot: node, mailbox, link and names, see `OdometryVehicle`
+    :param period: length of a plan's stages (us), `Robot.period`
+    :param lead: time ahead of now that is commanded (us), by default half of a period
+    :param controller: holds the heading
+    :raises ValueError: if the period is not positive
     """
 
-    def __init__(
-        self,
-        node: Any,
-        mailbox: Mailbox,
-        link: RosLink,
-        names: Sequence[str],
-        controller: AttitudeController | None = None,
-        period: int = 50_000,
-        lead: int | None = None,
-    ):
+    def __init__(self, *robot: Any, period: int, lead: int | None = None, controller: AttitudeController | None = None):
+        if not period > 0:
+            raise ValueError(f"period={period}: give the length of the plans' stages in microseconds, `Robot.period`")
         self._period, self._lead = period, period // 2 if lead is None else lead
         self._held: np.ndarray | None = None
-        super().__init__(node, mailbox, link, names, twist="world", controller=controller)
+        super().__init__(*robot, twist="world", controller=controller)
 
     def _make_publishers(self) -> None:
         self._full_state = _class("crazyflie_interfaces", "FullState")
@@ -222,22 +218,18 @@ class CrazyswarmVehicle(OdometryVehicle):
 class LegacyCrazyswarmVehicle(OdometryVehicle):
     """Crazyflies behind Crazyswarm2: roll, pitch, yaw rate and thrust, which the firmware's attitude controller flies.
 
-    **Not tested on hardware.** The parameters are those of `OdometryVehicle`.
+    **Not tested on hardware.**
+
+    :param robot: node, mailbox, link and names, see `OdometryVehicle`
+    :param controller: attitude and thrust for set-points
     """
 
-    def __init__(
-        self,
-        node: Any,
-        mailbox: Mailbox,
-        link: RosLink,
-        names: Sequence[str],
-        controller: AttitudeController | None = None,
-    ):
-        super().__init__(node, mailbox, link, names, twist="world", controller=controller)
-        self._commands.publish(msgs().Twist())  # which unlocks the thrust
+    def __init__(self, *robot: Any, controller: AttitudeController | None = None):
+        super().__init__(*robot, twist="world", controller=controller)
 
     def _make_publishers(self) -> None:
         self._commands = self._publisher(msgs().Twist, "cmd_vel_legacy")
+        self._commands.publish(msgs().Twist())  # which unlocks the thrust
 
     def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
         """See `quad_swarm.realtime.Vehicle`."""
@@ -256,21 +248,17 @@ class AerostackVehicle(OdometryVehicle):
 
     **Not tested on hardware, nor with Aerostack2's simulators.**
 
-    :param most_thrust: largest thrust (N), for platforms that take newtons. The other parameters are those of
-        `OdometryVehicle`
+    :param robot: node, mailbox, link and names, see `OdometryVehicle`
+    :param most_thrust: largest thrust (N): some platforms take newtons
+    :param controller: attitude and thrust for set-points
+    :raises ValueError: if the largest thrust is not positive and finite
     """
 
-    def __init__(
-        self,
-        node: Any,
-        mailbox: Mailbox,
-        link: RosLink,
-        names: Sequence[str],
-        controller: AttitudeController | None = None,
-        most_thrust: float = 0.0,
-    ):
+    def __init__(self, *robot: Any, most_thrust: float, controller: AttitudeController | None = None):
+        if not 0 < most_thrust < np.inf:
+            raise ValueError(f"most_thrust={most_thrust}: give the largest thrust in newtons")
         self._most_thrust = most_thrust
-        super().__init__(node, mailbox, link, names, "self_localization/odom", controller=controller)
+        super().__init__(*robot, topic="self_localization/odom", controller=controller)
 
     def _make_publishers(self) -> None:
         self._pose, self._thrust = msgs().PoseStamped, _class("as2_msgs", "Thrust")
@@ -298,8 +286,8 @@ class Px4Vehicle(TeamVehicle):
     :param mailbox: receives for it
     :param link: the robot's link, whose clock it uses
     :param names: names of all robots
+    :param origins: where each robot's local frame begins, (n, 3), world frame (m)
     :param controller: attitude and thrust for set-points
-    :param origins: where each robot's local frame begins, (n, 3), world frame (m); by default all begin together
     :raises ValueError: if there are not as many origins as robots
     """
 
@@ -309,10 +297,10 @@ class Px4Vehicle(TeamVehicle):
         mailbox: Mailbox,
         link: RosLink,
         names: Sequence[str],
+        origins: np.ndarray,
         controller: AttitudeController | None = None,
-        origins: np.ndarray | None = None,
     ):
-        self._origins = np.zeros((len(names), 3)) if origins is None else np.asarray(origins, float)
+        self._origins = np.asarray(origins, float)
         if self._origins.shape != (len(names), 3) or not np.isfinite(self._origins).all():
             raise ValueError(f"origins={self._origins.tolist()}: give three numbers for each of {len(names)} robots")
         kinds = ("VehicleOdometry", "OffboardControlMode", "VehicleAttitudeSetpoint", "VehicleCommand")
@@ -366,15 +354,6 @@ class Px4Vehicle(TeamVehicle):
         if not np.isfinite(state).all():
             raise ValueError("a state is not finite")
         return int(message.timestamp_sample or message.timestamp), state
-
-
-VEHICLES: dict[str, Callable[..., TeamVehicle]] = {
-    "odometry": OdometryVehicle,
-    "crazyswarm2": CrazyswarmVehicle,
-    "crazyswarm2-legacy": LegacyCrazyswarmVehicle,
-    "px4": Px4Vehicle,
-    "aerostack2": AerostackVehicle,
-}
 
 
 def followed(plan: Plan, at: int, period: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

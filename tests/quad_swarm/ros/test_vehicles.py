@@ -218,7 +218,7 @@ def test_crazyswarm_follows_the_plan(packages):
 
 def test_crazyswarm_by_attitude():
     vehicle, node, link = make(
-        vehicles.LegacyCrazyswarmVehicle, AttitudeController(AttitudeGains(hover_thrust=0.6, integral=0.0))
+        vehicles.LegacyCrazyswarmVehicle, controller=AttitudeController(AttitudeGains(hover_thrust=0.6, integral=0.0))
     )
     unlocks, *commands = node.published["/robot_0/cmd_vel_legacy"]
     assert unlocks == msgs().Twist()
@@ -237,7 +237,7 @@ def test_crazyswarm_by_attitude():
 
 def test_aerostack(packages):
     controller = AttitudeController(AttitudeGains(hover_thrust=0.5), yaw=0.3)
-    vehicle, node, link = make(vehicles.AerostackVehicle, controller, most_thrust=20.0)
+    vehicle, node, link = make(vehicles.AerostackVehicle, controller=controller, most_thrust=20.0)
     seen(node, link, np.zeros((2, 9)), "self_localization/odom")
     assert vehicle.sense() is not None
     vehicle.command(np.array([0.1, -0.2, 0.0, 0.0]), None)
@@ -284,7 +284,7 @@ def test_px4_perceives(packages, body):
 
 
 def test_px4_arms_and_goes_offboard(packages):
-    vehicle, node, _ = make(vehicles.Px4Vehicle)
+    vehicle, node, _ = make(vehicles.Px4Vehicle, np.zeros((2, 3)))
     vehicle.arm()
     vehicle.begin_offboard()
     vehicle.disarm()
@@ -297,7 +297,7 @@ def test_px4_arms_and_goes_offboard(packages):
 def test_px4_holds_height_and_heading_and_flies_where_it_leans(packages, heading):
     """A body with PX4's frames, whose hover thrust is 20 % less than was thought."""
     controller = AttitudeController(AttitudeGains(hover_thrust=0.5), yaw=heading)
-    vehicle, node, link = make(vehicles.Px4Vehicle, controller)
+    vehicle, node, link = make(vehicles.Px4Vehicle, np.zeros((2, 3)), controller)
     ned, velocity, attitude = np.array([0, 0, -1.5]), np.zeros(3), np.array([0, 0, np.pi / 2 - heading])
     for k in range(800):
         state = np.concatenate([to_ned(ned), to_ned(velocity), to_frd(attitude)])
@@ -321,16 +321,24 @@ def test_px4_holds_height_and_heading_and_flies_where_it_leans(packages, heading
     assert abs(left) < 0.02
 
 
-def test_as_many_origins_as_robots(packages):
+def test_what_a_vehicle_cannot_know_is_asked_for(packages):
     with pytest.raises(ValueError, match="three numbers for each of 2 robots"):
         make(vehicles.Px4Vehicle, origins=np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="period=0: give the length"):
+        make(vehicles.CrazyswarmVehicle, period=0)
+    with pytest.raises(ValueError, match="most_thrust=nan: give the largest thrust in newtons"):
+        make(vehicles.AerostackVehicle, most_thrust=np.nan)
 
 
 @pytest.mark.parametrize(
-    ("name", "package"),
-    [("crazyswarm2", "crazyflie_interfaces"), ("px4", "px4_msgs"), ("aerostack2", "as2_msgs")],
+    ("kind", "package", "options"),
+    [
+        (vehicles.CrazyswarmVehicle, "crazyflie_interfaces", {"period": PERIOD}),
+        (vehicles.Px4Vehicle, "px4_msgs", {"origins": np.zeros((2, 3))}),
+        (vehicles.AerostackVehicle, "as2_msgs", {"most_thrust": 20.0}),
+    ],
 )
-def test_missing_messages_are_named(name, package, monkeypatch):
+def test_missing_messages_are_named(kind, package, options, monkeypatch):
     monkeypatch.setitem(sys.modules, f"{package}.msg", None)
     with pytest.raises(ImportError, match=rf"{package} is not there: build it"):
-        make(vehicles.VEHICLES[name])
+        make(kind, **options)
