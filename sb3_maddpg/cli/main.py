@@ -97,7 +97,7 @@ COMMANDS: dict[str, Command] = {
         quiet=True,
     ),
     "evaluate": Command(
-        "compare policies over the same episodes",
+        "compare policies over the same episodes, or judge recorded flights",
         "offered:run",
         None,
         f"  {PROG} evaluate --env ENV --policy latest:logs",
@@ -109,7 +109,7 @@ COMMANDS: dict[str, Command] = {
         f"  {PROG} replay --env ENV --policy latest:logs --out replay.html",
     ),
     "identify": Command(
-        "fit the vehicle model of an environment to a simulator",
+        "fit the vehicle model of an environment to a simulator or to logged flights",
         "offered:run",
         None,
         f"  {PROG} identify --env ENV --plant SIMULATOR:VEHICLE --out vehicle.yml",

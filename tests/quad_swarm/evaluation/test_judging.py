@@ -164,7 +164,7 @@ def test_what_is_given_replaces_what_is_recorded(tmp_path, capsys):
 
 def test_only_collisions_are_recorded_on_request(tmp_path, capsys):
     words = ["--preset", "flight", "--n-robots", "6", "--policy", "none", "full", "--scenario", "symmetric_swap"]
-    words += ["--episodes", "3", "--json", str(tmp_path / "rows.json")]
+    words += ["--episodes", "2", "--json", str(tmp_path / "rows.json")]
     assert main([*words, "--record", str(tmp_path / "met.npz"), "--record-collided"]) == 0
     none, full = json.loads((tmp_path / "rows.json").read_text())
     assert none["collisions"] > 0
