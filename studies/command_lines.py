@@ -316,7 +316,7 @@ def main() -> None:
         prepare(folder)
         shutil.copytree(folder, kept)
         recorder = Recorder(folder)
-        flies = (patch.object(evaluation, "evaluate", _accept), patch("quad_swarm.figures.replay.replay_page", _accept))
+        flies = (patch.object(evaluation, "fly_all", _accept), patch("quad_swarm.figures.replay.replay_page", _accept))
         trains = (
             patch.object(training.Training, "learn", _accept),
             patch.object(study.Search, "run", _accept),
