@@ -6,6 +6,7 @@ the same episodes by full communication, the best rule of `flight` (docs/flight.
 - ``nothing``,
 - ``a process dies`` after 1.5 s; its vehicle levels, and lands a second after its last command,
 - ``a process stands still`` for 0.3 s,
+- ``a busy machine``: each process stands still for 20 to 100 ms about five times a second,
 - ``two halves``: for a second, no message gets from one half of the robots to the other,
 - ``clocks`` of the robots are up to 20 ms wrong,
 - ``duplicates``: 30 % of the messages arrive twice, 30 % after the next one, and all take up to 30 ms,
@@ -25,9 +26,11 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
@@ -60,6 +63,13 @@ def _stands(flight: VirtualFlight) -> None:
     flight.at(int(1.3 * _S), lambda: flight.halt(2, 0.3))
 
 
+def _waits(flight: VirtualFlight) -> None:
+    rng = np.random.default_rng(0)
+    for robot in range(N_ROBOTS):
+        for at in np.sort(rng.uniform(0, MOST, round(5 * MOST))):
+            flight.at(int(at * _S), partial(flight.halt, robot, rng.uniform(0.02, 0.1)))
+
+
 def _halves(flight: VirtualFlight) -> None:
     flight.at(_S, lambda: flight.part(range(N_ROBOTS // 2), 1.0))
 
@@ -77,6 +87,7 @@ FAULTS: dict[str, tuple[Happens, Conditions, Timing, bool]] = {
     "nothing": (_nothing, _LOST, Timing(), False),
     "a process dies": (_dies, _LOST, Timing(), False),
     "a process stands still": (_stands, _LOST, Timing(), False),
+    "a busy machine": (_waits, _LOST, Timing(), False),
     "two halves": (_halves, _LOST, Timing(), False),
     "clocks": (_nothing, _LOST, Timing(clock=(-0.02, 0.02)), False),
     "duplicates": (_nothing, Conditions(0.1, 0.3, 0.0, 0.3), Timing(message=(0.0003, 0.03)), False),
