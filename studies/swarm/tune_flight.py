@@ -115,8 +115,6 @@ def families(up_to: int = UP_TO) -> dict[str, list[str]]:
         ],
         "cpa and stale": [f"{cpa}&stale:{k}" for cpa, k in product(cpas, (2, 3, 4, 6, 8))],
         "cpa and event": [f"{cpa}&event:{e}" for cpa, e in product(far, (0.02, 0.03, 0.05, 0.1))],
-        "cpa and push": [f"{cpa}&push:{e}" for cpa, e in product(far, (0.1, 0.15, 0.2, 0.3))],
-        "plan and push": [f"{plan}&push:{e}" for plan, e in product(plans[2::2], (0.1, 0.15, 0.2, 0.3))],
         "push": [f"push:{e}" for e in (0.1, 0.15, 0.2, 0.3, 0.4)],
         "cpa, soon or stale": [
             f"{cpa}&soon:{t}|{cpa}&stale:{k}" for cpa, t, k in product(far, (0.2, 0.3, 0.5), (3, 4, 6))
