@@ -248,12 +248,13 @@ def test_mlp_policies_divide_images_of_bytes_like_stable_baselines3(normalize_im
         scaled[:, 56:] /= 255  # the state
     assert scaled[:, 56:].max() == (1.0 if normalize_images else 255.0)
     batch, unscaled = th.as_tensor(scaled[None]), th.as_tensor(obs[None])
-    assert th.allclose(model.actor.logits(unscaled), plain.actor.logits(batch), atol=1e-6)
+    rounding = 1e-6 if normalize_images else 1e-4  # of sums of hundreds that may almost cancel
+    assert th.allclose(model.actor.logits(unscaled), plain.actor.logits(batch), atol=rounding)
     actions = model.actor(unscaled)
-    assert th.allclose(model.critic(unscaled, actions), plain.critic(batch, actions), atol=1e-5)
+    assert th.allclose(model.critic(unscaled, actions), plain.critic(batch, actions), atol=10 * rounding)
     own = model.actor.actions.columns_of(0)
     alone = model.agent_policy("a").network(unscaled[:, 0, :48])[:, own]
-    assert th.allclose(alone, model.actor.logits(unscaled)[:, 0, own], atol=1e-6)
+    assert th.allclose(alone, model.actor.logits(unscaled)[:, 0, own], atol=rounding)
 
 
 @pytest.mark.parametrize("normalize_images", [True, False])
