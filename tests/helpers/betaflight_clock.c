@@ -1,55 +1,73 @@
-// Preloaded into Betaflight's SITL, gives it a clock that its main thread moves on by reading it and by sleeping: freely
-// until the first state of the vehicle, and from then on no farther than the newest one. However busy the machine is, the
-// firmware does the same in each step. With the machine's clock, its scheduler stands still for ever if the machine takes
-// the processor away from it for 250 us when it starts.
-//
-// The thread that serves its serial lines over TCP waits until the main thread has opened them: it frees all streams that
-// are closed, as those are that the main thread is about to open, which then never answer.
+// Preloaded into Betaflight's SITL, lets one of its threads run at a time: they take turns where they wait. Its TCP library,
+// dyad, is called by two threads without a lock: one frees the stream that the other is just opening, since a stream counts
+// as closed until it listens, and then nobody answers on that line any more.
+// The clock is moved on by its main thread, by reading it and by sleeping: freely until the first state of the vehicle, and
+// from then on no farther than the newest one. However busy the machine is, the firmware does the same in each step. With
+// the machine's clock, its scheduler stands still for ever if the machine takes the processor away for 250 us at its start.
 #define _GNU_SOURCE
 #include <dlfcn.h>
-#include <stdatomic.h>
+#include <pthread.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/select.h>
 #include <sys/socket.h>
+#include <sys/time.h>
 #include <time.h>
 #include <unistd.h>
 
-enum { STATE_BYTES = 144, READING = 100 };  // ns that reading the clock takes
+enum { STATE_BYTES = 144, READING = 100, NAP = 1000000 };  // ns that reading the clock takes, and between real sleeps
 #define SECOND INT64_C(1000000000)
+#define ORIGINAL(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
 
-static _Atomic int64_t now = SECOND, until = INT64_MAX;  // ns
-static _Atomic int64_t opened = INT64_MAX;  // when the main thread last opened a line
-static _Thread_local double newest = -1;  // time (s) of a state that its thread is still storing
+static pthread_mutex_t turn = PTHREAD_MUTEX_INITIALIZER;
+static int64_t now = SECOND, until = INT64_MAX;  // ns
+static double newest = -1;  // time (s) of a state that a thread is still storing
+
+__attribute__((constructor)) static void begin(void) { pthread_mutex_lock(&turn); }
+
+static void rest(useconds_t us) {
+    pthread_mutex_unlock(&turn);
+    usleep(us);
+    pthread_mutex_lock(&turn);
+}
 
 static void pass(int64_t ns) {
     if (getpid() != gettid()) return;
     now += ns;
-    while (now > until) usleep(20);
+    while (now > until) rest(20);
 }
 
 int clock_gettime(clockid_t id, struct timespec *ts) {
     (void)id;  // the firmware reads one clock only
     pass(READING);
-    int64_t time = now;
-    ts->tv_sec = time / SECOND;
-    ts->tv_nsec = time % SECOND;
+    ts->tv_sec = now / SECOND;
+    ts->tv_nsec = now % SECOND;
     return 0;
 }
 
-int nanosleep(const struct timespec *time, struct timespec *rest) {
+int gettimeofday(struct timeval *restrict tv, void *restrict zone) {
+    (void)zone;  // dyad's clock: it closes a line after 120 s without a word
+    tv->tv_sec = now / SECOND;
+    tv->tv_usec = now % SECOND / 1000;
+    return 0;
+}
+
+int nanosleep(const struct timespec *time, struct timespec *left) {
     static uint32_t more = 1;  // who sleeps wakes up a little late, which scheduling is made for
-    (void)rest;
+    static int64_t rested;
+    (void)left;
     more = more * 1664525 + 1013904223;
-    if (until == INT64_MAX) usleep(time->tv_sec * 1000000 + time->tv_nsec / 1000);
     pass(time->tv_sec * SECOND + time->tv_nsec + more % 16384);
+    if (until == INT64_MAX && now - rested >= NAP) {  // each sleep would wait for a busy machine
+        rest(NAP / 1000);
+        rested = now;
+    }
     return 0;
 }
 
 ssize_t recvfrom(int fd, void *data, size_t size, int flags, struct sockaddr *from, socklen_t *length) {
-    static ssize_t (*receive)(int, void *, size_t, int, struct sockaddr *, socklen_t *);
-    if (!receive) receive = dlsym(RTLD_NEXT, "recvfrom");
-    ssize_t received = receive(fd, data, size, flags, from, length);
+    ssize_t received = ORIGINAL(recvfrom)(fd, data, size, flags, from, length);
     if (received == STATE_BYTES) {
         memcpy(&newest, data, sizeof newest);
         memset(data, 0, sizeof newest);  // else the firmware changes the rate of its clock
@@ -57,24 +75,42 @@ ssize_t recvfrom(int fd, void *data, size_t size, int flags, struct sockaddr *fr
     return received;
 }
 
-int listen(int fd, int backlog) {
-    static int (*wait)(int, int);
-    if (!wait) wait = dlsym(RTLD_NEXT, "listen");
-    int result = wait(fd, backlog);
-    opened = now;
-    return result;
-}
-
 int select(int n, fd_set *reading, fd_set *writing, fd_set *failing, struct timeval *timeout) {
-    static int (*wait)(int, fd_set *, fd_set *, fd_set *, struct timeval *);
     static int64_t began;
-    if (!wait) wait = dlsym(RTLD_NEXT, "select");
-    // The threads for the vehicle's state only read
-    while ((writing || !reading) && now - SECOND / 2 < opened) usleep(100);
     if (newest >= 0) {  // its thread has stored it, and waits for the next one
         if (!began) began = now;
         until = began + (int64_t)(newest * 1e9 + 0.5);
         newest = -1;
     }
-    return wait(n, reading, writing, failing, timeout);
+    pthread_mutex_unlock(&turn);
+    int ready = ORIGINAL(select)(n, reading, writing, failing, timeout);
+    pthread_mutex_lock(&turn);
+    return ready;
+}
+
+struct work {
+    void *(*function)(void *);
+    void *argument;
+};
+
+static void *in_turn(void *data) {
+    struct work work = *(struct work *)data;
+    free(data);
+    pthread_mutex_lock(&turn);
+    void *result = work.function(work.argument);
+    pthread_mutex_unlock(&turn);
+    return result;
+}
+
+int pthread_create(pthread_t *thread, const pthread_attr_t *attributes, void *(*function)(void *), void *argument) {
+    struct work *work = malloc(sizeof *work);
+    *work = (struct work){function, argument};
+    return ORIGINAL(pthread_create)(thread, attributes, in_turn, work);
+}
+
+int pthread_join(pthread_t thread, void **result) {
+    pthread_mutex_unlock(&turn);
+    int failed = ORIGINAL(pthread_join)(thread, result);
+    pthread_mutex_lock(&turn);
+    return failed;
 }

@@ -40,18 +40,17 @@ def executable() -> Path | None:
 
 
 def connected() -> TcpPort:
-    """A line to the firmware once it answers. It forgets what arrives while it opens the line."""
+    """A line to the firmware, once it answers."""
     until = time.monotonic() + LONGEST
+    port = None
     while time.monotonic() < until:
-        with contextlib.suppress(OSError):
-            port = TcpPort(SERIAL)
-            for _ in range(20):
+        time.sleep(0.05)
+        if port is None:
+            with contextlib.suppress(ConnectionRefusedError):
+                port = TcpPort(SERIAL)
                 port.send(pack(MSP_STATUS))
-                time.sleep(0.1)
-                if port.receive():
-                    return port
-            port.close()
-        time.sleep(0.1)
+        elif port.receive():
+            return port
     raise TimeoutError("the firmware does not answer")
 
 
