@@ -100,7 +100,7 @@ def test_a_browser_follows(live, flown, browser):
     for sample in every[:3]:
         live.add(sample)
     page = browser.new_page()
-    page.set_default_timeout(300_000)  # ms, on a busy machine
+    page.set_default_timeout(500_000)  # ms, on a busy machine
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(live.url)

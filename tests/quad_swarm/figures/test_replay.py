@@ -139,6 +139,7 @@ def view(browser, pages):
     def open_page(name, hash_="step=0", size="desktop", scheme="light", script="", **options):
         width, height = SIZES[size]
         page = browser.new_page(color_scheme=scheme, viewport={"width": width, "height": height}, **options)
+        page.set_default_timeout(500_000)  # ms, on a busy machine
         opened.append(page)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: message.type == "error" and errors.append(message.text))
@@ -523,6 +524,7 @@ def test_without_webgl_the_rest_works(view):
 @pytest.mark.slow
 def test_frames_for_scripts_depend_on_their_time_alone(browser, pages):
     page = browser.new_page()
+    page.set_default_timeout(500_000)
     page.goto(f"{pages['four'].as_uri()}#hero")
     options = {"width": 480, "height": 240, "ratio": 1, "theme": "dark"}
     assert 1 < page.evaluate("prepare", options) < 10
