@@ -12,7 +12,7 @@ import inspect
 import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import numpy as np
@@ -255,6 +255,35 @@ def read_yaml(text: str) -> Any:
         raise ValueError("nested too deeply") from None
     except (yaml.YAMLError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise ValueError("no valid YAML: " + " ".join(str(error).split())) from None
+
+
+def read_assignments(option: str, assignments: Iterable[str]) -> dict[str, Any]:
+    """Convert ``["noise.wind=1", "memory=0.3"]`` to ``{"noise": {"wind": 1}, "memory": 0.3}``.
+
+    :param option: where they were given, for error messages
+    :param assignments: names and values, ``NAME=VALUE``
+    :raises ValueError: if one is no assignment, or a name is given twice
+    """
+    values: dict[str, Any] = {}
+    for assignment in assignments:
+        name, equals, value = assignment.partition("=")
+        if not equals:
+            raise ValueError(f"{option} {assignment!r}: write NAME=VALUE, for example planner.separation=0.63.")
+        *parents, leaf = name.split(".")
+        place = values
+        for parent in parents:
+            place = place.setdefault(parent, {})
+            if not isinstance(place, dict):
+                raise ValueError(f"{option} {assignment!r}: {parent!r} already has a plain value.")
+        if leaf in place:
+            raise ValueError(f"{option} {assignment!r}: {name!r} is given twice.")
+        try:
+            place[leaf] = read_yaml(value)
+        except ValueError as error:
+            raise ValueError(
+                f"{option} {shown(assignment)}: {shown(value)} is not valid YAML ({shown(str(error))}); quote text."
+            ) from None
+    return values
 
 
 def explained(error: pydantic.ValidationError, owner: Any, *path: str) -> ValueError:

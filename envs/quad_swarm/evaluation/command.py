@@ -6,14 +6,14 @@ import argparse
 import dataclasses
 import importlib
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
-from quad_swarm.errors import needs_extra, shown, unknown_name
+from quad_swarm.errors import needs_extra, unknown_name
 from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise_all
 from quad_swarm.evaluation.flight import Condition, fly
 from quad_swarm.evaluation.judging import flat, format_flights, judge, legend, totals
@@ -27,7 +27,7 @@ from quad_swarm.parsing import Parser
 from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
 from quad_swarm.task.rules import RULES
-from quad_swarm.validation import read_yaml
+from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -125,30 +125,6 @@ def _latex(texts: Sequence[Sequence[str]]) -> str:
     return "\n".join((*lines, r"\bottomrule", r"\end{tabular}", ""))
 
 
-def parse_world(assignments: Iterable[str]) -> dict[str, Any]:
-    """Convert ``["noise.wind=1", "memory=0.3"]`` to ``{"noise": {"wind": 1}, "memory": 0.3}``."""
-    world: dict[str, Any] = {}
-    for assignment in assignments:
-        name, equals, value = assignment.partition("=")
-        if not equals:
-            raise ValueError(f"--world {assignment!r}: write NAME=VALUE, for example planner.separation=0.63.")
-        *parents, leaf = name.split(".")
-        place = world
-        for parent in parents:
-            place = place.setdefault(parent, {})
-            if not isinstance(place, dict):
-                raise ValueError(f"--world {assignment!r}: {parent!r} already has a plain value.")
-        if leaf in place:
-            raise ValueError(f"--world {assignment!r}: {name!r} is given twice.")
-        try:
-            place[leaf] = read_yaml(value)
-        except ValueError as error:
-            raise ValueError(
-                f"--world {shown(assignment)}: {shown(value)} is not valid YAML ({shown(str(error))}); quote text."
-            ) from None
-    return world
-
-
 def _rules_usage() -> str:
     return ", ".join(":".join((name, *arguments)) for name, (_, arguments) in RULES.items())
 
@@ -220,7 +196,7 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
             raise unknown_name("scenario", name, SCENARIOS)
     models = {policy: trained_in(load_model(policy, args.algo)) for policy in args.policy if is_model(policy)}
     args.preset = args.preset or preset_of(models)
-    config = make_config(args.preset, parse_world(args.world), n_robots=args.n_robots, plant=args.plant)
+    config = make_config(args.preset, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
     for policy, trained in models.items():
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, but this is {args.preset!r}", file=sys.stderr)
@@ -350,7 +326,7 @@ def _judge(args: argparse.Namespace) -> None:
         if getattr(args, name):
             raise ValueError(f"--{name} is for policies to fly, --flight for recorded flights: leave one of them out.")
     printed = _check_files(args)
-    flights = read_flights(args.flight, args.preset, parse_world(args.world))
+    flights = read_flights(args.flight, args.preset, read_assignments("--world", args.world))
     rows = [judge(str(path), recording) for path, recording in flights]
     sums = totals(rows)
     try:

@@ -11,10 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 from quad_swarm.errors import needs_extra, shown
-from quad_swarm.evaluation.command import parse_world, preset_of
+from quad_swarm.evaluation.command import preset_of
 from quad_swarm.evaluation.policies import OBSERVATION_ARGUMENTS, fitted, is_model, load_model, short_name, trained_in
 from quad_swarm.parsing import Parser
 from quad_swarm.robot import files
+from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 
 EXAMPLES = "  sb3-maddpg export pretrained:quad-swarm-flight --n-robots 8 --out robots"
@@ -86,7 +87,7 @@ def main(argv: list[str] | None = None) -> int:
         raise ValueError(f"{shown(args.model)} is no model: pass the path of a .zip, latest:LOGDIR or pretrained:NAME.")
     trained = trained_in(load_model(args.model, args.algo))
     preset = args.preset or preset_of({args.model: trained})
-    config = make_config(preset, parse_world(args.world), n_robots=args.n_robots)
+    config = make_config(preset, read_assignments("--world", args.world), n_robots=args.n_robots)
     if args.out.exists() and not args.out.is_dir():
         raise ValueError(f"--out {args.out} is a file: choose a folder.")
     written = export(args.model, config, args.out, args.algo)

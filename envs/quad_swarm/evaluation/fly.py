@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from quad_swarm.evaluation.command import parse_world, preset_of, run
+from quad_swarm.evaluation.command import preset_of, run
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.inference import wilson_interval
@@ -37,6 +37,7 @@ from quad_swarm.realtime.udp_world import UdpWorld
 from quad_swarm.realtime.vehicles import Flight
 from quad_swarm.realtime.virtual import VirtualFlight
 from quad_swarm.ros.world import RosWorld
+from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 
@@ -271,7 +272,7 @@ def _main(args: argparse.Namespace) -> None:
         check_writable(args.json, "--json")
     models = {one: trained_in(load_model(one, args.algo)) for one in args.policy if is_model(one)}
     preset = args.preset or (preset_of(models) if models else "flight")
-    config = make_config(preset, parse_world(args.world), n_robots=args.n_robots, plant=args.plant)
+    config = make_config(preset, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
     if not 0 <= args.priority <= 99:
         raise ValueError(f"--priority {args.priority}: it must be from 1 to 99, or 0 for none.")
     if not set_priority(args.priority):

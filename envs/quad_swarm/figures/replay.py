@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.evaluation.command import add_flight_argument, add_policy_arguments, make_conditions, parse_world, run
+from quad_swarm.evaluation.command import add_flight_argument, add_policy_arguments, make_conditions, run
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import is_model, short_name
 from quad_swarm.evaluation.provenance import plant_name
@@ -29,6 +29,7 @@ from quad_swarm.geometry import closest_approach, length
 from quad_swarm.parsing import Parser
 from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.task.rules import parse_rule
+from quad_swarm.validation import read_assignments
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
@@ -215,7 +216,9 @@ def _write(args: argparse.Namespace) -> None:
     if bool(args.flight) == bool(args.policy):
         raise ValueError("pass either policies to fly (--policy) or recorded flights (--flight).")
     if args.flight:
-        _finish(args.out, recorded_page(read_flights(args.flight, args.preset, parse_world(args.world))))
+        _finish(
+            args.out, recorded_page(read_flights(args.flight, args.preset, read_assignments("--world", args.world)))
+        )
         return
     conditions = make_conditions(args, [args.scenario])
     changes = [*args.world, *([f"plant={plant_name(conditions[0].config)}"] if args.plant else [])]

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from quad_swarm.realtime.link import Sensed, Traffic, monotonic
+from quad_swarm.realtime.link import Sensed, Traffic, monotonic, of_day
 from quad_swarm.realtime.process import Hears, Report, Sample
 from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.team import Team
@@ -25,7 +25,7 @@ _US = 1_000_000
 _MOST_ROBOTS = 64  # which reports have bits for
 _READY = 90.0  # s that robots have to start; the first start on a machine compiles the planner
 _LEAD = 0.3  # s between the order to fly and the first period
-_PAUSE = 0.1  # s of delay from which on the world itself stood still, and goes on from there
+PAUSE = 100_000  # us of delay from which on the world itself stood still, and goes on from there
 _SAYS_STOP = 0.2  # s
 _ENDS = 10.0  # s that robots have to report, and to end
 
@@ -132,20 +132,20 @@ class Arena:
             places = {"start": list(starts[k]), "goal": list(goals[k])}
             # Robots that nobody synchronises begin their periods at any time; on one machine, they share its cores so
             first = begins + round(k * team.config.planner.dt * _US / n)
-            self._exchange.say(k, says="fly", flight=self._flight, first=self._of_day(first), **places)
+            self._exchange.say(k, says="fly", flight=self._flight, first=of_day(first), **places)
         todo, period = sorted(events, key=lambda event: event[0]), team.config.substeps
         steps, there, slipped = 0, None, 0
         while vehicles.now - begins < most * _US:
             for k in range(n):
                 if k not in self._frozen:
                     self._senses[k] = vehicles.sensed(k)
-                seen = self._senses[k]._replace(stamp=self._of_day(vehicles.now + slipped))
+                seen = self._senses[k]._replace(stamp=of_day(vehicles.now + slipped))
                 self._exchange.tell(k, seen)
             while todo and todo[0][0] * _US <= vehicles.now - begins:
                 todo.pop(0)[1](self)
             due = vehicles.now + vehicles.step_us + slipped
             self._exchange.receive(due, self)
-            if monotonic() - due > _PAUSE * _US:
+            if monotonic() - due > PAUSE:
                 slipped += monotonic() - due
                 self._pauses += 1
             vehicles.advance()
@@ -266,7 +266,3 @@ class Arena:
         statistics = [None if one is None else Statistics.from_json(one["statistics"]) for one in done]
         traffic = [None if one is None else Traffic(**one["traffic"]) for one in done]
         return vehicles.flight(begins, statistics, traffic, sorted(killed), self._pauses)
-
-    def _of_day(self, at: int) -> int:
-        """Return a time on the clock of the day (us)."""
-        return at + time.time_ns() // 1000 - monotonic()

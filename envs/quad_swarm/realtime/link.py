@@ -96,6 +96,11 @@ def monotonic() -> int:
     return time.monotonic_ns() // 1000
 
 
+def of_day(at: int) -> int:
+    """Return a time of `monotonic` on the clock of the day (us)."""
+    return at + time.time_ns() // 1000 - monotonic()
+
+
 @dataclass
 class Traffic:
     """What a robot sent and received.
@@ -139,14 +144,11 @@ class BaseLink:
     def shared(self, at: int) -> int:
         """Return a time of the robot's clock on the clock that all robots share (us). Clocks that only count up differ
         between machines; those of the day are kept together by PTP or NTP."""
-        return at + self._offset()
+        return of_day(at) + self.clock_error
 
     def own(self, at: int) -> int:
         """Return a time of the clock that all robots share on the robot's own (us)."""
-        return at - self._offset()
-
-    def _offset(self) -> int:
-        return time.time_ns() // 1000 - monotonic() + self.clock_error
+        return at - of_day(0) - self.clock_error
 
 
 class WireLink(BaseLink):

@@ -76,6 +76,7 @@ class Supervisor:
     :ivar sees: whether what is perceived can be planned with
     :ivar reasons: how often each guard stepped in
     :ivar why: the guards that step in now
+    :ivar shall_land: whether `land` was called
 
     :param config: the world
     :param limits: when to hover and when to land
@@ -96,7 +97,11 @@ class Supervisor:
         self.mode, self.why, self.sees = Mode.FLY, frozenset[str](), False
         self._state: np.ndarray | None = None
         self._changed = self._landing_since = 0
-        self._is_frozen = False
+        self._is_frozen = self.shall_land = False
+
+    def land(self) -> None:
+        """Land from the next check on, since somebody outside wishes so. This is final, as every landing is."""
+        self.shall_land = True
 
     def check(self, now: int, sensed: Sensed | None, setpoint: np.ndarray, unanswered: float = 0.0) -> Mode:
         """Check everything once a period.
@@ -109,6 +114,8 @@ class Supervisor:
         if self.mode is Mode.OFF:
             return self.mode
         limits, why = self.limits, dict[str, Mode]()
+        if self.shall_land:
+            why["told to land"] = Mode.LAND
         if sensed is None:
             why["no state yet"] = Mode.HOVER
         elif (age := (now - sensed.stamp) / _US) > limits.stale:

@@ -61,6 +61,7 @@ class Vehicles:
     :ivar state: true states, (n, 9)
     :ivar closest: smallest distance of each pair of robots while both were flying, (n, n) (m)
     :ivar flying: which robots are in the air, (n,) bool
+    :ivar held: which robots are held where they are until their first command, (n,) bool; `reset` holds nobody
 
     :param config: the world; its clock skew is not used, since commands take effect when they arrive
     :raises ValueError: if a sub-step is no whole number of microseconds
@@ -102,7 +103,7 @@ class Vehicles:
             self._realisation.reset(0, noise_seed)
         self._u = np.zeros((1, n, N_INPUTS))
         self._commanded = np.full(n, now)
-        self.flying = np.ones(n, dtype=bool)
+        self.flying, self.held = np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
         self.closest = np.full((n, n), np.inf)
         self.arrived = np.full(n, -1)
         self._sense()
@@ -121,8 +122,12 @@ class Vehicles:
         :param robot: number of the robot
         :param setpoint: roll, pitch (rad), climb rate (m/s), yaw rate (rad/s), (4,)
         """
-        if np.isfinite(setpoint).all():
-            self._u[0, robot], self._commanded[robot] = setpoint, self.now
+        if not np.isfinite(setpoint).all():
+            return
+        self._u[0, robot], self._commanded[robot] = setpoint, self.now
+        if self.held[robot]:
+            self.held[robot] = False
+            self._plant.place(0, self._state[0])  # simulators have flown on meanwhile
 
     def sensed(self, robot: int) -> Sensed:
         """Return what a robot perceives of the last sub-step."""
@@ -135,14 +140,15 @@ class Vehicles:
         u = np.where((silent > LEVELS_AFTER)[:, None], 0.0, self._u[0])
         u = np.where((silent > LANDS_AFTER)[:, None], _LANDING, u)
         before, realisation = self.state[:, POSITION].copy(), self._realisation
-        landed = self.state[~self.flying].copy()
+        still = ~self.flying | self.held
+        stays = self.state[still].copy()
         self._state = self._plant.step(self._state, u[None], realisation.air, realisation.factors)
         self._steps += 1
         if self._steps % self.config.substeps == 0 and self.config.is_random:
             kicks = realisation.advance()
             if kicks is not None:
                 self._state = self._state + kicks
-        self.state[~self.flying] = landed
+        self.state[still] = stays
         self.now += self.step_us
         self._meet(before)
         self.flying &= self.state[:, 2] > 0.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,6 +30,7 @@ def msgs() -> SimpleNamespace:
     """
     names = {
         "builtin_interfaces": "Duration Time",
+        "diagnostic_msgs": "DiagnosticArray DiagnosticStatus KeyValue",
         "geometry_msgs": "PoseStamped Quaternion Transform Twist TwistStamped Vector3",
         "nav_msgs": "Odometry",
         "std_msgs": "Header String",
@@ -46,6 +48,23 @@ def to_time(us: int) -> Any:
 def from_time(time: Any) -> int:
     """Return a message's time (us)."""
     return int(time.sec) * _S + int(time.nanosec) // 1000
+
+
+def to_diagnostics(name: str, level: int, message: str, values: Mapping[str, object], stamp: int) -> Any:
+    """Return a status as ``diagnostic_msgs/DiagnosticArray``.
+
+    :param name: whose status it is
+    :param level: 0 (well), 1 (warning) or 2 (error)
+    :param message: the status in words
+    :param values: further values by name
+    :param stamp: the time (us)
+    """
+    names = msgs()
+    status = names.DiagnosticStatus(level=bytes([level]), name=name, message=message)
+    status.values = [names.KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    array = names.DiagnosticArray(status=[status])
+    array.header.stamp = to_time(stamp)
+    return array
 
 
 def rotation(attitude: np.ndarray) -> np.ndarray:

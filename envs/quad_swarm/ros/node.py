@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from quad_swarm.errors import shown
 from quad_swarm.realtime.link import Handler, monotonic
+from quad_swarm.robot import Plan
 
 # Wheels name no middleware, and nothing shall leave this machine unless the user says so
 DEFAULTS = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -29,13 +32,12 @@ def quality(depth: int, lasting: bool = False) -> Any:
     )
 
 
-def make_node(name: str, namespace: str = "", context: Any = None) -> Any:
-    """Create a node.
+def make_context(args: Sequence[str] | None = None) -> Any:
+    """Create a context, which nodes live in.
 
-    :param name: its name
-    :param namespace: its namespace
-    :param context: context to create it in, by default one of its own
+    :param args: command line, of which those after ``--ros-args`` count; none by default
     :raises ImportError: if ROS 2 is not there
+    :raises ValueError: if the arguments of ROS are wrong
     """
     for key, value in DEFAULTS.items():
         os.environ.setdefault(key, value)
@@ -45,11 +47,75 @@ def make_node(name: str, namespace: str = "", context: Any = None) -> Any:
         raise ImportError(
             "ROS 2 is not there: source a distribution's setup.bash, or pip install 'sb3-maddpg[ros]' on x86-64."
         ) from None
-    if context is None:
-        context = rclpy.Context()
-        rclpy.init(context=context)
+    context = rclpy.Context()
+    try:
+        rclpy.init(args=list(args or ()), context=context)
+    except RuntimeError as error:
+        raise ValueError(f"the arguments of ROS are wrong: {error}") from None
+    return context
+
+
+def make_node(name: str, namespace: str = "", context: Any = None) -> Any:
+    """Create a node.
+
+    :param name: its name
+    :param namespace: its namespace
+    :param context: context to create it in, by default one of its own
+    :raises ImportError: if ROS 2 is not there
+    """
+    context = make_context() if context is None else context
+    import rclpy
+
     options: Any = {"start_parameter_services": False, "enable_rosout": False}
     return rclpy.create_node(name, namespace=namespace, context=context, **options)
+
+
+def declare(node: Any, defaults: Mapping[str, Any]) -> None:
+    """Declare parameters of any type: whoever reads them checks them, and can say what is wrong.
+
+    :param node: the node
+    :param defaults: what they are if nobody sets them, by name
+    """
+    from rcl_interfaces.msg import ParameterDescriptor
+
+    for name, value in defaults.items():
+        node.declare_parameter(name, value, ParameterDescriptor(dynamic_typing=True))
+
+
+def values_of(node: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of parameters by name. An empty list has no type, so ROS takes it for none at all.
+
+    :param node: the node
+    :param defaults: what was given to `declare`
+    """
+    values = {name: node.get_parameter(name).value for name in defaults}
+    return {name: defaults[name] if value is None else value for name, value in values.items()}
+
+
+def texts(name: str, value: Any) -> list[str]:
+    """Return a parameter that is a list of texts.
+
+    :param name: its name
+    :param value: its value
+    :raises ValueError: if it is none
+    """
+    values = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [None]
+    if not all(isinstance(one, str) for one in values):
+        raise ValueError(f"{name}={shown(value)}: give a list of texts, as in {name}:=[a,b]")
+    return values
+
+
+def checked_names(value: Any) -> list[str]:
+    """Return the names of all robots, from the parameter ``names``.
+
+    :raises ValueError: if they are not two or more different names
+    """
+    names = texts("names", value)
+    if len(names) < 2 or len(set(names)) < len(names):
+        raise ValueError(f"names={shown(names)}: give the names of all robots, two or more, each once")
+    if wrong := [name for name in names if re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is None]:
+        raise ValueError(f"names: {shown(wrong[0])} is no name: use letters, digits and underscores, a letter first")
+    return names
 
 
 def make_executor(context: Any) -> Any:
@@ -62,6 +128,16 @@ def make_executor(context: Any) -> Any:
 
         return SingleThreadedExecutor(context=context)
     return EventsExecutor(context=context)
+
+
+class Nobody:
+    """A handler of those who have no plans."""
+
+    def on_request(self, sender: int) -> None:
+        """See `Handler`."""
+
+    def on_plan(self, sender: int, plan: Plan, sent: int | None, period: int) -> None:
+        """See `Handler`."""
 
 
 class Mailbox:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,9 @@ import numpy as np
 
 from quad_swarm.realtime.link import Handler, Sensed
 from quad_swarm.realtime.process import Hears, Report
-from quad_swarm.robot import Plan
 from quad_swarm.ros.link import RosLink
 from quad_swarm.ros.messages import from_command, msgs, to_odometry
-from quad_swarm.ros.node import Mailbox, make_node, quality
+from quad_swarm.ros.node import Mailbox, Nobody, make_node, quality
 from quad_swarm.ros.vehicles import OdometryVehicle
 
 
@@ -67,6 +66,30 @@ class RosVehicle(OdometryVehicle):
         self.control.append(json.loads(message.data))
 
 
+class VehicleTopics:
+    """The end of simulated vehicles: ``/NAME/odom`` and ``/NAME/cmd`` of each.
+
+    :param node: the world's node
+    :param mailbox: receives for it
+    :param names: names of all robots
+    :param command: takes a robot's number and its set-point, (4,)
+    """
+
+    def __init__(self, node: Any, mailbox: Mailbox, names: Sequence[str], command: Callable[[int, np.ndarray], None]):
+        self._names = list(names)
+        self._odometry = [node.create_publisher(msgs().Odometry, f"/{one}/odom", quality(1)) for one in names]
+        for number, name in enumerate(names):
+
+            def take(message: Any, handler: Handler, number: int = number) -> None:
+                command(number, from_command(message))
+
+            mailbox.subscribe(msgs().TwistStamped, f"/{name}/cmd", quality(2), take)
+
+    def tell(self, robot: int, sensed: Sensed) -> None:
+        """Publish a robot's state, stamped with the time of the day."""
+        self._odometry[robot].publish(to_odometry(sensed.state, sensed.stamp, f"{self._names[robot]}/base_link"))
+
+
 class RosWorld:
     """The world's end, see `quad_swarm.realtime.arena.Exchange`.
 
@@ -76,17 +99,10 @@ class RosWorld:
     def __init__(self, n_robots: int):
         node = make_node("world")
         self._mailbox, self._names = Mailbox(node), names_of(n_robots)
-        self._odometry = [node.create_publisher(msgs().Odometry, f"/{one}/odom", quality(1)) for one in self._names]
+        self._vehicles = VehicleTopics(node, self._mailbox, self._names, self._command)
         self._words = [node.create_publisher(msgs().String, f"/{one}/words", quality(10)) for one in self._names]
         self._hears: Hears | None = None
         self._mailbox.subscribe(msgs().String, "/world/words", quality(50 * n_robots), self._hear)
-        for number, name in enumerate(self._names):
-
-            def take(message: Any, handler: Handler, number: int = number) -> None:
-                assert self._hears is not None
-                self._hears.on_command(number, from_command(message))
-
-            self._mailbox.subscribe(msgs().TwistStamped, f"/{name}/cmd", quality(2), take)
 
     def process(self, team: Path, robot: int) -> list[str]:
         """See `Exchange`."""
@@ -94,7 +110,7 @@ class RosWorld:
 
     def tell(self, robot: int, sensed: Sensed) -> None:
         """See `Exchange`."""
-        self._odometry[robot].publish(to_odometry(sensed.state, sensed.stamp, f"{self._names[robot]}/base_link"))
+        self._vehicles.tell(robot, sensed)
 
     def say(self, robot: int, **words: Any) -> None:
         """See `Exchange`."""
@@ -103,11 +119,15 @@ class RosWorld:
     def receive(self, until: int, hears: Hears) -> None:
         """See `Exchange`."""
         self._hears = hears
-        self._mailbox.wait(until, _Nobody())
+        self._mailbox.wait(until, Nobody())
 
     def close(self) -> None:
         """See `Exchange`."""
         self._mailbox.close()
+
+    def _command(self, robot: int, setpoint: np.ndarray) -> None:
+        assert self._hears is not None
+        self._hears.on_command(robot, setpoint)
 
     def _hear(self, message: Any, handler: Handler) -> None:
         assert self._hears is not None
@@ -117,13 +137,3 @@ class RosWorld:
             self._hears.on_report(Report(words["robot"], mode, asked, told, arrived, np.array(plan)))
         else:
             self._hears.on_words(words)
-
-
-class _Nobody:
-    """The world itself is asked for no plans."""
-
-    def on_request(self, sender: int) -> None:
-        """See `Handler`."""
-
-    def on_plan(self, sender: int, plan: Plan, sent: int | None, period: int) -> None:
-        """See `Handler`."""

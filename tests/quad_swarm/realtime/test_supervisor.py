@@ -86,6 +86,19 @@ def test_a_landing_without_a_state_ends_some_time():
     assert flown[-1] is Mode.OFF
 
 
+def test_a_robot_lands_if_somebody_wishes_so():
+    """Whatever it perceives afterwards, until it is on the ground."""
+    supervisor = Supervisor(CONFIG, SafetyLimits())
+    assert modes(supervisor, [sensed]) == [Mode.FLY]
+    supervisor.land()
+    assert modes(supervisor, [sensed] * 2) == [Mode.LAND] * 2
+    assert supervisor.why == {"told to land"}
+    assert modes(supervisor, [lambda now: sensed(now, (0, 0, 0.05))] * 2) == [Mode.OFF] * 2
+    assert supervisor.reasons == {"told to land": 1}
+    supervisor.reset()
+    assert modes(supervisor, [sensed]) == [Mode.FLY], "the wish was that of the last flight"
+
+
 @pytest.mark.parametrize(("pos", "outside"), [((0, 0, -0.2), False), ((-9, 0, 1), True), ((0, 0, 9), True)])
 def test_the_fence_is_open_to_the_ground(pos, outside):
     supervisor = Supervisor(CONFIG, SafetyLimits())

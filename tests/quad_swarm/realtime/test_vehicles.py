@@ -60,6 +60,22 @@ def test_what_is_not_finite_is_no_command():
     assert np.isfinite(flown(0.2, broken).state).all()
 
 
+def test_robots_are_held_until_their_first_command():
+    vehicles = Vehicles(CONFIG)
+    vehicles.reset(STARTS, STARTS, 0, 0)
+    vehicles.held[:] = True
+    for _ in range(500):  # without commands, they would have landed by now
+        vehicles.advance()
+    np.testing.assert_array_equal(vehicles.state[:, :3], STARTS)
+    vehicles.command(0, np.full(4, np.nan))
+    assert vehicles.held.all(), "that is no command"
+    vehicles.command(0, np.array([0, 0, 0.5, 0]))
+    for _ in range(20):
+        vehicles.advance()
+    assert vehicles.state[0, 2] > STARTS[0][2]
+    np.testing.assert_array_equal(vehicles.state[1, :3], STARTS[1])
+
+
 def test_arrivals_are_the_first_ones():
     vehicles = flown(0.1, starts=GOALS)
     assert vehicles.arrived.tolist() == [vehicles.step_us] * 2

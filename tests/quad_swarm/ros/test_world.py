@@ -1,12 +1,12 @@
 """Robots over ROS 2, in a network that contains nothing but this machine."""
 
 import json
-import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from network import alone
 
 from quad_swarm.robot import Plan
 
@@ -143,11 +143,7 @@ raise SystemExit(main(words))
 
 @pytest.mark.slow
 def test_four_processes_fly(tmp_path):
-    """In a network namespace nothing can leave the machine, and tests beside each other do not meet."""
-    alone = ["unshare", "--net", "--map-root-user", "sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
-    if shutil.which("ip") is None or subprocess.run([*alone, "true"], capture_output=True).returncode:
-        pytest.skip("no network namespaces here")
-    done = subprocess.run([*alone, sys.executable, "-c", FLIES], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run([*alone(), sys.executable, "-c", FLIES], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((tmp_path / "rows.json").read_text())
     assert row["link"] == "ros2"

@@ -1,0 +1,249 @@
+"""The node of a robot: its parameters, its life, its goals."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from network import alone
+
+pytest.importorskip("rclpy")
+
+from quad_swarm.realtime import Mode
+from quad_swarm.realtime.link import monotonic
+from quad_swarm.ros.messages import msgs
+from quad_swarm.ros.robot_node import RobotNode
+
+ROOT = Path(__file__).parents[3]
+GOOD = {"policy": "full", "names": ["robot_0", "robot_1"], "index": 0}
+
+
+@pytest.fixture
+def make(monkeypatch):
+    """Makes nodes that nobody sees."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    made = []
+
+    def node(namespace="/robot_0", **parameters):
+        given = [word for name, value in parameters.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
+        made.append(RobotNode(["robot", "--ros-args", "-r", f"__ns:={namespace}", *given]))
+        return made[-1]
+
+    yield node
+    for one in made:
+        one.close()
+
+
+def topics(robot):
+    return {one.topic_name for one in (*robot.node.publishers, *robot.node.subscriptions)}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"policy": "ful"}, "ful"),
+        ({"policy": 3}, "policy"),
+        ({"preset": "fligth"}, "Did you mean 'flight'"),
+        ({"world": ["radius"]}, "world 'radius': write NAME=VALUE"),
+        ({"world": ["radius=-1"]}, "radius"),
+        ({"names": []}, "names of all robots"),
+        ({"names": ["robot_0", "robot_0"]}, "each once"),
+        ({"names": ["robot_0", "a b"]}, "'a b' is no name"),
+        ({"index": 2}, "index=2: give the robot's place"),
+        ({"index": True}, "index=True"),
+        ({"index": 1}, "start it with -r __ns:=/robot_1"),
+        ({"wait": 0.2}, "waiting must end within the period"),
+        ({"late": "soon"}, "late"),
+        ({"priority": 100}, "priority"),
+        ({"limits": ["stale=2"]}, "hovers before it lands"),
+        ({"limits": ["stale=.nan"]}, "stale"),
+        ({"limits": ["stall=2"]}, "stall"),
+        ({"vehicle": "crazy"}, "Unknown vehicle 'crazy'"),
+        ({"twist": "map"}, "choose 'body' or 'world'"),
+        ({"vehicle": "aerostack"}, "give the largest thrust"),
+        ({"vehicle": "px4", "origins": [0.0, 0.0]}, "x, y and z of each robot"),
+        ({"vehicle": "px4", "origins": [0.0, 0.0, 0.0]}, "each of 2 robots"),
+        ({"gains": ["hover_thrust=2"]}, "hover_thrust"),
+        ({"heading": "north"}, "heading='north'"),
+    ],
+)
+def test_what_is_wrong_is_told_and_nothing_stays(make, wrong, reason):
+    robot = make(**{**GOOD, **wrong})
+    before = topics(robot)
+    with pytest.raises(ValueError, match=re.escape(reason)):
+        robot.configure()
+    assert robot.loop is None
+    assert topics(robot) == before
+
+
+def test_missing_messages_are_told(make, monkeypatch):
+    monkeypatch.setitem(sys.modules, "as2_msgs.msg", None)
+    robot = make(**GOOD, vehicle="aerostack", most_thrust=20.0)
+    before = topics(robot)
+    with pytest.raises(ImportError, match="as2_msgs is not there: build it"):
+        robot.configure()
+    assert topics(robot) == before
+
+
+@pytest.fixture(scope="module")
+def transitions():
+    from rclpy.lifecycle import TransitionCallbackReturn
+
+    return TransitionCallbackReturn
+
+
+def see(robot, age=0, height=1.5):
+    """Let the robot perceive both, some time ago (us)."""
+    for k in range(2):
+        state = np.zeros(9)
+        state[:3] = 3.0 * k, 0, height
+        robot._vehicle._states[k] = monotonic() - age, state
+
+
+def goal(x, y, z, frame="map"):
+    message = msgs().PoseStamped()
+    message.header.frame_id = frame
+    message.pose.position.x, message.pose.position.y, message.pose.position.z = float(x), float(y), float(z)
+    return message
+
+
+def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions, capfd):
+    robot = make(**GOOD)
+    node, before = robot.node, topics(robot)
+    assert node.trigger_configure() == transitions.SUCCESS
+    assert {"/robot_0/goal_pose", "/robot_0/status", "/robot_0/cmd", "/robot_1/odom"} <= topics(robot)
+
+    def refused():
+        result, error = node.trigger_activate(), capfd.readouterr().err
+        assert result == transitions.FAILURE
+        assert not robot.flies
+        return error
+
+    assert "no state of each robot has arrived" in refused()
+    see(robot, age=5_000_000)
+    assert "limits.stale=0.2" in refused()
+    robot.loop.supervisor.limits = replace(robot.loop.supervisor.limits, stale=1.0)
+    see(robot, height=0.05)
+    assert "take off first" in refused()
+    see(robot)
+    assert node.trigger_activate() == transitions.SUCCESS
+    assert robot.flies
+    np.testing.assert_allclose(robot.loop._goal, [[[0, 0, 1.5]]])
+
+    for message, reason in (
+        (goal(1, 0, 1, "odom"), "its frame is 'odom': give it in 'map'"),
+        (goal(1, 0, 1, ""), "its frame is ''"),
+        (goal(np.nan, 0, 1), "finite"),
+        (goal(0, np.inf, 1), "finite"),
+        (goal(0, 0, 90), "outside the workspace"),
+    ):
+        robot._take_goal(message, None)
+        assert reason in capfd.readouterr().err
+        np.testing.assert_allclose(robot.loop._goal, [[[0, 0, 1.5]]])
+    robot._take_goal(goal(1, 0.5, 1.2), None)
+    np.testing.assert_allclose(robot.loop._goal, [[[1, 0.5, 1.2]]])
+
+    assert node.trigger_deactivate() == transitions.SUCCESS
+    assert robot.loop.supervisor.shall_land
+    assert node.trigger_cleanup() == transitions.FAILURE
+    assert "has not landed yet" in capfd.readouterr().err
+    robot._take_goal(goal(1, 0.5, 1.2), None)
+    assert "activate it first" in capfd.readouterr().err
+    see(robot, height=0.05)
+    robot.end()
+    robot.run()
+    assert robot.loop.supervisor.mode is Mode.OFF
+    assert not robot.flies
+    assert node.trigger_cleanup() == transitions.SUCCESS
+    assert topics(robot) == before
+    assert node.trigger_configure() == transitions.SUCCESS
+
+
+# Limits that a busy machine does not reach
+LIMITS = ["stale=60", "lost=60", "frozen=60", "unanswered=60", "silence=200", "hung=60", "landing_time=200"]
+BEGIN = f"""
+import sys
+from dataclasses import replace
+sys.path.insert(0, {str(ROOT / "examples")!r})
+import numpy as np
+from ros2_nodes import Operator, swap
+
+LIMITS = {LIMITS}
+"""
+LIFE = (
+    BEGIN
+    + """
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+
+def log():
+    return open("robot_0.log").read()
+
+with Operator(["robot_0", "robot_1"]) as operator:
+    operator.start_robot("robot_0", open("robot_0.log", "wb"), policy="ful", limits=LIMITS)
+    assert not operator.change("robot_0", "configure")
+    operator.wait(lambda: "configure refused" in log() and "'ful'" in log())
+    client = operator.node.create_client(SetParameters, "/robot_0/robot/set_parameters")
+    operator.wait(client.service_is_ready)
+    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="full")
+    future = client.call_async(SetParameters.Request(parameters=[Parameter(name="policy", value=value)]))
+    operator.wait(future.done)
+    assert operator.change("robot_0", "configure")
+    assert not operator.change("robot_0", "activate"), "nobody publishes any state"
+    operator.start_robot("robot_1", policy="full", limits=LIMITS)
+    assert operator.change("robot_1", "configure")
+    operator.start_world(scenario="random", seed=3)
+    for name in operator.names:
+        operator.activate(name)
+    start = operator.position["robot_0"].copy()
+    operator.send("robot_0", start, "odom")
+    operator.send("robot_0", [np.nan, 0, 1])
+    operator.wait(lambda: "its frame is 'odom'" in log() and "finite" in log())
+    goal = start + [0, 0, 0.5]
+    operator.send("robot_0", goal)
+    operator.wait(lambda: np.linalg.norm(operator.position["robot_0"] - goal) < 0.2)
+    operator.wait(lambda: operator.status.get("robot_0", {}).get("mode") == "fly")
+    assert {"why", "missed", "late commands", "plans sent", "bytes"} <= operator.status["robot_0"].keys()
+    assert operator.change("robot_0", "deactivate")
+    operator.wait(lambda: operator.status["robot_0"]["mode"] == "idle")
+    operator.wait(lambda: "robot_0" in operator.status["world"]["on the ground"])
+    assert operator.position["robot_0"][2] < 0.1
+    assert operator.change("robot_0", "cleanup")
+    operator.wait(lambda: operator.node.count_publishers("/robot_0/status") == 0)
+    assert operator.change("robot_0", "configure")
+    assert not operator.change("robot_0", "activate"), "it lies on the ground"
+    process = operator.processes.pop("robot_1")
+    process.terminate()
+    operator.wait(lambda: process.poll() is not None)
+    assert process.returncode == 0
+    operator.wait(lambda: operator.status["world"]["on the ground"] == "robot_0 robot_1")
+"""
+)
+SWAP = (
+    BEGIN
+    + """
+with Operator([f"robot_{k}" for k in range(4)]) as operator:
+    operator.start_world(scenario="symmetric_swap")
+    errors = swap(operator, "full", limits=LIMITS)
+    assert max(errors) < 0.3, errors
+    assert operator.status["world"]["collisions"] == "", operator.status
+"""
+)
+
+
+def run(script, folder):
+    done = subprocess.run([*alone(), sys.executable, "-c", script], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_life(tmp_path):
+    run(LIFE, tmp_path)
+
+
+@pytest.mark.slow
+def test_four_exchange_their_places(tmp_path):
+    run(SWAP, tmp_path)
