@@ -45,7 +45,7 @@ ROOMS = {
     "interfaces": {"", "planner", "world", "task"},
     "robot": {"", "native", "planner", "plants", "world", "task"},
     "realtime": {"", "native", "planner", "plants", "world", "robot"},
-    "ros": {"", "robot", "realtime"},
+    "ros": {"", "plants", "world", "robot", "realtime"},
     "evaluation": {"", "jobs", "planner", "plants", "world", "task", "robot", "realtime", "ros"},
     "figures": {"", "planner", "world", "task", "realtime", "evaluation"},
     "models": set(),

@@ -216,9 +216,8 @@ def _write(args: argparse.Namespace) -> None:
     if bool(args.flight) == bool(args.policy):
         raise ValueError("pass either policies to fly (--policy) or recorded flights (--flight).")
     if args.flight:
-        _finish(
-            args.out, recorded_page(read_flights(args.flight, args.preset, read_assignments("--world", args.world)))
-        )
+        flights = read_flights(args.flight, args.preset, read_assignments("--world", args.world))
+        _finish(args.out, recorded_page(flights))
         return
     conditions = make_conditions(args, [args.scenario])
     changes = [*args.world, *([f"plant={plant_name(conditions[0].config)}"] if args.plant else [])]

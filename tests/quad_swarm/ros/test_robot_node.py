@@ -2,10 +2,12 @@
 
 import json
 import re
+import runpy
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +17,9 @@ pytest.importorskip("rclpy")
 
 from quad_swarm.realtime import Mode
 from quad_swarm.realtime.link import monotonic
+from quad_swarm.ros import plant_node
 from quad_swarm.ros.messages import msgs
-from quad_swarm.ros.robot_node import RobotNode
+from quad_swarm.ros.robot_node import PARAMETERS, RobotNode
 
 ROOT = Path(__file__).parents[3]
 GOOD = {"policy": "full", "names": ["robot_0", "robot_1"], "index": 0}
@@ -242,6 +245,45 @@ def run(script, folder):
 
 def test_a_life(tmp_path):
     run(LIFE, tmp_path)
+
+
+def test_the_launch_file_gives_the_nodes_their_parameters(monkeypatch):
+    """What it imports stands in here: it is no wheel."""
+    made = []
+
+    def module(name, *names):
+        one = ModuleType(name)
+        for each in names:
+            setattr(one, each, lambda *args, each=each, **options: made.append((each, args, options)) or made[-1])
+        monkeypatch.setitem(sys.modules, name, one)
+        return one
+
+    module("launch", "LaunchDescription")
+    actions = ("DeclareLaunchArgument", "EmitEvent", "OpaqueFunction", "RegisterEventHandler", "TimerAction")
+    module("launch.actions", *actions)
+    module("launch.conditions", "IfCondition")
+    module("launch.events", "matches_action")
+    module("launch_ros.actions", "LifecycleNode", "Node")
+    module("launch_ros.event_handlers", "OnStateTransition")
+    module("launch_ros.events.lifecycle", "ChangeState")
+    values = {"n_robots": "3"}
+    substitutions = module("launch.substitutions")
+    path = ROOT / "ros" / "quad_swarm_ros" / "launch" / "swarm.launch.py"
+    substitutions.LaunchConfiguration = lambda name: SimpleNamespace(
+        perform=lambda context: values.get(name, launch["ARGUMENTS"][name][0])
+    )
+    launch = runpy.run_path(str(path))
+    launch["generate_launch_description"]()
+    launch["start"](None)
+    (plant,) = (options["parameters"][0] for kind, _, options in made if kind == "Node")
+    assert plant.keys() <= plant_node.PARAMETERS.keys()
+    robots = [options for kind, _, options in made if kind == "LifecycleNode"]
+    assert [one["namespace"] for one in robots] == ["robot_0", "robot_1", "robot_2"]
+    for index, one in enumerate(robots):
+        assert one["parameters"][0].keys() <= PARAMETERS.keys()
+        assert one["parameters"][0]["index"] == index
+    changes = [options["transition_id"] for kind, _, options in made if kind == "ChangeState"]
+    assert sorted(changes) == [1, 1, 1, 3, 3, 3], "configure and activate of each"
 
 
 @pytest.mark.slow
