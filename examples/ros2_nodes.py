@@ -50,10 +50,12 @@ class Operator:
         return self
 
     def __exit__(self, *_):
-        for process in self.processes.values():
-            process.terminate()
-        for process in self.processes.values():
-            process.wait()
+        # Robots land first, in the world that they still perceive
+        for names in (self.processes.keys() - {"world"}, self.processes.keys() & {"world"}):
+            for name in names:
+                self.processes[name].terminate()
+            for name in names:
+                self.processes[name].wait()
         self.executor.shutdown()
         self.node.destroy_node()
         self.node.context.try_shutdown()
@@ -83,7 +85,9 @@ class Operator:
 
     def activate(self, name):
         """Activate a robot's node, as soon as it has perceived everybody."""
-        self.wait(lambda: self.change(name, "activate"))
+        self.wait(lambda: len(self.position) == len(self.names))
+        while not self.change(name, "activate"):
+            self.wait(lambda again=time.monotonic() + 0.5: time.monotonic() > again)
 
     def send(self, name, goal, frame="map"):
         """Send a robot a goal."""

@@ -170,7 +170,6 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
 LIMITS = ["stale=60", "lost=60", "frozen=60", "unanswered=60", "silence=200", "hung=60", "landing_time=200"]
 BEGIN = f"""
 import sys
-from dataclasses import replace
 sys.path.insert(0, {str(ROOT / "examples")!r})
 import numpy as np
 from ros2_nodes import Operator, swap
