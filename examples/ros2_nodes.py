@@ -87,7 +87,7 @@ class Operator:
         """Activate a robot's node, as soon as it has perceived everybody."""
         self.wait(lambda: len(self.position) == len(self.names))
         while not self.change(name, "activate"):
-            self.wait(lambda again=time.monotonic() + 0.5: time.monotonic() > again)
+            self.executor.spin_once(timeout_sec=0.2)
 
     def send(self, name, goal, frame="map"):
         """Send a robot a goal."""
