@@ -99,7 +99,7 @@ def texts(name: str, value: Any) -> list[str]:
     :param value: its value
     :raises ValueError: if it is none
     """
-    values = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [None]
+    values: list[Any] = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [None]
     if not all(isinstance(one, str) for one in values):
         raise ValueError(f"{name}={shown(value)}: give a list of texts, as in {name}:=[a,b]")
     return values

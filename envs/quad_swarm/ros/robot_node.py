@@ -33,7 +33,7 @@ import numpy as np
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.attitude import AttitudeController, AttitudeGains
-from quad_swarm.realtime.link import Handler, monotonic
+from quad_swarm.realtime.link import Handler, Vehicle, monotonic
 from quad_swarm.realtime.loop import Loop, freeze_garbage
 from quad_swarm.realtime.process import set_priority
 from quad_swarm.realtime.supervisor import Mode, SafetyLimits, Watchdog
@@ -47,7 +47,6 @@ from quad_swarm.ros.vehicles import (
     LegacyCrazyswarmVehicle,
     OdometryVehicle,
     Px4Vehicle,
-    TeamVehicle,
 )
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import make_config, points
@@ -77,7 +76,7 @@ _DISARMS = 5  # times that the vehicle is told so: messages get lost
 _OFFBOARD = 1_500_000  # us of set-points that PX4 has had before it is told to fly them
 
 
-def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[str, Any], period: int) -> TeamVehicle:
+def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[str, Any], period: int) -> Vehicle:
     """Create the vehicle that the parameters name.
 
     :param robot: node, mailbox, link and names, see `OdometryVehicle`
@@ -87,7 +86,8 @@ def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[st
     :raises ImportError: if the package of its messages is not there
     """
     origins, thrust, heading = values["origins"], values["most_thrust"], values["heading"]
-    numbers = [*origins, thrust, heading] if isinstance(origins, Sequence) and not isinstance(origins, str) else [None]
+    is_list = isinstance(origins, Sequence) and not isinstance(origins, str)
+    numbers: list[Any] = [*origins, thrust, heading] if is_list else [None]
     if not all(type(one) in (int, float) and np.isfinite(one) for one in numbers) or len(origins) % 3:
         raise ValueError(
             f"origins={shown(origins)}, most_thrust={shown(thrust)}, heading={shown(heading)}: give finite numbers, "
@@ -96,7 +96,7 @@ def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[st
     gains = AttitudeGains(**read_assignments("gains", texts("gains", values["gains"])))
     controller = AttitudeController(gains, float(heading))
     places = np.array(origins, float).reshape(-1, 3)
-    makers: dict[str, Callable[[], TeamVehicle]] = {
+    makers: dict[str, Callable[[], Vehicle]] = {
         "odometry": lambda: OdometryVehicle(*robot, topic=values["odom_topic"], twist=values["twist"]),
         "crazyswarm": lambda: CrazyswarmVehicle(*robot, period=period, controller=controller),
         "crazyswarm_legacy": lambda: LegacyCrazyswarmVehicle(*robot, controller=controller),
@@ -332,7 +332,7 @@ def _lifecycle_node(robot: RobotNode, context: Any) -> Any:
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
-    class Node(LifecycleNode):  # type: ignore[misc]  # ROS is not there when types are checked
+    class Node(LifecycleNode):
         def on_configure(self, state: Any) -> Any:
             return taken(robot.configure)
 
