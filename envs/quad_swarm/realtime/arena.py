@@ -25,9 +25,36 @@ _US = 1_000_000
 _MOST_ROBOTS = 64  # which reports have bits for
 _READY = 90.0  # s that robots have to start; the first start on a machine compiles the planner
 _LEAD = 0.3  # s between the order to fly and the first period
-PAUSE = 100_000  # us of delay from which on the world itself stood still, and goes on from there
+_PAUSE = 0.1  # s of delay from which on the world itself stood still, and goes on from there
 _SAYS_STOP = 0.2  # s
 _ENDS = 10.0  # s that robots have to report, and to end
+
+
+class Pace:
+    """Holds simulated vehicles to the clock. A world that stood still, as busy machines let it, goes on from there.
+
+    :ivar pauses: how often it stood still
+    """
+
+    def __init__(self) -> None:
+        self._slipped = self.pauses = 0
+
+    def stamp(self, at: int) -> int:
+        """Return a time of the vehicles on the clock of the day (us)."""
+        return of_day(at + self._slipped)
+
+    def due(self, at: int) -> int:
+        """Return when a time of the vehicles is there (us)."""
+        return at + self._slipped
+
+    def notice(self, due: int) -> None:
+        """Notice whether the world stood still.
+
+        :param due: when it wanted to go on (us)
+        """
+        if (late := monotonic() - due) > _PAUSE * _US:
+            self._slipped += late
+            self.pauses += 1
 
 
 class RobotEndedError(RuntimeError):
@@ -81,7 +108,7 @@ class Arena:
         self._reports: list[Report] = []
         self._frozen: set[int] = set()
         self._wanted: set[int] = set()  # robots whose processes were ended on purpose
-        self._flight, self._pauses = 0, 0
+        self._flight, self._pace = 0, Pace()
         self._folder = tempfile.TemporaryDirectory(prefix="quad-swarm-")
         self._processes: list[subprocess.Popen[bytes]] = []
         self.vehicles.warm_up()
@@ -124,7 +151,7 @@ class Arena:
         """
         team, vehicles, n = self.team, self.vehicles, self.team.config.n_robots
         self._flight += 1
-        self._done, self._reports, self._frozen, self._pauses = {}, [], set(), 0
+        self._done, self._reports, self._frozen, self._pace = {}, [], set(), Pace()
         killed = self._ended()
         begins = monotonic() + round(_LEAD * _US)
         vehicles.reset(starts, goals, noise_seed, begins)
@@ -134,20 +161,17 @@ class Arena:
             first = begins + round(k * team.config.planner.dt * _US / n)
             self._exchange.say(k, says="fly", flight=self._flight, first=of_day(first), **places)
         todo, period = sorted(events, key=lambda event: event[0]), team.config.substeps
-        steps, there, slipped = 0, None, 0
+        steps, there, pace = 0, None, self._pace
         while vehicles.now - begins < most * _US:
             for k in range(n):
                 if k not in self._frozen:
                     self._senses[k] = vehicles.sensed(k)
-                seen = self._senses[k]._replace(stamp=of_day(vehicles.now + slipped))
-                self._exchange.tell(k, seen)
+                self._exchange.tell(k, self._senses[k]._replace(stamp=pace.stamp(vehicles.now)))
             while todo and todo[0][0] * _US <= vehicles.now - begins:
                 todo.pop(0)[1](self)
-            due = vehicles.now + vehicles.step_us + slipped
+            due = pace.due(vehicles.now + vehicles.step_us)
             self._exchange.receive(due, self)
-            if monotonic() - due > PAUSE:
-                slipped += monotonic() - due
-                self._pauses += 1
+            pace.notice(due)
             vehicles.advance()
             steps += 1
             if steps % period:
@@ -265,4 +289,4 @@ class Arena:
         done = [self._done.get(k) for k in range(n)]
         statistics = [None if one is None else Statistics.from_json(one["statistics"]) for one in done]
         traffic = [None if one is None else Traffic(**one["traffic"]) for one in done]
-        return vehicles.flight(begins, statistics, traffic, sorted(killed), self._pauses)
+        return vehicles.flight(begins, statistics, traffic, sorted(killed), self._pace.pauses)

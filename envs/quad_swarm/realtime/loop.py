@@ -36,6 +36,12 @@ def freeze_garbage() -> None:
     gc.disable()
 
 
+def thaw_garbage() -> None:
+    """Collect garbage again, also what had been frozen."""
+    gc.unfreeze()
+    gc.enable()
+
+
 def check_times(wait: float, late: float, period: float) -> None:
     """Check the times of a loop.
 

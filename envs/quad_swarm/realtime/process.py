@@ -17,7 +17,7 @@ import numpy as np
 
 from quad_swarm.realtime.link import Channel, Link, Traffic, Vehicle
 from quad_swarm.realtime.loop import Loop, freeze_garbage
-from quad_swarm.realtime.supervisor import Watchdog
+from quad_swarm.realtime.supervisor import Mode, Watchdog
 from quad_swarm.realtime.team import Team, load
 
 _SAYS_HELLO = 0.2  # s
@@ -121,9 +121,7 @@ class RobotProcess:
         self.link, self.vehicle = link, vehicle
         link.channel = Channel(team.conditions, [team.session, link.index])
         link.clock_error = round(team.clock_errors[link.index] * _US) if team.clock_errors else 0
-        self.loop = Loop(team.robot(link.index), link, vehicle, team.limits, team.wait, team.late)
-        self.watchdog = Watchdog(vehicle, team.limits)
-        self.loop.warm_up()
+        self.loop, self.watchdog = prepare(team, link, vehicle)
 
     def run(self) -> None:
         """Fly until the world says goodbye, or nothing any more."""
@@ -164,11 +162,26 @@ class RobotProcess:
         return bool(control) or self._is_forsaken()
 
     def _after_period(self, loop: Loop) -> None:
-        self.watchdog.beat()
+        self.watchdog.beat(loop.supervisor.mode is not Mode.OFF)
         self.vehicle.report(report_of(loop))
 
     def _is_forsaken(self) -> bool:
         return self.link.now() - self.vehicle.heard > _GIVES_UP * _US
+
+
+def prepare(team: Team, link: SimulatedLink, vehicle: Vehicle) -> tuple[Loop, Watchdog]:
+    """Return a robot's loop and its watchdog, ready for the first period: everything is compiled and loaded, and the
+    process has the team's priority.
+
+    :param team: the team
+    :param link: the robot's link
+    :param vehicle: the robot's vehicle
+    """
+    loop = Loop(team.robot(link.index), link, vehicle, team.limits, team.wait, team.late)
+    loop.warm_up()
+    if not set_priority(team.priority):
+        print("no real-time priority: the system does not allow it", file=sys.stderr)
+    return loop, Watchdog(vehicle, team.limits)
 
 
 def report_of(loop: Loop) -> Report:
@@ -206,8 +219,6 @@ def run(path: str, make: Callable[[Team], tuple[SimulatedLink, SimulatedVehicle]
         print(f"error: {error}", file=sys.stderr)
         return 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the world, which ends the robots
-    if not set_priority(team.priority):
-        print("no real-time priority: the system does not allow it", file=sys.stderr)
     process.run()
     return 0
 

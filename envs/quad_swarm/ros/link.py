@@ -44,6 +44,10 @@ class RosLink(BaseLink):
         mailbox.subscribe(header, f"/{names[index]}/plan_requests", quality(depth), self._take_request)
         mailbox.subscribe(trajectory, f"/{names[index]}/plans", quality(depth), self._take_plan)
 
+    def absent(self) -> list[str]:
+        """Return the names of the robots that do not receive requests, as far as discovery knows."""
+        return [self._names[k] for k, publisher in self._requests.items() if not publisher.get_subscription_count()]
+
     def request(self, other: int) -> None:
         """See `Link`."""
         self.traffic.requests += 1

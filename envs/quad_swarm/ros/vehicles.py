@@ -39,6 +39,7 @@ _STALE = 200_000  # us between two robots' states from which on the older one co
 _S = 1_000_000
 _CRAZYFLIE_THRUST, _CRAZYFLIE_MOST = 65535, 60000
 _PX4_NED, _PX4_BODY_FRD = 1, 3
+_OFFBOARD = 1_500_000  # us of set-points before PX4 is told to fly them
 _PX4_SET_MODE, _PX4_ARM, _PX4_OFFBOARD = 176, 400, 6
 
 
@@ -98,6 +99,9 @@ class TeamVehicle:
             vel[place] = state[VELOCITY]
             pos[place] = state[POSITION] + (stamp - then) / _S * vel[place]
         return Sensed(stamp if stamp - oldest < _STALE else oldest, own, pos, vel)
+
+    def engage(self) -> None:
+        """Prepare for set-points: a flight begins."""
 
     def disarm(self) -> None:
         """See `quad_swarm.realtime.Vehicle`. Here, whoever stands behind the topics stops the motors of what lies on
@@ -311,9 +315,17 @@ class Px4Vehicle(TeamVehicle):
         self._modes, self._attitudes, self._commands = (
             self._publisher(kind, _px4(topic, kind)) for topic, kind in zip(topics, self._kinds, strict=True)
         )
+        self._offboard_at: int | None = None
+
+    def engage(self) -> None:
+        """Go offboard after 1.5 s of set-points: PX4 wants to have had some for a second before."""
+        self._offboard_at = self._link.now() + _OFFBOARD
 
     def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
         """See `quad_swarm.realtime.Vehicle`."""
+        if self._offboard_at is not None and self._link.now() >= self._offboard_at:
+            self._offboard_at = None
+            self.begin_offboard()
         mode, attitudes, _ = self._kinds
         attitude, stamp = self._attitude(setpoint), self._stamp()
         self._modes.publish(mode(timestamp=stamp, attitude=True))

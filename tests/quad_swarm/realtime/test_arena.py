@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from quad_swarm.realtime import Conditions, Mode
-from quad_swarm.realtime.arena import Arena, RobotEndedError
+from quad_swarm.realtime.arena import Arena, Pace, RobotEndedError
+from quad_swarm.realtime.link import monotonic, of_day
 from quad_swarm.realtime.team import Team
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
@@ -19,6 +20,17 @@ CONFIG = make_config("flight", n_robots=4)
 def places(config, episode=0):
     rng = np.random.default_rng([4, episode])
     return ScenarioSampler("symmetric_swap", config.n_robots, config.space, config).sample(rng)[1:]
+
+
+def test_a_world_that_stood_still_goes_on_from_there():
+    pace, now = Pace(), monotonic()
+    pace.notice(now)
+    assert (pace.due(5), pace.pauses) == (5, 0)
+    pace.notice(now - 3_000_000)
+    assert pace.pauses == 1
+    slipped = pace.due(0)
+    assert slipped >= 3_000_000
+    assert abs(pace.stamp(now) - of_day(now + slipped)) < 1000
 
 
 @pytest.mark.slow

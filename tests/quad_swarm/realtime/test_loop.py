@@ -1,9 +1,12 @@
 """The loop of one robot, on a clock, a link and a vehicle that a test moves by hand."""
 
+import gc
+
 import numpy as np
 import pytest
 
 from quad_swarm.realtime import Loop, Mode, SafetyLimits, Sensed
+from quad_swarm.realtime.loop import thaw_garbage
 from quad_swarm.robot import Plan, Robot, RulePolicy
 from quad_swarm.world.presets import make_config
 
@@ -297,3 +300,14 @@ def test_warming_up_leaves_no_trace():
 def test_times_that_do_not_fit_are_refused(times):
     with pytest.raises(ValueError, match=next(iter(times))):
         make(**times)
+
+
+def test_garbage_is_collected_again():
+    gc.disable()
+    try:
+        gc.freeze()
+        thaw_garbage()
+        assert gc.isenabled()
+        assert not gc.get_freeze_count()
+    finally:
+        gc.enable()

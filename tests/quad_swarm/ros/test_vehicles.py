@@ -293,6 +293,20 @@ def test_px4_arms_and_goes_offboard(packages):
     assert all(one.target_system == 1 and one.from_external for one in commands)
 
 
+def test_px4_goes_offboard_when_it_has_had_set_points(packages):
+    vehicle, node, link = make(vehicles.Px4Vehicle, np.zeros((2, 3)))
+    commands = node.published["/robot_0/fmu/in/vehicle_command"]
+    vehicle.command(np.zeros(4), None)
+    vehicle.engage()
+    for _ in range(40):
+        link.time += PERIOD
+        vehicle.command(np.zeros(4), None)
+        assert len(commands) == (link.time >= 1_000_000 + 1_500_000)
+    assert commands[0].command == 176
+    odometry, _, _ = make(vehicles.OdometryVehicle)
+    odometry.engage()  # which nobody else needs
+
+
 @pytest.mark.parametrize("heading", [0.0, np.pi / 2])
 def test_px4_holds_height_and_heading_and_flies_where_it_leans(packages, heading):
     """A body with PX4's frames, whose hover thrust is 20 % less than was thought."""
