@@ -69,19 +69,35 @@ class Operator:
         words = {"names": self.names, "index": self.names.index(name), **parameters}
         self._start(name, "quad_swarm.ros.robot_node", words, ("-r", f"__ns:=/{name}"), stderr)
 
+    def call(self, kind, service, **request):
+        """Call a service, and return its answer."""
+        if service not in self.clients:
+            self.clients[service] = self.node.create_client(kind, service)
+        client = self.clients[service]
+        self.wait(client.service_is_ready)
+        future = client.call_async(kind.Request(**request))
+        self.wait(future.done)
+        return future.result()
+
     def change(self, name, transition):
         """Take a robot's node through a transition, such as "configure". Return whether it succeeded."""
         from lifecycle_msgs.msg import Transition
         from lifecycle_msgs.srv import ChangeState
 
-        if name not in self.clients:
-            self.clients[name] = self.node.create_client(ChangeState, f"/{name}/robot/change_state")
-        client = self.clients[name]
-        self.wait(client.service_is_ready)
         number = getattr(Transition, f"TRANSITION_{transition.upper()}")
-        future = client.call_async(ChangeState.Request(transition=Transition(id=number)))
-        self.wait(future.done)
-        return future.result().success
+        return self.call(ChangeState, f"/{name}/robot/change_state", transition=Transition(id=number)).success
+
+    def state(self, name):
+        """Return the state of a robot's node, such as "inactive"."""
+        from lifecycle_msgs.srv import GetState
+
+        return self.call(GetState, f"/{name}/robot/get_state").current_state.label
+
+    def trigger(self, service):
+        """Call a service such as "/robot_0/robot/land", and return whether it succeeded."""
+        from std_srvs.srv import Trigger
+
+        return self.call(Trigger, service).success
 
     def activate(self, name):
         """Activate a robot's node, as soon as it has perceived everybody."""

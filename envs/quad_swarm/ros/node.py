@@ -7,12 +7,15 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from quad_swarm.errors import shown
+import numpy as np
+
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.realtime.link import Handler, monotonic
 from quad_swarm.robot import Plan
 
 # Wheels name no middleware, and nothing shall leave this machine unless the user says so
 DEFAULTS = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+_OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 Take = Callable[[Any, Any], None]
 
 
@@ -87,7 +90,14 @@ def values_of(node: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
 
     :param node: the node
     :param defaults: what was given to `declare`
+    :raises ValueError: if somebody set a parameter that there is not, or simulated time
     """
+    # rclpy does not tell what was set and never declared: a misspelt name would be ignored
+    for name in getattr(node, "_parameter_overrides", {}):
+        if name not in defaults and name.partition(".")[0] not in _OF_ROS:
+            raise unknown_name("parameter", name, defaults)
+    if node.has_parameter("use_sim_time") and node.get_parameter("use_sim_time").value:
+        raise ValueError("use_sim_time=True: robots fly in real time here, so leave it out")
     values = {name: node.get_parameter(name).value for name in defaults}
     return {name: defaults[name] if value is None else value for name, value in values.items()}
 
@@ -105,6 +115,21 @@ def texts(name: str, value: Any) -> list[str]:
     return values
 
 
+def numbers(name: str, value: Any, width: int) -> np.ndarray:
+    """Return a parameter that is a list of finite numbers, as rows, (k, width).
+
+    :param name: its name
+    :param value: its value
+    :param width: how many make a row
+    :raises ValueError: if it is none, or a row is not complete
+    """
+    values: list[Any] = list(value) if np.iterable(value) and not isinstance(value, str) else [None]
+    if len(values) % width or not all(type(one) in (int, float) and np.isfinite(one) for one in values):
+        what = "a finite number" if width == 1 else f"finite numbers, {width} for each point"
+        raise ValueError(f"{name}={shown(value[0] if width == 1 else value)}: give {what}")
+    return np.array(values, float).reshape(-1, width)
+
+
 def checked_names(value: Any) -> list[str]:
     """Return the names of all robots, from the parameter ``names``.
 
@@ -116,6 +141,12 @@ def checked_names(value: Any) -> list[str]:
     if wrong := [name for name in names if re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is None]:
         raise ValueError(f"names: {shown(wrong[0])} is no name: use letters, digits and underscores, a letter first")
     return names
+
+
+def entities(node: Any) -> list[tuple[Callable[[Any], Any], Any]]:
+    """Return what a node publishes, receives and offers, each with what destroys it."""
+    kinds = ("publisher", "subscription", "service")
+    return [(getattr(node, f"destroy_{kind}"), one) for kind in kinds for one in getattr(node, f"{kind}s")]
 
 
 def make_executor(context: Any) -> Any:

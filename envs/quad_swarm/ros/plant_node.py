@@ -7,9 +7,11 @@ topic                  type                                  content
 ``/NAME/odom``         nav_msgs/Odometry                     a robot's state, each sub-step
 ``/NAME/cmd``          geometry_msgs/TwistStamped            its set-point
 ``/world/status``      diagnostic_msgs/DiagnosticArray       once a second: collisions, who flies
+``/world/reset``       std_srvs/Trigger (a service)          puts everybody back to their starts
 ====================== ===================================== ===============================================
 
-Robots are held at the starts of a scenario until their first command. Without commands they level, and land.
+Robots are held at ``starts``, by default those of a scenario, until their first command. Without
+commands they level, and land.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.plants.base import PlantError
-from quad_swarm.realtime.arena import PAUSE
+from quad_swarm.realtime.arena import Pace
 from quad_swarm.realtime.link import monotonic, of_day
 from quad_swarm.realtime.vehicles import Vehicles
 from quad_swarm.ros.messages import msgs, to_diagnostics
@@ -33,13 +35,14 @@ from quad_swarm.ros.node import (
     declare,
     make_context,
     make_node,
+    numbers,
     quality,
     texts,
     values_of,
 )
 from quad_swarm.ros.world import VehicleTopics
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.presets import make_config, points
 from quad_swarm.world.scenarios import ScenarioSampler
 
 PARAMETERS: dict[str, Any] = {
@@ -49,21 +52,24 @@ PARAMETERS: dict[str, Any] = {
     "names": [],
     "scenario": "symmetric_swap",
     "seed": 0,
+    "starts": [],
 }
 _STATUS = 1_000_000  # us
+_LANDINGS = 10_000_000  # us that robots have to land when the node ends
 
 
 class PlantNode:
     """The node of the simulated vehicles.
 
     :ivar vehicles: the vehicles
-    :ivar pauses: how often the machine, and the world with it, stood still for more than a tenth of a second
 
     :param node: its node of ROS
     :raises ValueError: if a parameter is wrong
     """
 
     def __init__(self, node: Any):
+        from std_srvs.srv import Trigger
+
         self._mailbox = Mailbox(node)
         declare(node, PARAMETERS)
         values = values_of(node, PARAMETERS)
@@ -74,35 +80,49 @@ class PlantNode:
         config = make_config(values["preset"], world, n_robots=len(self.names), plant=values["plant"] or None)
         rng = np.random.default_rng(seed)
         sampler = ScenarioSampler(values["scenario"], config.n_robots, config.space, config)
-        _, self._starts, self._goals, *_ = sampler.sample(rng)
+        starts, drawn = numbers("starts", values["starts"], 3), sampler.sample(rng)[1]
+        self._starts = points("starts", starts, config.n_robots) if len(starts) else drawn
         self._noise = int(rng.integers(2**63)) if config.is_random else 0
-        self.vehicles, self.pauses = Vehicles(config), 0
+        self.vehicles, self._node = Vehicles(config), node
         self.vehicles.warm_up()
         self._topics = VehicleTopics(node, self._mailbox, self.names, self.vehicles.command)
         self._status = node.create_publisher(msgs().DiagnosticArray, "/world/status", quality(5))
-        self._ended = False
+        node.create_service(Trigger, "/world/reset", self._reset)
+        self._ends: int | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Put everybody back to their starts, where they are held."""
+        self.vehicles.reset(self._starts, self._starts, self._noise, monotonic())
+        self.vehicles.held[:] = True
+        self._pace, self._told, self._met = Pace(), 0, set[tuple[int, int]]()
 
     def run(self) -> None:
-        """Fly until `end`."""
-        vehicles, slipped, told = self.vehicles, 0, 0
-        vehicles.reset(self._starts, self._goals, self._noise, monotonic())
-        vehicles.held[:] = True
-        while not self._ended:
+        """Fly until `end`, and until everybody has landed then, for ten seconds at most."""
+        vehicles = self.vehicles
+        while self._ends is None or ((vehicles.flying & ~vehicles.held).any() and monotonic() < self._ends):
+            pace = self._pace
             for k in range(len(self.names)):
-                self._topics.tell(k, vehicles.sensed(k)._replace(stamp=of_day(vehicles.now + slipped)))
-            due = vehicles.now + vehicles.step_us + slipped
+                self._topics.tell(k, vehicles.sensed(k)._replace(stamp=pace.stamp(vehicles.now)))
+            due = pace.due(vehicles.now + vehicles.step_us)
             self._mailbox.wait(due, Nobody())
-            if monotonic() - due > PAUSE:
-                slipped += monotonic() - due
-                self.pauses += 1
+            pace.notice(due)
             vehicles.advance()
-            if vehicles.now - told >= _STATUS:
-                told = vehicles.now
+            for i, j in set(vehicles.collisions()) - self._met:
+                self._met.add((i, j))
+                self._node.get_logger().warning(f"{self.names[i]} and {self.names[j]} collided")
+            if vehicles.now - self._told >= _STATUS:
+                self._told = vehicles.now
                 self._tell()
 
     def end(self) -> None:
-        """End `run`."""
-        self._ended = True
+        """End `run` soon.
+
+        :raises SystemExit: if that has been called before
+        """
+        if self._ends is not None:
+            raise SystemExit(1)
+        self._ends = monotonic() + _LANDINGS
 
     def close(self) -> None:
         """Release everything."""
@@ -117,10 +137,15 @@ class PlantNode:
             "closest": f"{vehicles.closest.min():.3f}",
             "flying": " ".join(name for name, one in zip(self.names, flying, strict=True) if one),
             "on the ground": " ".join(name for name, one in zip(self.names, vehicles.flying, strict=True) if not one),
-            "pauses": self.pauses,
+            "pauses": self._pace.pauses,
         }
         message = f"{len(pairs)} pairs of robots have collided"
         self._status.publish(to_diagnostics("world", 2 if pairs else 0, message, values, of_day(monotonic())))
+
+    def _reset(self, request: Any, response: Any) -> Any:
+        self.reset()
+        response.success, response.message = True, "everybody is at their start"
+        return response
 
 
 def main() -> int:

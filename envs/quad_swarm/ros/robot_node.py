@@ -4,21 +4,26 @@
 transition     what it does
 ============== ==============================================================================================
 ``configure``  reads the parameters, checks them, subscribes and publishes, and warms up
-``activate``   begins to fly from where the robot is and holds that place, if the states of all robots are
-               fresh and it is in the air. Taking off is the autopilot's or the operator's
+``activate``   begins to fly to ``goal``, or holds its place, if the states of all robots are fresh, it is in the air,
+               everybody is configured and no guard objects. Taking off is the autopilot's or the operator's
 ``deactivate`` begins to land; the robot disarms on the ground, and is not activated or cleaned up before
-``cleanup``    destroys publishers and subscriptions
-``shutdown``   lands and ends the process, as SIGINT and SIGTERM do
+``cleanup``    destroys publishers, subscriptions and services
+``shutdown``   lands and ends the process, as SIGINT and SIGTERM do; a second signal ends it at once
 ============== ==============================================================================================
 
-Besides the topics of `RosLink` and those of the vehicle, there are
+A robot that has landed for another reason becomes inactive by itself. With ``autostart``, it configures itself, and
+activates itself once as soon as it may. Besides the topics of `RosLink` and those of the vehicle, there are
 
 ====================== =================================== ==================================================
-topic                  type                                content
+name                   type                                content
 ====================== =================================== ==================================================
 ``/NAME/goal_pose``    geometry_msgs/PoseStamped           where to fly, in the frame "map"; no heading
 ``/NAME/status``       diagnostic_msgs/DiagnosticArray     once a second: what the robot does, why, and counts
+``/NAME/robot/land``   std_srvs/Trigger (a service)        begins to land, as ``deactivate`` does
 ====================== =================================== ==================================================
+
+A wish to land must not get lost and wants an answer, so it is a service, as with Crazyswarm2 and Aerostack2. Its name
+is below the node's, since Crazyswarm2 has a service ``/NAME/land`` of another type.
 """
 
 from __future__ import annotations
@@ -33,23 +38,35 @@ import numpy as np
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.attitude import AttitudeController, AttitudeGains
-from quad_swarm.realtime.link import Handler, Vehicle, monotonic
-from quad_swarm.realtime.loop import Loop, freeze_garbage
-from quad_swarm.realtime.process import set_priority
-from quad_swarm.realtime.supervisor import Mode, SafetyLimits, Watchdog
+from quad_swarm.realtime.link import Handler, monotonic
+from quad_swarm.realtime.loop import Loop, freeze_garbage, thaw_garbage
+from quad_swarm.realtime.process import prepare
+from quad_swarm.realtime.supervisor import HOVERING, Mode, SafetyLimits, Supervisor
 from quad_swarm.realtime.team import Team
 from quad_swarm.ros.link import RosLink
 from quad_swarm.ros.messages import FRAME, msgs, to_diagnostics
-from quad_swarm.ros.node import Mailbox, Nobody, checked_names, declare, make_context, quality, texts, values_of
+from quad_swarm.ros.node import (
+    Mailbox,
+    Nobody,
+    checked_names,
+    declare,
+    entities,
+    make_context,
+    numbers,
+    quality,
+    texts,
+    values_of,
+)
 from quad_swarm.ros.vehicles import (
     AerostackVehicle,
     CrazyswarmVehicle,
     LegacyCrazyswarmVehicle,
     OdometryVehicle,
     Px4Vehicle,
+    TeamVehicle,
 )
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import make_config, points
+from quad_swarm.world.presets import SwarmConfig, make_config, points
 
 PARAMETERS: dict[str, Any] = {
     "policy": "",
@@ -62,6 +79,8 @@ PARAMETERS: dict[str, Any] = {
     "late": 0.25,
     "priority": 0,
     "limits": [],
+    "goal": [],
+    "autostart": False,
     # Of vehicles, which need some of them
     "odom_topic": "odom",
     "twist": "body",
@@ -73,10 +92,9 @@ PARAMETERS: dict[str, Any] = {
 _IDLE = 100_000  # us after which a node without a flight looks around
 _STATUS = 1_000_000  # us
 _DISARMS = 5  # times that the vehicle is told so: messages get lost
-_OFFBOARD = 1_500_000  # us of set-points that PX4 has had before it is told to fly them
 
 
-def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[str, Any], period: int) -> Vehicle:
+def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[str, Any], period: int) -> TeamVehicle:
     """Create the vehicle that the parameters name.
 
     :param robot: node, mailbox, link and names, see `OdometryVehicle`
@@ -85,27 +103,32 @@ def make_vehicle(robot: tuple[Any, Mailbox, RosLink, list[str]], values: dict[st
     :raises ValueError: if it is unknown, or one of its own parameters is wrong
     :raises ImportError: if the package of its messages is not there
     """
-    origins, thrust, heading = values["origins"], values["most_thrust"], values["heading"]
-    is_list = isinstance(origins, Sequence) and not isinstance(origins, str)
-    numbers: list[Any] = [*origins, thrust, heading] if is_list else [None]
-    if not all(type(one) in (int, float) and np.isfinite(one) for one in numbers) or len(origins) % 3:
-        raise ValueError(
-            f"origins={shown(origins)}, most_thrust={shown(thrust)}, heading={shown(heading)}: give finite numbers, "
-            "x, y and z of each robot one after the other as origins"
-        )
+    places = numbers("origins", values["origins"], 3)
+    thrust, heading = (float(numbers(name, [values[name]], 1)[0, 0]) for name in ("most_thrust", "heading"))
     gains = AttitudeGains(**read_assignments("gains", texts("gains", values["gains"])))
-    controller = AttitudeController(gains, float(heading))
-    places = np.array(origins, float).reshape(-1, 3)
-    makers: dict[str, Callable[[], Vehicle]] = {
+    controller = AttitudeController(gains, heading)
+    makers: dict[str, Callable[[], TeamVehicle]] = {
         "odometry": lambda: OdometryVehicle(*robot, topic=values["odom_topic"], twist=values["twist"]),
         "crazyswarm": lambda: CrazyswarmVehicle(*robot, period=period, controller=controller),
         "crazyswarm_legacy": lambda: LegacyCrazyswarmVehicle(*robot, controller=controller),
         "px4": lambda: Px4Vehicle(*robot, origins=places, controller=controller),
-        "aerostack": lambda: AerostackVehicle(*robot, most_thrust=float(thrust), controller=controller),
+        "aerostack": lambda: AerostackVehicle(*robot, most_thrust=thrust, controller=controller),
     }
     if values["vehicle"] not in makers:
         raise unknown_name("vehicle", values["vehicle"], makers)
     return makers[values["vehicle"]]()
+
+
+def reachable(goal: Any, config: SwarmConfig) -> np.ndarray:
+    """Return a goal that lies in the workspace, (3,) (m).
+
+    :raises ValueError: if it does not, or is no finite point
+    """
+    goal = points("the goal", np.asarray(goal, float)[None], 1)[0]
+    low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
+    if (goal < low).any() or (goal > high).any():
+        raise ValueError(f"{goal.tolist()} is outside the workspace, {low.tolist()} to {high.tolist()}")
+    return goal
 
 
 class RobotNode:
@@ -126,12 +149,15 @@ class RobotNode:
         declare(self.node, PARAMETERS)
         self._mailbox = Mailbox(self.node)
         self.loop: Loop | None = None
-        self.flies = self._ended = self._leaves = self._is_fresh = False
+        self.flies = self._ended = self._leaves = self._is_fresh = self._is_active = False
+        self._starts, self._refused = self.node.get_parameter("autostart").value is True, ""
         self._own: list[tuple[Callable[[Any], Any], Any]] = []
-        self._off, self._told, self._offboard_at, self._mode = 0, 0, 0, Mode.OFF
+        self._off, self._told, self._mode = 0, 0, Mode.OFF
 
     def run(self) -> None:
         """Run until `end` or the transition ``shutdown``."""
+        if self._starts:
+            self.node.trigger_configure()
         while not self._ended:
             loop = self.loop
             if loop is not None and self.flies:
@@ -139,18 +165,26 @@ class RobotNode:
                 self._watchdog.beat(armed=False)
                 self.flies = False
                 self._log(f"landed ({loop.statistics.counts['periods']} periods flown)")
+                if self._is_active:  # nobody deactivated it
+                    self.node.trigger_deactivate()
             else:
                 if self._is_fresh:
                     self._is_fresh = False
                     freeze_garbage()
                 self._mailbox.wait(monotonic() + _IDLE, loop or Nobody(), lambda: self.flies or self._leaves)
-                self._tell()
+                if self._tell() and self._starts and not self._leaves:
+                    self.node.trigger_activate()
             self._ended = self._leaves and not self.flies
 
     def end(self) -> None:
-        """Land if the robot flies, and end `run`."""
+        """Land if the robot flies, and end `run`.
+
+        :raises SystemExit: if that has been called before
+        """
+        if self._leaves:
+            raise SystemExit(1)
         self._leaves = True
-        self._land()
+        self.land()
 
     def close(self) -> None:
         """Release everything."""
@@ -164,13 +198,13 @@ class RobotNode:
         :raises ImportError: if a package of messages is not there
         :raises OSError: if the folder of a model cannot be read
         """
-        before = {id(one) for one in (*self.node.publishers, *self.node.subscriptions)}
+        if self.flies:
+            raise ValueError("the robot has not landed yet: wait until its status says so")
+        before = {id(one) for _, one in entities(self.node)}
         try:
             self._configure(values_of(self.node, PARAMETERS))
         finally:
-            for kind, destroy in (("publishers", "destroy_publisher"), ("subscriptions", "destroy_subscription")):
-                made = [one for one in getattr(self.node, kind) if id(one) not in before]
-                self._own += [(getattr(self.node, destroy), one) for one in made]
+            self._own += [(destroy, one) for destroy, one in entities(self.node) if id(one) not in before]
             if self.loop is None:
                 self._release()
 
@@ -191,13 +225,21 @@ class RobotNode:
             raise ValueError("the own state is not finite")
         if own[2] <= limits.ground:
             raise ValueError(f"the robot is on the ground ({own[2]:.2f} m high): take off first")
-        loop.start(own, own, now + loop.robot.period)
-        self._off, self._mode, self._offboard_at = 0, Mode.FLY, now + _OFFBOARD
-        self.flies = True
+        guards = Supervisor(loop.robot.config, limits)
+        if guards.check(now, sensed, HOVERING) is not Mode.FLY:
+            raise ValueError(f"the robot would not fly: {', '.join(sorted(guards.why))}")
+        if absent := self._link.absent():
+            raise ValueError(f"{absent[0]} does not listen: configure all robots first")
+        loop.start(own, own if self._goal is None else self._goal, now + loop.robot.period)
+        self._vehicle.engage()
+        self._off, self._mode = 0, Mode.FLY
+        self.flies = self._is_active = True
+        self._starts = False
 
     def deactivate(self) -> None:
         """Take the transition ``deactivate``: begin to land."""
-        self._land()
+        self._is_active = False
+        self.land()
 
     def cleanup(self) -> None:
         """Take the transition ``cleanup``.
@@ -205,37 +247,59 @@ class RobotNode:
         :raises ValueError: if the robot flies or lands
         """
         self._grounded()
+        self._starts = False
         self._release()
 
+    def land(self) -> bool:
+        """Begin to land. Return whether the robot flies."""
+        if self.loop is not None and self.flies:
+            self.loop.supervisor.land()
+        return self.flies
+
+    def refuse(self, transition: str, reason: str) -> None:
+        """Tell why a transition is refused, but not again and again while the robot starts by itself."""
+        if not self._starts or transition not in self._refused:
+            self.node.get_logger().error(f"{transition} refused: {reason}")
+        self._refused = f"{transition} refused: {reason}"
+
     def _configure(self, values: dict[str, Any]) -> None:
+        from std_srvs.srv import Trigger
+
         names, index = checked_names(values["names"]), values["index"]
         config = make_config(
             values["preset"], read_assignments("world", texts("world", values["world"])), n_robots=len(names)
         )
         limits = SafetyLimits(**read_assignments("limits", texts("limits", values["limits"])))
         team = Team(config, values["policy"], limits, values["wait"], values["late"], priority=values["priority"])
+        if index == -1 and (place := self.node.get_namespace().strip("/")) in names:
+            index = names.index(place)
         if type(index) is not int or not 0 <= index < len(names):
-            raise ValueError(f"index={shown(index)}: give the robot's place among the {len(names)} names, from 0")
+            raise ValueError(
+                f"index={shown(index)}: give the robot's place among the {len(names)} names, from 0, or start the node "
+                "with -r __ns:=/NAME"
+            )
         name = names[index]
         if self.node.get_namespace() != f"/{name}":
             raise ValueError(
                 f"the node's namespace is {self.node.get_namespace()}: start it with -r __ns:=/{name}, so that robots "
                 "have services of their own"
             )
-        robot = team.robot(index)
+        if type(values["autostart"]) is not bool:
+            raise ValueError(f"autostart={shown(values['autostart'])}: give true or false")
+        goals = numbers("goal", values["goal"], 3)
+        if len(goals) > 1:
+            raise ValueError(f"goal={shown(values['goal'])}: give one point")
+        self._goal = reachable(goals[0], config) if len(goals) else None
         link = RosLink(self.node, self._mailbox, index, names)
-        vehicle = make_vehicle((self.node, self._mailbox, link, names), values, robot.period)
-        loop = Loop(robot, link, vehicle, team.limits, team.wait, team.late)
+        period = round(config.planner.dt * 1e6)
+        vehicle = make_vehicle((self.node, self._mailbox, link, names), values, period)
         self._status = self.node.create_publisher(msgs().DiagnosticArray, f"/{name}/status", quality(5))
         # Goals must arrive; whoever sends one to a robot that does not fly yet is told so by the log
         self._mailbox.subscribe(msgs().PoseStamped, f"/{name}/goal_pose", 10, self._take_goal)
-        loop.warm_up()
-        if not set_priority(team.priority):
-            self._log("no real-time priority: the system does not allow it")
-        self._is_fresh = True
+        self.node.create_service(Trigger, "~/land", self._take_wish)
         self.name, self._link, self._vehicle = name, link, vehicle
-        self._watchdog = Watchdog(vehicle, team.limits)
-        self.loop = loop
+        self.loop, self._watchdog = prepare(team, link, vehicle)
+        self._is_fresh = True
 
     def _grounded(self) -> Loop:
         """Return the loop of a robot that neither flies nor lands."""
@@ -245,10 +309,6 @@ class RobotNode:
             raise ValueError("the robot has not landed yet: wait until its status says so")
         return self.loop
 
-    def _land(self) -> None:
-        if self.loop is not None and self.flies:
-            self.loop.supervisor.land()
-
     def _release(self) -> None:
         """Destroy what `configure` created."""
         if self.loop is not None:
@@ -257,10 +317,11 @@ class RobotNode:
         for destroy, one in self._own:
             destroy(one)
         self._own.clear()
+        self._is_fresh = False
+        thaw_garbage()
 
     def _is_down(self) -> bool:
-        assert self.loop is not None
-        return self._off >= _DISARMS and self.loop.supervisor.shall_land
+        return self._off >= _DISARMS
 
     def _after_period(self, loop: Loop) -> None:
         mode = loop.supervisor.mode
@@ -269,16 +330,13 @@ class RobotNode:
         if mode is not self._mode:
             self._mode = mode
             self._log(f"{mode.name.lower()}: {', '.join(sorted(loop.supervisor.why)) or 'all is well'}")
-        if isinstance(self._vehicle, Px4Vehicle) and 0 < self._offboard_at <= loop.link.now():
-            self._offboard_at = 0
-            self._vehicle.begin_offboard()
         self._tell()
 
-    def _tell(self) -> None:
-        """Publish the status once a second."""
+    def _tell(self) -> bool:
+        """Publish the status once a second. Return whether that was now."""
         loop, now = self.loop, monotonic()
         if loop is None or now - self._told < _STATUS:
-            return
+            return False
         self._told = now
         counts, traffic, supervisor = loop.statistics.counts, self._link.traffic, loop.supervisor
         mode = supervisor.mode.name.lower() if self.flies else "idle"
@@ -288,6 +346,7 @@ class RobotNode:
             "periods": counts["periods"],
             "missed": counts["missed"],
             "late commands": counts["late commands"],
+            "age of plans (ms)": f"{loop.statistics.durations['plan_age'].quantile(0.5) * 1e-3:.0f}",
             "plans sent": traffic.answers + traffic.announcements,
             "bytes": traffic.bytes,
             "last error": loop.statistics.last_error,
@@ -295,6 +354,7 @@ class RobotNode:
         is_well = not self.flies or supervisor.mode is Mode.FLY or supervisor.shall_land
         stamp = self._link.shared(self._link.now())
         self._status.publish(to_diagnostics(self.name, 0 if is_well else 1, mode, values, stamp))
+        return True
 
     def _take_goal(self, message: Any, handler: Handler) -> None:
         try:
@@ -306,14 +366,14 @@ class RobotNode:
         loop, place = self.loop, message.pose.position
         if message.header.frame_id != FRAME:
             raise ValueError(f"its frame is {shown(message.header.frame_id)}: give it in {FRAME!r}")
-        goal = points("the goal", [[place.x, place.y, place.z]], 1)[0]
         if loop is None or not self.flies or loop.supervisor.shall_land or loop.supervisor.mode >= Mode.LAND:
             raise ValueError("the robot does not fly: activate it first")
-        planner = loop.robot.config.planner
-        low, high = np.array(planner.workspace_low), np.array(planner.workspace_high)
-        if (goal < low).any() or (goal > high).any():
-            raise ValueError(f"{goal.tolist()} is outside the workspace, {low.tolist()} to {high.tolist()}")
-        loop.fly_to(goal)
+        loop.fly_to(reachable([place.x, place.y, place.z], loop.robot.config))
+
+    def _take_wish(self, request: Any, response: Any) -> Any:
+        response.success = self.land()
+        response.message = "lands" if response.success else "the robot does not fly"
+        return response
 
     def _log(self, text: str) -> None:
         self.node.get_logger().warning(text)
@@ -328,7 +388,7 @@ def _lifecycle_node(robot: RobotNode, context: Any) -> Any:
             transition()
         except Exception as error:  # of a policy or a planner from outside, too
             kind = "" if isinstance(error, (ValueError, OSError, ImportError)) else f"{type(error).__name__}: "
-            robot.node.get_logger().error(f"{transition.__name__} refused: {kind}{error}")
+            robot.refuse(transition.__name__, f"{kind}{error}")
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 

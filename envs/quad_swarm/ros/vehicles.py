@@ -103,6 +103,10 @@ class TeamVehicle:
     def engage(self) -> None:
         """Prepare for set-points: a flight begins."""
 
+    def command(self, setpoint: np.ndarray, plan: Plan | None) -> None:
+        """See `quad_swarm.realtime.Vehicle`."""
+        raise NotImplementedError
+
     def disarm(self) -> None:
         """See `quad_swarm.realtime.Vehicle`. Here, whoever stands behind the topics stops the motors of what lies on
         the ground."""

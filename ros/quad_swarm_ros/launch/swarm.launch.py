@@ -1,77 +1,68 @@
-"""Start the simulated world and n robots, and configure and activate them:
+"""Start the simulated world and n robots, which configure and activate themselves:
 
 ros2 launch quad_swarm_ros swarm.launch.py n_robots:=4 policy:=full
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction, RegisterEventHandler, TimerAction
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
-from launch.events import matches_action
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import LifecycleNode, Node
-from launch_ros.event_handlers import OnStateTransition
-from launch_ros.events.lifecycle import ChangeState
-from lifecycle_msgs.msg import Transition
 
 ARGUMENTS = {
     "n_robots": ("4", "number of robots"),
+    "names": ("", "their names, separated by commas; robot_0, robot_1, ... if empty"),
     "policy": ("full", "a rule, or the folder of an exported model"),
     "preset": ("flight", "the world"),
     "vehicle": ("odometry", "odometry, crazyswarm, crazyswarm_legacy, px4 or aerostack"),
     "scenario": ("symmetric_swap", "where simulated robots start"),
     "plant": ("", "simulated vehicle, such as crazyflow:cf21B_500; the preset's if empty"),
     "simulated": ("true", "whether to start the simulated world"),
+    "parameters": ("", "file with more parameters of all robots; they replace those above"),
+    "autostart": ("true", "whether robots configure themselves, and activate themselves in the air"),
     "priority": ("0", "real-time priority of the robots, 1 to 99; 0 for none"),
 }
 _LANDS = "30"  # s after Ctrl-C before a robot that still lands is killed
-_PERCEIVES = 2.0  # s that a configured robot has to perceive the others
 
 
-def robot_actions(names, index, values):
-    """Return the actions that start a robot's node, and configure and activate it."""
+def robot(name, names, values):
+    """Return the action that starts a robot's node, which configures and activates itself."""
     parameters = {
         "names": names,
-        "index": index,
         "policy": values["policy"],
         "preset": values["preset"],
         "vehicle": values["vehicle"],
         "priority": int(values["priority"]),
+        "autostart": values["autostart"] == "true",
     }
-    node = LifecycleNode(
+    files = [values["parameters"]] if values["parameters"] else []
+    return LifecycleNode(
         package="quad_swarm_ros",
         executable="robot",
         name="robot",
-        namespace=names[index],
-        parameters=[parameters],
+        namespace=name,
+        parameters=[parameters, *files],
         sigterm_timeout=_LANDS,
         sigkill_timeout=_LANDS,
         output="screen",
     )
 
-    def change(transition):
-        return EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=transition))
-
-    activate = TimerAction(period=_PERCEIVES, actions=[change(Transition.TRANSITION_ACTIVATE)])
-    when_configured = OnStateTransition(
-        target_lifecycle_node=node, start_state="configuring", goal_state="inactive", entities=[activate]
-    )
-    return [RegisterEventHandler(when_configured), node, change(Transition.TRANSITION_CONFIGURE)]
-
 
 def start(context):
     """Return the actions for the arguments of the launch."""
     values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    names = [f"robot_{k}" for k in range(int(values["n_robots"]))]
+    names = values["names"].split(",") if values["names"] else [f"robot_{k}" for k in range(int(values["n_robots"]))]
     world = {"names": names, "preset": values["preset"], "scenario": values["scenario"], "plant": values["plant"]}
     plant = Node(
         package="quad_swarm_ros",
         executable="plant",
         name="world",
         parameters=[world],
+        sigterm_timeout=_LANDS,
         output="screen",
         condition=IfCondition(values["simulated"]),
     )
-    return [plant, *(action for k in range(len(names)) for action in robot_actions(names, k, values))]
+    return [plant, *(robot(name, names, values) for name in names)]
 
 
 def generate_launch_description():

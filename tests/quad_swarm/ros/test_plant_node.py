@@ -40,6 +40,9 @@ def make(monkeypatch):
         ({"scenario": "swop"}, "Unknown scenario 'swop'"),
         ({"world": ["radius=.inf"]}, "radius"),
         ({"plant": "gazebo:x"}, "gazebo"),
+        ({"starts": [1.0, 2.0]}, "give finite numbers, 3 for each point"),
+        ({"starts": [1.0, 2.0, 1.0]}, "starts"),
+        ({"policy": "full"}, "Unknown parameter 'policy'"),
     ],
 )
 def test_what_is_wrong_is_told(make, wrong, reason):
@@ -60,6 +63,7 @@ def test_robots_are_held_until_their_first_command(make):
         climbed = len(seen["a"]) > 5 and seen["a"][-1][2] > seen["a"][0][2] + 0.3
         if climbed and told:
             plant.end()
+            plant._ends = 0  # nobody waits until everybody has landed
 
     for name in seen:
         plant._mailbox.subscribe(
@@ -69,8 +73,23 @@ def test_robots_are_held_until_their_first_command(make):
         msgs().DiagnosticArray, "/world/status", quality(5), lambda m, handler: told.append(m.status[0])
     )
     plant.run()
+    with pytest.raises(SystemExit):
+        plant.end()  # for the second time
     np.testing.assert_array_equal(plant.vehicles.held, [False, True])
     assert np.linalg.norm(seen["b"][-1] - seen["b"][0]) < 0.2
     values = {one.key: one.value for one in told[-1].values}
     assert values["collisions"] == ""
     assert told[-1].message.startswith("0 pairs")
+
+
+def test_everybody_is_put_back(make):
+    plant = make(**{**GOOD, "starts": [-2.0, 0.0, 1.5, 2.0, 0.5, 1.5]})
+    starts = plant.vehicles.state[:, :3].copy()
+    np.testing.assert_array_equal(starts, [[-2, 0, 1.5], [2, 0.5, 1.5]])
+    for _ in range(50):
+        plant.vehicles.command(0, np.array([0, 0.2, 0, 0]))
+        plant.vehicles.advance()
+    assert plant.vehicles.state[0, 0] > -2.0
+    plant.reset()
+    np.testing.assert_array_equal(plant.vehicles.state[:, :3], starts)
+    assert plant.vehicles.held.all()

@@ -19,6 +19,7 @@ from quad_swarm.realtime import Mode
 from quad_swarm.realtime.link import monotonic
 from quad_swarm.ros import plant_node
 from quad_swarm.ros.messages import msgs
+from quad_swarm.ros.node import make_node, quality
 from quad_swarm.ros.robot_node import PARAMETERS, RobotNode
 
 ROOT = Path(__file__).parents[3]
@@ -42,7 +43,8 @@ def make(monkeypatch):
 
 
 def topics(robot):
-    return {one.topic_name for one in (*robot.node.publishers, *robot.node.subscriptions)}
+    services = (one.srv_name for one in robot.node.services)
+    return {*services, *(one.topic_name for one in (*robot.node.publishers, *robot.node.subscriptions))}
 
 
 @pytest.mark.parametrize(
@@ -57,6 +59,7 @@ def topics(robot):
         ({"names": ["robot_0", "robot_0"]}, "each once"),
         ({"names": ["robot_0", "a b"]}, "'a b' is no name"),
         ({"index": 2}, "index=2: give the robot's place"),
+        ({"names": ["robot_1", "robot_2"], "index": -1}, "start the node with -r __ns:=/NAME"),
         ({"index": True}, "index=True"),
         ({"index": 1}, "start it with -r __ns:=/robot_1"),
         ({"wait": 0.2}, "waiting must end within the period"),
@@ -68,10 +71,16 @@ def topics(robot):
         ({"vehicle": "crazy"}, "Unknown vehicle 'crazy'"),
         ({"twist": "map"}, "choose 'body' or 'world'"),
         ({"vehicle": "aerostack"}, "give the largest thrust"),
-        ({"vehicle": "px4", "origins": [0.0, 0.0]}, "x, y and z of each robot"),
+        ({"vehicle": "px4", "origins": [0.0, 0.0]}, "origins=[0.0, 0.0]: give finite numbers, 3 for each point"),
         ({"vehicle": "px4", "origins": [0.0, 0.0, 0.0]}, "each of 2 robots"),
         ({"gains": ["hover_thrust=2"]}, "hover_thrust"),
-        ({"heading": "north"}, "heading='north'"),
+        ({"heading": "north"}, "heading='north': give a finite number"),
+        ({"goal": [0.0, 0.0]}, "goal=[0.0, 0.0]: give finite numbers, 3 for each point"),
+        ({"goal": [0.0] * 6}, "give one point"),
+        ({"goal": [0.0, 0.0, 90.0]}, "outside the workspace"),
+        ({"autostart": 1}, "autostart=1: give true or false"),
+        ({"polcy": "full"}, "Unknown parameter 'polcy'"),
+        ({"use_sim_time": True}, "robots fly in real time here"),
     ],
 )
 def test_what_is_wrong_is_told_and_nothing_stays(make, wrong, reason):
@@ -133,6 +142,14 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
     see(robot, height=0.05)
     assert "take off first" in refused()
     see(robot)
+    assert "robot_1 does not listen: configure all robots first" in refused()
+    other = make_node("robot", "robot_1", node.context)
+    other.create_subscription(msgs().Header, "/robot_1/plan_requests", lambda message: None, quality(2))
+    while robot._link.absent():
+        robot._mailbox.wait(monotonic() + 10_000, robot.loop)
+    see(robot, height=9.0)
+    assert "outside the fence" in refused()
+    see(robot)
     assert node.trigger_activate() == transitions.SUCCESS
     assert robot.flies
     np.testing.assert_allclose(robot.loop._goal, [[[0, 0, 1.5]]])
@@ -164,6 +181,34 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
     assert node.trigger_cleanup() == transitions.SUCCESS
     assert topics(robot) == before
     assert node.trigger_configure() == transitions.SUCCESS
+
+
+def test_a_robot_that_has_landed_is_inactive_and_may_begin_again(make, transitions):
+    """Whoever made it land: here a service, and the parameters give it a goal."""
+    from std_srvs.srv import Trigger
+
+    robot = make(**GOOD | {"index": -1}, goal=[1.0, 0.5, 1.2])
+    node = robot.node
+    assert node.trigger_configure() == transitions.SUCCESS
+    other = make_node("robot", "robot_1", node.context)
+    other.create_subscription(msgs().Header, "/robot_1/plan_requests", lambda message: None, quality(2))
+    while robot._link.absent():
+        robot._mailbox.wait(monotonic() + 10_000, robot.loop)
+    assert not robot._take_wish(None, Trigger.Response()).success, "it does not fly"
+    for _ in range(2):
+        see(robot)
+        assert node.trigger_activate() == transitions.SUCCESS
+        np.testing.assert_allclose(robot.loop._goal, [[[1, 0.5, 1.2]]])
+        assert robot._take_wish(None, Trigger.Response()).success
+        see(robot, height=0.05)
+        robot._leaves = True
+        robot.run()
+        assert not robot.flies
+        robot._leaves = robot._ended = False
+    assert node.trigger_deactivate() == transitions.ERROR, "it is inactive already"
+    robot.end()
+    with pytest.raises(SystemExit):
+        robot.end()  # for the second time
 
 
 # Limits that a busy machine does not reach
@@ -258,13 +303,9 @@ def test_the_launch_file_gives_the_nodes_their_parameters(monkeypatch):
         return one
 
     module("launch", "LaunchDescription")
-    actions = ("DeclareLaunchArgument", "EmitEvent", "OpaqueFunction", "RegisterEventHandler", "TimerAction")
-    module("launch.actions", *actions)
+    module("launch.actions", "DeclareLaunchArgument", "OpaqueFunction")
     module("launch.conditions", "IfCondition")
-    module("launch.events", "matches_action")
     module("launch_ros.actions", "LifecycleNode", "Node")
-    module("launch_ros.event_handlers", "OnStateTransition")
-    module("launch_ros.events.lifecycle", "ChangeState")
     values = {"n_robots": "3"}
     substitutions = module("launch.substitutions")
     path = ROOT / "ros" / "quad_swarm_ros" / "launch" / "swarm.launch.py"
@@ -278,13 +319,43 @@ def test_the_launch_file_gives_the_nodes_their_parameters(monkeypatch):
     assert plant.keys() <= plant_node.PARAMETERS.keys()
     robots = [options for kind, _, options in made if kind == "LifecycleNode"]
     assert [one["namespace"] for one in robots] == ["robot_0", "robot_1", "robot_2"]
-    for index, one in enumerate(robots):
+    for one in robots:
         assert one["parameters"][0].keys() <= PARAMETERS.keys()
-        assert one["parameters"][0]["index"] == index
-    changes = [options["transition_id"] for kind, _, options in made if kind == "ChangeState"]
-    assert sorted(changes) == [1, 1, 1, 3, 3, 3], "configure and activate of each"
+        assert one["parameters"][0]["names"] == ["robot_0", "robot_1", "robot_2"]
+        assert one["parameters"][0]["autostart"] is True
 
 
 @pytest.mark.slow
 def test_four_exchange_their_places(tmp_path):
     run(SWAP, tmp_path)
+
+
+ALONE = (
+    BEGIN
+    + """
+with Operator(["robot_0", "robot_1"]) as operator:
+    goals = {"robot_0": [1.0, 0.5, 1.5], "robot_1": [-1.0, 0.5, 1.5]}
+    starts = [-1.0, -0.5, 1.2, 1.0, -0.5, 1.2]
+    for name, goal in goals.items():
+        operator.start_robot(name, policy="full", limits=LIMITS, goal=goal, index=-1, autostart=True)
+    operator.start_world(starts=starts)
+    there = lambda: operator.position and all(
+        np.linalg.norm(operator.position.get(name, np.inf) - goal) < 0.2 for name, goal in goals.items()
+    )
+    operator.wait(there)
+    assert operator.trigger("/robot_0/robot/land")
+    operator.wait(lambda: operator.status["robot_0"]["mode"] == "idle")
+    operator.wait(lambda: operator.status["world"]["on the ground"] == "robot_0")
+    operator.wait(lambda: operator.state("robot_0") == "inactive")
+    assert not operator.trigger("/robot_0/robot/land"), "it does not fly"
+    assert operator.trigger("/world/reset")
+    operator.wait(lambda: operator.change("robot_0", "activate"))
+    operator.wait(there)
+    assert operator.status["world"]["collisions"] == ""
+"""
+)
+
+
+@pytest.mark.slow
+def test_robots_start_by_themselves_land_by_a_service_and_fly_again(tmp_path):
+    run(ALONE, tmp_path)
