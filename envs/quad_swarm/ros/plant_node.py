@@ -33,6 +33,7 @@ from quad_swarm.ros.node import (
     Nobody,
     checked_names,
     declare,
+    leave,
     make_context,
     make_node,
     numbers,
@@ -151,7 +152,7 @@ class PlantNode:
 def main() -> int:
     """Run the node.
 
-    :return: exit status
+    :return: exit status, if it cannot start
     """
     try:
         plant = PlantNode(make_node("world", context=make_context(sys.argv)))
@@ -162,7 +163,7 @@ def main() -> int:
         signal.signal(number, lambda *_: plant.end())
     plant.run()
     plant.close()
-    return 0
+    leave()
 
 
 if __name__ == "__main__":

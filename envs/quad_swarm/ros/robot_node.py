@@ -51,6 +51,7 @@ from quad_swarm.ros.node import (
     checked_names,
     declare,
     entities,
+    leave,
     make_context,
     numbers,
     quality,
@@ -414,7 +415,7 @@ def _lifecycle_node(robot: RobotNode, context: Any) -> Any:
 def main() -> int:
     """Run the node.
 
-    :return: exit status
+    :return: exit status, if it cannot start
     """
     try:
         robot = RobotNode(sys.argv)
@@ -425,7 +426,7 @@ def main() -> int:
         signal.signal(number, lambda *_: robot.end())
     robot.run()
     robot.close()
-    return 0
+    leave()
 
 
 if __name__ == "__main__":
