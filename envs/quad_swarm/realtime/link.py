@@ -144,11 +144,14 @@ class BaseLink:
     def shared(self, at: int) -> int:
         """Return a time of the robot's clock on the clock that all robots share (us). Clocks that only count up differ
         between machines; those of the day are kept together by PTP or NTP."""
-        return of_day(at) + self.clock_error
+        return at + self._offset()
 
     def own(self, at: int) -> int:
         """Return a time of the clock that all robots share on the robot's own (us)."""
-        return at - of_day(0) - self.clock_error
+        return at - self._offset()
+
+    def _offset(self) -> int:
+        return of_day(0) + self.clock_error
 
 
 class WireLink(BaseLink):
