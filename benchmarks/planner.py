@@ -39,7 +39,7 @@ from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.planner import FatropSolver, OptimalControlProblem, Problems, RtiSolver, Solution
 from quad_swarm.planner.fatrop import transcribe
 from quad_swarm.world.presets import SwarmConfig, make_config
-from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from quad_swarm.world.scenarios import ScenarioSampler, without_obstacles
 from quad_swarm.world.swarm import Swarm
 
 HORIZONS = (10, 20)
@@ -92,7 +92,7 @@ def world(n_robots: int, horizon: int) -> tuple[str, SwarmConfig]:
 def record(config: SwarmConfig, n_envs: int, seed: int = 0) -> list[Call]:
     """Fly environments of all scenarios, half of them with full communication, half without, and record the calls."""
     swarm = Swarm(config, n_envs, "rti")
-    names = list(SCENARIOS)
+    names = without_obstacles()
     for k in range(n_envs):
         sampler = ScenarioSampler(names[k % len(names)], config.n_robots, config.space)
         swarm.reset(k, *sampler.sample(np.random.default_rng([seed, k]))[1:])

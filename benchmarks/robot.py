@@ -43,9 +43,9 @@ STEPS = 80
 class Recorder(Robot):
     """A robot that notes what it perceives and receives."""
 
-    def reset(self, start: np.ndarray, goal: np.ndarray, late: float = 0.0, kept: int = 1, now: int = 0) -> None:
-        super().reset(start, goal, late, kept, now)
-        self.begun = (np.array(start), np.array(goal), late, kept, now)
+    def reset(self, start: np.ndarray, goal: np.ndarray, *options: Any, **more: Any) -> None:
+        super().reset(start, goal, *options, **more)
+        self.begun = (np.array(start), np.array(goal), *options), more
         self.periods: list[tuple[tuple[Any, ...], list[tuple[int, Plan]]]] = []
 
     def decide(self, now: int, state: np.ndarray, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ def measure(config: SwarmConfig, policies: list[Policy], count: int, episodes_: 
     durations, flown, collections, before = Histogram(), 0, 0, 0
     while flown < count:
         for begun, periods in flights:
-            robot.reset(*begun)
+            robot.reset(*begun[0], **begun[1])
             for perceived, received in periods:
                 began = time.perf_counter()
                 robot.decide(*perceived)

@@ -57,6 +57,10 @@ def _range(low: float, high: float) -> Any:
     return lambda rng: sorted(_between(rng, low, high) for _ in range(2))
 
 
+def _count(high: int) -> Any:
+    return lambda rng: sorted(int(rng.integers(high + 1)) for _ in range(2))
+
+
 def _corner(low: float, high: float) -> Any:
     return lambda rng: [_between(rng, low, high) for _ in range(3)]
 
@@ -69,11 +73,21 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "max_vertical_speed": _real(1e-3, 1e3), "workspace_low": _corner(-50, -1), "workspace_high": _corner(1, 50),
         "goal_weight": _real(0, 1e4), "input_weight": _real(1e-4, 1e4), "repulsion_weight": _real(0, 1e3),
         "right_of_way": _real(0, 2), "violation_weight": _real(1e-2, 1e6), "max_neighbours": _whole(1, 8),
+        "max_obstacles": _whole(1, 12), "downwash": _real(1, 20),
     },
     "space": {
         "half_width": _real(0.1, 1e4), "heights": _range(-1e4, 1e4), "spacing": _real(0, 5),
         "circle_radius": _range(0, 50), "circle_jitter": _real(0, 5), "sector_radius": _range(0, 50),
-        "whole_sectors": _FLAG,
+        "whole_sectors": _FLAG, "pillars": _count(10), "pillar_radius": _range(1e-3, 1), "doorway": _range(0.1, 10),
+        "traffic": _count(6), "traffic_radius": _range(1e-3, 1), "traffic_speed": _range(1e-3, 10),
+    },
+    "obstacles": {
+        "number": _count(8), "shape": lambda rng: str(rng.choice(["sphere", "cylinder"])), "radius": _range(1e-3, 2),
+        "speed": _range(0, 10), "spacing": _real(0, 2), "margin": _real(0, 1),
+        "listed": lambda rng: [
+            {"position": _corner(-4, 4)(rng), "radius": _between(rng, 1e-3, 1), "velocity": _corner(-1, 1)(rng)}
+            for _ in range(rng.integers(4))
+        ],
     },
     "noise": {
         "pos": _real(0, 1), "vel": _real(0, 10), "attitude": _real(0, 3.14), "wind": _real(0, 1e3),
@@ -94,7 +108,7 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "pitch_time_constant": _real(0.02, 10), "climb_time_constant": _real(0.02, 10),
     },
 }  # fmt: skip
-_COMPILED = ("planner", "quadrotor", "neighbourhood")  # what kernels depend on
+_COMPILED = ("planner", "quadrotor", "neighbourhood", "obstacles", "space")  # what kernels depend on
 _PLAIN: dict[str, Any] = {
     "collision_tolerance": _real(0, 0.1), "goal_radius": _real(1e-3, 10),
     "memory": _real(0, 1e4), "substeps": _whole(1, 10), "continuous_collisions": _FLAG, "mismatch": _real(0, 0.5),
@@ -130,23 +144,34 @@ def _not_finite(where: str, value: Any) -> list[str]:
         return [name for key, one in value.items() for name in _not_finite(f"{where}.{key}", one)]
     array = np.asarray(value)
     finite = array.dtype.kind not in "fc" or bool(np.isfinite(array).all())
-    # Empty places of a limited neighbourhood and separations of none are infinite by definition
-    return [] if finite or (where.endswith("separation") and not np.isnan(array).any()) else [where]
+    # Empty places of a limited neighbourhood, separations of none and distances to no obstacle are infinite
+    none = where.endswith(("separation", "obstacle_distance", "obstacle_distance_continuous"))
+    return [] if finite or (none and not np.isnan(array).any()) else [where]
 
 
 def _misreports(swarm: Any, info: Mapping[str, Any]) -> list[str]:
     """Return what a step reports of the swarms, but the states do not say."""
     config, found = swarm.config, []
     pos = swarm.state[..., POSITION]
-    distances = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=-1)
+    flat = np.array([1.0, 1.0, 1 / config.planner.downwash])
+    distances = np.linalg.norm(flat * (pos[:, :, None] - pos[:, None]), axis=-1)
     distances[:, np.arange(config.n_robots), np.arange(config.n_robots)] = np.inf
     least = distances.min(axis=(1, 2))
     contact = 2 * config.radius - config.collision_tolerance
     scale = _TOLERANCE * max(1.0, float(np.abs(pos).max()))
     if not np.allclose(least, info["min_separation"], rtol=_TOLERANCE, atol=scale):
         found.append(f"min_separation is {info['min_separation']}, but {least}")
-    sure = np.abs(least - contact) > scale
-    if ((least < contact) != info["collision"])[sure].any():
+    sure, collides = np.abs(least - contact) > scale, least < contact
+    if swarm.obstacles is not None:
+        obstacles = swarm.obstacles
+        between = obstacles.factors[:, None] * (pos[:, :, None] - obstacles.position[:, None])
+        gaps = np.linalg.norm(between, axis=-1) - (obstacles.radius + config.radius)[:, None]
+        nearest = np.where(obstacles.radius[:, None] > 0, gaps, np.inf).min(axis=(1, 2))
+        if not np.allclose(nearest, info["min_obstacle_distance"], rtol=_TOLERANCE, atol=scale):
+            found.append(f"min_obstacle_distance is {info['min_obstacle_distance']}, but {nearest}")
+        sure &= np.abs(nearest + config.collision_tolerance) > scale
+        collides |= nearest < -config.collision_tolerance
+    if (collides != info["collision"])[sure].any():
         found.append(f"collision is {info['collision']} at {least}")
     if (np.asarray(info["min_separation_continuous"]) > np.asarray(info["min_separation"]) + scale).any():
         found.append("the least separation during the step exceeds that after it")

@@ -43,6 +43,7 @@ def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
+Count = Annotated[int, pydantic.Field(ge=0, le=200)]
 Range = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ascending)]
 
 

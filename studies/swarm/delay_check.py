@@ -65,10 +65,8 @@ class DelayCheckedSwarm(Swarm):
             setattr(self, name, getattr(self, name)[swarms])
         self._sent = [sent[swarms] for sent in self._sent]
 
-    def reset(
-        self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0, checked: bool = False
-    ) -> None:
-        super().reset(swarm, starts, goals, noise_seed, checked)
+    def reset(self, swarm: int, *episode: Any, **options: Any) -> None:
+        super().reset(swarm, *episode, **options)
         self._x[swarm] = self.state[swarm][:, None, None]
         self._inputs[swarm] = 0.0
         self._pending[swarm] = 0

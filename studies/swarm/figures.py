@@ -16,11 +16,11 @@ from quad_swarm.evaluation.policies import is_model
 from quad_swarm.figures.colours import INK, LEARNED, RULES, STYLE
 from quad_swarm.figures.plots import draw_flight, explain_flights
 from quad_swarm.world.presets import PRESETS, make_config
-from quad_swarm.world.scenarios import SCENARIOS
+from quad_swarm.world.scenarios import without_obstacles
 from studies.swarm.experiment import condition, progress
 from studies.swarm.protocol import EARLIER
 
-NAMES = list(SCENARIOS)[::-1]  # the hardest first
+NAMES = without_obstacles()[::-1]  # the hardest first
 WORLDS = {"paper": "Four robots (paper)", "dense": "Eight robots (dense)"}
 Rows = list[dict[str, Any]]
 

@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from quad_swarm.evaluation.evaluation import summarise
 from quad_swarm.world.presets import make_config
-from quad_swarm.world.scenarios import SCENARIOS
+from quad_swarm.world.scenarios import without_obstacles
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 from studies.swarm.experiment import Experiment, Job, Row
 from studies.swarm.protocol import ROOT, VALIDATION
@@ -153,7 +153,7 @@ def validate(
     :return: a row per scenario and value
     """
     table = []
-    for name in SCENARIOS:
+    for name in without_obstacles():
         job = Job({}, list(policies.values()), name, make_config("paper"), episodes, VALIDATION, algo)
         for value, rows in zip(policies, job.fly().values(), strict=True):
             row = {"scenario": name, what: value} | summarise(rows, job.config)

@@ -15,7 +15,7 @@ import itertools
 from quad_swarm.evaluation.command import workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.world.presets import PRESETS
-from quad_swarm.world.scenarios import SCENARIOS
+from quad_swarm.world.scenarios import SCENARIOS, without_obstacles
 from studies.swarm.experiment import Experiment, Row, absolute_path, command_line
 from studies.swarm.protocol import PRESETS_TESTED, QUICK_STAGES, STAGES, fly_validation, in_stages, world
 
@@ -109,7 +109,7 @@ def main() -> None:
     """Run the command line."""
     parser = command_line(__doc__, "fly few episodes and rules")
     parser.add_argument("--preset", nargs="+", default=PRESETS_TESTED, choices=list(PRESETS))
-    parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS), choices=list(SCENARIOS))
+    parser.add_argument("--scenario", nargs="+", default=without_obstacles(), choices=list(SCENARIOS))
     parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="default: the preset's")
     parser.add_argument("--family", nargs="+", default=list(families()), choices=list(families()))
     parser.add_argument("--json", type=absolute_path, metavar="FILE")

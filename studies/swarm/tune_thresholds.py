@@ -18,7 +18,7 @@ import itertools
 from quad_swarm.evaluation.command import workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.inference import Comparison
-from quad_swarm.world.scenarios import SCENARIOS
+from quad_swarm.world.scenarios import SCENARIOS, without_obstacles
 from sb3_maddpg import MADDPG
 from studies.swarm.experiment import Experiment, Row, absolute_path, command_line
 from studies.swarm.protocol import OF_PRESET, OF_TEAM, in_stages, models, world
@@ -85,7 +85,7 @@ def main() -> None:
     """Run the command line."""
     parser = command_line(__doc__, "fly few episodes")
     parser.add_argument("models", nargs="*", metavar="MODEL.zip", help="default: all models with a free threshold")
-    parser.add_argument("--scenario", nargs="+", default=list(SCENARIOS)[::-1], choices=list(SCENARIOS))
+    parser.add_argument("--scenario", nargs="+", default=without_obstacles()[::-1], choices=list(SCENARIOS))
     parser.add_argument("--n-robots", nargs="+", type=int, default=[None], help="default: the preset's")
     parser.add_argument("--json", type=absolute_path, metavar="FILE")
     parser.add_argument("--write", action="store_true", help="write each model's threshold into its file")

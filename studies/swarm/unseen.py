@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from quad_swarm.world.scenarios import SCENARIOS, Scenario, ScenarioSpace
+from quad_swarm.world.scenarios import Scenario, ScenarioSpace, random, symmetric_swap
 
 
 def half_swap(n_robots: int, space: ScenarioSpace, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Mixture of scenarios in an episode: half of the robots fly `symmetric_swap`, the others `random`."""
     half = n_robots // 2
     while True:
-        swapping, own = (
-            SCENARIOS[name](n, space, rng) for name, n in (("symmetric_swap", half), ("random", n_robots - half))
-        )
+        swapping, own = symmetric_swap(half, space, rng), random(n_robots - half, space, rng)
         starts, goals = (np.concatenate(both) for both in zip(swapping, own, strict=True))
         if min(apart(starts), apart(goals)) >= space.spacing:
             return starts, goals

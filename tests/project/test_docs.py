@@ -26,6 +26,7 @@ NO_LEARNING = (
     "tutorials/rule",
     "tutorials/reading",
     "planner",
+    "obstacles",
     "index",
     "faq",
     "files",

@@ -28,8 +28,8 @@ from quad_swarm.planner import SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
 from quad_swarm.task.rules import RULES
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
-from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
+from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler, without_obstacles
 from quad_swarm.world.swarm import Swarm
 
 # Shown by `sb3-maddpg --help`
@@ -201,7 +201,8 @@ def make_conditions(args: argparse.Namespace, scenarios: Sequence[str]) -> list[
         if (preset := trained.get("preset", args.preset)) != args.preset:
             print(f"note: {short_name(policy)} was trained in {preset!r}, but this is {args.preset!r}", file=sys.stderr)
     for name in scenarios:
-        ScenarioSampler(name, config.n_robots, config.space, config)  # raises if the robots do not fit
+        world = for_scenario(config, name)
+        ScenarioSampler(name, world.n_robots, world.space, world)  # raises if the robots do not fit
     return [
         Condition(policy, name, config, args.max_steps, args.algo, args.solver)
         for name in dict.fromkeys(scenarios)
@@ -251,7 +252,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"some of {', '.join(SCENARIOS)}, or all (default)",
+        help=f"some of {', '.join(SCENARIOS)}, or all without obstacles (default)",
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
     add_worker_arguments(parser, jobs=1)
@@ -343,7 +344,7 @@ def _compare(args: argparse.Namespace) -> None:
     if "all" in args.scenario and len(args.scenario) > 1:
         raise ValueError(f"--scenario {' '.join(args.scenario)}: 'all' already names every scenario.")
     args.policy = args.policy or paper_policies()
-    conditions = make_conditions(args, list(SCENARIOS) if args.scenario == ["all"] else args.scenario)
+    conditions = make_conditions(args, without_obstacles() if args.scenario == ["all"] else args.scenario)
     printed = _check_files(args)
     _check_record(args, len(conditions))
     solver = Swarm(conditions[0].config, 1, args.solver).planner.solver.name  # fails here if a simulator is missing

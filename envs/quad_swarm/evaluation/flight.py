@@ -20,7 +20,7 @@ from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import slots_to_robots
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, for_scenario
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
@@ -65,7 +65,8 @@ class Condition:
             )
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
-        ScenarioSampler(self.scenario, self.config.n_robots, self.config.space, self.config)
+        world = for_scenario(self.config, self.scenario)
+        ScenarioSampler(self.scenario, world.n_robots, world.space, world)
         for sentence in too_short(self.config, self.max_steps) if self.max_steps is not None else ():
             warn(sentence)
         if self.linger is not None and self.linger < 0:
@@ -104,7 +105,7 @@ def begin(
     :param model: model that flies instead of the condition's policy
     :return: the policy, the task, and random number generators for random rules
     """
-    config = condition.config
+    config = for_scenario(condition.config, condition.scenario)
     if model is None:
         policy, observation = make_policy(condition.policy, config, condition.algo)
     else:

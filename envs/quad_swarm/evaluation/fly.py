@@ -39,7 +39,7 @@ from quad_swarm.realtime.virtual import VirtualFlight
 from quad_swarm.ros.world import RosWorld
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
-from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from quad_swarm.world.scenarios import ScenarioSampler, without_obstacles
 
 EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
 LINKS = ("udp", "ros2", "virtual")
@@ -148,7 +148,7 @@ def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterat
     sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        _, starts, goals = sampler.sample(rng)
+        _, starts, goals, _ = sampler.sample(rng)
         yield starts, goals, int(rng.integers(2**63)) if config.is_random else 0
 
 
@@ -241,7 +241,8 @@ def main(argv: list[str] | None = None) -> int:
         "--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="fields of the preset"
     )
     parser.add_argument("--plant", help="simulated vehicle, such as crazyflow:cf21B_500 (default: the preset's)")
-    parser.add_argument("--scenario", choices=list(SCENARIOS), default="symmetric_swap", help="(default %(default)s)")
+    names = without_obstacles()
+    parser.add_argument("--scenario", choices=names, default="symmetric_swap", help="(default %(default)s)")
     parser.add_argument("--episodes", type=int, default=1, help="number of flights of each policy (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="set of episodes, see `sb3-maddpg evaluate` (default 0)")
     parser.add_argument("--link", choices=LINKS, default="udp", help="how robots talk (default %(default)s)")

@@ -14,7 +14,7 @@ from quad_swarm.evaluation.policies import trained_in
 from quad_swarm.figures.plots import draw_flights
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import make_config
-from quad_swarm.world.scenarios import SCENARIOS
+from quad_swarm.world.scenarios import without_obstacles
 
 
 def _line(tag: str) -> list[Any]:
@@ -64,7 +64,7 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
         share and collision rate of the same episodes
     """
     config = make_config(**({"preset": "paper"} | {k: v for k, v in env_kwargs.items() if k in _OF_THE_WORLD}))
-    conditions = [Condition("model", name, config, linger=5) for name in SCENARIOS]
+    conditions = [Condition("model", name, config, linger=5) for name in without_obstacles()]
     asked, possible, steps, collisions = requests_by_pair(conditions[-1], model)
     pictures: dict[str, Figure | float] = {
         f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5, "") for one in conditions

@@ -55,7 +55,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     `at_goal` (n,), `belief_source` (n, n - 1), `planner` (`status` and `iterations`, (n,)), and `metrics`. In the last
     step of an episode also `is_success` and further `metrics`. With a limited neighbourhood also `neighbours` (n, m),
     the index of the robot in each slot of the action and of the entries about others, -1 for an empty slot, and
-    `pair_terminated` (n, m), whether another robot, or none, is in the slot after the step.
+    `pair_terminated` (n, m), whether another robot, or none, is in the slot after the step. With obstacles also
+    `min_obstacle_distance` and `min_obstacle_distance_continuous` (m, between surfaces, infinity without any).
 
     ## Arguments
     :param preset: a name of `presets.PRESETS`, such as "paper" or "dense"

@@ -38,7 +38,12 @@ class Measured(NamedTuple):
 
 
 def measure(
-    positions: np.ndarray, goals: np.ndarray, contact: float, goal_radius: float, others: np.ndarray | None = None
+    positions: np.ndarray,
+    goals: np.ndarray,
+    contact: float,
+    goal_radius: float,
+    others: np.ndarray | None = None,
+    height: float = 1.0,
 ) -> Measured:
     """Measure a step, with straight motion between sub-steps.
 
@@ -48,7 +53,13 @@ def measure(
     :param goal_radius: distance within which a robot is at its goal (m)
     :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m); None for
         all n - 1 others in ascending order
+    :param height: height over width of the ellipsoids around robots: vertical parts of separations are divided by it
     """
+    if height != 1:
+        flown = measure(positions, goals, contact, goal_radius, others)
+        flat = np.array([1.0, 1.0, 1 / height])
+        of_pairs = measure(positions * flat, goals, contact, goal_radius, others)
+        return of_pairs._replace(moved=flown.moved, at_goal=flown.at_goal)
     n_swarms, n = goals.shape[:2]
     shape = (n_swarms, n, n - 1) if others is None else others.shape
     empty = np.empty if others is not None else _swarms_last

@@ -18,21 +18,26 @@ from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 SOLVERS: dict[str, Callable[[OptimalControlProblem], Solver]] = {"rti": RtiSolver, "fatrop": FatropSolver}
 
 
-def make_planner(config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: int, solver: str = "auto") -> Planner:
+def make_planner(
+    config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: int, solver: str = "auto", n_obstacles: int = 0
+) -> Planner:
     """Create the planner of a swarm.
 
     :param config: horizon, limits and weights
     :param quadrotor: physical parameters
     :param n_robots: number of robots in a swarm
     :param solver: one of `SOLVERS`, or "auto" for "rti" if it can be compiled, otherwise "fatrop" with a warning
+    :param n_obstacles: number of obstacles; up to ``config.max_obstacles`` are considered
     :raises ValueError: if the solver is unknown, or what `SOLVERS` holds under its name creates no `Solver`
     :raises BuildError: if the solver is "rti" and cannot be compiled
     """
     if solver != "auto" and solver not in SOLVERS:
         raise unknown_name("solver", solver, ["auto", *SOLVERS])
     n_others = n_robots - 1 if config.max_neighbours is None else min(n_robots - 1, config.max_neighbours)
-    problem = OptimalControlProblem(config, quadrotor, n_others)
-    return Planner(_make_solver(problem, solver), QuadrotorModel(quadrotor, config.dt), config)
+    n_bodies = n_others + min(n_obstacles, config.max_obstacles)
+    problem = OptimalControlProblem(config, quadrotor, n_bodies, n_obstacles > 0 or config.downwash != 1)
+    limit = None if n_bodies == n_robots - 1 + n_obstacles else n_bodies
+    return Planner(_make_solver(problem, solver), QuadrotorModel(quadrotor, config.dt), config, limit)
 
 
 def _make_solver(problem: OptimalControlProblem, name: str) -> Solver:

@@ -105,12 +105,15 @@ class Planner:
     :param solver: the solver
     :param model: discrete dynamics, for the levels without a solver
     :param config: horizon and limits
+    :param n_others: maximum number of bodies to avoid that the solver considers, those that the robot's last plan comes
+        closest to; None for all
     """
 
-    def __init__(self, solver: Solver, model: QuadrotorModel, config: PlannerConfig):
+    def __init__(self, solver: Solver, model: QuadrotorModel, config: PlannerConfig, n_others: int | None = None):
         self.solver = solver
         self.model = model
         self.config = config
+        self.n_others = n_others
         self.checks = True
 
     def plan(self, problems: Problems, previous: Plans) -> Plans:
@@ -126,6 +129,10 @@ class Planner:
         """
         if self.checks:
             problems, previous = self._checked(problems, previous)
+        if problems.shape is None and self.config.downwash != 1:
+            flat = np.ones((*problems.others.shape[:2], 3))
+            flat[..., 2] = 1 / self.config.downwash
+            problems = problems._replace(shape=flat)
         if not np.count_nonzero(problems.x[:, 8]):
             return self._plan(problems, previous)
         # Within, roll and pitch are those about the world's axes, to which the problem has no yaw. Only robots with a
@@ -149,7 +156,7 @@ class Planner:
 
     def _checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
         """Check the arrays of a call and convert them to their types."""
-        stages, kept = self.config.horizon, self.config.max_neighbours
+        stages, kept = self.config.horizon, self.n_others
         for name, value, kind in (("problems", problems, Problems), ("previous", previous, Plans)):
             if not isinstance(value, kind):
                 remedy = "; before the first solve, Plans.hover(x, horizon)" if kind is Plans else ""
@@ -162,12 +169,19 @@ class Planner:
         x = _array("x", problems.x, (count, N_STATES))
         goal = _array("goal", problems.goal, (count, 3))
         others = _array("others", problems.others, (count, n_others, stages, 3))
-        clearance, announced = problems.clearance, problems.announced
-        if clearance is not None:
-            clearance = _array("clearance", clearance, (count, n_others, stages))
-        if announced is not None:
-            announced = _array("announced", announced, (count, n_others), np.dtype(bool))
-        return Problems(x, goal, others, clearance, announced), Plans(
+        about: dict[str, np.ndarray | None] = {}
+        for name, more, dtype in (
+            ("clearance", (stages,), _TYPES[0]),
+            ("announced", (), np.dtype(bool)),
+            ("shape", (3,), _TYPES[0]),
+            ("size", (), _TYPES[0]),
+        ):
+            given = getattr(problems, name)
+            about[name] = None if given is None else _array(name, given, (count, n_others, *more), dtype)
+            shaped = getattr(getattr(self.solver, "problem", None), "shaped", True)
+            if given is not None and name in ("shape", "size") and not shaped:
+                raise ValueError(f"{name}: this planner avoids spheres only; create it with obstacles or downwash.")
+        return Problems(x, goal, others, **about), Plans(
             # The last plan is a guess, so that numbers which are not finite only cost a retry
             _array("previous.x", previous.x, (count, stages + 1, N_STATES), finite=False),
             _array("previous.u", previous.u, (count, stages, N_INPUTS), finite=False),
@@ -232,18 +246,17 @@ class Planner:
         return solution._replace(success=solution.success & possible[0] & possible[1])
 
     def _nearest_others(self, problems: Problems, x_guess: np.ndarray) -> Problems:
-        """Reduce problems to the ``max_neighbours`` others that come closest over the horizon."""
-        kept = self.config.max_neighbours
+        """Reduce problems to the bodies that the last plan comes closest to."""
+        kept, shape, size = self.n_others, problems.shape, problems.size
         if kept is None or kept >= problems.others.shape[1]:
             return problems
-        squared = sum((problems.others[..., i] - x_guess[:, None, 1:, i]) ** 2 for i in range(3))
-        nearest = np.sort(np.argsort(squared.min(axis=2), axis=1, kind="stable")[:, :kept], axis=1)
-        rows, clearance, announced = np.arange(len(nearest))[:, None], problems.clearance, problems.announced
-        return problems._replace(
-            others=problems.others[rows, nearest],
-            clearance=None if clearance is None else clearance[rows, nearest],
-            announced=None if announced is None else announced[rows, nearest],
-        )
+        between = [problems.others[..., i] - x_guess[:, None, 1:, i] for i in range(3)]
+        if shape is not None:
+            between = [shape[..., i, None] * one for i, one in enumerate(between)]
+        squared = sum(one**2 for one in between).min(axis=2)
+        gaps = squared if size is None else np.sqrt(squared) - size
+        nearest = np.sort(np.argsort(gaps, axis=1, kind="stable")[:, :kept], axis=1)
+        return problems.chosen(nearest)
 
     def braking_inputs(self, x: np.ndarray) -> np.ndarray:
         """Compute inputs that bring robots to hover from their states without a solver, (B, 9) -> (B, N, 4).

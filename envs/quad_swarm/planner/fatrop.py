@@ -62,8 +62,10 @@ class FatropSolver:
         iterations = np.zeros(count, dtype=np.int64)
         variables = np.zeros(program.bounds["lbx"].size)
         clearance = np.zeros(problems.others.shape[:3]) if problems.clearance is None else problems.clearance
+        shape = np.ones((*problems.others.shape[:2], 3)) if problems.shape is None else problems.shape
+        size = np.zeros(problems.others.shape[:2]) if problems.size is None else problems.size
         for b in range(count):
-            about_others = (problems.others[b].ravel(), clearance[b].ravel())
+            about_others = (problems.others[b].ravel(), clearance[b].ravel(), shape[b].ravel(), size[b])
             parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others])
             variables[program.x_index] = x_guess[b, 1:, :nx] + _aside(problems, b, horizon)[:, :nx]
             variables[program.u_index] = u_guess[b, :, :nu]
@@ -137,7 +139,8 @@ def _is_sane(numbers: np.ndarray) -> bool:
 class Program(NamedTuple):
     """The problem as a nonlinear program.
 
-    :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance), cost ``f``, constraints ``g``
+    :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance, shape, size), cost ``f`` and
+        constraints ``g``
     :param bounds: bounds of variables and constraints
     :param structure: fatrop's description of the stages
     :param x_index: indices of the states at stages 1..N in the variables, (N, nx)
@@ -159,6 +162,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
     x0, goal = ca.SX.sym("x0", nx), ca.SX.sym("goal", 3)
     others = ca.SX.sym("others", 3, horizon * n_others)  # column j * N + k - 1: robot j at stage k
     clearance = ca.SX.sym("clearance", horizon, n_others)
+    shape, size = ca.SX.sym("shape", 3, n_others), ca.SX.sym("size", n_others)
     states = [x0] + [ca.SX.sym(f"x{k}", nx) for k in range(1, horizon + 1)]
     inputs = [ca.SX.sym(f"u{k}", nu) for k in range(horizon)]
     step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
@@ -177,7 +181,11 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             lower.append(np.full(nx, -np.inf))
             x_index.append(np.arange(offset, offset + nx))
             offset += nx
-            distances = problem.distances(states[k], others[:, [j * horizon + k - 1 for j in range(n_others)]])
+            around = others[:, [j * horizon + k - 1 for j in range(n_others)]]
+            distances = problem.distances(states[k], around)
+            if problem.shaped:
+                shaped = problem.shaped_distances(states[k], around, shape)
+                distances = [d - size[j] for j, d in enumerate(shaped)]
             # At large distances, the repulsion is zero long before its exponential overflows. The overflow would make
             # derivatives NaN, with which fatrop regularises its Hessian forever.
             cost += sum((problem.repulsion_cost(ca.fmin(d, farthest)) for d in distances), start=ca.SX(0))
@@ -206,7 +214,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             "x": ca.vertcat(*variables),
             "f": cost,
             "g": ca.vertcat(*constraints),
-            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance)),
+            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size),
         },
         bounds={
             "lbx": bounds,

@@ -52,6 +52,10 @@ class PlannerConfig:
     :param violation_weight: weight of the squared violation of soft constraints (1/m^2)
     :param max_neighbours: maximum number of others to consider, those whose believed trajectories come closest to the
         robot's last plan; None for all
+    :param max_obstacles: maximum number of obstacles to consider. Places are common: a robot considers those of all
+        others and obstacles together that its last plan comes closest to
+    :param downwash: height over width of the ellipsoid around another robot that robots keep out of, because of the air
+        that rotors blow down (-); 1 for spheres
     :raises ValueError: if a value is not finite or out of range, or the workspace is empty
     """
 
@@ -73,6 +77,8 @@ class PlannerConfig:
     right_of_way: Length = 0.0
     violation_weight: PositiveFloat = 1e4
     max_neighbours: PositiveInt | None = None
+    max_obstacles: PositiveInt = 12
+    downwash: Annotated[float, Field(ge=1, le=20)] = 1.0
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
@@ -109,10 +115,15 @@ class Problems(NamedTuple):
 
     :param x: current states, (B, 9)
     :param goal: goals, (B, 3), world frame (m)
-    :param others: believed positions of the n - 1 others at stages 1..N, (B, n - 1, N, 3) (m)
-    :param clearance: minimum distance to the others beyond the separation, (B, n - 1, N) (m); None for 0
-    :param announced: whether the believed positions come from a plan, (B, n - 1) bool, see `right_of_way`; None for
-        False
+    :param others: believed positions of the m bodies to avoid, other robots and obstacles, at stages 1..N,
+        (B, m, N, 3) (m)
+    :param clearance: minimum distance to them beyond the separation, (B, m, N) (m); None for 0
+    :param announced: whether the believed positions come from a plan, (B, m) bool, see `right_of_way`; None for False
+    :param shape: shape of each body, (B, m, 3): factors of the differences along x, y and z in distances to it. (1, 1,
+        1) makes it a sphere, (1, 1, 1 / c) an ellipsoid c times as high as wide, and (1, 1, 0) a vertical cylinder;
+        None for ellipsoids with the planner's ``downwash``
+    :param size: how much larger than a robot each body is, (B, m) (m), added to the separation; smaller ones are
+        negative. None for 0
     """
 
     x: np.ndarray
@@ -120,16 +131,17 @@ class Problems(NamedTuple):
     others: np.ndarray
     clearance: np.ndarray | None = None
     announced: np.ndarray | None = None
+    shape: np.ndarray | None = None
+    size: np.ndarray | None = None
 
     def part(self, which: Any) -> Problems:
         """Return some of the problems, selected by anything that indexes an array."""
-        return Problems(
-            self.x[which],
-            self.goal[which],
-            self.others[which],
-            None if self.clearance is None else self.clearance[which],
-            None if self.announced is None else self.announced[which],
-        )
+        return Problems._make(None if array is None else array[which] for array in self)
+
+    def chosen(self, bodies: np.ndarray) -> Problems:
+        """Return the problems with some of the bodies only, whose indices are (B, k)."""
+        rows, (x, goal, *about) = np.arange(len(bodies))[:, None], self
+        return Problems._make([x, goal, *(None if array is None else array[rows, bodies] for array in about)])
 
 
 class OptimalControlProblem:
@@ -139,15 +151,17 @@ class OptimalControlProblem:
 
     :param config: horizon, limits and weights
     :param quadrotor: physical parameters
-    :param n_others: number of other robots
+    :param n_others: number of bodies to avoid, other robots and obstacles
+    :param shaped: whether they may have shapes and sizes, see `Problems`; otherwise, all are spheres of a robot's size
     :raises ValueError: if the planner does not fit the vehicle, see `check_vehicle`
     """
 
-    def __init__(self, config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int):
+    def __init__(self, config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int, shaped: bool = False):
         check_vehicle(config, quadrotor)
         self.config = config
         self.quadrotor = quadrotor
         self.n_others = n_others
+        self.shaped = shaped
         hold_yaw = config.max_yaw_rate == 0.0
         self.nx = N_STATES - 1 if hold_yaw else N_STATES
         self.nu = N_INPUTS - 1 if hold_yaw else N_INPUTS
@@ -177,6 +191,14 @@ class OptimalControlProblem:
         """Return the distances (m) to the believed positions of other robots; ``others`` is (3, n_others)."""
         # The small constant keeps the gradient finite if two centres coincide
         return [ca.sqrt(ca.sumsqr(x[:3] - others[:, j]) + 1e-6) for j in range(self.n_others)]
+
+    def shaped_distances(self, x: ca.SX, others: ca.SX, shapes: ca.SX) -> list[ca.SX]:
+        """Return the same for bodies of other shapes, (3, n_others): `distances` with all differences multiplied by the
+        factors of `Problems.shape`."""
+        return [
+            self.distances(ca.vertcat(others[:, j] + shapes[:, j] * (x[:3] - others[:, j]), x[3:]), others)[j]
+            for j in range(self.n_others)
+        ]
 
     def repulsion_residual(self, distance: ca.SX) -> ca.SX:
         """Return the square root of the repulsion from another robot, for methods that linearise it (Gauss-Newton)."""

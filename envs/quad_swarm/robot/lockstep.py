@@ -14,6 +14,7 @@ from quad_swarm.plants import make_plant
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.robot.robot import Plan, Robot
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
 
@@ -41,7 +42,9 @@ class LockstepWorld:
         # What is on its way, by the number of steps until it arrives: receiver, sender, plan
         self._flying: deque[list[tuple[int, int, Plan]]] = deque()
 
-    def reset(self, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0) -> None:
+    def reset(
+        self, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0, obstacles: Sequence[Obstacle] | None = None
+    ) -> None:
         """Begin an episode, see `Swarm.reset`."""
         self.state[:], self._u[:], self.now = 0.0, 0.0, 0
         self.state[0, :, POSITION] = starts
@@ -51,7 +54,7 @@ class LockstepWorld:
         radio, start = self.config.radio, self.realisation.start
         late = np.zeros(len(self.robots)) if start is None else start[0] / self.config.substeps
         for robot, where, goal, delay in zip(self.robots, starts, goals, late, strict=True):
-            robot.reset(where, goal, float(delay), kept=1 + radio.delay)
+            robot.reset(where, goal, float(delay), kept=1 + radio.delay, obstacles=obstacles)
         causal = radio.round_trip is not None
         self._flying = deque([] for _ in range(1 + (radio.round_trip or 0) + radio.jitter))
         most = 1 + radio.delay + (0 if causal else radio.jitter)

@@ -17,6 +17,7 @@ from quad_swarm.planner import Plans, base, make_planner
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, resampled
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
+from quad_swarm.world.obstacles import Obstacle, Obstacles
 from quad_swarm.world.presets import SwarmConfig
 
 # Whom a robot asks and whom it tells: (n - 1, 1 or 2) bool, see `Robot.decide`
@@ -74,14 +75,25 @@ class Robot:
         self.config, self.index, self.policy = config, index, policy
         self.others = np.array([other for other in range(config.n_robots) if other != index], dtype=np.int64)
         self.neighbours = _Others(self.others)
-        self.planner = planner or make_planner(config.planner, config.quadrotor, config.n_robots)
+        self.planner = planner or make_planner(
+            config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots
+        )
+        self.obstacles = Obstacles.of(config.obstacles, 1)
         self.period = round(1e6 * config.planner.dt)
         self.beliefs: Beliefs = make_beliefs(config, 1, 1)
         # What the others presumably believe about this robot, from what it sent
         self.presumed: Beliefs = make_beliefs(config, 1, 1)
         self.reset(np.zeros(3), np.zeros(3))
 
-    def reset(self, start: np.ndarray, goal: np.ndarray, late: float = 0.0, kept: int = 1, now: int = 0) -> None:
+    def reset(
+        self,
+        start: np.ndarray,
+        goal: np.ndarray,
+        late: float = 0.0,
+        kept: int = 1,
+        now: int = 0,
+        obstacles: Sequence[Obstacle] | None = None,
+    ) -> None:
         """Begin to fly.
 
         :param start: where the robot is commanded to hover, (3,), world frame (m)
@@ -89,7 +101,12 @@ class Robot:
         :param late: time from the start of a period until its command takes effect (periods), less than 1
         :param kept: number of own plans that may still be sent, where the radio delays them by whole periods
         :param now: start of the first period (us)
+        :param obstacles: the obstacles, where they are then; by default those that the world lists
+        :raises ValueError: if there are more obstacles than the world has room for
         """
+        obstacles = self.config.obstacles.listed if obstacles is None else obstacles
+        if self.obstacles is not None or obstacles:
+            (self.obstacles or Obstacles(1, 0)).reset(0, obstacles)
         x = np.zeros((1, N_STATES))
         x[:, POSITION] = start
         self.goal, self.late, self.now = np.array(goal, float).reshape(1, 1, 3), late, now - self.period
@@ -184,10 +201,11 @@ class Robot:
         self.presumed.receive(*self._message(self._sent, *self._own_motion()))
         believed, self.source = self.beliefs.update(*self._message(self._inbox, self._pos, self._vel))
         late = np.full((1, 1), self.late) if self.late else None
-        arguments = (self._estimate, self.goal, believed, self.source, self._u, late)
+        arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles)
         problems = make_problems(self.config, self.planner.model, *arguments)
         self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
+        self._pass_obstacles()
         self._sent, self._inbox = {}, {}
         self._own = [*self._own[1:], Plan(self.now, self.planned_positions()[0, 0].copy())]
         return self._u[0, 0]
@@ -200,6 +218,11 @@ class Robot:
         plans = self._plans
         self._plans = plans._replace(x=base.shift(plans.x), u=base.shift(plans.u), age=plans.age + 1)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
+        self._pass_obstacles()
+
+    def _pass_obstacles(self) -> None:
+        if self.obstacles is not None:
+            self.obstacles.advance(self.config.planner.dt)
 
     def _place(self, other: int) -> int:
         """Return the place of another robot among the others."""

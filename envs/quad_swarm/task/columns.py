@@ -125,6 +125,15 @@ COLUMNS: dict[str, list[Column]] = {
             )
         ),
     ],
+    "obstacles": [
+        column
+        for whose, what in (("own", "the own plan"), ("their", "the predicted motion of the other"))
+        for column in (
+            *_gap(f"{whose}_least", f"least of {what} and the nearest obstacle; 1 without obstacles"),
+            Column(f"{whose}_stage", "N steps", "", "stage at which it is reached; 0 without obstacles"),
+            *_vector(f"{whose}_way", "", "pair", "direction of that obstacle then; 0 without obstacles"),
+        )
+    ],
     "mask": [Column("mask", "", "", "whether the two may come close, 1 or 0: otherwise there is nothing to ask for")],
     "critic": [
         *(

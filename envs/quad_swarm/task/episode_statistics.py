@@ -16,6 +16,8 @@ from quad_swarm.world.swarm import StepReport
 _SHIFTED = int(PlanStatus.SHIFTED)
 _NAMES = STATISTICS.names or ()
 _STATE = [name for name in _NAMES if name != "at_goals"]
+# What is counted in worlds with obstacles, and how it begins
+_OBSTACLES = {"collided_obstacle": False, "min_obstacle_distance": np.inf}
 
 
 def exchange_bytes(config: SwarmConfig) -> int:
@@ -25,9 +27,10 @@ def exchange_bytes(config: SwarmConfig) -> int:
 
 def is_row(value: object) -> bool:
     """Return whether a value, such as one from a file, has the names and types of `EpisodeStatistics.row`."""
-    if not isinstance(value, dict) or set(value) != set(_STATE):
+    if not isinstance(value, dict) or set(value) not in (set(_STATE), {*_STATE, *_OBSTACLES}):
         return False
     kinds = {name: {"b": bool, "i": int, "u": int, "f": float}[STATISTICS[name].kind] for name in _STATE}
+    kinds |= {name: type(_OBSTACLES[name]) for name in value if name in _OBSTACLES}
     return all(type(value[name]) is kind and value[name] == value[name] for name, kind in kinds.items())  # not NaN
 
 
@@ -54,13 +57,17 @@ class EpisodeStatistics:
     :ivar at_goals: whether all robots were at their goals in the last step, not part of the state
     :ivar reached: whether all robots were at their goals at the same time
     :ivar arrived: whether they were so before any collision
-    :ivar collided: whether two robots collided, in the sense that ends episodes
-    :ivar collided_at_steps: whether two robots collided at a step
-    :ivar collided_continuous: whether two robots collided at or between steps
+    :ivar collided: whether two robots, or a robot and an obstacle, collided, in the sense that ends episodes
+    :ivar collided_at_steps: whether they collided at a step
+    :ivar collided_continuous: whether they collided at or between steps
     :ivar min_separation: smallest distance between two robots at a step (m)
     :ivar min_separation_continuous: smallest distance between two robots at or between steps (m)
     :ivar planner_failures: number of plans without a successful solve (status SHIFTED or BRAKING)
     :ivar solve_seconds: wall-clock time of the planner, as this swarm's share of each batch call (s)
+    :ivar collided_obstacle: whether a robot collided with an obstacle, in the sense that ends episodes; in worlds with
+        obstacles only, as is the next one
+    :ivar min_obstacle_distance: smallest distance between the surfaces of a robot and an obstacle, at steps, or at any
+        time if the world's collisions are continuous (m)
     """
 
     steps: np.ndarray
@@ -82,10 +89,18 @@ class EpisodeStatistics:
     min_separation_continuous: np.ndarray
     planner_failures: np.ndarray
     solve_seconds: np.ndarray
+    collided_obstacle: np.ndarray
+    min_obstacle_distance: np.ndarray
 
     def __init__(self, n_swarms: int, config: SwarmConfig):
         self.config = config
         self._records = np.zeros(n_swarms, dtype=STATISTICS)
+        if config.obstacles.slots:
+            self._names = [*_STATE, *_OBSTACLES]
+            self.collided_obstacle = np.zeros(n_swarms, dtype=bool)
+            self.min_obstacle_distance = np.zeros(n_swarms)
+        else:
+            self._names = _STATE
         self.reset(slice(None))
 
     def __getattr__(self, name: str) -> np.ndarray:
@@ -98,19 +113,25 @@ class EpisodeStatistics:
         self._records[swarm] = np.zeros((), dtype=STATISTICS)
         for name in ("min_separation", "min_separation_continuous"):
             self._records[name][swarm] = np.inf
+        for name in self._names[len(_STATE) :]:
+            getattr(self, name)[swarm] = _OBSTACLES[name]
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
         self._records = self._records[swarms]
+        for name in self._names[len(_STATE) :]:
+            setattr(self, name, getattr(self, name)[swarms])
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return all statistics by name."""
-        return {name: self._records[name].copy() for name in _STATE}
+        return {name: getattr(self, name).copy() for name in self._names}
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore a state from `state_dict`."""
         for name in _STATE:
             self._records[name] = like(self._records[name], state[name], name, 0, np.inf)
+        for name in self._names[len(_STATE) :]:
+            setattr(self, name, like(getattr(self, name), state[name], name, -np.inf, np.inf))
 
     def add(self, report: StepReport, n_requests: np.ndarray, collided: np.ndarray) -> None:
         """Add one step.
@@ -134,6 +155,10 @@ class EpisodeStatistics:
             min_separation_continuous=report.min_separation_continuous,
         )
         count(self._records, step, _SHIFTED, report.solve_seconds)
+        if report.obstacles is not None:
+            distance, colliding = report.obstacles.of(self.config.continuous_collisions)
+            self.min_obstacle_distance = np.minimum(self.min_obstacle_distance, distance.min(axis=(1, 2)))
+            self.collided_obstacle |= collided & colliding.any(axis=(1, 2))
 
     @property
     def success(self) -> np.ndarray:
@@ -142,7 +167,7 @@ class EpisodeStatistics:
 
     def row(self, swarm: int) -> dict[str, float]:
         """Return one swarm's statistics by name."""
-        return {name: getattr(self, name)[swarm].item() for name in _STATE}
+        return {name: getattr(self, name)[swarm].item() for name in self._names}
 
     def metrics(self) -> dict[str, np.ndarray]:
         """Return metrics of the episodes so far by the names under which they are logged, each (E,)."""
@@ -158,4 +183,11 @@ class EpisodeStatistics:
             "comm/plan_age": dt * self.plan_ages / np.maximum(self.plans_used, 1),
             "planner/failure_rate": self.planner_failures / plans,
             "planner/solve_us": 1e6 * self.solve_seconds / plans,
-        }
+        } | (
+            {}
+            if self._names is _STATE
+            else {
+                "swarm/obstacle_collision_rate": self.collided_obstacle.astype(float),
+                "swarm/min_obstacle_distance": self.min_obstacle_distance.copy(),
+            }
+        )

@@ -248,6 +248,22 @@ def _known_by_other(pair: PairView) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
+def _obstacles(pair: PairView) -> np.ndarray:
+    """Return features of the obstacles that are nearest to the robot's plan and to the other's predicted motion."""
+    view, shape, parts = pair.view, pair.view.pos.shape, []
+    own = view.own_obstacle
+    of_pairs = [np.broadcast_to(array[:, :, None], shape[: array.ndim + 1]) for array in own[:2]]
+    towards = np.broadcast_to(own.towards[:, :, None], shape)
+    for gap, stage, way in ((*of_pairs, towards), view.their_obstacle):
+        near = np.isfinite(gap)
+        parts += [
+            np.tanh(gap[..., None] / _GAPS),
+            np.where(near, (stage + 1) / pair.horizon, 0.0)[..., None],
+            pair.turn(way),
+        ]
+    return np.concatenate(parts, axis=-1)
+
+
 def _mask(pair: PairView) -> np.ndarray:
     """Return the action mask: whether the other's predicted motion comes close to the robot's own plan, or the two
     would soon meet at constant velocities. Otherwise, communication is of no use."""
@@ -268,7 +284,7 @@ def _critic(pair: PairView) -> np.ndarray:
         np.clip(_flat(pair.turn(surprise), 3) / ERROR_RANGE, -2, 2),
         np.tanh(size / ERROR_SCALE),
         np.tanh(view.of_the_other(size) / ERROR_SCALE),  # swaps the two robots of a pair
-        pair.closeness(certain.approach(view.own_pos, view.plan).least),
+        pair.closeness(view.approach_of(certain).least),
         pair.closeness(view.plan_approach.least),
         view.of_the_other(prediction.remembers)[..., None],
     )
@@ -283,6 +299,7 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
     "memory": _memory,
     "plan": _plan,
     "told": _known_by_other,
+    "obstacles": _obstacles,
     "mask": _mask,
     "critic": _critic,
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
@@ -17,7 +17,8 @@ from quad_swarm.validation import checked, replaced, with_fields
 from quad_swarm.world.beliefs import other_indices, reverse_indices
 from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import Neighbours
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.obstacles import Obstacle
+from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm
 
@@ -58,7 +59,7 @@ class Outcome(NamedTuple):
 
     :param reward: team rewards, (E,)
     :param pair_rewards: the part of a robot's reward that belongs to one of the others, (E, n, n - 1): its request,
-        their collision or near miss, and an equal share of the goal reward
+        their collision or near miss, and equal shares of the goal reward and of the robot's collision with an obstacle
     :param reward_terms: the weighted terms "goal", "collision" and "requests", and "near_miss" if it has a weight, each
         (E,)
     :param terminated: whether a collision, or the arrival of all robots, ended the episode, (E,) bool
@@ -167,7 +168,8 @@ class RequestTask:
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
         """Draw a new episode for one swarm. All random numbers of the episode derive from ``rng``."""
-        self.place(swarm, *self.sampler.sample(rng), rng, checked=self.sampler.world is self.swarm.config)
+        name, starts, goals, obstacles = self.sampler.sample(rng)
+        self.place(swarm, name, starts, goals, rng, self.sampler.world is self.swarm.config, obstacles)
 
     def place(
         self,
@@ -177,10 +179,11 @@ class RequestTask:
         goals: np.ndarray,
         rng: np.random.Generator,
         checked: bool = False,
+        obstacles: Sequence[Obstacle] | None = None,
     ) -> None:
         """Start a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
         noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
-        self.swarm.reset(swarm, starts, goals, noise_seed, checked)
+        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
 
@@ -281,6 +284,9 @@ class RequestTask:
             present = report.others >= 0
             share = present * (terms["goal"][:, None] / np.maximum(present.sum(axis=2), 1))[..., None]
         pair_rewards = share - self.reward.collision * colliding - self.reward.request * messages
+        if report.obstacles is not None:
+            hits = report.obstacles.of(self.continuous_collisions)[1].any(axis=2, keepdims=True)
+            pair_rewards = pair_rewards - self.reward.collision * hits / max(requests.shape[2], 1)
         if near_misses is not None:
             pair_rewards -= near_misses
         return Outcome(
@@ -307,8 +313,11 @@ class RequestTask:
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """Return the `info` of a step: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
         report = outcome.report
-        who = {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
-        return who | {
+        more = {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
+        if report.obstacles is not None:
+            more["min_obstacle_distance"] = report.obstacles.distance.min(axis=(1, 2))
+            more["min_obstacle_distance_continuous"] = report.obstacles.distance_continuous.min(axis=(1, 2))
+        return more | {
             "scenario": np.array(self.scenario),
             "team_reward": outcome.reward,
             "pair_rewards": outcome.pair_rewards,
@@ -351,6 +360,7 @@ def task_of(options: TaskOptions, n_swarms: int = 1) -> RequestTask:
         options.world,
         **{name: getattr(options, name) for name in ("n_robots", "memory", "planner", "noise", "radio", "space")},
     )
+    config = for_scenario(config, options.scenario)
     sampler = ScenarioSampler(options.scenario, config.n_robots, config.space, config)
     for sentence in too_short(config, options.max_steps) if options.max_steps is not None else ():
         warn(sentence)

@@ -83,6 +83,12 @@ def plan(distance: float) -> Rule:
     return lambda view: view.plan_approach.least < distance
 
 
+def blocked(distance: float) -> Rule:
+    """Request from robots whose predicted motion leads closer to an obstacle than ``distance`` (m), between surfaces:
+    they will not fly as predicted."""
+    return lambda view: view.their_obstacle.gap < distance
+
+
 def random(probability: float) -> Rule:
     """Request from each other robot with ``probability``, independently."""
     if not 0 <= probability <= 1:
@@ -104,6 +110,7 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
     "push": (push, ("EPS",)),
     "stale": (stale, ("STEPS",)),
     "plan": (plan, ("DIST",)),
+    "blocked": (blocked, ("DIST",)),
     "random": (random, ("P",)),
 }
 

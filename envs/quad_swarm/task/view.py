@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,20 @@ from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
 from quad_swarm.world.knowledge import Knowledge, SeenByOthers
+
+
+class ObstacleApproach(NamedTuple):
+    """The point of trajectories that is nearest to the surface of an obstacle, where there is one.
+
+    :param gap: distance between the surfaces of robot and obstacle there, (...) (m), infinity without obstacles
+    :param stage: the step at which it is reached, counting from 0, (...)
+    :param towards: direction from the robot to the obstacle's centre or axis, (..., 3), world frame; 0 without
+        obstacles
+    """
+
+    gap: np.ndarray
+    stage: np.ndarray
+    towards: np.ndarray
 
 
 class View:
@@ -32,6 +47,7 @@ class View:
         self.memory = knowledge.config.memory
         self.horizon = knowledge.config.planner.horizon
         self.separation = knowledge.config.planner.separation
+        self._downwash = knowledge.config.planner.downwash
 
     @cached_property
     def _observed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -134,14 +150,53 @@ class View:
 
     @cached_property
     def plan_approach(self) -> PlanApproach:
-        """Closest approach of the robot's own plan to the predicted others."""
-        return self.prediction.approach(self.own_pos, self.plan)
+        """Closest approach of the robot's own plan to the predicted others, in the metric of the planner's downwash."""
+        return self.approach_of(self.prediction)
+
+    def approach_of(self, prediction: Prediction) -> PlanApproach:
+        """Return the closest approach of the robot's own plan to other predictions, in the same metric."""
+        return prediction.flattened(1 / self._downwash).approach(self._flat(self.own_pos), self._flat(self.plan))
+
+    def _flat(self, vectors: np.ndarray) -> np.ndarray:
+        """Return vectors with heights divided by the downwash."""
+        return vectors if self._downwash == 1 else np.array([1.0, 1.0, 1 / self._downwash]) * vectors
+
+    @cached_property
+    def own_obstacle(self) -> ObstacleApproach:
+        """The nearest obstacle to the robot's own plan, (E, n) each."""
+        return self._nearest_obstacle(self.absolute_plans[:, :, None, 1:], 0)
+
+    @cached_property
+    def their_obstacle(self) -> ObstacleApproach:
+        """The nearest obstacle to the predicted motion of each of the others, (E, n, n - 1) each."""
+        return self._nearest_obstacle(self.prediction.believed(), None)
+
+    def _nearest_obstacle(self, trajectories: np.ndarray, chosen: int | None) -> ObstacleApproach:
+        """Return the nearest obstacles to trajectories, (E, n, m, N, 3), of all m or of a chosen one."""
+        obstacles, config, shape = self._knowledge.obstacles, self._knowledge.config, trajectories.shape[:3]
+        if obstacles is None:
+            found = ObstacleApproach(np.full(shape, np.inf), np.zeros(shape, np.int64), np.zeros((*shape, 3)))
+        else:
+            times = config.planner.dt * np.arange(1.0, self.horizon + 1)
+            centres = obstacles.ahead(np.broadcast_to(times, (*shape[:2], self.horizon)))[:, :, None]
+            between = obstacles.factors[:, None, None, :, None] * (centres - trajectories[:, :, :, None])
+            distance = length(between)
+            gaps = distance - (obstacles.radius + config.radius)[:, None, None, :, None]
+            gaps[np.broadcast_to(~obstacles.present[:, None, None, :, None], gaps.shape)] = np.inf
+            flat = gaps.reshape(*shape, -1)
+            nearest = flat.argmin(axis=-1)[..., None]
+            away = np.take_along_axis(distance.reshape(*shape, -1), nearest, axis=-1)
+            towards = np.take_along_axis(between.reshape(*shape, -1, 3), nearest[..., None], axis=-2)[..., 0, :]
+            gap = np.take_along_axis(flat, nearest, axis=-1)[..., 0]
+            towards = np.where(np.isfinite(gap)[..., None], towards / np.maximum(away, 1e-6), 0.0)
+            found = ObstacleApproach(gap, nearest[..., 0] % self.horizon, towards)
+        return found if chosen is None else ObstacleApproach(*(array[:, :, chosen] for array in found))
 
     def approach(self, look_ahead: float) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the closest approach at constant velocities.
+        """Compute the closest approach at constant velocities, in the metric of the planner's downwash.
 
         :param look_ahead: latest time to consider (s)
         :return: distance (m) and time from now (s), both (E, n, n - 1)
         """
-        nearest, time = closest_approach(self.pos, self.vel, look_ahead)
+        nearest, time = closest_approach(self._flat(self.pos), self._flat(self.vel), look_ahead)
         return length(nearest), time

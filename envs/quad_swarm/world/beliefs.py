@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cache
 from typing import NamedTuple
@@ -126,6 +126,13 @@ class Prediction:
         :param stages: indices among the next N steps, counting from 0; None for all
         """
         return pairs.believe(self.pos, self.vel, self.remembered, self.remembers, self.dt, stages)
+
+    def flattened(self, factor: float) -> Prediction:
+        """Return the prediction with heights and vertical velocities multiplied by a factor, itself for 1."""
+        if factor == 1:
+            return self
+        flat = np.array([1.0, 1.0, factor])
+        return replace(self, pos=flat * self.pos, vel=flat * self.vel, remembered=flat * self.remembered)
 
     def approach(self, own: np.ndarray, plan: np.ndarray) -> PlanApproach:
         """Compute the distances between plans and predictions.

@@ -15,6 +15,7 @@ from quad_swarm.native.pairs import resample
 from quad_swarm.planner import Problems
 from quad_swarm.quadrotor import QuadrotorModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
+from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.presets import SwarmConfig
 
 # Distance (in separations) from which an observation contradicts a plan that arrives: who keeps apart from the plan
@@ -77,6 +78,10 @@ class Knowledge(Protocol):
     def neighbours(self) -> Perceived:
         """The others that the robots perceive."""
 
+    @property
+    def obstacles(self) -> Obstacles | None:
+        """The obstacles, which all robots know, None in a world without any."""
+
     def estimate(self) -> np.ndarray:
         """Return the robots' estimates of their own states, (E, n, 9)."""
 
@@ -115,6 +120,7 @@ def make_problems(
     source: np.ndarray,
     u: np.ndarray,
     late: np.ndarray | None,
+    obstacles: Obstacles | None,
 ) -> Problems:
     """Return robots' planning problems, which start when their inputs take effect.
 
@@ -127,6 +133,7 @@ def make_problems(
     :param source: `BeliefSource` of each, (E, n, n - 1)
     :param u: inputs that act until then, (E, n, 4)
     :param late: when the inputs take effect, as a fraction of a step, (E, n); None if all do so at once
+    :param obstacles: obstacles, which follow the others among the bodies of a problem, None for none
     """
     x = estimate
     if late is not None:
@@ -137,4 +144,30 @@ def make_problems(
         announced = (source != int(BeliefSource.CONSTANT_VELOCITY)).reshape(-1, source.shape[2])
     others = believed.reshape(-1, *believed.shape[2:])
     # Copies: a solver that writes into its problem must not move robots or goals
-    return Problems(x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced)
+    problems = Problems(x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced)
+    return problems if obstacles is None else _among(obstacles, problems, config, late)
+
+
+def _among(obstacles: Obstacles, problems: Problems, config: SwarmConfig, late: np.ndarray | None) -> Problems:
+    """Add obstacles to problems, see `make_problems`."""
+    planner, (n_swarms, k) = config.planner, obstacles.radius.shape
+    count, m = problems.others.shape[:2]
+    n = count // n_swarms
+    times = np.broadcast_to(planner.dt * np.arange(1.0, planner.horizon + 1), (n_swarms, n, planner.horizon))
+    if late is not None:
+        times = times + planner.dt * late[..., None]
+    expected = obstacles.ahead(times).reshape(count, k, planner.horizon, 3)
+    shape, size = np.ones((n_swarms, n, m + k, 3)), np.zeros((n_swarms, n, m + k))
+    shape[..., :m, 2] = 1 / planner.downwash
+    kept = config.radius + config.obstacle_margin
+    shape[..., m:, :] = obstacles.factors[:, None]
+    size[..., m:] = (obstacles.radius + kept - planner.separation)[:, None]
+    announced = problems.announced
+    if announced is not None:
+        announced = np.concatenate([announced, np.zeros((count, k), bool)], axis=1)
+    return problems._replace(
+        others=np.concatenate([problems.others, expected], axis=1),
+        announced=announced,
+        shape=shape.reshape(count, m + k, 3),
+        size=size.reshape(count, m + k),
+    )

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -23,7 +23,8 @@ from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.doubts import doubts, far_goals, short_horizon, warn
 from quad_swarm.world.neighbours import Neighbourhood
-from quad_swarm.world.scenarios import SCENARIOS, Extent, ScenarioSpace, extent
+from quad_swarm.world.obstacles import Obstacle, ObstacleConfig, clearances, surroundings
+from quad_swarm.world.scenarios import SCENARIOS, Extent, ScenarioSpace, extent, most_obstacles
 
 PRESET_VERSION = 1
 
@@ -52,6 +53,7 @@ class SwarmConfig:
     :param sensing: errors of the estimated states
     :param radio: transmission of plans
     :param neighbourhood: which others robots perceive and may request plans from, see `quad_swarm.world.neighbours`
+    :param obstacles: obstacles
     :param plant: simulated vehicle: "model" for the planner's model (with the disturbances), or for example
         "crazyflow:cf21B_500" for a vehicle of that simulator, see `quad_swarm.plants`
     :param mismatch: maximum relative deviation of each vehicle's parameters from the planner's model, drawn uniformly
@@ -79,6 +81,7 @@ class SwarmConfig:
     sensing: SensingError = field(default_factory=SensingError)
     radio: Radio = field(default_factory=Radio)
     neighbourhood: Neighbourhood = field(default_factory=Neighbourhood)
+    obstacles: ObstacleConfig = field(default_factory=ObstacleConfig)
     plant: str = MODEL
     mismatch: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
@@ -149,18 +152,28 @@ class SwarmConfig:
         kept = separation + min(0.3 * separation, 0.2)
         return max(2 * self.radius, kept - 2 * self.goal_radius)
 
+    @property
+    def obstacle_margin(self) -> float:
+        """Distance that planners keep between the surfaces of robots and obstacles (m)."""
+        margin = self.obstacles.margin
+        return max(self.planner.separation - 2 * self.radius, 0.05) if margin is None else margin
+
     def outside(self, points: np.ndarray) -> np.ndarray:
         """Return the distances of points, (..., 3), to the workspace, (...) (m)."""
         low, high = self.planner.workspace_low, self.planner.workspace_high
         return np.linalg.norm(points - np.clip(points, low, high), axis=-1)
 
-    def check_flight(self, starts: Any, goals: Any) -> tuple[np.ndarray, np.ndarray]:
+    def check_flight(
+        self, starts: Any, goals: Any, obstacles: Sequence[Obstacle] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Check that robots can fly from starts to goals, and return them as arrays, (n, 3) each (m).
 
         :param starts: starts, (n, 3), world frame (m)
         :param goals: goals, (n, 3), world frame (m)
+        :param obstacles: obstacles, where they are at the start
         :raises ValueError: if they are not n finite points, a point is farther outside the workspace than half of the
-            goal radius, robots start in contact, or goals are too close for two robots to be at both
+            goal radius, robots start in contact with each other or an obstacle, goals are too close for two robots to
+            be at both, or a goal is too close to an obstacle that stands
         """
         starts, goals = points("starts", starts, self.n_robots), points("goals", goals, self.n_robots)
         for name, places, least in (
@@ -182,10 +195,31 @@ class SwarmConfig:
                     f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart, where {why}: place them at least "
                     f"{least + self.collision_tolerance:.3g} m apart"
                 )
+        if obstacles:
+            self._check_obstacles(starts, goals, obstacles)
         distance, warning = far_goals(self)
         if (np.linalg.norm(goals - starts, axis=1) > distance).any():
             warn(warning)
         return starts, goals
+
+    def _check_obstacles(self, starts: np.ndarray, goals: np.ndarray, obstacles: Sequence[Obstacle]) -> None:
+        touching = self.radius - self.collision_tolerance
+        stand = [number for number, one in enumerate(obstacles) if not any(one.velocity)]
+        kept = self.radius + self.obstacle_margin - self.goal_radius
+        for name, places, numbers, least in (
+            ("starts", starts, list(range(len(obstacles))), touching),
+            ("goals", goals, stand, max(touching, kept)),
+        ):
+            if not numbers:
+                continue
+            found = clearances(places, surroundings([obstacles[number] for number in numbers]))
+            robot, place = np.unravel_index(found.argmin(), found.shape)
+            if found[robot, place] < least:
+                why = "the robot touches it" if name == "starts" else "a robot that keeps its distance cannot be there"
+                raise ValueError(
+                    f"{name}[{robot}]={places[robot].tolist()} is {found[robot, place]:.3g} m from the surface of "
+                    f"obstacle {numbers[place]}, where {why}: choose a point at least {least:.3g} m away"
+                )
 
     def check_room(self, scenario: str, extent: Extent) -> None:
         """Check that the starts and goals of a scenario lie in the workspace.
@@ -295,6 +329,18 @@ def make_config(
     with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError):  # the check of the fields tells
         changes = _with_followers(base, changes)
     return replaced(base, changes)
+
+
+def for_scenario(config: SwarmConfig, scenario: str | Mapping[str, float]) -> SwarmConfig:
+    """Return a world with room for the obstacles of a scenario, or of a mixture; the world itself if that is enough.
+
+    :param config: the world
+    :param scenario: see `ScenarioSampler`
+    """
+    needed = most_obstacles([scenario] if isinstance(scenario, str) else list(scenario), config)
+    if config.obstacles.most is not None or needed <= config.obstacles.slots:
+        return config
+    return replace(config, obstacles=replace(config.obstacles, most=needed))
 
 
 def _with_followers(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,8 @@
-"""Starts and goals of robots (Sec. V-B).
+"""Starts and goals of robots (Sec. V-B), and obstacles between them.
 
-A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m). To add a scenario,
-write a function and add it to `SCENARIOS`.
+A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m), or ``(starts,
+goals, obstacles)``. To add a scenario, write a function and add it to `SCENARIOS`, and one with obstacles to
+`MOST_OBSTACLES`, too.
 """
 
 from __future__ import annotations
@@ -15,18 +16,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, Range, checked
+from quad_swarm.validation import LARGEST_LENGTH, Count, Length, PositiveLength, Range, checked
+from quad_swarm.world.obstacles import Obstacle, clearances, surroundings
 
 if TYPE_CHECKING:
     from quad_swarm.world.presets import SwarmConfig
 
 Rng = np.random.Generator
-Scenario = Callable[[int, "ScenarioSpace", Rng], tuple[np.ndarray, np.ndarray]]
+Scenario = Callable[[int, "ScenarioSpace", Rng], "tuple[np.ndarray, np.ndarray] | Scene"]
 
 _DRAWS_PER_POINT = 100  # before the whole set is redrawn
 _MAX_DRAWS = 20_000
 _MOST_ATTEMPTS = 100  # draws of a whole episode
 _TRIALS = 8  # episodes that are tried before the first one
+_DRAWS_PER_OBSTACLE = 30
+_FREE = 0.6  # distance of obstacles from starts and goals, in the distance of obstacles from each other
+_POST = 1.25  # radius of the pillars beside a doorway (m)
+_CROSSING = (1.0, 3.0)  # when traffic crosses the middle (s)
 
 
 @checked
@@ -40,6 +46,12 @@ class ScenarioSpace:
     :param circle_radius: minimum and maximum radius of the circle of `symmetric_swap` (m)
     :param circle_jitter: maximum displacement of starts and goals of `symmetric_swap` along each axis (m)
     :param sector_radius: minimum and maximum distance of the starts of `asymmetric_swap` from the centre (m)
+    :param pillars: minimum and maximum number of pillars in `forest`
+    :param pillar_radius: minimum and maximum of their radius (m)
+    :param doorway: minimum and maximum width of the opening in `doorway` (m)
+    :param traffic: minimum and maximum number of spheres that cross in `crossing_traffic`
+    :param traffic_radius: minimum and maximum of their radius (m)
+    :param traffic_speed: minimum and maximum of their speed (m/s)
     :param whole_sectors: whether sectors of `asymmetric_swap` start at the x axis and are used completely, as in the
         paper (for four robots, one anywhere in each quadrant). By default they are centred on the x axis and used to
         80 %
@@ -53,8 +65,20 @@ class ScenarioSpace:
     circle_jitter: Length = 0.15
     sector_radius: Range = (2.0, 4.5)
     whole_sectors: bool = False
+    pillars: tuple[Count, Count] = (3, 8)
+    pillar_radius: Range = (0.1, 0.3)
+    doorway: Range = (1.8, 2.4)
+    traffic: tuple[Count, Count] = (2, 4)
+    traffic_radius: Range = (0.2, 0.3)
+    traffic_speed: Range = (0.5, 1.0)
 
     def __post_init__(self) -> None:
+        for name in ("pillars", "traffic"):
+            if getattr(self, name)[0] > getattr(self, name)[1]:
+                raise ValueError(f"space.{name}={getattr(self, name)}: it must be the lowest number first")
+        for name in ("pillar_radius", "traffic_radius", "doorway", "traffic_speed"):
+            if not getattr(self, name)[0] > 0:
+                raise ValueError(f"space.{name}={getattr(self, name)}: both must be positive")
         for name in ("circle_radius", "sector_radius"):
             if getattr(self, name)[0] < 0:
                 raise ValueError(f"space.{name}={getattr(self, name)}: a radius must not be negative")
@@ -64,6 +88,19 @@ class ScenarioSpace:
                 f"space.circle_jitter={self.circle_jitter}: starts must stay within {LARGEST_LENGTH:.0f} m, so with "
                 f"space.circle_radius={self.circle_radius} and space.heights={self.heights} it must be at most {most:g}"
             )
+
+
+class Scene(NamedTuple):
+    """An episode to fly.
+
+    :param starts: starts, (n, 3), world frame (m)
+    :param goals: goals, (n, 3), world frame (m)
+    :param obstacles: obstacles
+    """
+
+    starts: np.ndarray
+    goals: np.ndarray
+    obstacles: tuple[Obstacle, ...] = ()
 
 
 class Extent(NamedTuple):
@@ -164,12 +201,115 @@ def symmetric_swap(n_robots: int, space: ScenarioSpace, rng: Rng) -> tuple[np.nd
     return _place(n_robots, draw_around(0.0), space.spacing), _place(n_robots, draw_around(np.pi), space.spacing)
 
 
-# In the order of the curriculum, by the number of requests needed (docs/method.md)
+def forest(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
+    """Forest: the symmetric swap with pillars in between, ``space.spacing`` from each other or more. Where fewer fit
+    than are drawn, there are as many as fit."""
+    starts, goals = symmetric_swap(n_robots, space, rng)
+    radius = float(np.hypot(*starts[:, :2].T).max())
+
+    def draw() -> Obstacle:
+        x, y = rng.uniform(-radius, radius, size=2)
+        return Obstacle((x, y, 0.0), rng.uniform(*space.pillar_radius))
+
+    count = int(rng.integers(space.pillars[0], space.pillars[1], endpoint=True))
+    free = np.concatenate([starts, goals])
+    return Scene(starts, goals, place_obstacles((space.pillars[0], count), draw, free, space.spacing))
+
+
+def doorway(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
+    """Doorway: two wide pillars leave an opening through which robots on either side fly to the places of those on the
+    other, as far as there are any."""
+    width = rng.uniform(*space.doorway)
+    pillars = tuple(Obstacle((0.0, side * (width / 2 + _POST), 0.0), _POST) for side in (-1, 1))
+    around, left = surroundings(pillars), (n_robots + 1) // 2
+    low, high = (space.spacing / 2, -space.half_width, space.heights[0]), (space.half_width, space.half_width)
+
+    def draw(i: int) -> np.ndarray:
+        for _ in range(_DRAWS_PER_POINT):
+            point = rng.uniform(low, (*high, space.heights[1]))
+            if clearances(point[None], around).min() >= _FREE * space.spacing:
+                break
+        else:
+            raise DoesNotFit(f"There is no room beside the doorway in space.half_width={space.half_width}.")
+        return point * (-1 if i < left else 1, 1, 1)
+
+    starts = _place(n_robots, draw, space.spacing)
+    right = n_robots - left
+    order = np.arange(n_robots)
+    order[:right], order[left:] = np.arange(left, n_robots), np.arange(right)
+    goals = starts[order]
+    goals[right:left] *= (-1, 1, 1)  # an odd robot has no partner
+    if ((np.delete(goals, right, axis=0) - goals[right]) ** 2).sum(axis=1).min() < space.spacing**2 and right < left:
+        raise DoesNotFit("The goal of the odd robot is taken.")
+    return Scene(starts, goals, pillars)
+
+
+def crossing_traffic(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
+    """Crossing traffic: the symmetric swap, which spheres cross in straight lines at a constant speed."""
+    starts, goals = symmetric_swap(n_robots, space, rng)
+
+    def draw() -> Obstacle:
+        direction, angle = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+        velocity = rng.uniform(*space.traffic_speed) * np.array([np.cos(direction), np.sin(direction), 0.0])
+        beside = rng.uniform(0, space.circle_radius[0] / 2)
+        middle = (beside * np.cos(angle), beside * np.sin(angle), rng.uniform(*space.heights))
+        start = middle - rng.uniform(*_CROSSING) * velocity
+        return Obstacle(tuple(start), rng.uniform(*space.traffic_radius), "sphere", tuple(velocity))
+
+    count = int(rng.integers(space.traffic[0], space.traffic[1], endpoint=True))
+    return Scene(starts, goals, place_obstacles((count, count), draw, starts, space.spacing))
+
+
+def place_obstacles(
+    number: tuple[int, int],
+    draw: Callable[[], Obstacle],
+    points: np.ndarray,
+    spacing: float,
+    present: Sequence[Obstacle] = (),
+) -> tuple[Obstacle, ...]:
+    """Draw obstacles whose surfaces keep a distance from each other, and a part of it from points.
+
+    :param number: minimum and maximum number; there are as many as fit
+    :param draw: draws one
+    :param points: points to keep free, (k, 3), world frame (m)
+    :param spacing: the distance (m)
+    :param present: obstacles that are there already
+    :raises DoesNotFit: if a limited number of draws finds fewer than the minimum
+    """
+    least, most = number
+    placed = list(present)
+    for _ in range(_DRAWS_PER_OBSTACLE * most):
+        one = draw()
+        gaps = clearances(points, surroundings([one])).min(initial=np.inf) / _FREE
+        if placed:
+            gaps = min(gaps, clearances(np.array([one.position]), surroundings(placed)).min() - one.radius)
+        if gaps >= spacing:
+            placed.append(one)
+        if len(placed) == len(present) + most:
+            break
+    if len(placed) < len(present) + least:
+        raise DoesNotFit(
+            f"{least} obstacles at least {spacing:g} m from each other and {_FREE * spacing:g} m from starts and goals "
+            "do not fit: choose fewer or smaller ones, or a smaller spacing."
+        )
+    return tuple(placed[len(present) :])
+
+
+# In the order of the curriculum, by the number of requests needed (docs/method.md), then those with obstacles
 SCENARIOS: dict[str, Scenario] = {
     "random": random,
     "random_swap": random_swap,
     "asymmetric_swap": asymmetric_swap,
     "symmetric_swap": symmetric_swap,
+    "forest": forest,
+    "doorway": doorway,
+    "crossing_traffic": crossing_traffic,
+}
+# Largest number of obstacles that scenarios place themselves
+MOST_OBSTACLES: dict[str, Callable[[ScenarioSpace], int]] = {
+    "forest": lambda space: space.pillars[1],
+    "doorway": lambda space: 2,
+    "crossing_traffic": lambda space: space.traffic[1],
 }
 MIXTURES = ("mixed", "curriculum")
 
@@ -177,14 +317,25 @@ MIXTURES = ("mixed", "curriculum")
 def extent(scenario: Scenario, space: ScenarioSpace) -> Extent | None:
     """Return the bounds of a scenario, None if it is not one of this module."""
     low, high = space.heights
-    if scenario in (random, random_swap):
+    if scenario in (random, random_swap, doorway):
         return Extent("half_width", space.half_width, low, high)
     if scenario is asymmetric_swap:
         return Extent("sector_radius", space.sector_radius[1], low, high)
-    if scenario is symmetric_swap:
+    if scenario in (symmetric_swap, forest, crossing_traffic):
         jitter = space.circle_jitter
         return Extent("circle_radius", space.circle_radius[1] + jitter, low - jitter, high + jitter)
     return None
+
+
+def without_obstacles() -> list[str]:
+    """Return the names of the scenarios that place no obstacles, those of mixtures."""
+    return [name for name in SCENARIOS if name not in MOST_OBSTACLES]
+
+
+def most_obstacles(names: Sequence[str], world: SwarmConfig) -> int:
+    """Return the largest number of obstacles in an episode of some scenarios of a world."""
+    placed = [MOST_OBSTACLES[name](world.space) for name in names if name in MOST_OBSTACLES]
+    return world.obstacles.least + max(placed, default=0)
 
 
 def _succeeds(scenario: Scenario, n_robots: int, space: ScenarioSpace, seed: int) -> bool:
@@ -233,11 +384,11 @@ def _larger(field: str, n_robots: int, space: ScenarioSpace) -> str:
 class ScenarioSampler:
     """Sampler of episodes of a scenario or a mixture of scenarios.
 
-    Draws that fail, or that the world refuses, are repeated.
+    Draws that fail, or that the world refuses, are repeated. The obstacles of the world follow those of the scenario.
 
-    :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among all of them; "curriculum" to draw uniformly
-        among the first ``level + 1`` of them; or a mapping of names to weights, such as ``{"symmetric_swap": 3,
-        "random": 1}``
+    :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among those without obstacles; "curriculum" to draw
+        uniformly among the first ``level + 1`` of them; or a mapping of names to weights, such as
+        ``{"symmetric_swap": 3, "random": 1}``
     :param n_robots: number of robots, at least 2
     :param space: the room
     :param world: the world that the episodes are flown in, whose `SwarmConfig.check_flight` then holds for each of them
@@ -268,6 +419,11 @@ class ScenarioSampler:
         self.world = world
         self.level = 0
         self._weights = np.array(weights) / sum(weights) if weights else None
+        if world is not None and (needed := most_obstacles(self._names, world)) > world.obstacles.slots:
+            raise ValueError(
+                f"obstacles.most={world.obstacles.slots}: in scenario={shown(name)}, there may be {needed} obstacles; "
+                "leave it out, or set it to that"
+            )
         # Fail now rather than during training
         for scenario in self._names:
             self._check_room(scenario)
@@ -275,6 +431,8 @@ class ScenarioSampler:
             if extent(SCENARIOS[scenario], space) is None:
                 for seed in range(_TRIALS):
                     self._attempt(scenario, np.random.default_rng(seed))
+            elif world is not None and world.obstacles.least:
+                self._try_obstacles(scenario)
 
     def _check_room(self, name: str) -> None:
         """Check a scenario of this module.
@@ -296,7 +454,21 @@ class ScenarioSampler:
             f"space.{bounds.field}={_larger(bounds.field, self.n_robots, self.space)}."
         )
 
-    def _attempt(self, name: str, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
+    def _try_obstacles(self, name: str) -> None:
+        """Check that about half of the attempts to draw an episode among the world's obstacles succeed.
+
+        :raises ValueError: if they do not
+        """
+        failed = 0
+        for seed in range(_TRIALS):
+            try:
+                self._attempt(name, np.random.default_rng(seed))
+            except ValueError:
+                failed += 1
+                if 2 * failed > _TRIALS:
+                    raise
+
+    def _attempt(self, name: str, rng: Rng) -> Scene:
         """Draw an episode once.
 
         :raises DoesNotFit: if the robots do not fit
@@ -304,27 +476,62 @@ class ScenarioSampler:
         """
         scenario = SCENARIOS[name]
         drawn = scenario(self.n_robots, self.space, rng)
-        if extent(scenario, self.space) is not None or self.world is None:
-            return drawn
+        ours = extent(scenario, self.space) is not None
         try:
-            starts, goals = drawn
+            scene = Scene(*drawn)
+            obstacles = tuple(scene.obstacles)
+            if not all(isinstance(one, Obstacle) for one in obstacles):
+                raise ValueError
         except (TypeError, ValueError):
-            raise ValueError(f"Scenario {name!r} returns {shown(drawn)}: it must return starts and goals.") from None
-        try:
-            return self.world.check_flight(starts, goals)
-        except ValueError as error:
-            raise ValueError(f"Scenario {name!r}: {error}") from None
+            raise ValueError(
+                f"Scenario {name!r} returns {shown(drawn)}: it must return starts and goals, and may return a sequence "
+                "of `Obstacle`."
+            ) from None
+        if self.world is None:
+            return scene
+        if not ours:
+            try:
+                scene = Scene(*self.world.check_flight(scene.starts, scene.goals, obstacles), obstacles)
+            except ValueError as error:
+                raise ValueError(f"Scenario {name!r}: {error}") from None
+        return self._with_obstacles(scene, self.world, rng)
+
+    def _with_obstacles(self, scene: Scene, world: SwarmConfig, rng: Rng) -> Scene:
+        """Add the world's obstacles.
+
+        :raises DoesNotFit: if those that are drawn do not fit
+        :raises ValueError: if those that are listed are in the way of a start or a goal
+        """
+        config = world.obstacles
+        if not config.least:
+            return scene
+        if config.listed:
+            world.check_flight(scene.starts, scene.goals, config.listed)
+        present = (*scene.obstacles, *config.listed)
+        low, high = (-self.space.half_width, self.space.heights[0]), (self.space.half_width, self.space.heights[1])
+
+        def draw() -> Obstacle:
+            x, y = rng.uniform(low[0], high[0], size=2)
+            angle, speed = rng.uniform(0, 2 * np.pi), rng.uniform(*config.speed)
+            velocity = (speed * np.cos(angle), speed * np.sin(angle), 0.0)
+            return Obstacle((x, y, rng.uniform(low[1], high[1])), rng.uniform(*config.radius), config.shape, velocity)
+
+        spacing = self.space.spacing if config.spacing is None else config.spacing
+        count = int(rng.integers(config.number[0], config.number[1], endpoint=True))
+        free = np.concatenate([scene.starts, scene.goals])
+        drawn = place_obstacles((config.number[0], count), draw, free, spacing, present)
+        return scene._replace(obstacles=(*present, *drawn))
 
     @property
     def _names(self) -> list[str]:
         if not isinstance(self.name, str):
             return list(self.name)
-        return list(SCENARIOS) if self.name in MIXTURES else [self.name]
+        return without_obstacles() if self.name in MIXTURES else [self.name]
 
     @property
     def n_levels(self) -> int:
         """Number of curriculum levels, 1 without a curriculum."""
-        return len(SCENARIOS) if self.name == "curriculum" else 1
+        return len(self._names) if self.name == "curriculum" else 1
 
     def _active(self) -> list[str]:
         return self._names[: self.level + 1] if self.name == "curriculum" else self._names
@@ -340,8 +547,9 @@ class ScenarioSampler:
             )
         self.level = level
 
-    def sample(self, rng: Rng) -> tuple[str, np.ndarray, np.ndarray]:
-        """Draw an episode and return the scenario's name, starts (n, 3) and goals (n, 3), world frame (m).
+    def sample(self, rng: Rng) -> tuple[str, np.ndarray, np.ndarray, tuple[Obstacle, ...]]:
+        """Draw an episode and return the scenario's name, starts (n, 3) and goals (n, 3), world frame (m), and
+        obstacles.
 
         :raises ValueError: if a registered scenario returns starts or goals that the world refuses again and again
         """

@@ -19,6 +19,7 @@ from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
+from quad_swarm.world.obstacles import Obstacle, Obstacles
 from quad_swarm.world.presets import SwarmConfig, points
 from quad_swarm.world.radio import make_channel
 from quad_swarm.world.realisation import Realisation
@@ -26,6 +27,28 @@ from quad_swarm.world.swarm_state import SwarmState
 
 # Distance (in separations) at which an empty slot shows a robot, far beyond all plans
 _EMPTY_SLOT = 30.0
+
+
+class ObstacleReport(NamedTuple):
+    """What robots of E swarms met among K obstacles in one step.
+
+    :param distance: distance between the surfaces of each robot and each obstacle after the step, (E, n, K) (m),
+        infinity for obstacles that are not there
+    :param distance_continuous: the smallest during the step, (E, n, K) (m)
+    :param colliding: which obstacles each robot touches after the step, (E, n, K) bool
+    :param colliding_continuous: which it touches at any time during the step, (E, n, K) bool
+    """
+
+    distance: np.ndarray
+    distance_continuous: np.ndarray
+    colliding: np.ndarray
+    colliding_continuous: np.ndarray
+
+    def of(self, continuous: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return distances and who collides, at any time of the step or after it."""
+        if continuous:
+            return self.distance_continuous, self.colliding_continuous
+        return self.distance, self.colliding
 
 
 class StepReport(NamedTuple):
@@ -40,8 +63,9 @@ class StepReport(NamedTuple):
     :param colliding: which of the others each robot collides with after the step, (E, n, n - 1) bool
     :param colliding_continuous: which of the others each robot collides with at any time during the step,
         (E, n, n - 1) bool
-    :param collision: whether two robots collide after the step (the paper's check), (E,) bool
-    :param collision_continuous: whether two robots collide at any time during the step, (E,) bool
+    :param collision: whether two robots, or a robot and an obstacle, collide after the step (the paper's check), (E,)
+        bool
+    :param collision_continuous: whether they collide at any time during the step, (E,) bool
     :param changed: whether another robot, or none, is in the slot after the step, (E, n, n - 1) bool; None if slots
         never change
     :param moved: distance that each robot flew, (E, n) (m)
@@ -51,6 +75,10 @@ class StepReport(NamedTuple):
     :param plan_status: `PlanStatus` of each robot's plan, (E, n)
     :param iterations: solver iterations of each robot, (E, n)
     :param solve_seconds: wall-clock time of the planner's batch call (s)
+    :param obstacles: what robots met among obstacles, None in a world without any
+
+    With `PlannerConfig.downwash`, separations are those in the ellipsoids' metric, in which vertical distances count
+    less.
     """
 
     min_separation: np.ndarray
@@ -69,6 +97,7 @@ class StepReport(NamedTuple):
     plan_status: np.ndarray
     iterations: np.ndarray
     solve_seconds: float
+    obstacles: ObstacleReport | None = None
 
 
 class Swarm(SwarmState):
@@ -87,7 +116,9 @@ class Swarm(SwarmState):
 
     def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
         self.config = config
-        self.planner: Planner = make_planner(config.planner, config.quadrotor, config.n_others + 1, solver)
+        self.planner: Planner = make_planner(
+            config.planner, config.quadrotor, config.n_others + 1, solver, config.obstacles.slots
+        )
         self.planner.checks = False
         n, horizon = config.n_robots, config.planner.horizon
         self._plant = make_plant(config.plant, config.quadrotor, config.planner.dt / config.substeps, n_swarms, n)
@@ -105,6 +136,7 @@ class Swarm(SwarmState):
             _other_beliefs=make_beliefs(config, n_swarms, n) if differ else None,
             disturbances=Realisation(config, n_swarms),
             neighbours=Neighbours(n_swarms, n, config.neighbourhood),
+            obstacles=Obstacles.of(config.obstacles, n_swarms),
         )
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
@@ -206,25 +238,36 @@ class Swarm(SwarmState):
         return np.sqrt(_dot(between, between))[:, self._pair_of]
 
     def reset(
-        self, swarm: int, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0, checked: bool = False
+        self,
+        swarm: int,
+        starts: np.ndarray,
+        goals: np.ndarray,
+        obstacles: Sequence[Obstacle] | None = None,
+        noise_seed: int = 0,
+        checked: bool = False,
     ) -> None:
         """Place the robots of one swarm at rest.
 
         :param swarm: index of the swarm
         :param starts: starts, (n, 3), world frame (m)
         :param goals: goals, (n, 3), world frame (m)
+        :param obstacles: the obstacles, by default those that the world lists
         :param noise_seed: seed of the disturbances, unused without any
         :param checked: whether the starts and goals are known to fit the world, as those of a `ScenarioSampler` are
-        :raises ValueError: if robots cannot fly from these starts to these goals, see `SwarmConfig.check_flight`
+        :raises ValueError: if robots cannot fly from these starts to these goals, see `SwarmConfig.check_flight`, or
+            there are more obstacles than the world has room for
         """
         n = self.config.n_robots
+        obstacles = self.config.obstacles.listed if obstacles is None else tuple(obstacles)
         if checked:
             starts, goals = points("starts", starts, n), points("goals", goals, n)
         else:
-            starts, goals = self.config.check_flight(starts, goals)
+            starts, goals = self.config.check_flight(starts, goals, obstacles)
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
         self.goal[swarm] = goals
+        if self.obstacles is not None or obstacles:
+            (self.obstacles or Obstacles(1, 0)).reset(swarm, obstacles)
         for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
             beliefs.forget(np.array([swarm]))
         hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
@@ -311,7 +354,7 @@ class Swarm(SwarmState):
         """Return the robots' planning problems, which start when their inputs take effect."""
         start = self.disturbances.start
         late = None if start is None else start / self.config.substeps
-        arguments = (self._estimate(), self.goal, believed, source, self._u, late)
+        arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles)
         return make_problems(self.config, self.planner.model, *arguments)
 
     def _fly(self) -> np.ndarray:
@@ -335,7 +378,14 @@ class Swarm(SwarmState):
         others = self.neighbours.others if self.neighbours.limited else None
         contact = 2 * self.config.radius - self.config.collision_tolerance
         # Of all pairs, including those that do not perceive each other
-        measured = measure(positions, self.goal, contact, self.config.goal_radius, others)
+        measured = measure(positions, self.goal, contact, self.config.goal_radius, others, self.config.planner.downwash)
+        collision, collision_continuous = (
+            one < contact for one in (measured.min_separation, measured.min_separation_continuous)
+        )
+        obstacles = self._report_obstacles(positions)
+        if obstacles is not None:
+            collision = collision | obstacles.colliding.any(axis=(1, 2))
+            collision_continuous = collision_continuous | obstacles.colliding_continuous.any(axis=(1, 2))
         shape = self.state.shape[:2]
         return StepReport(
             min_separation=measured.min_separation,
@@ -344,8 +394,8 @@ class Swarm(SwarmState):
             separation=measured.separation,
             colliding=measured.colliding,
             colliding_continuous=measured.colliding_continuous,
-            collision=measured.min_separation < contact,
-            collision_continuous=measured.min_separation_continuous < contact,
+            collision=collision,
+            collision_continuous=collision_continuous,
             changed=None,
             moved=measured.moved,
             at_goal=measured.at_goal,
@@ -354,7 +404,18 @@ class Swarm(SwarmState):
             plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
             iterations=self._plans.iterations.reshape(shape).copy(),
             solve_seconds=solve_seconds,
+            obstacles=obstacles,
         )
+
+    def _report_obstacles(self, positions: np.ndarray) -> ObstacleReport | None:
+        """Let the obstacles move for a step, and return what robots meet."""
+        config, obstacles = self.config, self.obstacles
+        if obstacles is None:
+            return None
+        after, during = obstacles.measure(positions, config.radius, config.planner.dt)
+        obstacles.advance(config.planner.dt)
+        contact = -config.collision_tolerance
+        return ObstacleReport(after, during, after < contact, during < contact)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from quad_swarm.planner import Plans, PlanStatus
 from quad_swarm.states import MOST_STEPS, like
 from quad_swarm.world.beliefs import Beliefs
 from quad_swarm.world.neighbours import Neighbours
+from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.radio import RadioChannel
 from quad_swarm.world.realisation import Realisation
 
@@ -43,6 +44,7 @@ class SwarmState:
     _other_beliefs: Beliefs | None
     disturbances: Realisation
     neighbours: Neighbours
+    obstacles: Obstacles | None
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""

@@ -52,7 +52,7 @@ def test_programs_answer_as_the_model_without_what_critics_see(tmp_path):
     actor, model = export(MODEL, config, tmp_path).actor(), load_model(MODEL, "sb3_maddpg:MADDPG")
     predictor, observation, n_bits = fitted(model, MODEL, config)
     swarm, rng = Swarm(config), np.random.default_rng(0)
-    _, starts, goals = ScenarioSampler("symmetric_swap", 3, config.space, config).sample(rng)
+    _, starts, goals, _ = ScenarioSampler("symmetric_swap", 3, config.space, config).sample(rng)
     swarm.reset(0, starts, goals, 1)
     asked = 0
     for _ in range(20):

@@ -180,6 +180,63 @@ def test_considers_only_the_nearest(solver):
     assert_same(limited, two.plan(Problems(x, goal, others[:, [1, 3]]), last))
 
 
+SHAPES = {"sphere": (1.0, 1.0, 1.0), "cylinder": (1.0, 1.0, 0.0), "ellipsoid": (1.0, 1.0, 0.5)}
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_keeps_clear_of_bodies_of_any_shape_and_size(shape, solver):
+    """A robot flies to the other side of a body, past a robot beside it: over it, if it is not too high."""
+    config = PlannerConfig(separation=0.8, workspace_high=(9.0, 9.0, 9.0), repulsion_weight=0.0)
+    planner = make_planner(config, QUADROTOR, 2, solver, n_obstacles=1)
+    x = np.zeros((1, 9))
+    x[0, :3] = [-2.5, 0.05, 2.0]
+    bodies, factors, size = np.array([[0.0, -1.6, 2.0], [0.0, 0.0, 1.2]]), np.array([(1, 1, 1), SHAPES[shape]]), 0.3
+    others = np.repeat(bodies[None, :, None], config.horizon, axis=2)
+    problems = Problems(x, np.array([[2.5, 0.0, 2.0]]), others, shape=factors[None], size=np.array([[0.0, size]]))
+    plans, positions = hover(problems, config), []
+    for _ in range(70):
+        plans = planner.plan(problems, plans)
+        problems = problems._replace(x=plans.x[:, 1])
+        positions.append(problems.x[0, :3])
+    distances = np.linalg.norm(factors * (np.array(positions)[:, None] - bodies), axis=-1).min(axis=0)
+    assert distances[0] > 0.8 - 2e-3
+    assert distances[1] == pytest.approx(0.8 + size, abs=2e-3)
+    assert np.linalg.norm(positions[-1] - problems.goal[0]) < 0.05
+    assert (max(z for _, _, z in positions) > 2.1) == (shape != "cylinder")
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_without_shapes_others_have_the_planners_downwash(solver):
+    config = PlannerConfig(downwash=2.0)
+    problems = crossing(3, config)
+    last = hover(problems, config)
+    shape = np.tile([1.0, 1.0, 0.5], (3, 2, 1))
+    planner = make_planner(config, QUADROTOR, 3, solver)
+    assert_same(planner.plan(problems, last), planner.plan(problems._replace(shape=shape), last))
+    flat = make_planner(PlannerConfig(), QUADROTOR, 3, solver)
+    assert not np.allclose(planner.plan(problems, last).u, flat.plan(problems, last).u)
+    with pytest.raises(ValueError, match="shape: this planner avoids spheres only"):
+        flat.plan(problems._replace(shape=shape), last)
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_a_large_body_far_away_takes_the_place_of_a_small_one_nearby(solver):
+    """What counts is the distance to the surface, in the metric of the shape."""
+    config = PlannerConfig(max_obstacles=1, max_neighbours=1)
+    x = np.zeros((1, 9))
+    x[0, 2] = 1.0
+    places = np.array([[0.9, 0, 1.0], [0, 1.2, 1.0], [-5.0, 0, 1.0], [0, -0.8, 7.0]])
+    others = np.repeat(places[None, :, None], config.horizon, axis=2)
+    shape, size = np.ones((1, 4, 3)), np.array([[0.0, 0.0, 4.3, 0.0]])
+    shape[0, 3, 2] = 0.0  # a pillar, whose height does not matter
+    problems = Problems(x, np.array([[3.0, 0.2, 1.0]]), others, shape=shape, size=size)
+    last = hover(problems, config)
+    limited = make_planner(config, QUADROTOR, 3, solver, n_obstacles=2)
+    nearest = make_planner(config, QUADROTOR, 2, solver, n_obstacles=1)
+    assert_same(limited.plan(problems, last), nearest.plan(problems.chosen(np.array([[2, 3]])), last))
+
+
 def test_a_limit_above_the_number_of_others_changes_nothing():
     problems, _, _ = scattered(PlannerConfig(), 4, 2)
     last = Plans.hover(problems.x, 10)

@@ -19,7 +19,7 @@ CONFIG = make_config("flight", n_robots=4)
 
 def places(config, episode=0):
     rng = np.random.default_rng([4, episode])
-    return ScenarioSampler("symmetric_swap", config.n_robots, config.space, config).sample(rng)[1:]
+    return ScenarioSampler("symmetric_swap", config.n_robots, config.space, config).sample(rng)[1:3]
 
 
 def test_a_world_that_stood_still_goes_on_from_there():

@@ -23,7 +23,7 @@ def flight_of(n=8, rule=RULE, **options):
 def begin(flight, episode, scenario="symmetric_swap"):
     config = flight.config
     rng = np.random.default_rng([12, episode])
-    _, starts, goals = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
+    _, starts, goals, _ = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
     flight.reset(starts, goals, episode)
 
 
@@ -42,7 +42,7 @@ def test_without_delays_it_is_the_flight_in_lock_step(n):
     full = RulePolicy("full")
     flight = VirtualFlight(config, [full] * n, timing=Timing(*[(0.0, 0.0)] * 5), late=0.0)
     lockstep = LockstepWorld(config, [Rounding(config, k, full) for k in range(n)])
-    _, starts, goals = ScenarioSampler("symmetric_swap", n, config.space, config).sample(np.random.default_rng(3))
+    _, starts, goals, _ = ScenarioSampler("symmetric_swap", n, config.space, config).sample(np.random.default_rng(3))
     lockstep.reset(starts, goals, 7)
     flight.reset(starts, goals, 7)
     for k in range(1, 61):

@@ -13,7 +13,7 @@ from quad_swarm.planner import make_planner
 from quad_swarm.robot import Plan, Robot, RulePolicy
 from quad_swarm.robot.lockstep import LockstepWorld
 from quad_swarm.task.request_task import requests_of
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from sb3_maddpg.hub.pretrained import pretrained_folder
 
@@ -24,21 +24,21 @@ RULES = ["none", "full", "cpa:1.2s:3&stale:4", "event:0.05|push:0.1"]
 
 @functools.cache
 def planner_of(config):
-    return make_planner(config.planner, config.quadrotor, config.n_robots)
+    return make_planner(config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots)
 
 
 def differences(config, policies, rule, scenario, model=None, steps=60, episode=0, make_robot=Robot, at_edge=None):
     """Fly the same episode as a swarm and as robots, and yield what differs. Ends where ``at_edge(observed, differing
     bits)`` says that bits may differ.
     """
-    seed = first_episode(0) + episode
+    seed, config = first_episode(0) + episode, for_scenario(config, scenario)
     policy, task, rngs = begin(Condition(rule, scenario, config), [seed], model)
     swarm, rng = task.swarm, np.random.default_rng(seed)
-    _, starts, goals = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
+    _, starts, goals, obstacles = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
     noise_seed = int(rng.integers(2**63)) if config.is_random else 0
     robots = [make_robot(config, k, one, planner_of(config)) for k, one in enumerate(policies)]
     world = LockstepWorld(config, robots)
-    world.reset(starts, goals, noise_seed)
+    world.reset(starts, goals, noise_seed, obstacles)
     columns = [k for k, column in enumerate(task.observation.columns) if ".critic." not in column.name]
     for step in range(steps):
         observed = task.observe()[0][:, columns] if model else None
@@ -70,7 +70,10 @@ def differences(config, policies, rule, scenario, model=None, steps=60, episode=
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize(("preset", "n", "scenario"), [("paper", 4, "random"), ("flight-hard", 3, "symmetric_swap")])
+@pytest.mark.parametrize(
+    ("preset", "n", "scenario"),
+    [("paper", 4, "random"), ("flight-hard", 3, "symmetric_swap"), ("flight", 3, "crossing_traffic")],
+)
 def test_robots_with_rules_fly_as_the_swarm(preset, n, scenario, rule):
     config = make_config(preset, n_robots=n)
     assert not list(differences(config, [RulePolicy(rule) for _ in range(n)], rule, scenario))
@@ -158,8 +161,8 @@ class Rounding(Robot):
 class Punctual(Robot):
     """A robot that believes that its commands act at once."""
 
-    def reset(self, start, goal, late=0.0, kept=1, now=0):
-        super().reset(start, goal, 0.0, kept, now)
+    def reset(self, start, goal, late=0.0, **others):
+        super().reset(start, goal, 0.0, **others)
 
 
 class Ahead(Robot):

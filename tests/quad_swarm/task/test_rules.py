@@ -42,6 +42,7 @@ SCENE = view([[0, 0, 0], [4, 0.5, 0], [0, -3, 0]], [[0, 0, 0], [-2, 0, 0], [0, 0
         ("none&full|cpa:0.6:3", [[1, 0], [1, 0], [0, 0]]),
         ("event:0.1", [[1, 1], [1, 1], [1, 1]]),  # nobody has been asked yet
         ("stale:3", [[1, 1], [1, 1], [1, 1]]),
+        ("blocked:9", [[0, 0], [0, 0], [0, 0]]),  # without obstacles
     ],
 )
 def test_whom_a_rule_asks(text, asked):
@@ -188,3 +189,14 @@ def test_a_rule_keeps_its_state_with_lengths_in_separations_too(monkeypatch):
     for text in ("own:1", "own:1s"):
         rule = parse_rule(text)
         assert [rule(SCENE).all() for _ in range(3)] == [False, True, True]
+
+
+def test_blocked_asks_whose_predicted_motion_leads_to_an_obstacle():
+    """Robot 1 flies towards a pillar, others stand beside it."""
+    config = make_config("paper", n_robots=3, obstacles={"listed": [{"position": (2.0, 0, 0), "radius": 0.5}]})
+    swarm = Swarm(config)
+    places = np.array([[0.0, 0, 1], [4, 0, 1], [2, 2, 1]])
+    swarm.reset(0, places, places, checked=True)
+    swarm.state[0, 1, VELOCITY] = [-2.0, 0, 0]
+    assert parse_rule("blocked:0.1")(View(swarm))[0].tolist() == [[True, False], [False, False], [False, True]]
+    assert parse_rule("blocked:1.3")(View(swarm))[0].tolist() == [[True, True], [True, True], [True, True]]

@@ -99,3 +99,34 @@ def test_a_robot_knows_whom_it_answered_but_not_whether_the_answer_arrived(loss)
     assert (told.age[0, 0] >= horizon).all(), "nobody asked robot 0"
     assert view.seen_by_others([0, 3]).believed.shape[-2] == 2
     assert np.array_equal(view.seen_by_others([3]).believed[..., 0, :], told.believed[..., 3, :])
+
+
+def test_downwash_makes_others_above_and_below_nearer():
+    above = np.array([[0.0, 0, 1], [0, 0.4, 2.4], [3, 0, 1]])
+    view, flat = (View(swarm_at(above, planner={"downwash": c})) for c in (3.5, 1.0))
+    assert view.approach(1.0)[0][0, 0].tolist() == pytest.approx([np.hypot(0.4, 0.4), 3.0])
+    assert flat.approach(1.0)[0][0, 0].tolist() == pytest.approx([np.hypot(0.4, 1.4), 3.0])
+    assert view.plan_approach.least[0, 0].tolist() == pytest.approx([np.hypot(0.4, 0.4), 3.0])
+
+
+AMONG = {"listed": [{"position": (2.0, 0, 0), "radius": 0.5}, {"position": (9.0, 0.5, 1), "radius": 0.1}], "most": 3}
+
+
+def test_the_nearest_obstacle_to_plans_and_to_predicted_motion():
+    """Robot 1 flies at 2 m/s past the pillar, at 0.5 m beside its axis."""
+    view = View(swarm_at(POS, VEL, obstacles=AMONG))
+    horizon = view.horizon
+    own, their = view.own_obstacle, view.their_obstacle
+    assert own.gap[0, 0] == pytest.approx(2.0 - 0.5 - 0.3)
+    assert own.towards[0, 0].tolist() == pytest.approx([1.0, 0.0, 0.0])
+    # In 1 s, robot 1 gets from x = 4 to x = 2, where the pillar is to its right
+    assert (their.gap[0, 0, 0], their.stage[0, 0, 0]) == (pytest.approx(0.5 - 0.8), horizon - 1)
+    assert their.towards[0, 0, 0].tolist() == pytest.approx([0.0, -1.0, 0.0], abs=1e-9)
+    assert their.gap[0, 2, 1] == pytest.approx(their.gap[0, 0, 0]), "whoever sees it"
+
+
+def test_without_obstacles_there_is_nothing_near():
+    view = View(swarm_at(POS, VEL))
+    assert np.isinf(view.own_obstacle.gap).all()
+    assert np.isinf(view.their_obstacle.gap).all()
+    assert not view.their_obstacle.towards.any()

@@ -17,7 +17,7 @@ CONFIG = make_config("flight", n_robots=3)
 @pytest.mark.parametrize("source", [Swarm, Robot])
 def test_swarms_and_robots_are_sources_of_knowledge(source):
     for name, member in vars(Knowledge).items():
-        if name.startswith("_") or name in ("config", "goal", "beliefs", "neighbours"):
+        if name.startswith("_") or name in ("config", "goal", "beliefs", "neighbours", "obstacles"):
             continue
         assert inspect.signature(getattr(source, name)) == inspect.signature(member), name
 
@@ -40,7 +40,7 @@ def test_problems_start_when_inputs_take_effect(late):
     source[0, 1, 0] = BeliefSource.REMEMBERED
     shares = None if late is None else np.full((1, 3), late)
     arguments = (estimate, np.ones((1, 3, 3)), believed, source, np.zeros((1, 3, 4)), shares)
-    problems = make_problems(CONFIG, swarm.planner.model, *arguments)
+    problems = make_problems(CONFIG, swarm.planner.model, *arguments, None)
     moved = 0.0 if late is None else late * CONFIG.planner.dt * 2.0
     np.testing.assert_allclose(problems.x[:, 0], moved, rtol=0.02)
     np.testing.assert_allclose(problems.others[..., 0, 0], late or 0.0)

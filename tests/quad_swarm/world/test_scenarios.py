@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from quad_swarm import QuadSwarmEnv, QuadSwarmParallelEnv, QuadSwarmVectorEnv
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.world.presets import PRESETS, make_config
-from quad_swarm.world.scenarios import SCENARIOS, DoesNotFit, ScenarioSampler, ScenarioSpace
+from quad_swarm.world.scenarios import SCENARIOS, DoesNotFit, ScenarioSampler, ScenarioSpace, without_obstacles
 
 SPACE = ScenarioSpace()
 
@@ -26,7 +26,7 @@ def spacing(points: np.ndarray) -> float:
 @given(n_robots=st.integers(2, 9), seed=st.integers(0, 2**32))
 @settings(max_examples=40, deadline=None)
 def test_keeps_bounds_and_spacing(name, n_robots, seed):
-    starts, goals = SCENARIOS[name](n_robots, SPACE, np.random.default_rng(seed))
+    _, starts, goals, _ = ScenarioSampler(name, n_robots, SPACE).sample(np.random.default_rng(seed))
     assert starts.shape == goals.shape == (n_robots, 3)
     for points in (starts, goals):
         assert spacing(points) >= SPACE.spacing
@@ -63,7 +63,7 @@ def test_mixed_draws_all_scenarios_alike():
     sampler = ScenarioSampler("mixed", 4, SPACE)
     rng = np.random.default_rng(0)
     names = [sampler.sample(rng)[0] for _ in range(800)]
-    assert all(150 < names.count(name) < 250 for name in SCENARIOS)
+    assert all(150 < names.count(name) < 250 for name in without_obstacles())
 
 
 def test_curriculum_opens_scenarios_one_by_one():
@@ -71,7 +71,7 @@ def test_curriculum_opens_scenarios_one_by_one():
     rng = np.random.default_rng(0)
     for level in range(sampler.n_levels):
         sampler.set_level(level)
-        assert {sampler.sample(rng)[0] for _ in range(100)} == set(list(SCENARIOS)[: level + 1])
+        assert {sampler.sample(rng)[0] for _ in range(100)} == set(without_obstacles()[: level + 1])
     with pytest.raises(ValueError, match="Level 4 does not exist"):
         sampler.set_level(4)
     with pytest.raises(ValueError, match="levels 0 to 0"):
@@ -130,7 +130,7 @@ def test_robots_that_fit_at_construction_fit_at_every_reset(preset, n_robots):
     config = make_config(preset, n_robots=n_robots)
     sampler = ScenarioSampler("symmetric_swap", n_robots, config.space, config)
     for seed in range(40):  # 13 to 87 of 200 draws fail
-        _, starts, goals = sampler.sample(np.random.default_rng(seed))
+        _, starts, goals, _ = sampler.sample(np.random.default_rng(seed))
         assert min(spacing(starts), spacing(goals)) >= config.space.spacing
 
 
@@ -153,7 +153,7 @@ def test_a_room_is_refused_at_construction_or_never(name, n_robots, gap, half_wi
     except DoesNotFit:
         return
     for k in range(3):
-        _, starts, goals = sampler.sample(np.random.default_rng(seed + k))
+        _, starts, goals, _ = sampler.sample(np.random.default_rng(seed + k))
         assert min(spacing(starts), spacing(goals)) >= gap
 
 

@@ -19,7 +19,7 @@ def make_swarm(n_swarms: int, scenario: str = "asymmetric_swap", **overrides) ->
     swarm = Swarm(config, n_swarms)
     sampler = ScenarioSampler(scenario, config.n_robots, config.space)
     for k in range(n_swarms):
-        _, starts, goals = sampler.sample(np.random.default_rng(k))
+        _, starts, goals, _ = sampler.sample(np.random.default_rng(k))
         swarm.reset(k, starts, goals, noise_seed=k)
     return swarm
 

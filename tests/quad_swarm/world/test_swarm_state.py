@@ -7,7 +7,9 @@ from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
-KEYS = ["state", "goal", "input", "plans", "earlier", "beliefs", "presumed_beliefs", "chance", "neighbours"]
+KEYS = ["state", "goal", "input", "plans", "earlier", "beliefs", "presumed_beliefs", "chance"]
+KEYS += ["neighbours", "obstacles"]
+AMONG = {"obstacles": {"number": (1, 2), "speed": (0.5, 1.0)}}
 LIMITED = {"neighbourhood": {"max_others": 2}}
 
 
@@ -15,14 +17,15 @@ def flown(config, steps: int) -> Swarm:
     swarm = Swarm(config, 3)
     sampler = ScenarioSampler("random", config.n_robots, config.space, config)
     for k in range(3):
-        _, starts, goals = sampler.sample(np.random.default_rng(k))
-        swarm.reset(k, starts, goals, k)
+        swarm.reset(k, *sampler.sample(np.random.default_rng(k))[1:], noise_seed=k)
     for _ in range(steps):
         swarm.step(np.ones((3, config.n_robots, config.n_others), dtype=bool))
     return swarm
 
 
-@pytest.mark.parametrize("config", [make_config("paper"), make_config("flight-hard", LIMITED, n_robots=4)])
+@pytest.mark.parametrize(
+    "config", [make_config("paper"), make_config("flight-hard", LIMITED, n_robots=4), make_config("flight", AMONG)]
+)
 def test_copies_parts_and_states_hold_what_changes(config):
     swarm = flown(config, 5)
     state = swarm.state_dict()

@@ -47,6 +47,7 @@ def generate_model(problem: OptimalControlProblem) -> str:
     lines = ["// Generated from the optimal control problem. Arrays hold one vector of lanes for each number.", ""]
     lines += [f"constexpr int {name} = {value};" for name, value in constants.items()]
     lines += [
+        f"constexpr bool SHAPED = {str(problem.shaped).lower()};",
         f"constexpr double VIOLATION_WEIGHT = {problem.config.violation_weight!r};",
         _array("double", "MAX_INPUT", problem.max_input.full().ravel()),
         _array("int", "BOUNDED_STATE", state),
@@ -78,7 +79,8 @@ def formulas(problem: OptimalControlProblem) -> tuple[object, ...]:
         problem.box_violations(x),
     ]
     function = ca.Function("formulas", [x, u, x0, goal, others, distance], outputs)
-    return problem.config, problem.n_others, tuple(problem.max_input.full().ravel()), function.serialize()
+    sizes = problem.n_others, problem.shaped, *problem.max_input.full().ravel()
+    return problem.config, sizes, function.serialize()
 
 
 def _check_form(problem: OptimalControlProblem) -> None:
@@ -129,11 +131,16 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
     # Gauss-Newton approximation of the repulsion r(d)^2: gradient 2 r r', curvature 2 r'^2
     residual = problem.repulsion_residual(distance)
     slope = ca.jacobian(residual, distance)
-    if problem.n_others:
-        columns = [other, *(ca.SX.sym(f"other{j}", 3) for j in range(1, problem.n_others))]
-        separation = problem.distances(x, ca.horzcat(*columns))[0]
-    else:  # nobody: the kernel does not call the function
-        separation = OptimalControlProblem(problem.config, problem.quadrotor, 1).distances(x, other)[0]
+    # With nobody, the kernel does not call the function
+    some = problem if problem.n_others else OptimalControlProblem(problem.config, problem.quadrotor, 1, problem.shaped)
+    columns = [other, *(ca.SX.sym(f"other{j}", 3) for j in range(1, some.n_others))]
+    about_other = {"x": x, "other": other}
+    if problem.shaped:
+        about_other["shape"] = ca.SX.sym("shape", 3)
+        shapes = ca.horzcat(*[about_other["shape"]] * some.n_others)
+        separation = some.shaped_distances(x, ca.horzcat(*columns), shapes)[0]
+    else:
+        separation = some.distances(x, ca.horzcat(*columns))[0]
     return [
         _emit("input_gradient", {"u": u}, {"gradient": ca.gradient(problem.input_cost(u), u)}),
         _emit(
@@ -143,7 +150,7 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
         ),
         _emit(
             "separation",
-            {"x": x, "other": other},
+            about_other,
             {
                 "distance": separation,
                 "gap": separation - problem.config.separation,

@@ -30,6 +30,8 @@ struct Batch {
   const double* goal;     // (count, 3)
   const double* others;   // (count, N_OTHERS, N, 3)
   const double* clearance;  // (count, N_OTHERS, N), or null
+  const double* shape;    // (count, N_OTHERS, 3), or null
+  const double* size;     // (count, N_OTHERS), or null
   double* x_plan;         // (count, N + 1, 9)
   double* u_plan;         // (count, N, 4)
   std::uint8_t* success;  // (count,)
@@ -153,6 +155,7 @@ class LaneGroup {
  private:
   Stage<V> stages_[N];
   V x0_[NX], goal_[3];
+  V shape_[SHAPED ? N_OTHERS : 0][3], size_[SHAPED ? N_OTHERS : 0];
   V goal_gradient_[NX], goal_hessian_[N_SYMMETRIC];
   Mask iterations_, converged_, moving_;
 
@@ -170,6 +173,7 @@ class LaneGroup {
           for (int i = 0; i < 3; i++) s.others[j][i][q] = static_cast<T>(others[(j * N + k) * 3 + i]);
       }
     }
+    if constexpr (SHAPED) load_shapes(batch, problems, count);
     for (int k = 0; k < N; k++) {
       limit_inputs(stages_[k].u);
       for (int j = 0; j < N_OTHERS; j++) {
@@ -178,6 +182,17 @@ class LaneGroup {
           for (int q = 0; q < W; q++)
             stages_[k].clearance[j][q] =
                 static_cast<T>(batch.clearance[(problems[q < count ? q : count - 1] * N_OTHERS + j) * N + k]);
+      }
+    }
+  }
+
+  void load_shapes(const Batch& batch, const std::int64_t* problems, int count) {
+    for (int q = 0; q < W; q++) {
+      const std::int64_t first = problems[q < count ? q : count - 1] * N_OTHERS;
+      for (int j = 0; j < N_OTHERS; j++) {
+        for (int i = 0; i < 3; i++)
+          shape_[j][i][q] = static_cast<T>(batch.shape ? batch.shape[(first + j) * 3 + i] : 1.0);
+        size_[j][q] = static_cast<T>(batch.size ? batch.size[first + j] : 0.0);
       }
     }
   }
@@ -213,7 +228,13 @@ class LaneGroup {
       }
       for (int j = 0; j < N_OTHERS; j++) {
         V distance, gap;
-        ::separation<V>(x, s.others[j], &distance, &gap, s.direction[j]);
+        if constexpr (SHAPED) {
+          ::separation<V>(x, s.others[j], shape_[j], &distance, &gap, s.direction[j]);
+          distance -= size_[j];
+          gap -= size_[j];
+        } else {
+          ::separation<V>(x, s.others[j], &distance, &gap, s.direction[j]);
+        }
         ::repulsion<V>(&distance, &s.repulsion_gradient[j], &s.repulsion_curvature[j]);
         s.separation[j].start(gap - s.clearance[j]);
       }
@@ -453,10 +474,10 @@ void solve_all(const Batch& batch, const double* u_guess, const std::vector<std:
 
 extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
     std::int64_t count, const double* x, const double* goal, const double* others, const double* clearance,
-    const double* u_guess, double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations,
+    const double* shape, const double* size, const double* u_guess, double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations,
     std::int64_t sqp_iterations, std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
   std::vector<std::uint8_t> moving(count);
-  const Batch batch{x, goal, others, clearance, x_plan, u_plan, success, iterations, moving.data()};
+  const Batch batch{x, goal, others, clearance, shape, size, x_plan, u_plan, success, iterations, moving.data()};
   const Options options{max_iterations, tolerance};
   std::fill(iterations, iterations + count, 0);
   std::vector<std::int64_t> problems(count);

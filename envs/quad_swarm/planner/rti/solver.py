@@ -28,6 +28,8 @@ SIGNATURE = Signature(
     goal="B 3 f8",
     others="B m N 3 f8",
     clearance="B m N f8 optional",
+    shape="B m 3 f8 optional",
+    size="B m f8 optional",
     u_guess=f"B N {N_INPUTS} f8",
     x_plan=f"B N+1 {N_STATES} f8 out",
     u_plan=f"B N {N_INPUTS} f8 out",
@@ -104,12 +106,17 @@ class RtiSolver:
 
         :raises ValueError: if an array has another shape than the problem's
         """
-        clearance = problems.clearance
+        clearance, shape, size = (
+            None if array is None else np.asarray(array, float)
+            for array in (problems.clearance, problems.shape, problems.size)
+        )
         return self._compiled()(
             x=np.asarray(problems.x, float),
             goal=np.asarray(problems.goal, float),
             others=np.asarray(problems.others, float),
-            clearance=None if clearance is None else np.asarray(clearance, float),
+            clearance=clearance,
+            shape=shape,
+            size=size,
             u_guess=np.asarray(u_guess, float),
             sqp_iterations=self.sqp_iterations,
             extra_iterations=self.extra_iterations,

@@ -9,7 +9,7 @@ from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import make_config
-from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from quad_swarm.world.scenarios import ScenarioSampler, without_obstacles
 from quad_swarm.world.swarm import Swarm
 
 QUADROTOR = QuadrotorParams()
@@ -21,10 +21,10 @@ class Recorded:
 
     def __init__(self, preset: str, steps: range):
         config = make_config(preset)
-        swarm = Swarm(config, len(SCENARIOS) * len(RULES), "rti")
+        swarm = Swarm(config, len(without_obstacles()) * len(RULES), "rti")
         rngs = [np.random.default_rng(k) for k in range(swarm.n_swarms)]
         for k, rng in enumerate(rngs):
-            name = list(SCENARIOS)[k // len(RULES)]
+            name = without_obstacles()[k // len(RULES)]
             swarm.reset(k, *ScenarioSampler(name, config.n_robots, config.space).sample(rng)[1:])
         self.config = config.planner
         self.problem = OptimalControlProblem(config.planner, QUADROTOR, config.n_robots - 1)
