@@ -43,6 +43,11 @@ def closest_approach(
     return position + time[..., None] * velocity, time
 
 
+def flattened(vectors: np.ndarray, height: float) -> np.ndarray:
+    """Return vectors, (..., 3), in the metric of ellipsoids: vertical parts are divided by their height over width."""
+    return vectors if height == 1 else np.array([1.0, 1.0, 1 / height]) * vectors
+
+
 def to_quaternion(attitude: np.ndarray) -> np.ndarray:
     """Return roll, pitch and yaw (rad), (3,), as a quaternion x, y, z, w, (4,)."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(attitude / 2), np.cos(attitude / 2)

@@ -46,6 +46,8 @@ class Column(NamedTuple):
     text: Callable[[Mapping[str, Any]], str]
     wide: bool = True
     """Whether only the wide table has this column"""
+    needs: str | None = None
+    """A name that rows need; the table has the column if any row has it"""
 
 
 COLUMNS = [
@@ -54,6 +56,12 @@ COLUMNS = [
     Column("collided", lambda r: f"{r['collisions']}/{r['episodes']}"),
     Column("collisions", lambda r: f"{r['collisions'] / r['episodes']:.1%}", False),
     Column("95 % interval", lambda r: f"{100 * r['collision_low']:.1f} - {r['collision_high']:.1%}", False),
+    Column(
+        "obstacles",
+        lambda r: f"{r['obstacle_collisions'] / r['episodes']:.1%}",
+        wide=False,
+        needs="obstacle_collisions",
+    ),
     Column("> 1 cm", lambda r: str(r["collisions_1cm"])),
     Column("at steps", lambda r: str(r["collisions_at_steps"])),
     Column("any time", lambda r: f"{r['collisions_continuous'] / r['episodes']:.1%}", False),
@@ -65,6 +73,11 @@ COLUMNS = [
     Column("steps", lambda r: "-" if r["steps_to_arrival"] is None else f"{r['steps_to_arrival']:.1f}", False),
     Column("lost (s)", lambda r: "-" if r.get("time_lost") is None else f"{r['time_lost']:+.2f}"),
     Column("min. dist. (m)", lambda r: f"{r['min_separation_continuous']:.3f}"),
+    Column(
+        "to obst. (m)",
+        lambda r: "-" if r["min_obstacle_distance"] is None else f"{r['min_obstacle_distance']:.3f}",
+        needs="min_obstacle_distance",
+    ),
     Column("failures", lambda r: str(r["planner_failures"])),
     Column("us/solve", lambda r: f"{r['solve_us']:.0f}"),
 ]
@@ -79,10 +92,18 @@ def table_texts(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> list[l
     :param rows: rows of `evaluate`
     :param wide: whether to include all columns instead of the most important ones
     """
-    columns = [column for column in COLUMNS if wide or not column.wide]
+    columns = [
+        column
+        for column in COLUMNS
+        if (wide or not column.wide) and (column.needs is None or any(column.needs in row for row in rows))
+    ]
     names = short_names(row["policy"] for row in rows)
     shown = [{**row, "policy": names[row["policy"]]} for row in rows]
-    return [[column.title for column in columns], *([column.text(row) for column in columns] for row in shown)]
+
+    def text(column: Column, row: Mapping[str, Any]) -> str:
+        return column.text(row) if column.needs is None or column.needs in row else "-"
+
+    return [[column.title for column in columns], *([text(column, row) for column in columns] for row in shown)]
 
 
 def format_table(rows: Sequence[Mapping[str, Any]], wide: bool = False) -> str:

@@ -55,7 +55,9 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
         possible requests, and the maximum in a step; bytes that a robot sends per second (requests and answers); mean
         age of believed plans (s); requests in all steps flown; number of arrivals, and mean steps and path length (m)
         until arrival; smallest separation, and quantiles over episodes of the smallest separation at any time (m);
-        number of plans without a successful solve, and time of the planner per plan (us)
+        number of plans without a successful solve, and time of the planner per plan (us). In worlds with obstacles also
+        ``obstacle_collisions``, number of episodes that a collision with an obstacle ended, and
+        ``min_obstacle_distance`` (m)
     """
     n, dt = config.n_robots, config.planner.dt
     figures = {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -99,6 +101,15 @@ def summarise(rows: Sequence[Mapping[str, float]], config: SwarmConfig) -> dict[
         "path_length": float(figures["path_length"][arrived].mean()) if arrived.any() else None,
         "planner_failures": int(figures["planner_failures"].sum()),
         "solve_us": float(1e6 * figures["solve_seconds"].sum() / (figures["steps"].sum() * n)),
+        **(_among_obstacles(figures) if "collided_obstacle" in figures else {}),
+    }
+
+
+def _among_obstacles(figures: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    distance = float(figures["min_obstacle_distance"].min())
+    return {
+        "obstacle_collisions": int(figures["collided_obstacle"].sum()),
+        "min_obstacle_distance": distance if np.isfinite(distance) else None,
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.evaluation.policies import RequestPolicy, make_policy, name_of, policy_of
-from quad_swarm.geometry import closest_approach, length
+from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, requests_of
 from quad_swarm.task.rules import parse_rule
@@ -20,6 +20,7 @@ from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.doubts import too_short, warn
 from quad_swarm.world.neighbours import slots_to_robots
+from quad_swarm.world.obstacles import Obstacle, clearances, surroundings
 from quad_swarm.world.presets import SwarmConfig, for_scenario
 from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -200,6 +201,12 @@ class Flight:
     :param min_separation: smallest distance between two robots at the start and in each step, (T + 1,) (m): at any time
         of the step if the world's collisions are continuous, otherwise after the step
     :param inputs: inputs that the robots chose in each step, (T, n, 4); None if they are not known
+    :param obstacles: obstacles, where they are at the start
+    :param obstacle_pos: their centres, (T + 1, K, 3), world frame (m); None without any
+    :param min_obstacle_distance: smallest distance between the surfaces of a robot and an obstacle, (T + 1,) (m), when
+        ``min_separation`` is; None without any
+
+    With `PlannerConfig.downwash`, distances between robots are those in the ellipsoids' metric.
     """
 
     config: SwarmConfig
@@ -211,11 +218,23 @@ class Flight:
     other_requests: np.ndarray
     min_separation: np.ndarray
     inputs: np.ndarray | None = None
+    obstacles: tuple[Obstacle, ...] = ()
+    obstacle_pos: np.ndarray | None = None
+    min_obstacle_distance: np.ndarray | None = None
 
     @property
     def n_robots(self) -> int:
         """Number of robots n."""
         return len(self.goal)
+
+    def obstacles_at(self, step: int) -> tuple[Obstacle, ...]:
+        """Return the obstacles where they are after a step."""
+        if self.obstacle_pos is None:
+            return ()
+        return tuple(
+            replace(one, position=tuple(where))
+            for one, where in zip(self.obstacles, self.obstacle_pos[step].tolist(), strict=True)
+        )
 
     @property
     def pos(self) -> np.ndarray:
@@ -236,13 +255,14 @@ class Flight:
     @cached_property
     def separation(self) -> np.ndarray:
         """Distances of each robot to the others, (T + 1, n, n - 1) (m)."""
-        return length(self.relative_pos)
+        return length(flattened(self.relative_pos, self.config.planner.downwash))
 
     @cached_property
     def closest_approach(self) -> tuple[np.ndarray, np.ndarray]:
         """Distance (m) and time (s) of the closest approach at constant velocities from each step on, without a time
         limit, both (T + 1, n, n - 1)."""
-        nearest, time = closest_approach(self.relative_pos, self.relative_vel)
+        downwash = self.config.planner.downwash
+        nearest, time = closest_approach(*(flattened(one, downwash) for one in (self.relative_pos, self.relative_vel)))
         return length(nearest), time
 
     @cached_property
@@ -252,10 +272,18 @@ class Flight:
         return int(at_goal.argmax()) + 1 if at_goal.any() else None
 
     @cached_property
+    def colliding(self) -> np.ndarray:
+        """Whether two robots, or a robot and an obstacle, collide at the start and in each step as the world counts
+        collisions, (T + 1,) bool."""
+        colliding = self.min_separation < 2 * self.config.radius - self.config.collision_tolerance
+        if self.min_obstacle_distance is not None:
+            colliding |= self.min_obstacle_distance < -self.config.collision_tolerance
+        return colliding
+
+    @cached_property
     def collision(self) -> int | None:
-        """First step with a collision as the world counts them, None without a collision."""
-        colliding = self.min_separation[1:] < 2 * self.config.radius - self.config.collision_tolerance
-        return int(colliding.argmax()) + 1 if colliding.any() else None
+        """First step with a collision, None without a collision."""
+        return int(self.colliding[1:].argmax()) + 1 if self.colliding[1:].any() else None
 
     def closest_pair(self, step: int) -> tuple[int, int]:
         """Return the two robots that are closest to each other after a step."""
@@ -288,16 +316,27 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         return policy(task, rngs)
 
     closest: list[float] = []
+    among, beside = task.swarm.obstacles, list[float]()
+    obstacles = () if among is None else among.of_swarm(0)
+    centres = [] if among is None else [among.position[0, among.present[0]]]
     for step in fly_steps(recorded, task, rngs, condition.linger):
         report = step.outcome.report
         closest.append((report.min_separation_continuous if task.continuous_collisions else report.min_separation)[0])
+        if among is not None and report.obstacles is not None:
+            beside.append(report.obstacles.of(task.continuous_collisions)[0].min())
+            centres.append(among.position[0, among.present[0]])
         requests.append(step.requests[0])
         announced.append(step.announced[0])
         state.append(task.swarm.state[0].copy())
         plans.append(task.swarm.plans[0].copy())
         inputs.append(task.swarm.inputs[0].copy())
         goal = task.swarm.goal[0].copy()
-    start = state[0][:, POSITION]
-    closest.insert(0, length(start[other_indices(len(start))] - start[:, None]).min())
+    start, config = state[0][:, POSITION], condition.config
+    apart = flattened(start[other_indices(len(start))] - start[:, None], config.planner.downwash)
+    closest.insert(0, length(apart).min())
     arrays = map(np.array, (state, plans, goal, requests, announced, other_requests, closest, inputs))
-    return Flight(condition.config, *arrays)
+    flight = Flight(config, *arrays)
+    if not obstacles:
+        return flight
+    beside.insert(0, clearances(start, surroundings(obstacles)).min() - config.radius)
+    return replace(flight, obstacles=obstacles, obstacle_pos=np.array(centres), min_obstacle_distance=np.array(beside))

@@ -384,8 +384,9 @@ def recorded(samples: Sequence[Sample], config: SwarmConfig, goals: np.ndarray, 
             asked[k, report.robot] |= (np.uint64(report.asked) & bits) > 0
             told[k, report.robot] |= (np.uint64(report.told) & bits) > 0
     time, state, setpoint = map(np.array, zip(*((one.time, one.state, one.setpoint) for one in samples), strict=True))
-    world = dataclasses.asdict(config)
-    return Recording(time, state, setpoint, plan, asked, told, goals, world, policy)
+    world, arrays = dataclasses.asdict(config), (time, state, setpoint, plan, asked, told, goals)
+    obstacles = tuple(one.after(float(time[0])) for one in config.obstacles.listed)
+    return Recording(*arrays, world, policy, obstacles=obstacles)
 
 
 def _line(policy: str, number: int, flight: Flight) -> str:

@@ -12,9 +12,10 @@ import numpy as np
 
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import short_name
-from quad_swarm.evaluation.recordings import MEASURED, Recording
+from quad_swarm.evaluation.recordings import MEASURED, Meetings, Recording
 from quad_swarm.evaluation.rows import aligned
 from quad_swarm.geometry import length
+from quad_swarm.world.presets import SwarmConfig
 
 Row = dict[str, Any]
 
@@ -29,14 +30,22 @@ def judge(name: str, recording: Recording) -> Row:
         (m), of whom and when; ``arrived``: whether all robots were at their goals at the same time before any
         collision, and ``robot_seconds_to_arrival``, when each was at its goal first; mean ``path_length`` (m) and
         ``requests``, ``announcements`` and their share of what is possible, until arrival, collision or end; values of
-        `MEASURED`, of the whole flight. What the file does not tell is None
+        `MEASURED`, of the whole flight. What the file does not tell is None. With obstacles also
+        ``obstacle_collisions``, the pairs of robot and obstacle, which count as collisions, too, and the smallest
+        distance between the surfaces of two, ``closest_obstacle`` (m), of whom and when
     """
     flight, config, time = recording.flight(), recording.config(), recording.time - recording.time[0]
-    contact = 2 * config.radius - config.collision_tolerance
-    meetings = recording.meetings()
-    counted = meetings if config.continuous_collisions else recording.meetings(continuous=False)
+    contact, downwash = 2 * config.radius - config.collision_tolerance, config.planner.downwash
+    found = [recording.meetings(continuous, downwash) for continuous in (False, True)]
+    beside = [recording.encounters(continuous) for continuous in (False, True)]
+    touch = config.radius - config.collision_tolerance
+    at_samples, at_any_time = (
+        bool((one.closest < contact).any() or (other.closest < touch).any())
+        for one, other in zip(found, beside, strict=True)
+    )
+    meetings, counted = found[True], found[config.continuous_collisions]
     least = int(meetings.closest.argmin())
-    touching = flight.min_separation < contact
+    touching = flight.colliding
     collision = int(touching.argmax()) if touching.any() else None
     knows_goals, knows_talk = (one not in recording.guessed for one in ("goal", "talk"))
     arrival = flight.arrival if knows_goals else None
@@ -58,8 +67,8 @@ def judge(name: str, recording: Recording) -> Row:
         "collided": bool(touching.any()),
         "seconds_to_collision": None if collision is None else float(time[collision]),
         "collisions": counted.pairs[counted.closest < contact].tolist(),
-        "collided_at_samples": bool((recording.separation(continuous=False) < contact).any()),
-        "collided_continuous": bool(meetings.closest[least] < contact),
+        "collided_at_samples": at_samples,
+        "collided_continuous": at_any_time,
         "closest": float(meetings.closest[least]),
         "closest_pair": meetings.pairs[least].tolist(),
         "closest_after": float(meetings.when[least] - recording.time[0]),
@@ -73,6 +82,22 @@ def judge(name: str, recording: Recording) -> Row:
         **{name: recording.measured.get(name) for name in MEASURED},
         "contact": contact,
         "goal_radius": config.goal_radius,
+        **(_among_obstacles(recording, config, beside) if recording.obstacles else {}),
+    }
+
+
+def _among_obstacles(recording: Recording, config: SwarmConfig, beside: Sequence[Meetings]) -> Row:
+    """Return what happened among obstacles.
+
+    :param beside: encounters at samples, and at any time
+    """
+    encounters, counted = beside[True], beside[config.continuous_collisions]
+    least = int(encounters.closest.argmin())
+    return {
+        "obstacle_collisions": counted.pairs[counted.closest < config.radius - config.collision_tolerance].tolist(),
+        "closest_obstacle": float(encounters.closest[least] - config.radius),
+        "closest_obstacle_pair": encounters.pairs[least].tolist(),
+        "closest_obstacle_after": float(encounters.when[least] - recording.time[0]),
     }
 
 
@@ -121,6 +146,20 @@ def _total(policy: str | None, rows: Sequence[Row]) -> Row:
         **{name: sum(known(name)) if known(name) else None for name in ("periods", "plans_sent")},
         "bytes_per_second": mean("bytes_per_second", "seconds"),
         **{name: mean(name, "periods") for name in ("missed", "late")},
+        **_total_obstacles([row for row in rows if row.get("closest_obstacle") is not None]),
+    }
+
+
+def _total_obstacles(rows: Sequence[Row]) -> Row:
+    """Return the number of flights with a collision with an obstacle, and the smallest distance (m), if any has
+    obstacles."""
+    if not rows:
+        return {}
+    collided = sum(bool(row["obstacle_collisions"]) for row in rows)
+    return {
+        "collided_obstacle": collided,
+        "obstacles_known": len(rows),
+        "closest_obstacle": min(row["closest_obstacle"] for row in rows),
     }
 
 
@@ -138,7 +177,15 @@ def _number(name: str, form: str) -> Callable[[Row], str]:
 
 
 def _met(row: Row) -> str:
-    pairs = ["-".join(map(str, pair)) for pair in row["collisions"]]
+    return _pairs(row["collisions"])
+
+
+def _met_obstacles(row: Row) -> str:
+    return "-" if row.get("closest_obstacle") is None else _pairs(row["obstacle_collisions"])
+
+
+def _pairs(met: Sequence[Sequence[int]]) -> str:
+    pairs = ["-".join(map(str, pair)) for pair in met]
     return " ".join(pairs[:2]) + (f" +{len(pairs) - 2}" if len(pairs) > 2 else "") if pairs else "no"
 
 
@@ -154,6 +201,12 @@ COLUMNS = [
     Column("closest (m)", _number("closest", ".3f")),
     Column("of", lambda row: "-".join(map(str, row["closest_pair"])), lambda row: ""),
     Column("after (s)", _number("closest_after", ".2f"), lambda row: ""),
+    Column(
+        "obstacles",
+        _met_obstacles,
+        lambda row: "-" if "obstacles_known" not in row else f"{row['collided_obstacle']}/{row['obstacles_known']}",
+    ),
+    Column("closest (m)", _number("closest_obstacle", ".3f")),
     Column(
         "arrived",
         lambda row: {None: "-", True: "yes", False: "no"}[row["arrived"]],
@@ -195,6 +248,10 @@ def legend(rows: Sequence[Row]) -> list[str]:
     lines = [
         f"collided: pairs of robots closer than {lengths('contact')} m; closest: at any time, straight between samples",
     ]
+    if any(row.get("closest_obstacle") is not None for row in rows):
+        lines.append(
+            "obstacles: robots that touch obstacles, as robot-obstacle, which count as collisions; closest: surfaces"
+        )
     if any(row["arrived"] is not None for row in rows):
         lines.append(f"arrived: all within {lengths('goal_radius')} m of their goals at once, before any collision")
     if unknown := files("arrived"):

@@ -8,7 +8,7 @@ topic                     type                         content
 ``/robot_0/cmd``          geometry_msgs/TwistStamped   set-point, see `quad_swarm.ros.messages.to_command`
 ``/swarm/talk``           std_msgs/String              who asked whom and who told whom, pairs of robots (JSON)
 ``/swarm/separation``     std_msgs/Float64             smallest distance of two robots (m)
-``/swarm/about``          std_msgs/String              world, policy and goals (JSON)
+``/swarm/about``          std_msgs/String              world, policy, goals and obstacles (JSON)
 ========================= ============================ ======================================================
 
 Other recordings need ``/NAME/odom`` of each robot only, at any times: these are interpolated at those of the first.

@@ -12,6 +12,8 @@ flight and to count its collisions; ``sb3-maddpg identify --log`` also needs att
 ``climb_set``, ``yaw_rate_set``
 ``goal_x``, ``goal_y``, ``goal_z`` goal (m), otherwise unknown
 ``asked``, ``told``                robots whose plan it asked for, and to whom it sent its own unasked, as in ``2 5``
+``obstacles``                      obstacles at the first time, see `Obstacle`, as JSON in one row; otherwise those that
+                                   the world lists
 ================================== =========================================================
 
 A table does not hold the world, the policy and the plans, which the other two formats do.
@@ -32,17 +34,18 @@ import numpy as np
 
 from quad_swarm.errors import needs_extra, shown
 from quad_swarm.evaluation.flight import Flight
-from quad_swarm.geometry import closest_approach, length
+from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.validation import replaced
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.obstacles import Obstacle, Surroundings, between, surroundings
 from quad_swarm.world.presets import SwarmConfig, make_config
 
 SUFFIXES = (".npz", ".csv", ".mcap")
 _STATE = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw")
 _SET = ("roll_set", "pitch_set", "climb_set", "yaw_rate_set")
 _GOAL = ("goal_x", "goal_y", "goal_z")
-_MOST_ROBOTS, _MOST_TIMES = 1000, 10**6
+_MOST_ROBOTS, _MOST_TIMES, _MOST_OBSTACLES = 1000, 10**6, 200
 _MOST_DISTANCES = 10**6  # at once
 # What a file need not tell: velocities are then differences, attitudes 0, goals where robots end, and nobody talks
 GUESSES = ("velocity", "attitude", "goal", "talk")
@@ -60,9 +63,9 @@ _ARRAYS: dict[str, Callable[[int, int], tuple[int, ...]]] = {
 
 
 class Meetings(NamedTuple):
-    """How close the pairs of robots came.
+    """How close the pairs of robots, or of a robot and an obstacle, came.
 
-    :param pairs: numbers of the robots of each pair, (P, 2)
+    :param pairs: numbers of each pair, (P, 2)
     :param closest: smallest distance of each pair, (P,) (m)
     :param when: when that was (s), (P,)
     """
@@ -87,6 +90,7 @@ class Recording:
     :param policy: what flew
     :param guessed: some of `GUESSES`, which the file did not tell
     :param measured: values of `MEASURED`; empty if unknown
+    :param obstacles: obstacles, where they are at the first time
     :raises ValueError: if the arrays do not belong together, or times, states or goals are not finite
     """
 
@@ -101,6 +105,7 @@ class Recording:
     policy: str = ""
     guessed: frozenset[str] = frozenset()
     measured: dict[str, float] = dataclasses.field(default_factory=dict)
+    obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self) -> None:
         times, n = len(self.time), len(self.goal)
@@ -129,21 +134,55 @@ class Recording:
         """Number of robots n."""
         return len(self.goal)
 
-    def separation(self, continuous: bool = True) -> np.ndarray:
+    def separation(self, continuous: bool = True, downwash: float = 1.0) -> np.ndarray:
         """Return the smallest distance of two robots at each time, (T,) (m); infinity for a single robot.
 
         :param continuous: whether also since the time before, if robots moved in straight lines
+        :param downwash: see `PlannerConfig`
         """
-        return np.concatenate([apart.min(axis=1, initial=np.inf) for _, apart, _ in self._apart(continuous)])
+        return self._smallest(self._apart(continuous, downwash))
 
-    def meetings(self, continuous: bool = True) -> Meetings:
+    def meetings(self, continuous: bool = True, downwash: float = 1.0) -> Meetings:
         """Return how close each pair of robots came, and when.
 
         :param continuous: see `separation`
+        :param downwash: see `PlannerConfig`
         """
         pairs = np.transpose(np.triu_indices(self.n_robots, k=1))
+        return self._met(pairs, self._apart(continuous, downwash))
+
+    def clearance(self, continuous: bool = True) -> np.ndarray:
+        """Return the smallest distance between a robot's centre and an obstacle's surface at each time, (T,) (m);
+        infinity without obstacles.
+
+        :param continuous: see `separation`
+        """
+        return self._smallest(self._beside(continuous))
+
+    def encounters(self, continuous: bool = True) -> Meetings:
+        """Return how close each robot's centre came to the surface of each obstacle, and when.
+
+        :param continuous: see `separation`
+        """
+        pairs = np.transpose(np.divmod(np.arange(self.n_robots * len(self.obstacles)), max(len(self.obstacles), 1)))
+        return self._met(pairs, self._beside(continuous))
+
+    @property
+    def obstacle_pos(self) -> np.ndarray:
+        """Centres of the obstacles at each time, (T, K, 3), world frame (m)."""
+        among, since = self._among, self.time - self.time[0]
+        return among.position + since[:, None, None] * among.velocity
+
+    @property
+    def _among(self) -> Surroundings:
+        return surroundings(self.obstacles)
+
+    def _smallest(self, distances: Iterator[tuple[int, np.ndarray, np.ndarray]]) -> np.ndarray:
+        return np.concatenate([apart.min(axis=1, initial=np.inf) for _, apart, _ in distances])
+
+    def _met(self, pairs: np.ndarray, distances: Iterator[tuple[int, np.ndarray, np.ndarray]]) -> Meetings:
         closest, when = np.full((2, len(pairs)), np.inf)
-        for first, apart, back in self._apart(continuous):
+        for first, apart, back in distances:
             least = apart.argmin(axis=0)
             nearest, rows = apart[least, np.arange(len(pairs))], first + least
             shorter = nearest < closest
@@ -152,19 +191,44 @@ class Recording:
             closest, when = np.where(shorter, nearest, closest), np.where(shorter, met, when)
         return Meetings(pairs, closest, when)
 
-    def _apart(self, continuous: bool) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    def _apart(self, continuous: bool, downwash: float) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yield some times after the other: the index of the first, the distances of the pairs at and since the time
         before (m), and how long before each time they were so close, as a share of the step, both (times, P)."""
         one, other = np.triu_indices(self.n_robots, k=1)
-        size = max(_MOST_DISTANCES // max(len(one), 1), 1)
+
+        def apart(times: slice) -> np.ndarray:
+            pos = self.state[times, :, POSITION]
+            return flattened(pos[:, other] - pos[:, one], downwash)
+
+        return self._distances(apart, len(one), continuous)
+
+    def _beside(self, continuous: bool) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Yield the same of the pairs of a robot and an obstacle's surface, those of the first robot first."""
+        among, centres, count = self._among, self.obstacle_pos, self.n_robots * len(self.obstacles)
+
+        def away(times: slice) -> np.ndarray:
+            pos = self.state[times, :, POSITION]
+            return between(pos, centres[times], among.factors).reshape(len(pos), count, 3)
+
+        for first, distance, back in self._distances(away, count, continuous):
+            yield first, distance - np.tile(among.radius, self.n_robots), back
+
+    def _distances(
+        self, vectors: Callable[[slice], np.ndarray], count: int, continuous: bool
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """See `_apart`.
+
+        :param vectors: returns what is between the pairs at some times, (times, P, 3) (m)
+        :param count: number of pairs P
+        """
+        size = max(_MOST_DISTANCES // max(count, 1), 1)
         for first in range(0, len(self.time), size):
-            pos = self.state[max(first - 1, 0) : first + size, :, POSITION]
-            between = pos[:, other] - pos[:, one]
+            found = vectors(slice(max(first - 1, 0), first + size))
             if first == 0:
-                between = np.concatenate([between[:1], between])
-            nearest, back = between[1:], np.zeros(between[1:].shape[:2])
+                found = np.concatenate([found[:1], found])
+            nearest, back = found[1:], np.zeros(found[1:].shape[:2])
             if continuous:
-                nearest, share = closest_approach(between[:-1], np.diff(between, axis=0), 1.0)
+                nearest, share = closest_approach(found[:-1], np.diff(found, axis=0), 1.0)
                 back = 1.0 - share
             yield first, length(nearest), back
 
@@ -192,8 +256,17 @@ class Recording:
         rows = np.arange(self.n_robots)[:, None]
         asked = self.asked[:-1][:, rows, others]
         announced = self.told[:-1].swapaxes(1, 2)[:, rows, others] & ~asked
-        none, separation = np.zeros_like(asked), self.separation(config.continuous_collisions)
-        return Flight(config, self.state, plans, self.goal, asked | announced, announced, none, separation)
+        continuous = config.continuous_collisions
+        none, separation = np.zeros_like(asked), self.separation(continuous, config.planner.downwash)
+        flight = Flight(config, self.state, plans, self.goal, asked | announced, announced, none, separation)
+        if not self.obstacles:
+            return flight
+        return dataclasses.replace(
+            flight,
+            obstacles=self.obstacles,
+            obstacle_pos=self.obstacle_pos,
+            min_obstacle_distance=self.clearance(continuous) - config.radius,
+        )
 
     @classmethod
     def of(cls, flight: Flight, policy: str = "") -> Recording:
@@ -211,8 +284,9 @@ class Recording:
         setpoint = np.full((times, n, 4), np.nan)
         if flight.inputs is not None:
             setpoint[:-1] = flight.inputs
-        world = dataclasses.asdict(flight.config)
-        return cls(time, flight.state, setpoint, flight.plans[..., POSITION], asked, told, flight.goal, world, policy)
+        world, plan = dataclasses.asdict(flight.config), flight.plans[..., POSITION]
+        arrays = (time, flight.state, setpoint, plan, asked, told, flight.goal)
+        return cls(*arrays, world, policy, obstacles=flight.obstacles)
 
 
 def _is_amount(value: object) -> bool:
@@ -265,7 +339,8 @@ def read(path: Path) -> Recording:
 def read_flights(
     paths: Sequence[Path], preset: str | None = None, changes: Mapping[str, Any] | None = None
 ) -> list[tuple[Path, Recording]]:
-    """Read recordings of swarms, each with its file. All get a world.
+    """Read recordings of swarms, each with its file. All get a world, whose listed obstacles a recording has that tells
+    none.
 
     :param paths: files
     :param preset: name of a preset, which replaces recorded worlds; it is "flight" for those that do not tell
@@ -279,7 +354,10 @@ def read_flights(
             raise ValueError(f"{path} holds one robot, which cannot meet another: name a flight of two or more.")
         base = preset or (recording.config() if recording.world else "flight")
         world = make_config(base, changes, n_robots=recording.n_robots)
-        found.append((path, dataclasses.replace(recording, world=dataclasses.asdict(world))))
+        listed = world.obstacles.listed
+        given = recording.world and listed != recording.config().obstacles.listed
+        obstacles = listed if listed and given else recording.obstacles or listed
+        found.append((path, dataclasses.replace(recording, world=dataclasses.asdict(world), obstacles=obstacles)))
     return found
 
 
@@ -296,7 +374,27 @@ def numbered(path: Path, number: int, count: int) -> Path:
 def about(recording: Recording) -> str:
     """Return as JSON what is no array, see `from_about`, and goals."""
     rest = {"guessed": sorted(recording.guessed), "measured": recording.measured, "goal": recording.goal.tolist()}
+    if recording.obstacles:
+        rest["obstacles"] = _plain(recording.obstacles)
     return json.dumps({"world": recording.world, "policy": recording.policy, **rest})
+
+
+def _plain(obstacles: Sequence[Obstacle]) -> list[dict[str, Any]]:
+    return [dataclasses.asdict(one) for one in obstacles]
+
+
+def _obstacles(listed: Any) -> tuple[Obstacle, ...]:
+    """Return obstacles from what `_plain` returned.
+
+    :raises ValueError: if there are too many, or one is none
+    """
+    if (
+        not isinstance(listed, list)
+        or len(listed) > _MOST_OBSTACLES
+        or not all(isinstance(one, dict) for one in listed)
+    ):
+        raise ValueError(f"obstacles={shown(listed)}: it must be a list of up to {_MOST_OBSTACLES} obstacles")
+    return tuple(Obstacle(**one) for one in listed)
 
 
 def from_about(rest: Mapping[str, Any]) -> dict[str, Any]:
@@ -306,6 +404,7 @@ def from_about(rest: Mapping[str, Any]) -> dict[str, Any]:
         "policy": str(rest["policy"]),
         "guessed": frozenset(rest.get("guessed", ())),
         "measured": dict(rest.get("measured", {})),
+        "obstacles": _obstacles(rest.get("obstacles", [])),
     }
 
 
@@ -328,7 +427,9 @@ def _write_csv(path: Path, recording: Recording) -> None:
     titles = [name for name, wanted in zip((*_STATE, *_SET, *_GOAL), shown, strict=True) if wanted]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time", "robot", *titles, *(["asked", "told"] if known["talk"] else [])])
+        told = json.dumps(_plain(recording.obstacles)) if recording.obstacles else None
+        titles += [*(["asked", "told"] if known["talk"] else []), *(["obstacles"] if told else [])]
+        writer.writerow(["time", "robot", *titles])
         for k, time in enumerate(recording.time):
             for robot in range(recording.n_robots):
                 numbers = (*recording.state[k, robot], *recording.setpoint[k, robot], *recording.goal[robot])
@@ -336,7 +437,8 @@ def _write_csv(path: Path, recording: Recording) -> None:
                 texts = ("" if np.isnan(one) else repr(float(one)) for one in wanted)
                 talk = (recording.asked, recording.told) if known["talk"] else ()
                 lists = (" ".join(map(str, np.flatnonzero(one[k, robot]))) for one in talk)
-                writer.writerow([repr(float(time)), robot, *texts, *lists])
+                writer.writerow([repr(float(time)), robot, *texts, *lists, *([told] if told else [])])
+                told = told and ""
 
 
 def _read_csv(path: Path) -> Recording:
@@ -379,4 +481,6 @@ def _read_csv(path: Path) -> Recording:
         guessed.add("talk")
     state, plan = np.concatenate([pos, vel, attitude], axis=-1), np.zeros((*shape, 0, 3))
     talk = (sets("asked"), sets("told"))
-    return Recording(time, state, columns(_SET), plan, *talk, goal, guessed=frozenset(guessed))
+    obstacles = _obstacles(json.loads(next(filter(None, (row.get("obstacles") for row in rows)), "[]")))
+    words = {"guessed": frozenset(guessed), "obstacles": obstacles}
+    return Recording(time, state, columns(_SET), plan, *talk, goal, **words)

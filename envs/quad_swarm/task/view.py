@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quad_swarm.geometry import closest_approach, length
+from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.native.pairs import advance
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.world.beliefs import PlanApproach, Prediction, of_others
@@ -158,8 +158,7 @@ class View:
         return prediction.flattened(1 / self._downwash).approach(self._flat(self.own_pos), self._flat(self.plan))
 
     def _flat(self, vectors: np.ndarray) -> np.ndarray:
-        """Return vectors with heights divided by the downwash."""
-        return vectors if self._downwash == 1 else np.array([1.0, 1.0, 1 / self._downwash]) * vectors
+        return flattened(vectors, self._downwash)
 
     @cached_property
     def own_obstacle(self) -> ObstacleApproach:

@@ -6,7 +6,7 @@ For a planner, an obstacle is one more body to avoid, see `quad_swarm.planner.Pr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -37,6 +37,18 @@ class Obstacle:
     radius: PositiveLength
     shape: Shape = "cylinder"
     velocity: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves."""
+        return any(self.velocity)
+
+    def after(self, time: float) -> Obstacle:
+        """Return the obstacle where it is after some time (s)."""
+        if not self.moves:
+            return self
+        x, y, z = (where + time * speed for where, speed in zip(self.position, self.velocity, strict=True))
+        return replace(self, position=(x, y, z))
 
 
 @checked
@@ -133,10 +145,21 @@ def surroundings(obstacles: Sequence[Obstacle], slots: int | None = None) -> Sur
     )
 
 
+def between(points: np.ndarray, centres: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Return what is as long as points are away from centres, or from the axes of cylinders.
+
+    :param points: points, (..., n, 3) (m)
+    :param centres: centres of obstacles, (..., K, 3) (m)
+    :param factors: see `Surroundings`, (..., K, 3)
+    :return: vectors, (..., n, K, 3) (m)
+    """
+    return factors[..., None, :, :] * (points[..., :, None, :] - centres[..., None, :, :])
+
+
 def clearances(points: np.ndarray, obstacles: Surroundings) -> np.ndarray:
     """Return the distances between points, (n, 3), and the surfaces of obstacles, (n, K) (m), negative inside."""
-    between = obstacles.factors * (points[:, None] - obstacles.position)
-    return np.sqrt(dot(between, between)) - obstacles.radius
+    away = between(points, obstacles.position, obstacles.factors)
+    return np.sqrt(dot(away, away)) - obstacles.radius
 
 
 class Obstacles:
@@ -180,6 +203,14 @@ class Obstacles:
         for mine, fresh in zip(self._arrays(), surroundings(obstacles, self.slots), strict=True):
             mine[swarm] = fresh
 
+    def of_swarm(self, swarm: int) -> tuple[Obstacle, ...]:
+        """Return the obstacles of one swarm, where they are now."""
+        arrays = zip(*(array[swarm][self.present[swarm]].tolist() for array in self._arrays()), strict=True)
+        return tuple(
+            Obstacle(tuple(position), radius, "sphere" if factors[2] else "cylinder", tuple(velocity))
+            for position, velocity, radius, factors in arrays
+        )
+
     def ahead(self, times: np.ndarray) -> np.ndarray:
         """Return where robots expect the obstacles.
 
@@ -206,10 +237,10 @@ class Obstacles:
         parts = len(positions) - 1
         times = dt / parts * np.arange(parts + 1)
         centres = self.position + times[:, None, None, None] * self.velocity
-        between = self.factors[:, None] * (positions[:, :, :, None] - centres[:, :, None])
-        closest, _ = closest_approach(between[:-1], between[1:] - between[:-1], 1.0)
+        away = between(positions, centres, self.factors)
+        closest, _ = closest_approach(away[:-1], away[1:] - away[:-1], 1.0)
         reach = (self.radius + radius)[:, None]
-        after, during = np.sqrt(dot(between[-1], between[-1])), np.sqrt(dot(closest, closest).min(axis=0))
+        after, during = np.sqrt(dot(away[-1], away[-1])), np.sqrt(dot(closest, closest).min(axis=0))
         there = self.present[:, None]
         return np.where(there, after - reach, np.inf), np.where(there, during - reach, np.inf)
 
