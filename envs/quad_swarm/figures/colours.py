@@ -8,6 +8,8 @@ from typing import Any
 COLOURS = ("#0072B2", "#C77700", "#008866", "#C2609A", "#3399D4", "#B84A00", "#8F8200", "#757575")
 # Colours of learned policies, of rules to compare with, and of text
 LEARNED, RULES, INK = "#B84A00", "#757575", "#333333"
+# Obstacles are bodies without a colour of their own: their inside and their outline
+OBSTACLE, OUTLINE = "#C9CCD1", "#8D939B"
 
 # For figures of at least 7.5 inches, which a page shows at about 100 pixels per inch
 STYLE: Any = {

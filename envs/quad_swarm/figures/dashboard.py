@@ -14,7 +14,7 @@ from quad_swarm.evaluation.policies import trained_in
 from quad_swarm.figures.plots import draw_flights
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.presets import make_config
-from quad_swarm.world.scenarios import without_obstacles
+from quad_swarm.world.scenarios import SCENARIOS, without_obstacles
 
 
 def _line(tag: str) -> list[Any]:
@@ -48,6 +48,7 @@ LAYOUT: dict[str, dict[str, list[Any]]] = {
         "steps per second": _line("time/fps"),
         "training: reward for requests": _line("reward/requests"),
         "training: planner failures": _line("planner/failure_rate"),
+        "training: collisions with obstacles, if there are any": _line("swarm/obstacle_collision_rate"),
     },
 }
 # Number of episodes for the heat map, and their own set of held-out episodes
@@ -60,11 +61,14 @@ def draw(model: Any, env_kwargs: Mapping[str, Any]) -> dict[str, Figure | float]
 
     :param model: a model with ``predict`` and ``env_spec``, see `evaluation.policies.policy_of`
     :param env_kwargs: arguments of `QuadSwarmEnv`, of which only those of the world are used
-    :return: by tag, figures of a flight in each scenario, a heat map of requests in the symmetric swap, and request
-        share and collision rate of the same episodes
+    :return: by tag, figures of a flight in each scenario without obstacles and in those of the training, a heat map of
+        requests in the symmetric swap, and request share and collision rate of the same episodes
     """
     config = make_config(**({"preset": "paper"} | {k: v for k, v in env_kwargs.items() if k in _OF_THE_WORLD}))
-    conditions = [Condition("model", name, config, linger=5) for name in without_obstacles()]
+    trained = env_kwargs.get("scenario", ())
+    trained = [trained] if isinstance(trained, str) else list(trained)
+    names = [name for name in trained if name in SCENARIOS and name not in without_obstacles()]
+    conditions = [Condition("model", name, config, linger=5) for name in (*names, *without_obstacles())]
     asked, possible, steps, collisions = requests_by_pair(conditions[-1], model)
     pictures: dict[str, Figure | float] = {
         f"eval/flight/{one.scenario}": draw_flights([one], [fly(one, SET, model=model)], 4.5, "") for one in conditions

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,13 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon
 from matplotlib.ticker import PercentFormatter
 from PIL import Image
 
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.evaluation.policies import short_name
-from quad_swarm.figures.colours import INK, RULES, STYLE, colour_of
+from quad_swarm.figures.colours import INK, OBSTACLE, OUTLINE, RULES, STYLE, colour_of
 from quad_swarm.figures.render import Renderer
 from quad_swarm.geometry import length
 from quad_swarm.world.beliefs import other_indices
@@ -54,10 +55,13 @@ def draw_all(rows: Sequence[Mapping[str, Any]], conditions: Sequence[Condition],
 
 @rc_context(STYLE)
 def draw_collisions(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the fraction of episodes with a collision, with 95 % Wilson intervals."""
+    """Draw the fraction of episodes with a collision, with 95 % Wilson intervals. Hatched: those with an obstacle."""
     figure = Figure(figsize=(8, 3.5), layout="constrained")
     axes = figure.subplots()
-    _bars(axes, rows, lambda r: r["collisions"] / r["episodes"], lambda r: (r["collision_low"], r["collision_high"]))
+    interval = ("collision_low", "collision_high")
+    _bars(axes, rows, lambda r: r["collisions"] / r["episodes"], lambda r: [r[name] for name in interval])
+    if any("obstacle_collisions" in row for row in rows):
+        _hatch(axes, rows, lambda r: r.get("obstacle_collisions", 0) / r["episodes"], "with an obstacle")
     axes.set_ylabel("episodes with a collision")
     return figure
 
@@ -104,21 +108,42 @@ def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return one != other and one[0] <= other[0] and one[1] <= other[1]
 
 
-def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: Any) -> None:
+def _places(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[Mapping[str, Any]], np.ndarray, float]]:
+    """Yield each policy, its rows by scenario, and where its bars are and how wide."""
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
     width = 0.8 / len(policies)
     for k, policy in enumerate(policies):
         mine = {row["scenario"]: row for row in rows if row["policy"] == policy}
         x = np.arange(len(scenarios)) + (k - (len(policies) - 1) / 2) * width
-        heights = np.array([height(mine[name]) for name in scenarios])
-        axes.bar(x, heights, 0.9 * width, color=colour_of(k), label=short_name(policy))
+        yield policy, [mine[name] for name in scenarios], x, 0.9 * width
+
+
+def _hatch(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, label: str) -> None:
+    """Hatch the lower parts of bars."""
+    style = {"facecolor": "none", "edgecolor": "white", "hatch": "////", "linewidth": 0}
+    for _, mine, x, width in _places(rows):
+        axes.bar(x, [height(row) for row in mine], width, **style)
+    handles, labels = axes.get_legend_handles_labels()
+    swatch = Patch(**{**style, "facecolor": RULES})
+    axes.legend([*handles, swatch], [*labels, label], **_legend(len(labels) + 1))
+
+
+def _legend(entries: int) -> dict[str, Any]:
+    return {"ncols": min(entries, 5), "loc": "upper left", "bbox_to_anchor": (0, 1.17)}
+
+
+def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, interval: Any) -> None:
+    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
+    for k, (policy, mine, x, width) in enumerate(_places(rows)):
+        heights = np.array([height(row) for row in mine])
+        axes.bar(x, heights, width, color=colour_of(k), label=short_name(policy))
         if interval is not None:
-            bounds = np.array([interval(mine[name]) for name in scenarios]).T
+            bounds = np.array([interval(row) for row in mine]).T
             axes.errorbar(x, heights, np.abs(bounds - heights), fmt="none", ecolor=INK, capsize=2, linewidth=1)
     axes.set_xticks(range(len(scenarios)), [name.replace("_", " ") for name in scenarios])
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    axes.legend(ncols=min(len(policies), 5), loc="upper left", bbox_to_anchor=(0, 1.17))
+    axes.legend(**_legend(k + 1))
     axes.grid(axis="x", visible=False)
 
 
@@ -142,8 +167,8 @@ def draw_flights(
     for axes, condition, flight in zip(panels.flat, conditions, flights, strict=False):
         draw_flight(axes, flight)
         axes.set_title(condition.scenario.replace("_", " "))
-    announced = any(flight.announced.any() for flight in flights)
-    explain_flights(figure, panels.flat[0], short_name(conditions[-1].policy) if name is None else name, announced)
+    policy = short_name(conditions[-1].policy) if name is None else name
+    explain_flights(figure, panels.flat[0], policy, flights)
     return figure
 
 
@@ -165,7 +190,8 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
             f"{short_name(condition.policy)}, {condition.scenario}",
             f"step {k + 1}   {'plans sent' if flight.announced.any() else 'requests'} {flight.requests[k].sum()}",
         ]
-        picture = renderer.draw(flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k], lines)
+        step = (flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k])
+        picture = renderer.draw(*step, lines, flight.obstacles_at(k + 1))
         frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
     durations = (10 * np.diff(times)).tolist()
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
@@ -173,7 +199,8 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
 
 def draw_flight(axes: Axes, flight: Flight) -> None:
     """Draw a flight from above in the colours of the robots, with dots where a robot makes requests, squares where it
-    announces its plan, and an arrow halfway along each path."""
+    announces its plan, and an arrow halfway along each path. Obstacles that move are drawn where they are when it ends,
+    with the way that they came."""
     asks = (flight.requests & ~flight.announced).any(axis=2)
     others = other_indices(flight.n_robots)
     for i, goal in enumerate(flight.goal):
@@ -196,22 +223,55 @@ def draw_flight(axes: Axes, flight: Flight) -> None:
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.margins(0.08)
+    _draw_obstacles(axes, flight)
 
 
-def explain_flights(figure: Figure, axes: Axes, policy: str = "", announced: bool = False) -> None:
+def _draw_obstacles(axes: Axes, flight: Flight) -> None:
+    """Draw the obstacles of a flight from above. Only those that stand belong to what must be seen."""
+    end = len(flight.requests) if flight.arrival is None else flight.arrival
+    style = {"facecolor": OBSTACLE, "edgecolor": OUTLINE, "linewidth": 0.8, "zorder": 1.5}
+    for one, there in zip(flight.obstacles_at(0), flight.obstacles_at(end), strict=True):
+        before, after = np.array(one.position[:2]), np.array(there.position[:2])
+        body = Circle((after[0], after[1]), one.radius, label="obstacle", **style)
+        if not one.moves:
+            axes.add_patch(body)
+            continue
+        if (before != after).any():
+            along = (after - before) / np.hypot(*(after - before))
+            aside = one.radius * np.array([-along[1], along[0]])
+            way = Polygon([before - aside, before + aside, after + aside, after - aside])
+            way.set(facecolor=OBSTACLE, alpha=0.3, linewidth=0, zorder=0.5)
+            arrow = FancyArrowPatch(before, after, arrowstyle="-|>", mutation_scale=10, color=OUTLINE, shrinkB=0)
+            arrow.set(linewidth=0.8, zorder=1.6)
+            for artist in (way, arrow):
+                axes.add_artist(artist)
+        axes.add_artist(body)
+
+
+def explain_flights(figure: Figure, axes: Axes, policy: str = "", flights: Sequence[Flight] = ()) -> None:
     """Add a legend of `draw_flight` at the bottom of a figure.
 
     :param figure: the figure
     :param axes: any of its panels
     :param policy: name of the policy
-    :param announced: whether robots announce their plans
+    :param flights: the flights, of which some may have announcements and obstacles
     """
     marks: dict[str, dict[str, Any]] = {
         "start": {"marker": "o", "markersize": 7, "markerfacecolor": "white"},
         "goal": {"marker": "*", "markersize": 10},
         "asks somebody": {"marker": "o", "markersize": 5, "markeredgecolor": "black"},
     }
-    if announced:
+    if any(flight.announced.any() for flight in flights):
         marks["announces its plan"] = {"marker": "s", "markersize": 5, "markerfacecolor": "white"}
-    handles = [axes.plot([], [], linestyle="", color=RULES, label=name, **style)[0] for name, style in marks.items()]
+    obstacles = [one for flight in flights for one in flight.obstacles]
+    if obstacles:
+        moving = any(one.moves for one in obstacles)
+        marks["obstacle, at the end of its way" if moving else "obstacle"] = {
+            "marker": "o",
+            "markersize": 10,
+            "color": OBSTACLE,
+            "markeredgecolor": OUTLINE,
+        }
+    styles = {name: {"color": RULES, **style} for name, style in marks.items()}
+    handles = [axes.plot([], [], linestyle="", label=name, **style)[0] for name, style in styles.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), title=policy or None)

@@ -25,12 +25,13 @@ from quad_swarm.evaluation.provenance import plant_name
 from quad_swarm.evaluation.recordings import Recording, read_flights
 from quad_swarm.evaluation.rows import STDOUT, check_writable, write_text
 from quad_swarm.figures.colours import COLOURS
-from quad_swarm.geometry import closest_approach, length
+from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.parsing import Parser
 from quad_swarm.quadrotor import ATTITUDE, POSITION
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.obstacles import between, surroundings
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -105,6 +106,15 @@ def live_step(flight: Flight) -> dict[str, Any]:
         **{name: step[name][-1] for name in ("positions", "attitudes", "plans", "requests", "separation")},
         "colliding": [pair[1:] for pair in step["colliding"]],
         "arrived": flight.arrival is not None,
+        **({"obstacles": _live_obstacles(step)} if flight.obstacles else {}),
+    }
+
+
+def _live_obstacles(step: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "positions": [one["positions"][-1] for one in step["obstacles"]],
+        "hitting": [pair[1:] for pair in step["hitting"]],
+        "distance": step["obstacle_distance"][-1],
     }
 
 
@@ -116,6 +126,7 @@ def _page(about: dict[str, Any], config: SwarmConfig, dt: float, flights: Iterab
         "radius": config.radius,
         "goal_radius": config.goal_radius,
         "collision_distance": 2 * config.radius,
+        **({"downwash": config.planner.downwash} if config.planner.downwash != 1 else {}),
         "colours": COLOURS,
         "flights": [_describe(policy, flight) for policy, flight in flights],
     }
@@ -131,7 +142,9 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
     at that time: (T, n, K, 3) (m); goals: (n, 3) (m); requests: for each step the pairs (robot, the other) of robots
     that get a plan, or (robot, the other, 1) if the plan was announced; separation, as the world counts it: (T + 1,)
     (m); arrival, collision: first steps after which all robots had arrived, and two collided, or None; colliding:
-    (step, robot, robot) for each pair that collides in a step.
+    (step, robot, robot) for each pair that collides in a step. With obstacles also these: shape, radius (m) and
+    positions, (T + 1, 3) or, if it stands, (1, 3) (m), of each; hitting: (step, robot, obstacle) for each pair that
+    collides; obstacle_distance: as the world counts it, (T + 1,) (m).
     """
     end = len(flight.requests) if flight.arrival is None else min(flight.arrival + _EXTRA_STEPS, len(flight.requests))
     others = other_indices(flight.n_robots)
@@ -149,6 +162,25 @@ def _describe(policy: str, flight: Flight) -> dict[str, Any]:
         "arrival": flight.arrival,
         "collision": flight.collision if flight.collision is not None and flight.collision <= end else None,
         "colliding": [pair for pair in _colliding(flight) if pair[0] <= end],
+        **(_describe_obstacles(flight, end) if flight.obstacles else {}),
+    }
+
+
+def _describe_obstacles(flight: Flight, end: int) -> dict[str, Any]:
+    assert flight.obstacle_pos is not None
+    assert flight.min_obstacle_distance is not None
+    places = flight.obstacle_pos[: end + 1].round(_DIGITS)
+    return {
+        "obstacles": [
+            {
+                "shape": one.shape,
+                "radius": round(one.radius, _DIGITS),
+                "positions": places[: None if one.moves else 1, k].tolist(),
+            }
+            for k, one in enumerate(flight.obstacles)
+        ],
+        "hitting": [pair for pair in _hitting(flight) if pair[0] <= end],
+        "obstacle_distance": flight.min_obstacle_distance[: end + 1].round(_DIGITS).tolist(),
     }
 
 
@@ -180,16 +212,41 @@ def _colliding(flight: Flight) -> list[list[int]]:
     flight does not record. The closest pair on the straight line between steps then has this distance, and others
     those on that line.
     """
-    before, after = flight.relative_pos[:-1], flight.relative_pos[1:]
+    relative, config = flattened(flight.relative_pos, flight.config.planner.downwash), flight.config
+    touching = _touching(flight, relative, 2 * config.radius - config.collision_tolerance, flight.min_separation)
+    others = other_indices(flight.n_robots)
+    pairs = ([int(step) + 1, int(a), int(others[a, k])] for step, a, k in touching)
+    return [pair for pair in pairs if pair[1] < pair[2]]
+
+
+def _hitting(flight: Flight) -> list[list[int]]:
+    """Return which robots collide with obstacles in each step, as `_colliding` does: (step, robot, obstacle)."""
+    assert flight.obstacle_pos is not None
+    assert flight.min_obstacle_distance is not None
+    among, tolerance = surroundings(flight.obstacles), flight.config.collision_tolerance
+    relative = between(flight.pos, flight.obstacle_pos, among.factors)
+    reach = among.radius + flight.config.radius
+    touching = _touching(flight, relative, -tolerance, flight.min_obstacle_distance, reach)
+    return [[int(step) + 1, int(robot), int(obstacle)] for step, robot, obstacle in touching]
+
+
+def _touching(
+    flight: Flight, relative: np.ndarray, limit: float, least: np.ndarray, reach: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Return the steps and pairs, counting from 0, that are closer than a limit, (pairs, 3).
+
+    :param relative: what is between pairs, (T + 1, n, m, 3) (m)
+    :param limit: distance (m)
+    :param least: smallest distances as the world counts them, (T + 1,) (m)
+    :param reach: what is subtracted from the lengths, (m,) (m)
+    """
+    before, after = relative[:-1], relative[1:]
     if flight.config.continuous_collisions:
         after, _ = closest_approach(before, after - before, 1.0)
-    apart = length(after)
-    closest, least = apart == apart.min(axis=(1, 2), keepdims=True), flight.min_separation[1:, None, None]
-    limit = 2 * flight.config.radius - flight.config.collision_tolerance
-    apart = np.where(least < limit, np.where(closest, least, apart), np.inf)
-    others = other_indices(flight.n_robots)
-    pairs = ([int(step) + 1, int(a), int(others[a, k])] for step, a, k in np.argwhere(apart < limit))
-    return [pair for pair in pairs if pair[1] < pair[2]]
+    apart = length(after) - reach
+    closest, counted = apart == apart.min(axis=(1, 2), keepdims=True), least[1:, None, None]
+    apart = np.where(counted < limit, np.where(closest, counted, apart), np.inf)
+    return np.argwhere(apart < limit)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

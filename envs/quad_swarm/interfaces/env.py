@@ -187,15 +187,18 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
 
             self._renderer = Renderer(self.config)
         swarm, statistics = self.task.swarm, self.task.statistics
+        obstacles = () if swarm.obstacles is None else swarm.obstacles.of_swarm(0)
         lines = [
             f"step {statistics.steps[0]}   {self.task.scenario[0]}",
             f"{'plans sent' if self.task.n_bits == 2 else 'requests'} {self._requests.sum()} now, "
             f"{statistics.requests[0]} in all",
             f"smallest separation {statistics.min_separation[0]:.2f} m",
         ]
+        if obstacles and np.isfinite(statistics.min_obstacle_distance[0]):
+            lines.append(f"closest to an obstacle {statistics.min_obstacle_distance[0]:.2f} m")
         if statistics.collided[0]:
             lines.append("COLLISION")
-        picture = self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, lines)
+        picture = self._renderer.draw(swarm.state[0], swarm.goal[0], swarm.plans[0], self._requests, lines, obstacles)
         if self.render_mode == "human":
             self._renderer.show(self.metadata["render_fps"])
             return None

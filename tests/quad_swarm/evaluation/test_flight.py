@@ -115,3 +115,23 @@ def test_contact_between_steps_is_a_collision_of_a_flight_where_the_world_says_s
     assert any(
         (flight.min_separation < 0.599).sum() > (flight.separation.min(axis=(1, 2)) < 0.599).sum() for flight in flights
     )
+
+
+def test_contact_with_an_obstacle_is_a_collision_of_a_flight():
+    """The pillar is in the way of all, and planners keep no distance."""
+    for continuous in (False, True):
+        world = {"listed": [{"position": (0, 0, 0), "radius": 0.5}], "margin": 0.0}
+        config = make_config("paper", {"obstacles": world, "continuous_collisions": continuous})
+        one = Condition("none", "symmetric_swap", config, 60)
+        flight, (row,) = fly(one, 0), run_episodes(one, [first_episode(0)])
+        assert flight.obstacle_pos is not None
+        assert flight.min_obstacle_distance is not None
+        assert flight.obstacles[0].radius == 0.5
+        assert len(flight.obstacle_pos) == len(flight.min_obstacle_distance) == len(flight.state)
+        to_axis = np.hypot(*flight.pos[..., :2].transpose(2, 0, 1)).min(axis=1) - 0.5 - config.radius
+        if not continuous:
+            np.testing.assert_allclose(flight.min_obstacle_distance, to_axis)
+        assert (flight.min_obstacle_distance <= to_axis + 1e-9).all()
+        touching = flight.min_obstacle_distance < -config.collision_tolerance
+        np.testing.assert_array_equal(flight.colliding, touching | (flight.min_separation < 0.599))
+        assert row["collided"] == (flight.collision is not None)

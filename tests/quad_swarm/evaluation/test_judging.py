@@ -218,3 +218,51 @@ def test_a_flight_without_words_keeps_them_unknown(tmp_path):
         write(tmp_path / f"again{suffix}", found)
         again = read(tmp_path / f"again{suffix}")
         assert again.guessed == found.guessed == {"velocity", "attitude", "goal", "talk"}
+
+
+def test_contact_with_obstacles_is_judged_at_any_time(tmp_path):
+    """Robot 0 flies to +x past x = 0 at t = 0.99, 0.3 m from the surface of a pillar."""
+    path = crossing(tmp_path / "lab.csv", 2.0)
+    pillar = {"position": [0.0, -0.4, 0.0], "radius": 0.1}
+    for radius, collided in ((0.29, False), (0.31, True)):
+        world = {"radius": radius, "obstacles": {"listed": [pillar]}}
+        ((_, recording),) = read_flights([path], changes=world)
+        row = judge("lab.csv", recording)
+        assert (row["collided"], row["obstacle_collisions"]) == (collided, [[0, 0]] if collided else [])
+        assert row["collisions"] == []
+        assert row["closest_obstacle"] == pytest.approx(0.3 - radius)
+        assert row["closest_obstacle_pair"] == [0, 0]
+        assert row["closest_obstacle_after"] == pytest.approx(0.99)
+    moving = {"position": [1.0, -0.4, 1.0], "radius": 0.1, "shape": "sphere", "velocity": [0.0, 1.0, 0.0]}
+    ((_, recording),) = read_flights([path], changes={"obstacles": {"listed": [moving]}})
+    # Robot 0 at (t - 0.99, 0), the sphere at (1, t - 0.4)
+    assert judge("lab.csv", recording)["closest_obstacle_after"] == pytest.approx((1.99 + 0.4) / 2)
+    write(tmp_path / "flight.npz", recording)
+    ((_, again),) = read_flights([tmp_path / "flight.npz"], changes={"radius": 0.2})
+    assert again.obstacles == recording.obstacles, "they are those of the file"
+    ((_, other),) = read_flights([tmp_path / "flight.npz"], changes={"obstacles": {"listed": [pillar]}})
+    assert other.obstacles[0].radius == 0.1, "unless others are given"
+    assert other.obstacles[0].shape == "cylinder"
+
+
+def test_flights_among_obstacles_are_judged_as_they_were_evaluated(tmp_path, capsys):
+    flown = ["--preset", "flight", "--n-robots", "6", "--policy", "none", "--scenario", "forest", "--episodes", "4"]
+    assert main([*flown, "--record", str(tmp_path / "f.csv"), "--json", str(tmp_path / "flown.json")]) == 0
+    table = capsys.readouterr().out
+    assert "obstacles" in table
+    files = [str(tmp_path / f"f_{k}.csv") for k in range(1, 5)]
+    assert main(["--flight", *files, "--preset", "flight", "--json", str(tmp_path / "judged.json")]) == 0
+    assert "obstacles" in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "flown.json").read_text())
+    judged = json.loads((tmp_path / "judged.json").read_text())
+    assert sum(one["collided"] for one in judged[:4]) == row["collisions"] == judged[4]["collided"]
+    assert row["obstacle_collisions"] <= judged[4]["collided_obstacle"], "flights go on after a collision"
+
+
+def test_downwash_counts_in_what_is_judged(tmp_path):
+    above = [[time, robot, 0.5 * time, 0.0, 1.0 + robot] for time in TIME for robot in (0, 1)]
+    path = table(tmp_path / "lab.csv", above)
+    for downwash, collided in ((1.0, False), (2.0, True)):
+        ((_, recording),) = read_flights([path], changes={"planner": {"downwash": downwash}})
+        row = judge("lab.csv", recording)
+        assert (row["collided"], row["closest"]) == (collided, pytest.approx(1.0 / downwash))

@@ -9,6 +9,7 @@ import pytest
 
 from quad_swarm.evaluation.flight import Condition, fly
 from quad_swarm.evaluation.recordings import MEASURED, SUFFIXES, Recording, read, write
+from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import make_config
 
 
@@ -144,3 +145,51 @@ def test_the_world_of_a_recording_is_checked(recording, tmp_path):
     with pytest.raises(ValueError, match="radius"):
         read(path).config()
     assert json.dumps(recording.world)
+
+
+AMONG = (
+    Obstacle((0.1, 0.2, 0.0), 0.3),
+    Obstacle((-1.0, 0.30000000000000004, 1.2), 0.25, "sphere", (0.5, -0.1, 0.0)),
+)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_obstacles_are_read_as_they_were_written(suffix, recording, tmp_path):
+    if suffix == ".mcap":
+        pytest.importorskip("mcap_ros2")
+    path = tmp_path / f"flight{suffix}"
+    write(path, dataclasses.replace(recording, obstacles=AMONG))
+    again = read(path)
+    assert again.obstacles == AMONG
+    np.testing.assert_allclose(again.state, recording.state, atol=1e-9)
+    write(path, recording)
+    assert b"radius" not in path.read_bytes() or suffix != ".csv", "without obstacles, the file is as it was"
+    assert read(path).obstacles == ()
+
+
+@pytest.mark.parametrize(
+    "told", ['{"position": 1}', '[{"position": [0, 0, 0]}]', '[{"radius": 1, "place": 1}]', "[1]", "x"]
+)
+def test_obstacles_that_are_none_are_refused(told, recording, tmp_path):
+    path = tmp_path / "flight.csv"
+    write(path, dataclasses.replace(recording, obstacles=AMONG))
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    rows[1][-1] = told
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    with pytest.raises(ValueError, match="is no recording of a flight"):
+        read(path)
+
+
+@pytest.mark.parametrize("preset", ["flight", "paper"])
+def test_a_flight_among_obstacles_is_a_flight_again(preset):
+    flown = fly(Condition("none", "crossing_traffic", make_config(preset), 60), 0)
+    assert flown.obstacle_pos is not None
+    assert any(one.moves for one in flown.obstacles)
+    again = Recording.of(flown, "none").flight()
+    assert again.obstacles == flown.obstacles
+    np.testing.assert_allclose(again.obstacle_pos, flown.obstacle_pos, atol=1e-9)
+    # Between steps, a recording is straight
+    np.testing.assert_allclose(again.min_obstacle_distance, flown.min_obstacle_distance, atol=0.02)
+    assert again.obstacles_at(60)[0].position == pytest.approx(tuple(flown.obstacle_pos[60, 0]))

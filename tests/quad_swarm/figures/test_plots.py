@@ -7,12 +7,15 @@ import sys
 import matplotlib.colors
 import numpy as np
 import pytest
+from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from PIL import Image
 
 from quad_swarm.evaluation.flight import Condition, Flight, fly
 from quad_swarm.figures import plots
 from quad_swarm.figures.colours import colour_of
+from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import make_config
 
 
@@ -149,3 +152,32 @@ def test_drawing_leaves_the_backend_of_matplotlib_alone():
         "assert matplotlib.get_backend() == 'svg'"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_obstacles_are_drawn_from_above_and_explained(flown):
+    condition, flight = flown
+    still, moving = Obstacle((0.5, 1.0, 0.0), 0.4), Obstacle((-1.0, 0.0, 1.0), 0.2, "sphere", (0.5, 0.0, 0.0))
+    steps = np.arange(len(flight.state))[:, None, None]
+    centres = np.array([one.position for one in (still, moving)]) + 0.1 * steps * [[0, 0, 0], [0.5, 0, 0]]
+    flight = dataclasses.replace(
+        flight, obstacles=(still, moving), obstacle_pos=centres, min_obstacle_distance=np.ones(len(steps))
+    )
+    figure = plots.draw_flights([condition], [flight])
+    circles = [one for one in figure.axes[0].get_children() if isinstance(one, Circle)]
+    assert flight.arrival is not None
+    places = {(one.radius, *np.round(one.center, 6)) for one in circles}
+    assert places == {(0.4, 0.5, 1.0), (0.2, round(-1 + 0.05 * flight.arrival, 6), 0.0)}, "at the end of the way"
+    assert figure.legends[0].get_texts()[-1].get_text() == "obstacle, at the end of its way"
+    alone = dataclasses.replace(flight, obstacles=(still,), obstacle_pos=centres[:, :1])
+    assert plots.draw_flights([condition], [alone]).legends[0].get_texts()[-1].get_text() == "obstacle"
+
+
+def test_collisions_with_obstacles_are_a_part_of_the_bars():
+    rows = [
+        one | ({"obstacle_collisions": one["collisions"] // 2} if one["scenario"] == "random" else {}) for one in ROWS
+    ]
+    (axes,) = plots.draw_collisions(rows).axes
+    hatched = [bars for bars in axes.containers if isinstance(bars, BarContainer) and bars[0].get_hatch()]
+    assert [[bar.get_height() for bar in bars] for bars in hatched] == [[0.25, 0], [0, 0], [0.05, 0], [0.1, 0]]
+    assert axes.get_legend().get_texts()[-1].get_text() == "with an obstacle"
+    assert len(plots.draw_collisions(ROWS).axes[0].get_legend().get_texts()) == 4

@@ -7,8 +7,10 @@ import numpy as np
 import pygame
 import pytest
 
+from quad_swarm.figures.colours import colour_of
 from quad_swarm.figures.render import _COLLISION, _NEAR, Renderer, _Camera, _rotation
 from quad_swarm.interfaces.env import QuadSwarmEnv
+from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import make_config
 
 CONFIG = make_config("paper", n_robots=2)
@@ -116,3 +118,76 @@ def test_a_window_shows_every_step(monkeypatch):
     assert env.render() is None
     env.close()
     assert pygame.display.get_surface() is None
+
+
+def seen(obstacles: list[Obstacle], config=CONFIG, gap: float = 4.0) -> np.ndarray:
+    return Renderer(config).draw(*scene(gap), [], obstacles)
+
+
+def changed(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.nonzero((one != other).any(axis=-1))
+
+
+def test_obstacles_are_drawn_where_they_are():
+    """Far from robots, and moving, so that the view is the same without them."""
+    plain = seen([])
+    camera = _Camera(np.array([[-2, 0, 1], [2, 0, 1], [0, 2, 1], [0, -2, 1.0]]), (640, 480))
+    for x in (-1.0, 1.0):
+        ball = Obstacle((x, 0.0, 1.2), 0.3, "sphere", (0.1, 0.0, 0.0))
+        rows, columns = changed(seen([ball]), plain)
+        middle = camera.project(np.array([ball.position]))[0]
+        rim = camera.silhouette(np.array(ball.position), np.full(3, 0.3))
+        assert columns.min() >= rim[:, 0].min() - 2
+        assert columns.max() <= max(rim[:, 0].max(), camera.project(np.array([[x + 0.3, 0, 0]]))[0, 0]) + 2
+        assert rows.min() == pytest.approx(rim[:, 1].min(), abs=2)
+        assert (np.hypot(rows - middle[1], columns - middle[0]) < 3).any()
+    pillar = Obstacle((0.0, 0.0, 7.0), 0.25, velocity=(0.1, 0.0, 0.0))
+    rows, columns = changed(seen([pillar]), plain)
+    foot, above = camera.project(np.array([[0, 0, 0], [0, 0, 1.5]]))
+    assert rows.max() == pytest.approx(foot[1], abs=30)
+    assert rows.min() == pytest.approx(above[1], abs=40), "it fades out above the robots"
+    assert abs(columns.mean() - foot[0]) < 10
+
+
+def test_what_is_behind_an_obstacle_is_drawn_behind_it():
+    (_, robot), *_ = scene()[0][:, :3], None
+    camera = _Camera(np.array([[-2, 0, 1], [2, 0, 1], [0, 2, 1], [0, -2, 1.0]]), (640, 480))
+    towards = camera._eye - robot
+    towards = towards * (1, 1, 0) / np.hypot(*towards[:2])
+    moves = {"velocity": (0.1, 0.0, 0.0)}
+    before, behind = (Obstacle(tuple(robot + side * towards), 0.3, **moves) for side in (0.8, -0.8))
+    plain = pixels_of(seen([]), colour_of(1))
+    assert pixels_of(seen([behind]), colour_of(1)) > 0.8 * plain
+    assert pixels_of(seen([before]), colour_of(1)) < 0.5 * plain
+
+
+@pytest.mark.parametrize(("gap", "ring"), [(0.2, None), (0.02, _NEAR), (-0.02, _COLLISION)])
+def test_contact_with_an_obstacle_wears_the_rings_of_contact(gap, ring):
+    config = make_config("flight", n_robots=2)
+    beside = Obstacle((2 + config.radius + gap + 0.5, 0.0, 0.0), 0.5)
+    picture = seen([beside], config)
+    for colour in (_NEAR, _COLLISION):
+        assert (pixels_of(picture, colour) > 20) == (colour == ring)
+
+
+def test_with_downwash_robots_wear_the_ellipsoids_that_collide():
+    config = make_config("flight", n_robots=2, planner={"downwash": 2.0})
+    state, *rest = scene(0.0)
+    for apart, ring in ((2.1, _NEAR), (1.9, _COLLISION)):
+        state[1, 2] = state[0, 2] + 2 * apart * config.radius
+        picture = Renderer(config).draw(state, *rest, [])
+        rows, _ = np.nonzero((picture == np.array(pygame.Color(ring))[:3]).all(axis=-1))
+        assert np.ptp(rows) > 100, "outlines that are twice as high as wide"
+
+
+def test_an_environment_draws_its_obstacles():
+    world = {"obstacles": {"listed": [{"position": [0, 0, 0], "radius": 0.5}]}}
+    shots = []
+    for more in ({}, {"world": world}):
+        env = gymnasium.make(
+            "QuadSwarm-v0", render_mode="rgb_array", scenario="symmetric_swap", preset="flight", **more
+        )
+        env.reset(seed=0)
+        shots.append(env.render())
+        env.close()
+    assert (shots[0] != shots[1]).any(axis=-1).mean() > 0.01

@@ -553,3 +553,49 @@ def test_recorded_flights_are_replayed(tmp_path, monkeypatch, capsys):
     for words in ([], ["--flight", "lab.csv", "--policy", "full"]):
         assert main([*words, "--out", "page.html"]) == 1
         assert "--policy" in capsys.readouterr().err
+
+
+def test_the_page_holds_obstacles_and_ellipsoids(tmp_path):
+    page = tmp_path / "replay.html"
+    arguments = ["--preset", "flight", "--policy", "none", "--n-robots", "4", "--max-steps", "40", "--out", str(page)]
+    assert main([*arguments, "--scenario", "crossing_traffic", "--world", "planner.downwash=2"]) == 0
+    data = data_of(page.read_text())
+    (flight,) = data["flights"]
+    assert data["downwash"] == 2
+    assert 2 <= len(flight["obstacles"]) <= 4
+    steps = len(flight["requests"])
+    for one in flight["obstacles"]:
+        assert one["shape"] == "sphere"
+        places = np.array(one["positions"])
+        assert places.shape == (steps + 1, 3)
+        np.testing.assert_allclose(np.diff(places, axis=0), np.diff(places, axis=0)[:1].repeat(steps, 0), atol=0.003)
+    assert len(flight["obstacle_distance"]) == steps + 1
+    hit = {step for step, distance in enumerate(flight["obstacle_distance"]) if step and distance < -0.001}
+    assert {step for step, _, _ in flight["hitting"]} == hit
+    assert main([*arguments, "--scenario", "forest"]) == 0
+    data = data_of(page.read_text())
+    assert all(len(one["positions"]) == 1 for one in data["flights"][0]["obstacles"]), "pillars stand"
+    assert main([*arguments, "--scenario", "random"]) == 0
+    plain = data_of(page.read_text())
+    assert "downwash" not in plain
+    assert set(data["flights"][0]) - set(plain["flights"][0]) == {"obstacles", "hitting", "obstacle_distance"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_obstacles_are_drawn_and_explained(browser, tmp_path, scheme):
+    shots = []
+    for name, radius in (("plain", None), ("pillar", 0.6)):
+        page = tmp_path / f"{name}.html"
+        listed = [] if radius is None else ["--world", f"obstacles.listed=[{{position: [0, 0, 0], radius: {radius}}}]"]
+        arguments = ["--preset", "flight", "--n-robots", "4", "--policy", "none", "--scenario", "symmetric_swap"]
+        assert main([*arguments, *listed, "--max-steps", "10", "--out", str(page)]) == 0
+        tab = browser.new_page(color_scheme=scheme, viewport={"width": 800, "height": 600})
+        tab.goto(f"{page.as_uri()}#step=0&view=top", timeout=300_000)
+        tab.wait_for_function("document.body.dataset.drawn !== undefined", timeout=300_000)
+        painted(tab)
+        shots.append(pixels(tab))
+        assert tab.locator("#legend .body").count() == (radius is not None)
+        tab.close()
+    rows, columns = np.nonzero(np.abs(shots[0] - shots[1]).max(axis=-1) > 12)
+    assert len(rows) > 500, "seen from above, in the middle"

@@ -5,6 +5,7 @@ export const flights = data.flights;
 export const nRobots = flights[0].goals.length;
 export const nPairs = nRobots * (nRobots - 1);
 export const contact = data.collision_distance;
+export const downwash = data.downwash ?? 1; // height over width of the ellipsoids that count as contact
 export let last = 0;
 
 for (const flight of flights) {
@@ -13,17 +14,21 @@ for (const flight of flights) {
   for (const step of flight.requests) flight.asked.push(flight.asked.at(-1) + step.length);
   flight.announces = flight.requests.some(step => step.some(pair => pair[2]));
   flight.touching = new Map();
-  derive(flight, flight.colliding);
+  flight.obstacles ??= [];
+  for (const obstacle of flight.obstacles) obstacle.moves = obstacle.positions.length > 1;
+  derive(flight, flight.colliding.concat((flight.hitting ?? []).map(hit => hit.slice(0, 2))));
 }
 
+// :param colliding: step, and the robots that collide in it
 function derive(flight, colliding) {
   flight.steps = flight.requests.length;
   last = Math.max(last, flight.steps);
   flight.closest = Math.min(...flight.separation);
   flight.closestStep = flight.separation.indexOf(flight.closest);
-  for (const [step, i, j] of colliding) {
+  if (flight.obstacle_distance) flight.closestObstacle = Math.min(...flight.obstacle_distance);
+  for (const [step, ...robots] of colliding) {
     if (!flight.touching.has(step)) flight.touching.set(step, new Set());
-    flight.touching.get(step).add(i).add(j);
+    for (const robot of robots) flight.touching.get(step).add(robot);
   }
 }
 
@@ -36,8 +41,11 @@ export function append(flight, step) {
   flight.separation.push(step.separation);
   flight.asked.push(flight.asked.at(-1) + step.requests.length);
   flight.arrival ??= step.arrived ? flight.requests.length : null;
-  flight.collision ??= step.colliding.length ? flight.requests.length : null;
-  derive(flight, step.colliding.map(pair => [flight.requests.length, ...pair]));
+  const hits = (step.obstacles?.hitting ?? []).map(hit => hit.slice(0, 1)), colliding = step.colliding.concat(hits);
+  flight.obstacles.forEach((obstacle, k) => { if (obstacle.moves) obstacle.positions.push(step.obstacles.positions[k]); });
+  flight.obstacle_distance?.push(step.obstacles.distance);
+  flight.collision ??= colliding.length ? flight.requests.length : null;
+  derive(flight, colliding.map(robots => [flight.requests.length, ...robots]));
 }
 
 const capital = text => text[0].toUpperCase() + text.slice(1);
@@ -84,6 +92,21 @@ export function position(flight, i, t, out) {
   }
   return out;
 }
+
+// Obstacles fly straight on.
+export function obstaclePosition(obstacle, t) {
+  const [k, next, s] = ends(t, obstacle.positions.length);
+  return obstacle.positions[k].map((x, axis) => lerp(x, obstacle.positions[next][axis], s));
+}
+
+// m from a robot's centre to the surface of an obstacle
+export function toSurface(p, obstacle, t) {
+  const q = obstaclePosition(obstacle, t), dz = obstacle.shape === "sphere" ? p[2] - q[2] : 0;
+  return Math.hypot(p[0] - q[0], p[1] - q[1], dz) - obstacle.radius;
+}
+
+// m, where vertical parts count less with downwash
+export const apart = (p, q) => Math.hypot(p[0] - q[0], p[1] - q[1], (p[2] - q[2]) / downwash);
 
 export function attitude(flight, i, t) {
   const [k, next, s] = ends(t, flight.attitudes.length);

@@ -1,7 +1,7 @@
 // What belongs to each flight on the page: its view with counters, and its timeline and plots.
 
 import {
-  askedUntil, contact, counted, data, flights, fullName, grouped, hasArrived, hasCollided, metres, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
+  askedUntil, contact, counted, data, downwash, flights, fullName, grouped, hasArrived, hasCollided, metres, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
 } from "./data.js";
 import {drawRequests, drawSeparation, stepUnder, timeScale, top} from "./plots.js";
 import {drawTimeline, wordsAt} from "./timeline.js";
@@ -21,6 +21,7 @@ function summary(flight) {
     `${flight.steps} steps (${seconds(flight.steps)})`,
     `${grouped(asked)} of ${grouped(possible)} ${counted(possible)} (${percent(asked, possible)})`,
     `closest ${metres(flight.closest)}`,
+    ...(flight.closestObstacle === undefined ? [] : [`to an obstacle ${flight.closestObstacle.toFixed(2)}\u00a0m`]),
     flight.collision === null ? "no collision" : `collision at step ${flight.collision}`,
     flight.arrival === null ? "not all arrived" : `all arrived after ${seconds(flight.arrival)}`,
   ];
@@ -97,17 +98,22 @@ function set(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
+const obstacles = flights.flatMap(flight => flight.obstacles);
+
 export const legend = [
   ["arc", "request: from the robot that asks to the one it asks; a light runs there and returns with the plan"],
   ...(flights.some(flight => flight.announces) ? [["arc announced", "announced plan, sent unasked: from the robot whose plan it is; a light runs there"]] : []),
   ["tube", `plan for the next ${seconds((flights[0].plans[0][0].length - 1) * data.plan_stride)}`],
   ["goal", "goal of the robot of this colour"],
-  ["bubble", `safety bubble, radius ${data.radius} m: two that touch are a collision`],
-  ["bubble close", `closer than ${(1.1 * contact).toFixed(2)} m to another`],
+  ["bubble", `safety bubble, radius ${data.radius} m${downwash === 1 ? "" : `, ${downwash} times as high as wide`}: two that touch are a collision`],
+  ...(obstacles.length ? [["body", `obstacle${obstacles.some(one => one.moves) ? ", some fly straight on" : ""}: a robot closer than ${data.radius} m collides`]] : []),
+  ["bubble close", `closer than ${(1.1 * contact).toFixed(2)} m to another${obstacles.length ? `, or ${(data.radius + 0.1 * contact).toFixed(2)} m to an obstacle` : ""}`],
   ["bubble alarm", "collision"],
 ];
 
 export const about = `${nRobots} quadrotors fly from where they start to the rings of their colours. Each plans its own path every ` +
   `${seconds(1, 2)} and may ask others for their plans; of those it does not ask it assumes that they fly straight on. ` +
   `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A request is one robot asking another in one step.` +
-  (flights.some(flight => flight.announces) ? " A plan is sent in answer to a request, or announced without one." : "");
+  (flights.some(flight => flight.announces) ? " A plan is sent in answer to a request, or announced without one." : "") +
+  (obstacles.length ? " All know the obstacles: where they are, how large, and how fast." : "") +
+  (downwash === 1 ? "" : ` They keep out of the air that others blow down: vertical parts of distances count 1 / ${downwash}.`);

@@ -6,7 +6,8 @@ import {
   TorusGeometry,
 } from "three";
 import {mergeGeometries} from "three/addons/utils/BufferGeometryUtils.js";
-import {attitude, colour, contact, data, nRobots, plan, position, touchingAt} from "./data.js";
+import {apart, attitude, colour, contact, data, downwash, nRobots, plan, position, touchingAt, toSurface} from "./data.js";
+import {Obstacles} from "./obstacles.js";
 import {Requests} from "./requests.js";
 import {Tubes} from "./tubes.js";
 
@@ -48,7 +49,7 @@ const shared = {
   airframe: airframe(),
   propeller: propeller(),
   disc: new CircleGeometry(0.95 * rotor, 24),
-  bubble: new SphereGeometry(data.radius, 32, 20),
+  bubble: new SphereGeometry(data.radius, 32, 20).scale(1, 1, downwash),
   ring: new TorusGeometry(data.goal_radius, 0.018, 8, 56),
   stem: new CylinderGeometry(0.008, 0.008, 1, 6).rotateX(Math.PI / 2).translate(0, 0, 0.5),
   foot: new CircleGeometry(0.07, 20),
@@ -149,9 +150,11 @@ class Robot {
 }
 
 export class Swarm {
-  constructor(flight) {
+  // :param top: see `Obstacles`
+  constructor(flight, top) {
     this.flight = flight;
     this.group = new Group();
+    this.obstacles = new Obstacles(flight, top);
     this.robots = Array.from({length: nRobots}, (_, i) => new Robot(i));
     this.positions = this.robots.map(() => [0, 0, 0]);
     this.plans = new Tubes(nRobots, flight.plans[0][0].length);
@@ -159,7 +162,7 @@ export class Swarm {
     this.plans.mesh.renderOrder = this.trails.mesh.renderOrder = 1;
     this.requests = new Requests();
     this.robots.forEach((robot, i) => this.group.add(robot.group, robot.goal(flight.goals[i])));
-    this.group.add(this.plans.mesh, this.trails.mesh, this.requests.mesh);
+    this.group.add(this.obstacles.group, this.plans.mesh, this.trails.mesh, this.requests.mesh);
   }
 
   // :param t: steps :param clock: s, of what moves although the flight stands still
@@ -167,9 +170,11 @@ export class Swarm {
     const {flight, positions} = this, now = Math.min(t, flight.steps);
     positions.forEach((p, i) => position(flight, i, now, p));
     const touching = touchingAt(flight, now), spin = t * data.dt;
+    this.obstacles.update(now, dark);
     this.robots.forEach((robot, i) => {
       const p = positions[i];
-      const close = positions.some((q, j) => j !== i && Math.hypot(p[0] - q[0], p[1] - q[1], p[2] - q[2]) < 1.1 * contact);
+      const close = positions.some((q, j) => j !== i && apart(p, q) < 1.1 * contact)
+        || flight.obstacles.some(obstacle => toSurface(p, obstacle, now) - data.radius < 0.1 * contact);
       const state = touching?.has(i) ? "collision" : close ? "close" : "free";
       robot.update(p, attitude(flight, i, now), spin, state, dark, labelSize);
       const ahead = plan(flight, i, now);

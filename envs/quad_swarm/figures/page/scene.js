@@ -19,6 +19,14 @@ const ends = flights[0].positions[0].concat(flights[0].goals);
 const near = [0, 1, 2].map(k => [Math.min(...ends.map(p => p[k])) - 2 * data.radius, Math.max(...ends.map(p => p[k])) + 2 * data.radius]);
 const visited = flights.flatMap(flight => flight.positions.filter((_, k) => k % 3 === 0).flat().concat(flight.goals))
   .map(p => p.map((x, k) => k < 2 ? Math.min(Math.max(x, near[k][0]), near[k][1]) : x));
+// Of obstacles that stand, what is among the robots or beside them
+const feet = [];
+for (const {moves, radius, positions: [[x, y]]} of flights.flatMap(flight => flight.obstacles)) {
+  if (moves) continue;
+  const clipped = (at, k) => Math.min(Math.max(at, near[k][0] - 0.7), near[k][1] + 0.7), z = flights[0].goals[0][2];
+  for (const [east, north] of [[-1, 0], [1, 0], [0, -1], [0, 1]]) feet.push([clipped(x + east * radius, 0), clipped(y + north * radius, 1), z]);
+}
+visited.push(...feet);
 const bounds = {
   low: [0, 1, 2].map(k => Math.min(...visited.map(p => p[k])) - data.radius),
   high: [0, 1, 2].map(k => Math.max(...visited.map(p => p[k])) + data.radius),
@@ -45,7 +53,7 @@ export function framed(preset, aspect, head) {
   const tall = Math.tan(FOV * Math.PI / 360), wide = tall * aspect;
   const points = visited.map(p => new Vector3(...p).sub(middle));
   // The shadows too, where they can be seen
-  if (preset !== "side") points.push(...flights[0].goals.map(([x, y]) => new Vector3(x, y, 0).sub(middle)));
+  if (preset !== "side") points.push(...flights[0].goals.concat(feet).map(([x, y]) => new Vector3(x, y, 0).sub(middle)));
   const [left, bottom, top] = [0.95, -0.94, 0.94 - 2 * head];
   let distance = 12, x0 = 0, y0 = 0;
   for (let pass = 0; pass < 12; pass++) {
@@ -74,7 +82,7 @@ export class Views {
     this.camera.up.set(0, 0, 1);
     this.background = new Color();
     this.scenes = flights.map(flight => {
-      const scene = new Scene(), swarm = new Swarm(flight), ground = new Ground(bounds), sky = new HemisphereLight();
+      const scene = new Scene(), swarm = new Swarm(flight, bounds.high[2] + 0.6), ground = new Ground(bounds), sky = new HemisphereLight();
       const sun = new DirectionalLight("#fff6e8", 2.2), reach = Math.hypot(...[0, 1, 2].map(k => bounds.high[k] - bounds.low[k])) / 2 + 0.5;
       sky.position.set(0, 0, 1);
       sun.position.set(middle.x - 2, middle.y - 2.5, 11);
