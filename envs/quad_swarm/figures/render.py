@@ -24,8 +24,8 @@ from quad_swarm.world.presets import SwarmConfig
 _BACKGROUND, _GRID, _INK, _REQUEST = "#FAFAFA", "#D9D9D9", "#333333", "#555555"
 _NEAR, _COLLISION = "#F0A000", "#D50000"
 _TRAIL_STEPS = 40
-_OPACITY, _FADE = 0.75, 10  # of obstacles; bands in which the upper half of a pillar fades out
-_OPEN = 0.5  # m that a pillar is drawn above starts and goals
+_OPACITY, _FADE = 0.75, 10  # of obstacles; bands in which a pillar fades out
+_OPEN = 1.0  # m above starts and goals in which it does
 
 
 class Renderer:
@@ -199,7 +199,7 @@ class Renderer:
             front = screen[self._camera.away(foot[:-1]) <= self._camera.away(foot).mean()]
             front = front[np.argsort(front[:, 0])]
             sides = centre + radius * np.outer([-1, 1], self._camera.right)
-            heights = np.concatenate([[0], np.linspace(0.5, 1, _FADE + 1)]) * self._top
+            heights = [0.0, *np.linspace(self._top - _OPEN, self._top, _FADE + 1)]
             edges = [self._project(np.column_stack([sides[:, :2], [height] * 2])) for height in heights]
             edges[0] = front
             for k, (low, high) in enumerate(itertools.pairwise(edges)):

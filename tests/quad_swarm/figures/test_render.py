@@ -8,7 +8,7 @@ import pygame
 import pytest
 
 from quad_swarm.figures.colours import colour_of
-from quad_swarm.figures.render import _COLLISION, _NEAR, Renderer, _Camera, _rotation
+from quad_swarm.figures.render import _COLLISION, _NEAR, Renderer, _Camera, _circle, _rotation
 from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import make_config
@@ -137,28 +137,31 @@ def test_obstacles_are_drawn_where_they_are():
         rows, columns = changed(seen([ball]), plain)
         middle = camera.project(np.array([ball.position]))[0]
         rim = camera.silhouette(np.array(ball.position), np.full(3, 0.3))
-        assert columns.min() >= rim[:, 0].min() - 2
-        assert columns.max() <= max(rim[:, 0].max(), camera.project(np.array([[x + 0.3, 0, 0]]))[0, 0]) + 2
+        shadow = camera.project(_circle(np.array([x, 0.0, 0.0]), 0.3))
+        assert columns.min() == pytest.approx(min(rim[:, 0].min(), shadow[:, 0].min()), abs=2)
+        assert columns.max() == pytest.approx(max(rim[:, 0].max(), shadow[:, 0].max()), abs=2)
         assert rows.min() == pytest.approx(rim[:, 1].min(), abs=2)
         assert (np.hypot(rows - middle[1], columns - middle[0]) < 3).any()
     pillar = Obstacle((0.0, 0.0, 7.0), 0.25, velocity=(0.1, 0.0, 0.0))
     rows, columns = changed(seen([pillar]), plain)
-    foot, above = camera.project(np.array([[0, 0, 0], [0, 0, 1.5]]))
+    foot, above = camera.project(np.array([[0, 0, 0], [0, 0, 2.0]]))
     assert rows.max() == pytest.approx(foot[1], abs=30)
     assert rows.min() == pytest.approx(above[1], abs=40), "it fades out above the robots"
     assert abs(columns.mean() - foot[0]) < 10
 
 
 def test_what_is_behind_an_obstacle_is_drawn_behind_it():
-    (_, robot), *_ = scene()[0][:, :3], None
     camera = _Camera(np.array([[-2, 0, 1], [2, 0, 1], [0, 2, 1], [0, -2, 1.0]]), (640, 480))
-    towards = camera._eye - robot
-    towards = towards * (1, 1, 0) / np.hypot(*towards[:2])
+    robot = scene()[0][1, :3]
+    x, y = camera.project(robot[None])[0].round().astype(int)
+    around = slice(y - 25, y + 26), slice(x - 25, x + 26)
+    towards = -np.cross([0.0, 0.0, 1.0], camera.right)
     moves = {"velocity": (0.1, 0.0, 0.0)}
-    before, behind = (Obstacle(tuple(robot + side * towards), 0.3, **moves) for side in (0.8, -0.8))
-    plain = pixels_of(seen([]), colour_of(1))
-    assert pixels_of(seen([behind]), colour_of(1)) > 0.8 * plain
-    assert pixels_of(seen([before]), colour_of(1)) < 0.5 * plain
+    before, behind = (Obstacle(tuple(robot + side * towards), 0.2, **moves) for side in (0.4, -0.4))
+    plain = pixels_of(seen([])[around], colour_of(1))
+    assert plain > 50
+    assert pixels_of(seen([behind])[around], colour_of(1)) == plain
+    assert pixels_of(seen([before])[around], colour_of(1)) < 0.5 * plain
 
 
 @pytest.mark.parametrize(("gap", "ring"), [(0.2, None), (0.02, _NEAR), (-0.02, _COLLISION)])
