@@ -1,6 +1,6 @@
 // Pillars and spheres: bodies without a colour of their own. A pillar is as high as the world, so it fades out above the robots.
 
-import {BufferAttribute, CylinderGeometry, Group, Mesh, MeshStandardMaterial, SphereGeometry} from "three";
+import {BufferAttribute, CircleGeometry, CylinderGeometry, Group, Mesh, MeshStandardMaterial, SphereGeometry} from "three";
 import {obstaclePosition} from "./data.js";
 
 const PAINT = {light: "#b9bec6", dark: "#66717e"};
@@ -27,7 +27,8 @@ export class Obstacles {
       const mesh = new Mesh(whole, this.paints[0]);
       mesh.castShadow = true;
       body.add(mesh);
-      if (shape !== "sphere") body.add(new Mesh(fading(radius, BARE * top, top), this.paints[1]));
+      // From above, one looks down to its foot
+      if (shape !== "sphere") body.add(new Mesh(fading(radius, BARE * top, top), this.paints[1]), new Mesh(new CircleGeometry(radius, 40).translate(0, 0, 0.005), this.paints[0]));
       this.group.add(body);
       return body;
     });
