@@ -262,7 +262,7 @@ class Flight:
         """Distance (m) and time (s) of the closest approach at constant velocities from each step on, without a time
         limit, both (T + 1, n, n - 1)."""
         downwash = self.config.planner.downwash
-        nearest, time = closest_approach(*(flattened(one, downwash) for one in (self.relative_pos, self.relative_vel)))
+        nearest, time = closest_approach(flattened(self.relative_pos, downwash), flattened(self.relative_vel, downwash))
         return length(nearest), time
 
     @cached_property
@@ -334,8 +334,17 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     start, config = state[0][:, POSITION], condition.config
     apart = flattened(start[other_indices(len(start))] - start[:, None], config.planner.downwash)
     closest.insert(0, length(apart).min())
-    arrays = map(np.array, (state, plans, goal, requests, announced, other_requests, closest, inputs))
-    flight = Flight(config, *arrays)
+    flight = Flight(
+        config,
+        np.array(state),
+        np.array(plans),
+        goal,
+        np.array(requests),
+        np.array(announced),
+        np.array(other_requests),
+        np.array(closest),
+        np.array(inputs),
+    )
     if not obstacles:
         return flight
     beside.insert(0, clearances(start, surroundings(obstacles)).min() - config.radius)

@@ -482,5 +482,5 @@ def _read_csv(path: Path) -> Recording:
     state, plan = np.concatenate([pos, vel, attitude], axis=-1), np.zeros((*shape, 0, 3))
     talk = (sets("asked"), sets("told"))
     obstacles = _obstacles(json.loads(next(filter(None, (row.get("obstacles") for row in rows)), "[]")))
-    words = {"guessed": frozenset(guessed), "obstacles": obstacles}
-    return Recording(time, state, columns(_SET), plan, *talk, goal, **words)
+    arrays = (time, state, columns(_SET), plan, *talk, goal)
+    return Recording(*arrays, guessed=frozenset(guessed), obstacles=obstacles)

@@ -121,7 +121,7 @@ def _places(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, list[Mappi
 
 def _hatch(axes: Axes, rows: Sequence[Mapping[str, Any]], height: Any, label: str) -> None:
     """Hatch the lower parts of bars."""
-    style = {"facecolor": "none", "edgecolor": "white", "hatch": "////", "linewidth": 0}
+    style: dict[str, Any] = {"facecolor": "none", "edgecolor": "white", "hatch": "////", "linewidth": 0}
     for _, mine, x, width in _places(rows):
         axes.bar(x, [height(row) for row in mine], width, **style)
     handles, labels = axes.get_legend_handles_labels()
@@ -229,7 +229,7 @@ def draw_flight(axes: Axes, flight: Flight) -> None:
 def _draw_obstacles(axes: Axes, flight: Flight) -> None:
     """Draw the obstacles of a flight from above. Only those that stand belong to what must be seen."""
     end = len(flight.requests) if flight.arrival is None else flight.arrival
-    style = {"facecolor": OBSTACLE, "edgecolor": OUTLINE, "linewidth": 0.8, "zorder": 1.5}
+    style: dict[str, Any] = {"facecolor": OBSTACLE, "edgecolor": OUTLINE, "linewidth": 0.8, "zorder": 1.5}
     for one, there in zip(flight.obstacles_at(0), flight.obstacles_at(end), strict=True):
         before, after = np.array(one.position[:2]), np.array(there.position[:2])
         body = Circle((after[0], after[1]), one.radius, label="obstacle", **style)
@@ -241,7 +241,14 @@ def _draw_obstacles(axes: Axes, flight: Flight) -> None:
             aside = one.radius * np.array([-along[1], along[0]])
             way = Polygon([before - aside, before + aside, after + aside, after - aside])
             way.set(facecolor=OBSTACLE, alpha=0.3, linewidth=0, zorder=0.5)
-            arrow = FancyArrowPatch(before, after, arrowstyle="-|>", mutation_scale=10, color=OUTLINE, shrinkB=0)
+            arrow = FancyArrowPatch(
+                (before[0], before[1]),
+                (after[0], after[1]),
+                arrowstyle="-|>",
+                mutation_scale=10,
+                color=OUTLINE,
+                shrinkB=0,
+            )
             arrow.set(linewidth=0.8, zorder=1.6)
             for artist in (way, arrow):
                 axes.add_artist(artist)

@@ -320,7 +320,7 @@ def _rotation(phi: float, theta: float, psi: float) -> np.ndarray:
 
 def _clear(colour: pygame.Color, opacity: float) -> pygame.Color:
     """Return a colour through which what is behind it shows; 1 is opaque."""
-    return pygame.Color(*colour[:3], round(255 * opacity))
+    return pygame.Color(colour.r, colour.g, colour.b, round(255 * opacity))
 
 
 def _blend(colour: str, amount: float) -> pygame.Color:

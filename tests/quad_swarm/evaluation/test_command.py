@@ -18,6 +18,9 @@ from quad_swarm.world.scenarios import SCENARIOS, without_obstacles
 from quad_swarm.world.swarm import Swarm
 from sb3_maddpg.hub.pretrained import pretrained_folder
 
+# Columns of worlds without obstacles
+USUAL = [column for column in COLUMNS if column.needs is None]
+
 KEYS = {
     "policy", "scenario", "preset", "episodes", "collisions", "collision_low", "collision_high",
     "collisions_continuous", "requests_per_step", "request_share", "reduction", "arrived", "steps_to_arrival",
@@ -98,8 +101,31 @@ def test_a_table_fits_one_hundred_columns_unless_all_are_asked_for(capsys):
     assert main([*flags, "--wide"]) == 0
     printed = capsys.readouterr().out
     titles = printed.splitlines()[0]
-    assert [column.title for column in COLUMNS] == [title.strip() for title in titles.split("  ") if title]
+    assert [column.title for column in USUAL] == [title.strip() for title in titles.split("  ") if title]
     assert all(rule in printed for rule in rules)
+
+
+def test_worlds_with_obstacles_have_columns_of_their_own(capsys):
+    flags = [
+        "--preset",
+        "flight",
+        "--n-robots",
+        "4",
+        "--policy",
+        "none",
+        "--episodes",
+        "1",
+        "--max-steps",
+        "20",
+        "--wide",
+    ]
+    assert main([*flags, "--scenario", "forest", "random"]) == 0
+    titles, _, forest, plain = capsys.readouterr().out.partition("\n\n")[0].splitlines()
+    assert "  obstacles  " in titles
+    assert "  to obst. (m)  " in titles
+    begin = titles.index("obstacles")
+    assert forest[begin : begin + len("obstacles")].strip() == "0.0%"
+    assert plain[begin : begin + len("obstacles")].strip() == "-"
 
 
 def test_the_table_goes_into_latex_and_csv(tmp_path, capsys):
@@ -109,11 +135,11 @@ def test_the_table_goes_into_latex_and_csv(tmp_path, capsys):
     tex = (tmp_path / "a.tex").read_text().splitlines()
     comments, tex = tex[:2], tex[2:]
     assert [line.removeprefix("% ") for line in comments] == printed.split("\n\n")[1].splitlines()[:2]
-    assert tex[:2] == [f"\\begin{{tabular}}{{ll{'r' * (len(COLUMNS) - 2)}}}", r"\toprule"]
+    assert tex[:2] == [f"\\begin{{tabular}}{{ll{'r' * (len(USUAL) - 2)}}}", r"\toprule"]
     assert "$>$ 1 cm" in tex[2]
     assert tex[-2:] == [r"\bottomrule", r"\end{tabular}"]
     cells = [line.removesuffix(r" \\").split(" & ") for line in tex if line.endswith(r"\\")]
-    assert {len(line) for line in cells} == {len(COLUMNS)}
+    assert {len(line) for line in cells} == {len(USUAL)}
     assert cells[2][:2] == [r"random\_swap", r"\texttt{full$|$none}"]
     assert cells[2][9] == r"100.00\%"
     assert tex.count(r"\addlinespace") == 1
