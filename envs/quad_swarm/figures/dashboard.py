@@ -48,7 +48,6 @@ LAYOUT: dict[str, dict[str, list[Any]]] = {
         "steps per second": _line("time/fps"),
         "training: reward for requests": _line("reward/requests"),
         "training: planner failures": _line("planner/failure_rate"),
-        "training: collisions with obstacles, if there are any": _line("swarm/obstacle_collision_rate"),
     },
 }
 # Number of episodes for the heat map, and their own set of held-out episodes

@@ -1,5 +1,6 @@
 """What TensorBoard shows beside the curves."""
 
+import gymnasium
 import numpy as np
 import pytest
 import yaml
@@ -60,6 +61,15 @@ def test_pairs_are_counted_as_episodes_are():
     assert possible == sum(row["possible_requests"] for row in rows)
     assert collisions == sum(row["collided"] for row in rows)
     assert not np.diag(asked).any()
+
+
+@pytest.mark.slow
+def test_scenarios_with_obstacles_are_drawn_if_they_are_trained(monkeypatch):
+    monkeypatch.setattr(dashboard, "EPISODES", 1)
+    known = {"preset": "flight", "n_robots": 3, "max_steps": 10, "scenario": "forest"}
+    model = MADDPG("MlpPolicy", gymnasium.make("QuadSwarm-v0", **known), seed=0)
+    drawn = {tag for tag in dashboard.draw(model, known) if tag.startswith("eval/flight/")}
+    assert drawn == {f"eval/flight/{name}" for name in ("forest", *without_obstacles())}
 
 
 @pytest.mark.parametrize("algorithm", [MADDPG, PPO])
