@@ -99,7 +99,8 @@ _FIELDS: dict[str, dict[str, Any]] = {
     },
     "radio": {
         "loss": _real(0, 1), "delay": _whole(0, 30), "jitter": _whole(0, 10), "bursts": _real(0, 0.99),
-        "burst_length": _real(1, 100), "outage": _real(0, 1),
+        "burst_length": _real(1, 100), "outage": _real(0, 1), "range": _real(0.1, 100),
+        "half_distance": _real(0.1, 100), "path_loss_exponent": _real(1, 10),
     },
     "neighbourhood": {"max_others": _whole(1, 16), "range": _real(0.1, 100), "look_ahead": _real(0, 5)},
     "quadrotor": {

@@ -86,8 +86,9 @@ class DelayCheckedSwarm(Swarm):
             (E, n, n - 1, 2, stages + 1, 3)
         """
         self._sent = [advance(sent) for sent in self._sent]
-        arriving, _ = self.disturbances.arrivals(requests, self.neighbours.others)
-        newest = self._sent[0][:, self.neighbours.others]
+        others = self.neighbours.others
+        arriving, _ = self.disturbances.arrivals(self.disturbances.carried(requests, self.pos, others), others)
+        newest = self._sent[0][:, others]
         self._known = np.where(arriving[..., None, None, None], newest, advance(self._known))
         start = self.disturbances.start
         if start is None:

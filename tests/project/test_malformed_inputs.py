@@ -363,7 +363,7 @@ FIELDS = {
         "goal_weight", "input_weight", "repulsion_buffer", "violation_weight", "max_neighbours",
     ),
     "noise": ("pos", "vel", "attitude", "wind"),
-    "radio": ("loss", "delay"),
+    "radio": ("loss", "delay", "range", "half_distance", "path_loss_exponent"),
     "space": ("half_width", "heights", "spacing", "circle_radius", "circle_jitter", "sector_radius", "whole_sectors"),
     "world": ("n_robots", "radius", "collision_tolerance", "goal_radius", "memory", "quadrotor", "noise", "space"),
 }  # fmt: skip

@@ -94,12 +94,18 @@ class Arena:
     :param exchange: how the world and the robots talk, by default over UDP
     :param log: folder for what the robots' processes print; by default it is shown
     :raises RobotEndedError: if a robot's process does not start
-    :raises ValueError: if there are more than 64 robots
+    :raises ValueError: if there are more than 64 robots, or the world's radio depends on distances
     """
 
     def __init__(self, team: Team, exchange: Exchange | None = None, log: Path | None = None):
         if team.config.n_robots > _MOST_ROBOTS:
             raise ValueError(f"n_robots={team.config.n_robots}: at most {_MOST_ROBOTS} fly in real time here.")
+        for name in ("range", "half_distance"):
+            if (value := getattr(team.config.radio, name)) is not None:
+                raise ValueError(
+                    f"radio.{name}={value:g}: messages of processes do not know how far they travel; fly in virtual "
+                    "time (fly --link virtual), or leave it out."
+                )
         self.team, self.vehicles = team, Vehicles(team.config)
         self._exchange = exchange or UdpWorld()
         self._senses: dict[int, Sensed] = {}

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from quad_swarm.planner import base, make_planner
+from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.link import Channel, Conditions, Handler, Sensed, Traffic, WireLink
 from quad_swarm.realtime.loop import Loop
 from quad_swarm.realtime.process import Sample, report_of
@@ -50,9 +51,10 @@ class VirtualFlight:
     :ivar loops: the robots' loops
     :ivar now: the time (us)
 
-    :param config: the world
+    :param config: the world. Of its radio, `Radio.range` and `Radio.half_distance` apply, to every message, by true
+        distances; what these do to messages between two robots is drawn once in a period, for both directions
     :param policies: a policy for each robot
-    :param conditions: how messages fare
+    :param conditions: how messages fare apart from that
     :param timing: delays and clocks
     :param limits: when robots hover and land
     :param wait: see `Loop`
@@ -94,6 +96,9 @@ class VirtualFlight:
         self._rng = np.random.default_rng(seed)
         self._channel = Channel(self.conditions, [seed, 1])
         self.now, self._events = 0, []
+        self._fading, self._fade = np.random.default_rng([seed, 2]), np.zeros((n, n))
+        if self.config.radio.half_distance is not None:
+            self._begin_fade()
         self.dead, self.frozen = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self._until = np.zeros(n, dtype=np.int64)  # robots whose processes stand still
         self._apart: tuple[int, ...] | None = None
@@ -173,6 +178,8 @@ class VirtualFlight:
         """Let a message travel."""
         if self._apart is not None and (sender in self._apart) != (receiver in self._apart):
             return
+        if self.config.radio.limits_distance and not self._carries(sender, receiver):
+            return
         for arriving in self._channel.arriving(message):
             self.at(self.now + round(self._draw(self.timing.message)), partial(self._arrive, receiver, arriving))
 
@@ -185,6 +192,18 @@ class VirtualFlight:
         """Return what a robot perceives, with its own clock."""
         seen = self._seen[robot]
         return None if seen is None else seen._replace(stamp=seen.stamp + self.links[robot].error)
+
+    def _carries(self, sender: int, receiver: int) -> bool:
+        """Return whether the distance of two robots lets messages through."""
+        pos = self.vehicles.state[:, POSITION]
+        distance = np.linalg.norm(pos[sender] - pos[receiver])
+        return bool(self._fade[sender, receiver] < self.config.radio.carries(distance))
+
+    def _begin_fade(self) -> None:
+        """Draw how messages fare between each two robots in the next period."""
+        drawn = np.triu(self._fading.random(self._fade.shape), 1)
+        self._fade = drawn + drawn.T
+        self.at(self.now + round(self.config.planner.dt * _US), self._begin_fade, first=True)
 
     def _join(self) -> None:
         self._apart = None

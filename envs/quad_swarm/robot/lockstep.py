@@ -86,17 +86,18 @@ class LockstepWorld:
     def _exchange(self, bits: np.ndarray) -> None:
         """Let the radio carry requests, answers and announcements of a period."""
         radio, n = self.config.radio, len(self.robots)
-        wanted = np.zeros((n, n), dtype=bool)  # [receiver, sender]
+        asked, told = np.zeros((2, n, n), dtype=bool)  # [receiver, sender]
         for i in range(n):
-            wanted[i, self._others[i]] |= bits[i, :, 0]
+            asked[i, self._others[i]] = bits[i, :, 0]
             if bits.shape[2] == 2:
-                wanted[self._others[i], i] |= bits[i, :, 1]
-        wanted = np.take_along_axis(wanted, self._others, axis=1)
+                told[self._others[i], i] = bits[i, :, 1]
+        asked, told = (np.take_along_axis(one, self._others, axis=1) for one in (asked, told))
         for plans, robot in zip(self._plans, self.robots, strict=True):
             if robot.newest.stamp != plans[-1].stamp:
                 plans.append(robot.newest)
-        arriving, lateness = self.realisation.arrivals(wanted[None], self._others)
-        for i, k in np.argwhere(wanted):
+        carried = self.realisation.carried((asked | told)[None], self.state[..., POSITION], self._others)
+        arriving, lateness = self.realisation.arrivals(carried, self._others)
+        for i, k in np.argwhere(carried[0] | told):
             robot = self.robots[self._others[i, k]]
             robot.sent(int(i), self.now - (1 + radio.delay) * robot.period)
         for i, k in np.argwhere(arriving[0]):

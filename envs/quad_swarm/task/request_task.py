@@ -234,8 +234,10 @@ class RequestTask:
         if bits.shape[-1] == 1:
             return self.step(bits[..., 0])
         requests = requests_of(bits, neighbours)
+        announced = requests_of(bits & [False, True], neighbours)
         unheard = bits[..., 1:] & (neighbours.reverse < 0)[..., None]
-        return self.step(requests, bits.sum(axis=-1), requests.sum(axis=(1, 2)) + unheard.sum(axis=(1, 2, 3)))
+        n_requests = requests.sum(axis=(1, 2)) + unheard.sum(axis=(1, 2, 3))
+        return self.step(requests, bits.sum(axis=-1), n_requests, announced)
 
     def sent(self, bits: np.ndarray) -> np.ndarray:
         """Return the actions without the bits for empty slots.
@@ -246,7 +248,11 @@ class RequestTask:
         return bits if present is None else bits & present[..., None]
 
     def step(
-        self, requests: np.ndarray, messages: np.ndarray | None = None, n_requests: np.ndarray | None = None
+        self,
+        requests: np.ndarray,
+        messages: np.ndarray | None = None,
+        n_requests: np.ndarray | None = None,
+        announced: np.ndarray | None = None,
     ) -> Outcome:
         """Take one step in every swarm.
 
@@ -254,8 +260,9 @@ class RequestTask:
         :param messages: number of bits that each robot sets for each of the others, which the reward penalises,
             (E, n, n - 1); by default the requests
         :param n_requests: number of requests to report, (E,); by default that of ``requests``
+        :param announced: which of the plans are sent unasked, as in `Swarm.step`
         """
-        report = self.swarm.step(requests)
+        report = self.swarm.step(requests, announced)
         collided = report.collision_continuous if self.continuous_collisions else report.collision
         colliding = report.colliding_continuous if self.continuous_collisions else report.colliding
         if n_requests is None:

@@ -10,9 +10,10 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field, NonNegativeFloat
 
-from quad_swarm.validation import checked
+from quad_swarm.validation import PositiveLength, checked
 
 # Limits far beyond any flight, and small enough for precise calculations
 Disturbance = Annotated[float, Field(ge=0, le=1e3)]
@@ -92,18 +93,30 @@ class Radio:
     its sender must have known of the request when it made the plan. With ``round_trip``, the answer is the plan of the
     last step, as of the request, and is used later, as in a network.
 
-    :param loss: probability that an answer is lost, independently for each answer
+    What distance does is drawn once in a step for each exchange: a request and its answer, even one that comes steps
+    later, or an announcement. Either the radio carries all of it or nothing, as radio channels are reciprocal and
+    hardly change while a robot answers. What counts is the true distance at the request, which robots do not know: a
+    robot that is not reached does not know that it was asked, and who announces a plan assumes that it arrives.
+
+    :param loss: probability that an answer is lost, independently for each answer, at any distance
     :param delay: delay of answers (steps); with 0 a robot receives the plan that was made one step ago
     :param jitter: maximum additional delay (steps), drawn uniformly from 0 to this for each answer; robots keep the
         newer of two plans
     :param round_trip: steps from a request to the use of its answer, apart from jitter; 0 if robots wait for answers
         within a step; None for answers that are used at once and are older, by ``delay``
+    :param range: distance beyond which nothing is carried (m), as ``MaxRange`` of ns-3's ``RangePropagationLossModel``;
+        None for any distance
+    :param half_distance: distance at which half of the exchanges fail (m), see `carries`; None if none fails within the
+        range
+    :param path_loss_exponent: exponent n with which the power received falls with distance: 2 in free space, 3 in
+        ns-3's ``LogDistancePropagationLossModel``; only with ``half_distance``
     :param bursts: fraction of the time in which the link from one robot to another is interrupted
     :param burst_length: mean length of an interruption (steps)
     :param outage: probability that a robot stops answering for good, at a time drawn uniformly from the first 5 s; it
         still flies and makes requests
     :raises ValueError: if a probability is outside [0, 1] (``bursts``: [0, 1)), a delay is outside 0 to 1000,
-        ``burst_length`` is less than a step, or there are both ``delay`` and ``round_trip``
+        ``burst_length`` is less than a step, a distance is not positive, ``path_loss_exponent`` is outside 1 to 10, or
+        there are both ``delay`` and ``round_trip``
     """
 
     loss: Share = 0.0
@@ -113,6 +126,9 @@ class Radio:
     burst_length: Annotated[float, Field(ge=1)] = 10.0
     outage: Share = 0.0
     round_trip: Annotated[int, Field(ge=0, le=1000)] | None = None
+    range: PositiveLength | None = None
+    half_distance: PositiveLength | None = None
+    path_loss_exponent: Annotated[float, Field(ge=1, le=10)] = 3.0
 
     def __post_init__(self) -> None:
         if self.round_trip is not None and self.delay:
@@ -124,4 +140,25 @@ class Radio:
     @functools.cached_property
     def is_random(self) -> bool:
         """Whether it is random which answers arrive, and when."""
-        return any((self.loss, self.jitter, self.bursts, self.outage))
+        return any((self.loss, self.jitter, self.bursts, self.outage, self.half_distance))
+
+    @property
+    def limits_distance(self) -> bool:
+        """Whether it depends on distance what arrives."""
+        return self.range is not None or self.half_distance is not None
+
+    def carries(self, distance: np.ndarray) -> np.ndarray:
+        """Return the probability that the radio carries an exchange: ``2 ** -(d / half_distance) ** n`` at the distance
+        d up to ``range``, 0 beyond.
+
+        This is the share that arrives if power falls as in the log-distance model, Rayleigh fading is drawn for each
+        exchange, and a receiver needs a certain power (outage probability in A. Goldsmith, *Wireless Communications*,
+        2005). In ns-3: ``LogDistancePropagationLossModel``, then ``NakagamiPropagationLossModel`` with m = 1.
+
+        :param distance: distances, (...) (m)
+        """
+        carried = np.ones_like(distance)
+        if self.half_distance is not None:
+            with np.errstate(over="ignore"):  # so far away that nothing arrives
+                carried = np.exp2(-((distance / self.half_distance) ** self.path_loss_exponent))
+        return carried if self.range is None else np.where(distance <= self.range, carried, 0.0)

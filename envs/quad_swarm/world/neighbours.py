@@ -26,7 +26,8 @@ class Neighbourhood:
 
     :param max_others: maximum number of others, of which the nearest are chosen, as the robot observes them; None for
         all
-    :param range: maximum distance of others, for both sensors and radio (m); None for any distance
+    :param range: maximum distance of others (m), beyond which robots neither perceive them nor ask them; None for any
+        distance. The radio has a range of its own, see `Radio`
     :param look_ahead: time over which the smallest distance at constant velocities decides which others are nearest
         (s); 0 for the current distance. In a crowd, the others that are currently nearest are not the most relevant
     :raises ValueError: if a value is negative or not finite, or a value other than ``look_ahead`` is zero

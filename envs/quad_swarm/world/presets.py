@@ -109,12 +109,16 @@ class SwarmConfig:
                 f"space.spacing={self.space.spacing:g}: robots would start or stop in contact; it must be at least "
                 f"2 * radius = {contact:g}, or left out of `make_config` to follow the separation"
             )
-        reach = self.neighbourhood.range
-        if reach is not None and reach < planner.separation:
-            raise ValueError(
-                f"neighbourhood.range={reach}: robots must perceive others at least up to the distance that they keep, "
-                f"planner.separation={planner.separation}"
-            )
+        for name, reach, does in (
+            ("neighbourhood.range", self.neighbourhood.range, "robots must perceive others"),
+            ("radio.range", self.radio.range, "the radio must carry plans"),
+            ("radio.half_distance", self.radio.half_distance, "the radio must carry half of the plans"),
+        ):
+            if reach is not None and reach < planner.separation:
+                raise ValueError(
+                    f"{name}={reach}: {does} at least up to the distance that robots keep, "
+                    f"planner.separation={planner.separation}"
+                )
 
     def _check_vehicle(self) -> None:
         planner, longest = self.planner, self.quadrotor.longest_step

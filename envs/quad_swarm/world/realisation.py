@@ -152,10 +152,27 @@ class Realisation:
         """The observers' errors about positions and velocities of others, (E, n, n - 1, 6); None without any."""
         return self._observer if self.config.sensing.others else None
 
+    def carried(self, requests: np.ndarray, pos: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """Draw which exchanges of this step are carried over their distance, see `Radio`.
+
+        :param requests: whose plans each robot requests, (E, n, n - 1) bool
+        :param pos: true positions, (E, n, 3) (m)
+        :param others: see `other_indices` or `Neighbours.others`
+        :return: which of the requests get through, (E, n, n - 1) bool
+        """
+        radio = self.config.radio
+        if not radio.limits_distance:
+            return requests
+        between = of_others(pos, others) - pos[:, :, None]
+        chance = radio.carries(np.sqrt((between * between).sum(axis=-1)))
+        if radio.half_distance is None:
+            return requests & (chance > 0)
+        return requests & (np.stack([rng.random(requests.shape[1:]) for rng in self._rngs]) < chance)
+
     def arrivals(self, requests: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Draw which answers of this step arrive.
 
-        :param requests: whose plans each robot requests, (E, n, n - 1) bool
+        :param requests: which requests get through, (E, n, n - 1) bool, see `carried`
         :param others: see `other_indices` or `Neighbours.others`
         :return: which requests are answered, (E, n, n - 1) bool, and the answers' additional delays beyond the radio's
             delay (steps), (E, n, n - 1), None without jitter

@@ -125,7 +125,8 @@ class Swarm(SwarmState):
         state = np.zeros((n_swarms, n, 9))
         plans = Plans.hover(state.reshape(-1, 9), horizon)
         plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
-        differ = config.radio.is_random or config.radio.round_trip or config.sensing.others
+        radio = config.radio
+        differ = radio.is_random or radio.limits_distance or radio.round_trip or config.sensing.others
         super().__init__(
             state=state,
             goal=np.zeros((n_swarms, n, 3)),
@@ -309,13 +310,15 @@ class Swarm(SwarmState):
             raise ValueError(f"plant={self.config.plant!r} does not provide its state: only plant={MODEL!r} does.")
         return super().state_dict()
 
-    def step(self, requests: np.ndarray) -> StepReport:
+    def step(self, requests: np.ndarray, announced: np.ndarray | None = None) -> StepReport:
         """Let all robots make requests, plan and fly for one step.
 
         :param requests: whose plans each robot requests, (E, n, n - 1) bool, with the others in ascending order or as
             in `neighbours`, and False for empty slots
+        :param announced: which of these plans are sent unasked, (E, n, n - 1) bool; None for none. Who sends one
+            assumes that it arrives, however far the receiver is
         """
-        believed, source = self._believe(requests)
+        believed, source = self._believe(requests, announced)
         started = time.perf_counter()
         self._plans = self.planner.plan(self._problems(believed, source), self._plans)
         solve_seconds = time.perf_counter() - started
@@ -339,14 +342,15 @@ class Swarm(SwarmState):
             self.disturbances.draw_for_new_neighbours(self.neighbours.perceived(changed))
         return changed
 
-    def _believe(self, requests: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _believe(self, requests: np.ndarray, announced: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the beliefs after the answers have arrived, see `Beliefs.update`."""
         others = self.neighbours.others
         self._radio.send(self.planned_positions())
+        carried = self.disturbances.carried(requests, self.pos, others)
         if self._other_beliefs is not None:
-            sent = self._radio.answers(requests, others)
-            self._other_beliefs.receive(requests, *self._seen_by_all(), *sent)
-        answered, lateness = self.disturbances.arrivals(requests, others)
+            sent = carried if announced is None else carried | announced
+            self._other_beliefs.receive(sent, *self._seen_by_all(), *self._radio.answers(sent, others))
+        answered, lateness = self.disturbances.arrivals(carried, others)
         arriving, received, age = self._radio.deliver(answered, others, lateness)
         return self.beliefs.update(arriving, *self.observe(), received, age)
 

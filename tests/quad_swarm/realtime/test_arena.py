@@ -56,6 +56,13 @@ def test_four_processes_swap_places():
     assert reports[-1].plan.shape == (CONFIG.planner.horizon + 1, 3)
 
 
+@pytest.mark.parametrize("field", ["range", "half_distance"])
+def test_processes_do_not_know_how_far_messages_travel(field):
+    config = make_config("flight", {"radio": {field: 2.0}}, n_robots=4)
+    with pytest.raises(ValueError, match=rf"radio\.{field}=2: .* virtual time .*--link virtual"):
+        Arena(Team(config, "none"))
+
+
 @pytest.mark.slow
 def test_a_process_that_dies_on_purpose_ends_no_flight():
     with Arena(Team(CONFIG, "none")) as arena:

@@ -108,6 +108,27 @@ def test_the_same_seed_is_the_same_flight():
     assert ends[0] == ends[1]
 
 
+def test_exchanges_arrive_as_distance_lets_them():
+    """Three robots stand in a row, 1.5 m and 2.5 m apart."""
+    calm = {"noise": dict.fromkeys(("vel", "attitude", "wind", "gust"), 0.0), "mismatch": 0.0}
+    sensing = dict.fromkeys(("pos", "vel", "attitude", "others_pos", "others_vel"), 0.0)
+    radio = {"range": 2.0, "half_distance": 1.5}
+    config = make_config("flight", {**calm, "sensing": sensing, "radio": radio}, n_robots=3)
+    flight = VirtualFlight(config, [RulePolicy("full")] * 3)
+    places = np.array([[-2.0, 0, 1], [-0.5, 0, 1], [2, 0, 1]])
+    flight.reset(places, places, 0)
+    flight.run(16.0)
+    counts = [one.counts for one in flight.result().statistics]
+    for near in counts[:2]:
+        periods = near["requests"] / 2
+        assert periods > 300
+        share = near["plans received"] / periods  # of the one that is near; requests and answers fare alike
+        assert abs(share - 0.5) <= 4 * np.sqrt(0.25 / periods)
+    assert counts[2]["requests"] > 600
+    assert counts[2]["plans received"] == counts[2]["answers"] == 0
+    assert not flight.vehicles.flying[2], "a robot that hears nobody lands"
+
+
 def test_a_robot_that_gets_no_state_lands():
     flight = flight_of(4)
     begin(flight, 0)

@@ -79,6 +79,13 @@ def test_robots_with_rules_fly_as_the_swarm(preset, n, scenario, rule):
     assert not list(differences(config, [RulePolicy(rule) for _ in range(n)], rule, scenario))
 
 
+@pytest.mark.parametrize("rule", ["full", "event:0.05|push:0.1"])
+@pytest.mark.parametrize("radio", [{}, {"delay": 0, "round_trip": 1}])
+def test_robots_fly_as_the_swarm_with_a_radio_that_distance_limits(radio, rule):
+    config = make_config("flight", {"radio": {"range": 3.0, "half_distance": 2.0, **radio}}, n_robots=3)
+    assert not list(differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap"))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 @pytest.mark.parametrize("n", [2, 4, 8])
@@ -95,6 +102,10 @@ CHANGED = {
     "answers within the step": {"radio": {"delay": 0, "jitter": 0, "round_trip": 0}},
     "answers a step later": {"radio": {"delay": 0, "jitter": 0, "round_trip": 1}},
     "answers one to four steps later": {"radio": {"delay": 0, "jitter": 3, "round_trip": 1}},
+    "a short range": {"radio": {"range": 1.5}},
+    "a short range in a network": {"radio": {"delay": 0, "round_trip": 1, "range": 1.5}},
+    "loss by distance": {"radio": {"half_distance": 2.0, "path_loss_exponent": 2.0, "bursts": 0.1}},
+    "loss by distance in a network": {"radio": {"delay": 0, "jitter": 2, "round_trip": 0, "half_distance": 2.0}},
     "half lost": {"radio": {"loss": 0.5, "bursts": 0.2}},
     "punctual": {"clock_skew": 0.0},
     "no right of way": {"planner": {"right_of_way": 0.0}},

@@ -5,6 +5,7 @@ import pytest
 
 from quad_swarm.interfaces.env import QuadSwarmEnv
 from quad_swarm.task.request_task import RewardConfig, make_task, requests_of
+from quad_swarm.world.beliefs import BeliefSource
 
 
 @pytest.mark.parametrize(
@@ -180,6 +181,20 @@ def test_an_announcement_arrives_as_an_answer_and_costs_who_sends_it():
     both = tasks[1].act(bits)
     assert both.n_requests == 2
     assert both.reward_terms["requests"] == pytest.approx(-3 * costs)
+
+
+def test_messages_that_reach_nobody_count():
+    task = make_task(n_robots=3, announcements=True, world={"radio": {"range": 2.0}})
+    places = np.array([[0.0, 0, 1], [0, 4, 1], [4, 0, 1]])
+    task.place(0, "", places, places[[1, 2, 0]], np.random.default_rng(0))
+    bits = np.zeros((1, 3, 2, 2), bool)
+    bits[0, 0, 0, 0] = bits[0, 1, 1, 1] = True  # 0 asks 1, 1 sends its plan to 2
+    outcome = task.act(bits)
+    assert outcome.n_requests == 2
+    assert outcome.reward_terms["requests"] == pytest.approx(-2 * task.reward.request)
+    assert (outcome.report.belief_source == BeliefSource.CONSTANT_VELOCITY).all()
+    remembers = task.swarm.seen_by_others([0]).remembers
+    assert np.argwhere(remembers).tolist() == [[0, 1, 1]], "1 assumes that 2 knows its plan"
 
 
 def test_near_misses_cost_in_proportion():

@@ -13,7 +13,15 @@ EVERYTHING = {
     "substeps": 5,
     "noise": {"pos": 0.002, "vel": 0.02, "attitude": 0.005, "wind": 1.0, "gust": 0.5},
     "sensing": {"pos": 0.01, "vel": 0.05, "attitude": 0.01, "others_pos": 0.01, "others_vel": 0.05},
-    "radio": {"loss": 0.2, "delay": 1, "jitter": 2, "bursts": 0.1, "outage": 0.3},
+    "radio": {
+        "loss": 0.2,
+        "delay": 1,
+        "jitter": 2,
+        "bursts": 0.1,
+        "outage": 0.3,
+        "range": 3.0,
+        "half_distance": 2.0,
+    },
     "mismatch": 0.1,
     "clock_skew": 0.8,
 }
@@ -105,6 +113,36 @@ def test_links_are_interrupted_for_the_share_and_the_time_given():
     assert (~arrived).mean() == pytest.approx(0.2, abs=0.02)
     ends = (~arrived[:-1] & arrived[1:]).sum() / (~arrived[:-1]).sum()
     assert 1 / ends == pytest.approx(8, rel=0.1)
+
+
+RADIUS = np.array([0.0, 0.5, 1.5, 3.0])  # where four robots stand in a row
+DISTANCE = np.abs(RADIUS[other_indices(4)] - RADIUS[:, None])
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_the_share_that_arrives_falls_with_distance(loss):
+    radio = {"loss": loss, "range": 2.7, "half_distance": 1.5, "path_loss_exponent": 2.0}
+    _, chance = drawn(100, radio=radio)
+    requests, others = np.ones((100, 4, 3), bool), other_indices(4)
+    pos = np.tile(RADIUS[:, None] * [0.6, 0.0, 0.8], (100, 1, 1))
+    carried = [chance.carried(requests, pos, others) for _ in range(200)]
+    arrived = [chance.arrivals(one, others)[0] for one in carried]
+    expected = np.where(DISTANCE <= 2.7, 0.5 ** ((DISTANCE / 1.5) ** 2), 0.0)
+    for found, share in ((carried, expected), (arrived, (1 - loss) * expected)):
+        error = np.sqrt(share * (1 - share) / 20_000)
+        assert (np.abs(np.mean(found, axis=(0, 1)) - share) <= 4 * error).all()
+    assert not carried[0][:, 0, 2].any(), "3 m is beyond the range"
+
+
+def test_without_a_limit_of_distance_the_radio_draws_what_it_drew():
+    _, chance = drawn(1, radio={"loss": 0.3, "jitter": 2})
+    requests, others, rng = np.ones((1, 4, 3), bool), other_indices(4), np.random.default_rng(0)
+    rng.uniform()  # the direction of the wind
+    for pos in np.random.default_rng(1).normal(size=(20, 1, 4, 3)):
+        assert chance.carried(requests, pos, others) is requests
+        arrived, lateness = chance.arrivals(requests, others)
+        assert np.array_equal(arrived[0], rng.random((4, 3)) >= 0.3)
+        assert np.array_equal(lateness[0], rng.integers(0, 3, (4, 3)))
 
 
 def test_silent_robots_answer_nobody_and_stay_silent():

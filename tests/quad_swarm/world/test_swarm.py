@@ -171,6 +171,29 @@ def test_a_robot_takes_its_answers_to_have_arrived():
     assert not View(swarm).seen_by_others([0]).remembers.any()
 
 
+@pytest.mark.parametrize("round_trip", [None, 0, 1])
+def test_nothing_arrives_beyond_the_range_of_the_radio(round_trip):
+    """Robots 0 and 1 stand 1 m apart, robot 2 stands 4 m away."""
+    swarm = Swarm(make_config("paper", n_robots=3, memory=0.5, radio={"range": 2.0, "round_trip": round_trip}))
+    places = np.array([[0.0, 0, 1], [1, 0, 1], [0, 4, 1]])
+    swarm.reset(0, places, places)
+    told = np.zeros((1, 3, 2), bool)
+    told[0, 2, 0] = True  # robot 0 sends its plan to robot 2, too
+    for _ in range(3):
+        report = swarm.step(np.ones((1, 3, 2), bool), told)
+    near = [[[True, False], [True, False], [False, False]]]
+    assert np.array_equal(report.belief_source == BeliefSource.REQUESTED, near)
+    view = View(swarm)
+    assert np.array_equal(view.prediction.remembers, near)
+    assert np.array_equal(view.seen_by_others([0]).remembers, [[[True, True], [True, False], [False, False]]]), (
+        "who was not reached knows of no request, and who announced assumes that it arrived"
+    )
+    swarm.state[0, 2, :3] = [0, 1.5, 1]
+    for _ in range(4):
+        swarm.step(np.ones((1, 3, 2), bool))
+    assert View(swarm).prediction.remembers.all(), "until they meet"
+
+
 def test_late_answers_are_older_plans():
     swarm, late = make_swarm(1), make_swarm(1, radio={"delay": 2})
     plans = []
