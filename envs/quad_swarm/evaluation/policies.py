@@ -23,7 +23,7 @@ from gymnasium import spaces
 from quad_swarm.errors import shown
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.task.request_task import RequestTask
-from quad_swarm.task.rules import as_bits, parse_rule
+from quad_swarm.task.rules import as_bits, parse_decisions, parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import SwarmConfig
 
@@ -134,20 +134,26 @@ def make_policy(policy: Any, config: SwarmConfig, algo: str) -> tuple[RequestPol
     :param policy: a rule, a model's zip or an object with ``predict``
     :param config: the world
     :param algo: see `load_model`
-    :raises ValueError: if the rule is unknown, or the model was trained for another number of robots or another space
+    :raises ValueError: if the rule is unknown, or the model was trained for another number of robots or another space;
+        or if distance limits the radio, so that it matters who sends, and the rule does not tell, see `parse_decisions`
     """
     if not isinstance(policy, str):
         return policy_of(policy, name_of(policy), config)
     if is_model(policy):
         return policy_of(load_model(policy, algo), policy, config)
     try:
-        rule = parse_rule(policy)
+        asks, tells = parse_decisions(policy) if config.radio.limits_distance else (parse_rule(policy), None)
     except ValueError as error:
         hint = "Pass a model as the path of its .zip"
         if policy.startswith(("pretrained:", "latest:")):
             hint += "; only `sb3-maddpg evaluate` also accepts latest:LOGDIR and pretrained:NAME"
         raise ValueError(f"{error} {hint}.") from None
-    return (lambda task, rngs: rule(View(task.swarm, rngs))[..., None]), PaperObservation(config)
+
+    def decide(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
+        view = View(task.swarm, rngs)
+        return np.stack([asks(view)] if tells is None else [asks(view), tells(view)], axis=-1)
+
+    return decide, PaperObservation(config)
 
 
 def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:

@@ -124,7 +124,7 @@ def test_exchanges_arrive_as_distance_lets_them():
         assert periods > 300
         share = near["plans received"] / periods  # of the one that is near; requests and answers fare alike
         assert abs(share - 0.5) <= 4 * np.sqrt(0.25 / periods)
-    assert counts[2]["requests"] > 600
+    assert counts[2]["requests"] > 300
     assert counts[2]["plans received"] == counts[2]["answers"] == 0
     assert not flight.vehicles.flying[2], "a robot that hears nobody lands"
 
