@@ -102,7 +102,7 @@ class DelayCheckedSwarm(Swarm):
         own = self._x[:, :, None, None, CANDIDATE, :, POSITION]
         return length(own - known)[..., 1:].min(axis=(2, 3, 4)) < self.clearance
 
-    def step(self, requests: np.ndarray) -> StepReport:
+    def step(self, requests: np.ndarray, announced: np.ndarray | None = None) -> StepReport:
         for field in (self._x, self._inputs):
             field[..., :-1, :] = field[..., 1:, :].copy()
         self._inputs[..., -1, :] = 0.0

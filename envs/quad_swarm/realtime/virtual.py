@@ -196,7 +196,7 @@ class VirtualFlight:
     def _carries(self, sender: int, receiver: int) -> bool:
         """Return whether the distance of two robots lets messages through."""
         pos = self.vehicles.state[:, POSITION]
-        distance = np.linalg.norm(pos[sender] - pos[receiver])
+        distance = np.asarray(np.linalg.norm(pos[sender] - pos[receiver]))
         return bool(self._fade[sender, receiver] < self.config.radio.carries(distance))
 
     def _begin_fade(self) -> None:
