@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from quad_swarm.evaluation.flight import Condition, first_episode, fly, run_episodes
+from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, run_episodes
 from quad_swarm.evaluation.policies import load_model, make_policy, short_name, trained_in
 from quad_swarm.figures.replay import replay_page
 from quad_swarm.task.request_task import requests_of
@@ -228,3 +228,13 @@ def test_a_foreign_class_needs_no_more_than_load_and_predict(tmp_path):
         run_episodes(one, range(2))
     with pytest.raises(ValueError, match="not an importable module:Class with a `load`"):
         run_episodes(Condition(path, "random", make_config("paper"), 5, algo="foreign:Asker"), range(2))
+
+
+def test_rules_say_who_sends_where_distance_limits_the_radio():
+    near, anywhere = make_config("paper", radio={"range": 2.0}), make_config("paper")
+    for config, n_bits in ((near, 2), (anywhere, 1)):
+        policy, task, rngs = begin(Condition("full|push:0.1", "random", config), [0])
+        assert policy(task, rngs).shape == (1, 4, 3, n_bits)
+    make_policy("stale:4&push:0.1", anywhere, "")
+    with pytest.raises(ValueError, match="joins what the receiver and the sender know"):
+        make_policy("stale:4&push:0.1", near, "")
