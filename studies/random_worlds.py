@@ -176,11 +176,18 @@ def _misreports(swarm: Any, info: Mapping[str, Any]) -> list[str]:
         found.append(f"collision is {info['collision']} at {least}")
     if (np.asarray(info["min_separation_continuous"]) > np.asarray(info["min_separation"]) + scale).any():
         found.append("the least separation during the step exceeds that after it")
-    at_goal = np.linalg.norm(pos - swarm.goal, axis=-1)
-    sure = np.abs(at_goal - config.goal_radius) > scale
-    if ((at_goal < config.goal_radius) != info["at_goal"])[sure].any():
+    to_goal = np.linalg.norm(pos - swarm.final_goal, axis=-1)
+    sure = np.abs(to_goal - config.goal_radius) > scale
+    last = True if swarm.route is None else swarm.route.at_last
+    if (((to_goal < config.goal_radius) & last) != info["at_goal"])[sure].any():
         found.append("at_goal is wrong")
     return found
+
+
+def _next_goals(swarm: Any) -> np.ndarray:
+    """Return where the goals of swarms must be after a step, (E, n, 3) (m)."""
+    route, dt = swarm.route, swarm.config.planner.dt
+    return swarm.final_goal.copy() if route is None else swarm.final_goal + dt * route.velocity
 
 
 def _same(one: Any, batch: Any, k: int) -> bool:
@@ -213,7 +220,7 @@ def fly(arguments: Mapping[str, Any], seed: int, steps: int = 20, resets: int = 
         wrong += _not_finite("observation", seen)
         for _ in range(steps):
             actions = rng.integers(0, 2, batch.action_space.shape)
-            goals, running = batch.task.swarm.goal.copy(), np.ones(n_swarms, dtype=bool)
+            goals, running = _next_goals(batch.task.swarm), np.ones(n_swarms, dtype=bool)
             own, reward, terminated, truncated, info = alone.step(actions[which])
             wrong += _misreports(
                 alone.task.swarm, {key: np.asarray(value)[None] for key, value in info.items() if key != "planner"}
@@ -222,7 +229,7 @@ def fly(arguments: Mapping[str, Any], seed: int, steps: int = 20, resets: int = 
             running &= ~(ended | cut)
             wrong += _not_finite("observation", seen) + _not_finite("reward", rewards)
             wrong += _not_finite("state", batch.task.swarm.state) + _not_finite("info", info)
-            if not np.array_equal(goals[running], batch.task.swarm.goal[running]):
+            if not np.array_equal(goals[running], batch.task.swarm.final_goal[running]):
                 wrong.append("goals changed in flight")
             last = infos["final_obs"][which] if terminated or truncated else seen[which]
             same = own.tobytes() == last.tobytes() and reward == rewards[which]

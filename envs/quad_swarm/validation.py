@@ -47,6 +47,29 @@ Count = Annotated[int, pydantic.Field(ge=0, le=200)]
 Range = Annotated[tuple[Coordinate, Coordinate], pydantic.AfterValidator(_ascending)]
 
 
+def points(name: str, values: Any, count: int) -> np.ndarray:
+    """Convert points to an array, (count, 3) (m).
+
+    :raises ValueError: if the points have another shape, are not numbers, or are farther away than `LARGEST_LENGTH`
+    """
+    try:
+        array = np.asarray(values, dtype=float)
+        valid = (
+            not np.ma.is_masked(values)
+            and not np.iscomplexobj(values)
+            and array.shape == (count, 3)
+            and bool((np.abs(array) <= LARGEST_LENGTH).all())
+        )
+    except (TypeError, ValueError, OverflowError):
+        valid = False
+    if not valid:
+        raise ValueError(
+            f"{name} must be {count} finite points, shape ({count}, 3), within {LARGEST_LENGTH:.0f} m; got "
+            f"{shown(values)}."
+        )
+    return array
+
+
 def checked(cls: type[T]) -> type[T]:
     """Decorate a frozen dataclass so that its fields are converted to their types and checked against their bounds.
 

@@ -42,6 +42,8 @@ def odd_world(rng: random.Random, preset: str) -> dict[str, Any]:
 def _other(rng: random.Random, name: str, value: Any) -> Any:
     if name == "plant":
         return rng.choice(PLANTS)
+    if isinstance(value, str):  # shapes of obstacles
+        return rng.choice(("sphere", "cylinder", "cube", ""))
     if isinstance(value, tuple):
         if rng.random() < 0.3:
             return list(reversed(value))

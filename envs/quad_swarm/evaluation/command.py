@@ -273,7 +273,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"some of {', '.join(SCENARIOS)}, or all without obstacles (default)",
+        help=f"some of {', '.join(SCENARIOS)}, or all without obstacles and changing goals (default)",
     )
     parser.add_argument("--episodes", type=int, default=200, help="episodes per policy and scenario (default 200)")
     add_worker_arguments(parser, jobs=1)

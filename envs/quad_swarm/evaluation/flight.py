@@ -193,7 +193,7 @@ class Flight:
     :param config: the world
     :param state: states, (T + 1, n, 9)
     :param plans: planned states at stages 0..N, (T + 1, n, N + 1, 9)
-    :param goal: goals, (n, 3), world frame (m)
+    :param goal: goals, (n, 3), world frame (m); those after the last step if they change
     :param requests: whose plan each robot got in each step, (T, n, n - 1) bool, with all others in ascending order even
         if the neighbourhood is limited
     :param announced: which of these plans were announced without a request, (T, n, n - 1) bool
@@ -205,6 +205,9 @@ class Flight:
     :param obstacle_pos: their centres, (T + 1, K, 3), world frame (m); None without any
     :param min_obstacle_distance: smallest distance between the surfaces of a robot and an obstacle, (T + 1,) (m), when
         ``min_separation`` is; None without any
+    :param goals: where the robots flew to at each step, goals or waypoints, (T + 1, n, 3), world frame (m); None if
+        this never changed
+    :param at_goal: which robots were at their goals after each step, (T, n) bool; None if the goals tell
 
     With `PlannerConfig.downwash`, distances between robots are those in the ellipsoids' metric.
     """
@@ -221,6 +224,8 @@ class Flight:
     obstacles: tuple[Obstacle, ...] = ()
     obstacle_pos: np.ndarray | None = None
     min_obstacle_distance: np.ndarray | None = None
+    goals: np.ndarray | None = None
+    at_goal: np.ndarray | None = None
 
     @property
     def n_robots(self) -> int:
@@ -268,8 +273,10 @@ class Flight:
     @cached_property
     def arrival(self) -> int | None:
         """First step after which all robots are at their goals at the same time, None if they never are."""
-        at_goal = (length(self.pos[1:] - self.goal) <= self.config.goal_radius).all(axis=1)
-        return int(at_goal.argmax()) + 1 if at_goal.any() else None
+        known = self.at_goal is not None
+        at_goal = self.at_goal if known else length(self.pos[1:] - self.goal) <= self.config.goal_radius
+        arrived = np.all(at_goal, axis=1)
+        return int(arrived.argmax()) + 1 if arrived.any() else None
 
     @cached_property
     def colliding(self) -> np.ndarray:
@@ -305,6 +312,7 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     policy, task, rngs = begin(condition, [episode], model)
     rule, other_rngs = parse_rule(other_rule), [np.random.default_rng([episode, 2])]
     state, plans, inputs = [task.swarm.state[0].copy()], [task.swarm.plans[0].copy()], list[np.ndarray]()
+    goals, at_goal, changes = [task.swarm.goal[0].copy()], list[np.ndarray](), task.swarm.route is not None
     requests: list[np.ndarray] = []
     announced: list[np.ndarray] = []
     other_requests: list[np.ndarray] = []
@@ -330,7 +338,9 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         state.append(task.swarm.state[0].copy())
         plans.append(task.swarm.plans[0].copy())
         inputs.append(task.swarm.inputs[0].copy())
-        goal = task.swarm.goal[0].copy()
+        goals.append(task.swarm.goal[0].copy())
+        at_goal.append(report.at_goal[0].copy())
+        goal = task.swarm.final_goal[0].copy()
     start, config = state[0][:, POSITION], condition.config
     apart = flattened(start[other_indices(len(start))] - start[:, None], config.planner.downwash)
     closest.insert(0, length(apart).min())
@@ -345,6 +355,8 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         np.array(closest),
         np.array(inputs),
     )
+    if changes:
+        flight = replace(flight, goals=np.array(goals), at_goal=np.array(at_goal))
     if not obstacles:
         return flight
     beside.insert(0, clearances(start, surroundings(obstacles)).min() - config.radius)

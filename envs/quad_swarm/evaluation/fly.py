@@ -39,6 +39,7 @@ from quad_swarm.realtime.virtual import VirtualFlight
 from quad_swarm.ros.world import RosWorld
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+from quad_swarm.world.route import Targets
 from quad_swarm.world.scenarios import ScenarioSampler, without_obstacles
 
 EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
@@ -144,11 +145,14 @@ def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterat
     :param config: the world
     :param scenario: a name of `SCENARIOS`
     :param seeds: seeds, see `first_episode`
+    :raises ValueError: if goals change in flight
     """
     sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        _, starts, goals, _ = sampler.sample(rng)
+        name, (starts, goals, _, velocities, waypoints) = sampler.draw(rng)
+        if Targets.of(goals, velocities, waypoints, config.n_robots).change:
+            raise ValueError(f"scenario={name!r}: its goals change in flight, which only simulated swarms fly.")
         yield starts, goals, int(rng.integers(2**63)) if config.is_random else 0
 
 

@@ -285,8 +285,10 @@ class Recording:
         if flight.inputs is not None:
             setpoint[:-1] = flight.inputs
         world, plan = dataclasses.asdict(flight.config), flight.plans[..., POSITION]
+        # Recordings hold a single goal of each robot, so that of flights to several, nothing is said about arrivals
+        guessed = frozenset() if flight.goals is None else frozenset({"goal"})
         arrays = (time, flight.state, setpoint, plan, asked, told, flight.goal)
-        return cls(*arrays, world, policy, obstacles=flight.obstacles)
+        return cls(*arrays, world, policy, guessed, obstacles=flight.obstacles)
 
 
 def _is_amount(value: object) -> bool:

@@ -190,7 +190,8 @@ def animate(condition: Condition, flight: Flight, path: Path) -> None:
             f"{short_name(condition.policy)}, {condition.scenario}",
             f"step {k + 1}   {'plans sent' if flight.announced.any() else 'requests'} {flight.requests[k].sum()}",
         ]
-        step = (flight.state[k + 1], flight.goal, flight.plans[k + 1], flight.requests[k])
+        goal = flight.goal if flight.goals is None else flight.goals[k + 1]
+        step = (flight.state[k + 1], goal, flight.plans[k + 1], flight.requests[k])
         picture = renderer.draw(*step, lines, flight.obstacles_at(k + 1))
         frames.append(Image.fromarray(picture).quantize(colors=64, dither=Image.Dither.NONE))
     durations = (10 * np.diff(times)).tolist()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -43,7 +44,11 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     ## Starting State
     Robots start at rest. The scenario draws starts and goals; `reset(options={"starts": ..., "goals": ...})` sets them,
     both (n, 3), m. They must lie in the workspace; robots must not start in contact, and goals must not be too close
-    for two robots to be at both.
+    for two robots to be at both. With them, "velocities" (n, 3), m/s, lets goals move, and "waypoints", n sequences
+    (any number, 3), m, are what each robot passes on the way to its goal.
+
+    ## Goals in Flight
+    Gymnasium's `step` takes an action only, so goals are changed between steps: `env.unwrapped.set_goals(...)`.
 
     ## Episode End
     A collision terminates the episode, and with `end_at_arrival` so does the arrival of all robots. The episode is
@@ -87,7 +92,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
-    reset_options = ("starts", "goals")
+    reset_options = ("starts", "goals", "velocities", "waypoints")
 
     @with_fields(TaskOptions)
     def __init__(self, options: TaskOptions, render_mode: str | None = None):
@@ -116,10 +121,17 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         options = checked_options(options)
         if unknown := set(options).difference(self.reset_options):
             raise unknown_name("reset option", unknown.pop(), self.reset_options)
-        if len(options) == 1:
-            raise ValueError(f"reset options name only {next(iter(options))!r}; pass both 'starts' and 'goals'.")
+        if options and not {"starts", "goals"} <= set(options):
+            raise ValueError(
+                f"reset options name only {', '.join(map(repr, options))}; pass both 'starts' and 'goals'."
+            )
         if options:
-            self.task.place(0, "custom", options["starts"], options["goals"], self.np_random)
+            velocities, waypoints = options.get("velocities"), options.get("waypoints")
+            self.task.place(
+                *(0, "custom", options["starts"], options["goals"], self.np_random),
+                velocities=velocities,
+                waypoints=waypoints,
+            )
         else:
             self.task.reset(0, self.np_random)
         self._requests = np.zeros_like(self._requests)
@@ -153,6 +165,26 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         if self.render_mode == "human":
             self.render()
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
+
+    def set_goals(
+        self, goals: Any, velocities: Any = None, waypoints: Any = None, robots: Sequence[int] | None = None
+    ) -> np.ndarray:
+        """Let k robots fly to other goals from now on. Their former goals and waypoints are forgotten, and the episode
+        counts as arrived only when all robots are at the goals that they have now.
+
+        :param goals: goals, (k, 3), world frame (m)
+        :param velocities: velocities of the goals, (k, 3), world frame (m/s), by default 0
+        :param waypoints: what each of the robots passes before, k sequences (any number, 3), world frame (m), by
+            default nothing
+        :param robots: indices of the robots, (k,), by default all
+        :return: the observation of all robots, (n, size) float32, with the new goals
+        :raises ValueError: if there are no such robots, or goals do not fit, see `SwarmConfig.check_goals`
+        :raises gymnasium.error.ResetNeeded: if ``reset`` has not been called yet
+        """
+        if not self._is_reset:
+            raise need_reset("set_goals")
+        self.task.set_goals(0, goals, velocities, waypoints, robots)
+        return self.task.observe()[0]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the complete state as plain values and arrays, see `load_state_dict`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,12 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         self._is_reset = True
         self.agents = list(self.possible_agents)
         return self._rows(observation), {agent: dict(info) for agent in self.agents}
+
+    def set_goals(
+        self, goals: Any, velocities: Any = None, waypoints: Any = None, robots: Sequence[int] | None = None
+    ) -> dict[str, np.ndarray]:
+        """See `QuadSwarmEnv.set_goals`. Returns the observations of all robots, with the new goals."""
+        return self._rows(self.team.set_goals(goals, velocities, waypoints, robots))
 
     def state_dict(self) -> dict[str, Any]:
         """See `QuadSwarmEnv.state_dict`."""

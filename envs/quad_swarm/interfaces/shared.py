@@ -99,9 +99,9 @@ def checked_options(options: Any) -> dict[str, Any]:
     return dict(options)
 
 
-def need_reset() -> gym.error.ResetNeeded:
-    """Create the error for a step before the first reset."""
-    return gym.error.ResetNeeded("step() was called before reset(): reset the environment first.")
+def need_reset(called: str = "step") -> gym.error.ResetNeeded:
+    """Create the error for a step, or another call, before the first reset."""
+    return gym.error.ResetNeeded(f"{called}() was called before reset(): reset the environment first.")
 
 
 def checked_bits(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import gymnasium as gym
@@ -54,7 +54,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """Start an episode in every swarm.
 
         :param seed: seed of swarm 0, from which the seeds of the others count up, or a list with one seed per swarm
-        :param options: must be empty
+        :param options: must be empty; `set_goals` changes goals
         :raises ValueError: if a seed is invalid, or there are options
         """
         if options := checked_options(options):
@@ -98,6 +98,28 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
             observations = observations.copy()
             observations[done] = self.task.observe(done)
         return observations, outcome.reward, outcome.terminated, outcome.truncated, infos
+
+    def set_goals(
+        self,
+        swarm: int,
+        goals: Any,
+        velocities: Any = None,
+        waypoints: Any = None,
+        robots: Sequence[int] | None = None,
+    ) -> np.ndarray:
+        """Let robots of one swarm fly to other goals from now on, until its episode ends; see `QuadSwarmEnv.set_goals`.
+
+        :param swarm: index of the swarm
+        :return: the observation of that swarm, (n, size) float32, with the new goals
+        :raises ValueError: if there is no such swarm, or as in `QuadSwarmEnv.set_goals`
+        :raises gymnasium.error.ResetNeeded: if ``reset`` has not been called yet
+        """
+        if not self._rngs:
+            raise need_reset("set_goals")
+        if isinstance(swarm, bool) or not isinstance(swarm, (int, np.integer)) or not 0 <= swarm < self.num_envs:
+            raise ValueError(f"swarm={shown(swarm)}: it must be the number of a swarm, from 0 to {self.num_envs - 1}.")
+        self.task.set_goals(int(swarm), goals, velocities, waypoints, robots)
+        return self.task.observe(np.arange(self.num_envs) == swarm)[0]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the complete state as plain values and arrays, see `load_state_dict`."""

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from quad_swarm.errors import shown
+from quad_swarm.geometry import length
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
-from quad_swarm.quadrotor import N_INPUTS, N_STATES, QuadrotorModel
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, QuadrotorModel
 
 
 class Solution(NamedTuple):
@@ -129,6 +130,8 @@ class Planner:
         """
         if self.checks:
             problems, previous = self._checked(problems, previous)
+        if (cruise := self.config.cruise_distance) is not None:
+            problems = problems._replace(goal=nearer(problems.x[:, POSITION], problems.goal, cruise))
         if problems.shape is None and self.config.downwash != 1:
             flat = np.ones((*problems.others.shape[:2], 3))
             flat[..., 2] = 1 / self.config.downwash
@@ -349,6 +352,20 @@ def turned(values: np.ndarray, angle: np.ndarray, first: int = 6) -> np.ndarray:
     roll, pitch = values[..., first].copy(), values[..., first + 1].copy()
     values[..., first], values[..., first + 1] = cos * roll + sin * pitch, cos * pitch - sin * roll
     return values
+
+
+def nearer(positions: np.ndarray, goals: np.ndarray, distance: float) -> np.ndarray:
+    """Return goals that are at most as far away as a distance, in the same directions, (B, 3) (m).
+
+    :param positions: positions of the robots, (B, 3), world frame (m)
+    :param goals: goals, (B, 3), world frame (m)
+    :param distance: the distance (m)
+    """
+    between = goals - positions
+    with np.errstate(invalid="ignore"):  # states that are not finite fail in the solver
+        far = length(between)
+        points = positions + between * (distance / np.maximum(far, distance))[:, None]
+        return np.where((far > distance)[:, None], points, goals)
 
 
 def shift(trajectory: np.ndarray) -> np.ndarray:

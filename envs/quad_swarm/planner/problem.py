@@ -56,6 +56,9 @@ class PlannerConfig:
         others and obstacles together that its last plan comes closest to
     :param downwash: height over width of the ellipsoid around another robot that robots keep out of, because of the air
         that rotors blow down (-); 1 for spheres
+    :param cruise_distance: distance (m) beyond which a goal counts as if it were this far away, in its direction, so
+        that robots fly to goals at any distance at the same speed; None for goals as they are, see
+        `quad_swarm.planner.Planner`
     :raises ValueError: if a value is not finite or out of range, or the workspace is empty
     """
 
@@ -79,6 +82,7 @@ class PlannerConfig:
     max_neighbours: PositiveInt | None = None
     max_obstacles: PositiveInt = 12
     downwash: Annotated[float, Field(ge=1, le=20)] = 1.0
+    cruise_distance: PositiveLength | None = None
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):

@@ -20,8 +20,8 @@ from quad_swarm.realtime.link import Link, Sensed, Vehicle
 from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.supervisor import HOVERING, Mode, SafetyLimits, Supervisor
 from quad_swarm.robot import Plan, Robot
+from quad_swarm.robot.robot import target_of
 from quad_swarm.world.beliefs import resampled
-from quad_swarm.world.presets import points
 
 _US = 1e6
 _AHEAD = 0.05  # s by which clocks may differ before a plan comes from the future
@@ -93,6 +93,7 @@ class Loop:
         self.statistics = Statistics()
         self._wait = round(wait * _US)
         self._flying = False
+        self._next: tuple[Any, Any, Any] | None = None  # where to fly to from the next period on
         self._forget()
 
     def warm_up(self) -> None:
@@ -120,17 +121,17 @@ class Loop:
         self._flying = True
         self._began = time.perf_counter(), time.process_time()
 
-    def fly_to(self, goal: np.ndarray) -> None:
-        """Fly to another goal from the next period on.
+    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None) -> None:
+        """Fly to another goal from the next period on, see `Robot.fly_to`.
 
-        :param goal: the goal, (3,), world frame (m)
-        :raises ValueError: if it is no finite point
+        :raises ValueError: if something has another shape, or is not finite
         """
-        self._goal = points("goal", np.asarray(goal, float).reshape(1, -1), 1).reshape(1, 1, 3)
+        target_of(goal, velocity, waypoints)
+        self._next = goal, velocity, waypoints
 
     def _forget(self) -> None:
-        self._goal, self._setpoint = self.robot.goal.copy(), HOVERING
-        self._hold: np.ndarray | None = None  # where it hovers
+        self._next = None
+        self._setpoint = HOVERING
         self._sensed: Sensed | None = None
         self._pending: dict[int, int] = {}  # whom it asked in this period, and when
         self._unheard = self._unheard_since = 0  # requests since the last message of anybody
@@ -338,11 +339,14 @@ class Loop:
 
     def _aim(self, mode: Mode, sensed: Sensed) -> None:
         """Fly to the goal, or hold the place where hovering began."""
+        robot = self.robot
+        if self._next is not None:
+            robot.fly_to(*self._next)
+            self._next = None
         if mode is Mode.FLY:
-            self._hold = None
-        elif self._hold is None:
-            self._hold = sensed.state[POSITION] + _BRAKING * sensed.state[VELOCITY]
-        self.robot.goal = self._goal if self._hold is None else self._hold.reshape(1, 1, 3)
+            robot.hold = None
+        elif robot.hold is None:
+            robot.hold = (sensed.state[POSITION] + _BRAKING * sensed.state[VELOCITY]).reshape(1, 1, 3)
 
     def _unanswered(self, now: int) -> float:
         """Return the time without any message in spite of requests (s)."""

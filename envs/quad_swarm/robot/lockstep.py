@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
+from quad_swarm.world.route import Targets
 
 
 class LockstepWorld:
@@ -43,7 +45,13 @@ class LockstepWorld:
         self._flying: deque[list[tuple[int, int, Plan]]] = deque()
 
     def reset(
-        self, starts: np.ndarray, goals: np.ndarray, noise_seed: int = 0, obstacles: Sequence[Obstacle] | None = None
+        self,
+        starts: np.ndarray,
+        goals: np.ndarray,
+        noise_seed: int = 0,
+        obstacles: Sequence[Obstacle] | None = None,
+        velocities: Any = None,
+        waypoints: Any = None,
     ) -> None:
         """Begin an episode, see `Swarm.reset`."""
         self.state[:], self._u[:], self.now = 0.0, 0.0, 0
@@ -53,8 +61,11 @@ class LockstepWorld:
             self.realisation.reset(0, noise_seed)
         radio, start = self.config.radio, self.realisation.start
         late = np.zeros(len(self.robots)) if start is None else start[0] / self.config.substeps
-        for robot, where, goal, delay in zip(self.robots, starts, goals, late, strict=True):
-            robot.reset(where, goal, float(delay), kept=1 + radio.delay, obstacles=obstacles)
+        targets = Targets.of(goals, velocities, waypoints, len(self.robots))
+        for k, robot in enumerate(self.robots):
+            goal, velocity, passed = (one[k] for one in targets)
+            delay, kept = float(late[k]), 1 + radio.delay
+            robot.reset(starts[k], goal, delay, kept=kept, obstacles=obstacles, velocity=velocity, waypoints=passed)
         causal = radio.round_trip is not None
         self._flying = deque([] for _ in range(1 + (radio.round_trip or 0) + radio.jitter))
         most = 1 + radio.delay + (0 if causal else radio.jitter)

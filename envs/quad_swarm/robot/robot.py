@@ -19,6 +19,7 @@ from quad_swarm.world.beliefs import Beliefs, resampled
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.obstacles import Obstacle, Obstacles
 from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.route import Route, Targets
 
 # Whom a robot asks and whom it tells: (n - 1, 1 or 2) bool, see `Robot.decide`
 Policy = Callable[["Robot"], np.ndarray]
@@ -50,12 +51,21 @@ class _Others:
         raise ValueError("A robot does not know what the others know: only a swarm can fly such a rule or observation.")
 
 
+def target_of(goal: Any, velocity: Any, waypoints: Any) -> Targets:
+    """Check where one robot flies to, see `Robot.fly_to`.
+
+    :raises ValueError: if something has another shape, or is not finite
+    """
+    return Targets.of([goal], None if velocity is None else [velocity], None if waypoints is None else [waypoints], 1)
+
+
 class Robot:
     """A robot of a team, see `quad_swarm.world.knowledge.Knowledge` for what policies read.
 
     :ivar others: numbers of the others in ascending order, (n - 1,)
     :ivar period: length of a period (us)
     :ivar now: start of the current period (us)
+    :ivar hold: where it stays instead of flying to its goal, (1, 1, 3), world frame (m); None to fly
     :ivar late: time from the start of a period until its command takes effect (periods)
 
     :param config: the world as far as robots know it: team, vehicle, planner and memory
@@ -93,6 +103,8 @@ class Robot:
         kept: int = 1,
         now: int = 0,
         obstacles: Sequence[Obstacle] | None = None,
+        velocity: Any = None,
+        waypoints: Any = None,
     ) -> None:
         """Begin to fly.
 
@@ -102,14 +114,18 @@ class Robot:
         :param kept: number of own plans that may still be sent, where the radio delays them by whole periods
         :param now: start of the first period (us)
         :param obstacles: the obstacles, where they are then; by default those that the world lists
-        :raises ValueError: if there are more obstacles than the world has room for
+        :param velocity: see `fly_to`
+        :param waypoints: see `fly_to`
+        :raises ValueError: if there are more obstacles than the world has room for, or goals do not fit, see `fly_to`
         """
         obstacles = self.config.obstacles.listed if obstacles is None else obstacles
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(0, obstacles)
         x = np.zeros((1, N_STATES))
         x[:, POSITION] = start
-        self.goal, self.late, self.now = np.array(goal, float).reshape(1, 1, 3), late, now - self.period
+        self.late, self.now = late, now - self.period
+        self.hold: np.ndarray | None = None
+        self.fly_to(goal, velocity, waypoints)
         self._estimate, self._u = x[None], np.zeros((1, 1, N_INPUTS))
         self._pos = self._vel = np.zeros((1, 1, len(self.others), 3))
         self._plans = Plans.hover(x, self.config.planner.horizon)
@@ -119,6 +135,29 @@ class Robot:
         self._inbox: dict[int, Plan] = {}
         self._own = [Plan(now - k * self.period, self.planned_positions()[0, 0]) for k in range(kept, 0, -1)]
         self.source = np.zeros((1, 1, len(self.others)), dtype=np.int64)
+
+    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None) -> None:
+        """Fly to another goal from now on. The former goal and waypoints are forgotten.
+
+        :param goal: goal, (3,), world frame (m)
+        :param velocity: velocity of the goal, (3,), world frame (m/s), by default 0
+        :param waypoints: what the robot passes before, each as soon as it is within the goal radius of it, (any number,
+            3), world frame (m), by default nothing
+        :raises ValueError: if something has another shape, or is not finite
+        """
+        targets = target_of(goal, velocity, waypoints)
+        self._goal = targets.goals[None]
+        self._route: Route | None = None
+        if targets.change:
+            self._route = Route(self._goal)
+            self._route.set(0, slice(None), targets)
+            self._goal = self._route.current()
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Where the robot flies to now, its goal or a waypoint before it, or where it holds its place, (1, 1, 3), world
+        frame (m)."""
+        return self._goal if self.hold is None else self.hold
 
     def estimate(self) -> np.ndarray:
         """Return the estimate of the own state, (1, 1, 9)."""
@@ -173,6 +212,9 @@ class Robot:
         self._estimate = np.array(state, float).reshape(1, 1, N_STATES)
         self._pos, self._vel = (np.array(a, float).reshape(1, 1, -1, 3) for a in (pos, vel))
         self.now = now
+        if self._route is not None:
+            self._route.take(self._estimate[..., POSITION], self.config.goal_radius)
+            self._goal = self._route.current()
         return np.asarray(self.policy(self), bool)
 
     def sent(self, other: int, stamp: int | None = None) -> None:
@@ -201,11 +243,14 @@ class Robot:
         self.presumed.receive(*self._message(self._sent, *self._own_motion()))
         believed, self.source = self.beliefs.update(*self._message(self._inbox, self._pos, self._vel))
         late = np.full((1, 1), self.late) if self.late else None
-        arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles)
+        goal_velocity = None
+        if self._route is not None and self.hold is None:
+            goal_velocity = self._route.current_velocity()
+        arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles, goal_velocity)
         problems = make_problems(self.config, self.planner.model, *arguments)
         self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
-        self._pass_obstacles()
+        self._pass_time()
         self._sent, self._inbox = {}, {}
         self._own = [*self._own[1:], Plan(self.now, self.planned_positions()[0, 0].copy())]
         return self._u[0, 0]
@@ -218,11 +263,15 @@ class Robot:
         plans = self._plans
         self._plans = plans._replace(x=base.shift(plans.x), u=base.shift(plans.u), age=plans.age + 1)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
-        self._pass_obstacles()
+        self._pass_time()
 
-    def _pass_obstacles(self) -> None:
+    def _pass_time(self) -> None:
+        """Let obstacles and the goal move for a period."""
         if self.obstacles is not None:
             self.obstacles.advance(self.config.planner.dt)
+        if self._route is not None:
+            self._route.advance(self.config.planner.dt)
+            self._goal = self._route.current()
 
     def _place(self, other: int) -> int:
         """Return the place of another robot among the others."""

@@ -37,6 +37,10 @@ def is_row(value: object) -> bool:
 class EpisodeStatistics:
     """Statistics of the running episodes of E swarms, as arrays of length E.
 
+    Goals are those that robots have at a time. Where they are replaced in flight (`Swarm.set_goals`), robots have not
+    arrived any more, and what counts until then counts again from there on; waypoints and goals that move by themselves
+    replace nothing.
+
     Requests and path length count until all robots are at their goals at the same time, until a collision, or until the
     time limit, whichever comes first. Separations cover all steps flown; if an episode continues after a collision,
     they show how deep the collision is.
@@ -115,6 +119,11 @@ class EpisodeStatistics:
             self._records[name][swarm] = np.inf
         for name in self._names[len(_STATE) :]:
             getattr(self, name)[swarm] = _OBSTACLES[name]
+
+    def change_goals(self, swarm: int) -> None:
+        """Take note that robots of one swarm have other goals now, at which they are yet to arrive."""
+        for name in ("at_goals", "reached", "arrived"):
+            self._records[name][swarm] = False
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""

@@ -168,8 +168,11 @@ class RequestTask:
 
     def reset(self, swarm: int, rng: np.random.Generator) -> None:
         """Draw a new episode for one swarm. All random numbers of the episode derive from ``rng``."""
-        name, starts, goals, obstacles = self.sampler.sample(rng)
-        self.place(swarm, name, starts, goals, rng, self.sampler.world is self.swarm.config, obstacles)
+        name, scene = self.sampler.draw(rng)
+        fits = self.sampler.world is self.swarm.config
+        self.place(
+            swarm, name, scene.starts, scene.goals, rng, fits, scene.obstacles, scene.velocities, scene.waypoints
+        )
 
     def place(
         self,
@@ -180,12 +183,27 @@ class RequestTask:
         rng: np.random.Generator,
         checked: bool = False,
         obstacles: Sequence[Obstacle] | None = None,
+        velocities: Any = None,
+        waypoints: Any = None,
     ) -> None:
         """Start a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
         noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
-        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked)
+        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked, velocities, waypoints)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
+
+    def set_goals(
+        self,
+        swarm: int,
+        goals: Any,
+        velocities: Any = None,
+        waypoints: Any = None,
+        robots: Sequence[int] | None = None,
+    ) -> None:
+        """Let robots of one swarm fly to other goals from now on, see `Swarm.set_goals`. The episode counts as arrived
+        only when all robots are at the goals that they have now."""
+        self.swarm.set_goals(swarm, goals, velocities, waypoints, robots)
+        self.statistics.change_goals(swarm)
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""

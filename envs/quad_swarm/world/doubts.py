@@ -29,6 +29,7 @@ _LIGHT_AIR = 0.01  # wind in which offsets are linear (m/s)
 _SETTLING = 2.5  # time for which a disturbed velocity moves a robot (s)
 _UNITS = {"vel": "m/s", "attitude": "rad"}
 _FASTEST_TURN = 4 * math.pi  # of the yaw (rad/s)
+_CRUISE = 1.5  # how far robots at full speed aim, in distances that they fly within the horizon
 
 
 class DoubtfulWorld(UserWarning):
@@ -103,17 +104,46 @@ def axes(planner: PlannerConfig, quadrotor: QuadrotorParams) -> tuple[_Axis, ...
     return tuple(found)
 
 
+def farthest(config: SwarmConfig) -> float:
+    """Return the distance (m) from which on goals as they are would be approached at less than half of the possible
+    speed."""
+    planner = config.planner
+    both = axes(planner, config.quadrotor)
+    return min(axis.farthest(min(planner.max_speed, axis.fastest) / 2) for axis in both)
+
+
 def far_goals(config: SwarmConfig) -> tuple[float, str]:
-    """Return the distance (m) from which on goals are approached at less than half of the possible speed, and the
-    warning about it."""
-    both, planner = axes(config.planner, config.quadrotor), config.planner
-    fastest = [min(planner.max_speed, axis.fastest) for axis in both]
-    distance = min(axis.farthest(speed / 2) for axis, speed in zip(both, fastest, strict=True))
-    return distance, (
+    """Return the distance (m) from which on goals are approached at less than half of the possible speed, infinity with
+    a cruise distance up to there, and the warning about it."""
+    planner, distance = config.planner, farthest(config)
+    fastest = min(min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor))
+    # Where robots aim beyond the end of the horizon, only their limits keep them from flying faster
+    cruise = min(_CRUISE * fastest * planner.horizon * planner.dt, distance)
+    warning = (
         f"planner.goal_weight={planner.goal_weight:g} is divided by the squared distance to the goal, so robots whose "
-        f"goals are more than {distance:.0f} m away fly at less than half of {min(fastest):.2g} m/s, the slower the "
-        f"farther: raise it to {2 * planner.goal_weight / max(distance, 1e-9):.2g} per metre of their distance"
+        f"goals are more than {distance:.0f} m away fly at less than half of {fastest:.2g} m/s, the slower the "
+        f"farther: with planner.cruise_distance={cruise:.2g}, they fly equally fast at any distance"
     )
+    within = planner.cruise_distance is not None and planner.cruise_distance <= distance
+    return (math.inf if within else distance), warning
+
+
+def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
+    """Yield a sentence if goals move faster than robots fly.
+
+    :param config: the world
+    :param velocities: velocities of goals, (n, 3) (m/s)
+    """
+    planner = config.planner
+    fastest = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
+    climb = min(planner.max_vertical_speed, planner.max_climb_rate * config.quadrotor.climb_gain)
+    beyond = np.abs(velocities) / [*fastest, climb]
+    if beyond.max(initial=0.0) > 1:
+        robot, axis = np.unravel_index(beyond.argmax(), beyond.shape)
+        yield (
+            f"velocities[{robot}]={velocities[robot].tolist()}: the goal moves faster than the "
+            f"{[*fastest, climb][axis]:.2g} m/s of robots along {'xyz'[axis]}, which fall behind"
+        )
 
 
 def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:

@@ -68,7 +68,7 @@ class Knowledge(Protocol):
 
     @property
     def goal(self) -> np.ndarray:
-        """Goals, (E, n, 3), world frame (m)."""
+        """Where the robots fly to now, goals or waypoints before them, (E, n, 3), world frame (m)."""
 
     @property
     def beliefs(self) -> Beliefs:
@@ -121,6 +121,7 @@ def make_problems(
     u: np.ndarray,
     late: np.ndarray | None,
     obstacles: Obstacles | None,
+    goal_velocity: np.ndarray | None = None,
 ) -> Problems:
     """Return robots' planning problems, which start when their inputs take effect.
 
@@ -134,7 +135,12 @@ def make_problems(
     :param u: inputs that act until then, (E, n, 4)
     :param late: when the inputs take effect, as a fraction of a step, (E, n); None if all do so at once
     :param obstacles: obstacles, which follow the others among the bodies of a problem, None for none
+    :param goal_velocity: velocities of the goals, (E, n, 3), world frame (m/s), None for goals that stand. Robots fly
+        to where their goals will be at the end of the horizon, so that they do not fall behind
     """
+    if goal_velocity is not None:
+        ahead = config.planner.dt * (config.planner.horizon + (0.0 if late is None else late[..., None]))
+        goal = goal + ahead * goal_velocity
     x = estimate
     if late is not None:
         x = model.ahead(x, u, late * config.planner.dt)

@@ -14,16 +14,18 @@ import numpy as np
 from pydantic import Field, PositiveInt
 
 from quad_swarm.errors import shown, unknown_name
+from quad_swarm.geometry import length
 from quad_swarm.planner import PlannerConfig
 from quad_swarm.planner.problem import check_vehicle
 from quad_swarm.plants.base import MODEL, parse_plant
 from quad_swarm.quadrotor import QuadrotorParams
-from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, checked, replaced
+from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, checked, points, replaced
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
-from quad_swarm.world.doubts import doubts, far_goals, short_horizon, warn
+from quad_swarm.world.doubts import doubts, far_goals, farthest, fast_goals, short_horizon, warn
 from quad_swarm.world.neighbours import Neighbourhood
-from quad_swarm.world.obstacles import Obstacle, ObstacleConfig, clearances, surroundings
+from quad_swarm.world.obstacles import Obstacle, ObstacleConfig, Surroundings, clearances, surroundings
+from quad_swarm.world.route import Targets
 from quad_swarm.world.scenarios import SCENARIOS, Extent, ScenarioSpace, extent, most_obstacles
 
 PRESET_VERSION = 1
@@ -135,7 +137,7 @@ class SwarmConfig:
                 f"planner.dt / substeps = {planner.dt / self.substeps:.2g} s: raise substeps"
             )
         short = short_horizon(self)
-        if short is not None and planner.goal_weight and far_goals(self)[0] < self.goal_radius:
+        if short is not None and planner.goal_weight and farthest(self) < self.goal_radius:
             raise ValueError(short)
         if planner.max_yaw_rate * planner.dt > math.pi:
             raise ValueError(
@@ -168,62 +170,97 @@ class SwarmConfig:
         return np.linalg.norm(points - np.clip(points, low, high), axis=-1)
 
     def check_flight(
-        self, starts: Any, goals: Any, obstacles: Sequence[Obstacle] = ()
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Check that robots can fly from starts to goals, and return them as arrays, (n, 3) each (m).
+        self, starts: Any, goals: Any, obstacles: Sequence[Obstacle] = (), velocities: Any = None, waypoints: Any = None
+    ) -> tuple[np.ndarray, Targets]:
+        """Check that robots can fly from starts to goals, and return both as arrays.
 
         :param starts: starts, (n, 3), world frame (m)
         :param goals: goals, (n, 3), world frame (m)
         :param obstacles: obstacles, where they are at the start
-        :raises ValueError: if they are not n finite points, a point is farther outside the workspace than half of the
-            goal radius, robots start in contact with each other or an obstacle, goals are too close for two robots to
-            be at both, or a goal is too close to an obstacle that stands
+        :param velocities: see `Targets.of`
+        :param waypoints: see `Targets.of`
+        :return: starts, (n, 3), and where the robots fly to
+        :raises ValueError: if starts are not n finite points, a start is farther outside the workspace than half of the
+            goal radius, robots start in contact with each other or an obstacle, or goals do not fit, see `check_goals`
         """
-        starts, goals = points("starts", starts, self.n_robots), points("goals", goals, self.n_robots)
-        for name, places, least in (
-            ("starts", starts, 2 * self.radius - self.collision_tolerance),
-            ("goals", goals, self.least_spacing - self.collision_tolerance),
-        ):
-            beyond = self.outside(places)
-            worst = int(beyond.argmax())
-            if beyond[worst] > self._leeway:
-                raise ValueError(
-                    f"{name}[{worst}]={places[worst].tolist()} is {beyond[worst]:.3g} m outside the workspace, "
-                    f"planner.workspace_low={self.planner.workspace_low} to "
-                    f"planner.workspace_high={self.planner.workspace_high}: choose a point inside, or enlarge it"
-                )
-            i, j, distance = _closest(places)
-            if distance < least:
-                why = "robots touch" if name == "starts" else "robots that keep their distance cannot be at both goals"
-                raise ValueError(
-                    f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart, where {why}: place them at least "
-                    f"{least + self.collision_tolerance:.3g} m apart"
-                )
-        if obstacles:
-            self._check_obstacles(starts, goals, obstacles)
-        distance, warning = far_goals(self)
-        if (np.linalg.norm(goals - starts, axis=1) > distance).any():
-            warn(warning)
-        return starts, goals
+        starts, around = points("starts", starts, self.n_robots), surroundings(obstacles)
+        touching = 2 * self.radius - self.collision_tolerance
+        self._check_inside("starts", starts)
+        self._check_apart("starts", starts, touching, "robots touch")
+        self._check_clear("starts", starts, around, self.radius - self.collision_tolerance, "the robot touches it")
+        return starts, self.check_goals(starts, goals, around, velocities, waypoints)
 
-    def _check_obstacles(self, starts: np.ndarray, goals: np.ndarray, obstacles: Sequence[Obstacle]) -> None:
-        touching = self.radius - self.collision_tolerance
-        stand = [number for number, one in enumerate(obstacles) if not any(one.velocity)]
-        kept = self.radius + self.obstacle_margin - self.goal_radius
-        for name, places, numbers, least in (
-            ("starts", starts, list(range(len(obstacles))), touching),
-            ("goals", goals, stand, max(touching, kept)),
-        ):
-            if not numbers:
-                continue
-            found = clearances(places, surroundings([obstacles[number] for number in numbers]))
-            robot, place = np.unravel_index(found.argmin(), found.shape)
-            if found[robot, place] < least:
-                why = "the robot touches it" if name == "starts" else "a robot that keeps its distance cannot be there"
-                raise ValueError(
-                    f"{name}[{robot}]={places[robot].tolist()} is {found[robot, place]:.3g} m from the surface of "
-                    f"obstacle {numbers[place]}, where {why}: choose a point at least {least:.3g} m away"
-                )
+    def check_goals(
+        self, places: np.ndarray, goals: Any, around: Surroundings, velocities: Any = None, waypoints: Any = None
+    ) -> Targets:
+        """Check that robots can fly from where they are to goals, and return these as arrays. Goals that move are
+        checked where they are now.
+
+        :param places: where the robots are, (n, 3), world frame (m)
+        :param goals: goals, (n, 3), world frame (m)
+        :param around: obstacles, where they are now
+        :param velocities: see `Targets.of`
+        :param waypoints: see `Targets.of`
+        :raises ValueError: if the arguments have other shapes, or are not finite, a goal or waypoint is farther outside
+            the workspace than half of the goal radius, or too close to an obstacle that stands, or goals are too close
+            for two robots to be at both
+        """
+        targets = Targets.of(goals, velocities, waypoints, self.n_robots)
+        apart = self.least_spacing - self.collision_tolerance
+        kept = self.radius + max(self.obstacle_margin - self.goal_radius, -self.collision_tolerance)
+        stands = np.logical_not(around.velocity.any(axis=1))
+        self._check_inside("goals", targets.goals)
+        self._check_apart("goals", targets.goals, apart, "robots that keep their distance cannot be at both goals")
+        named = {"goals": targets.goals} | {f"waypoints[{k}]": one for k, one in enumerate(targets.waypoints)}
+        for name, one in named.items():
+            self._check_inside(name, one)
+            self._check_clear(name, one, around, kept, "a robot that keeps its distance cannot be there", stands)
+        distance, warning = far_goals(self)
+        legs = zip(places, targets.waypoints, targets.goals, strict=True)
+        if any((length(np.diff(np.vstack([place, *one, goal]), axis=0)) > distance).any() for place, one, goal in legs):
+            warn(warning)
+        for sentence in fast_goals(self, targets.velocities):
+            warn(sentence)
+        return targets
+
+    def _check_inside(self, name: str, places: np.ndarray) -> None:
+        beyond = self.outside(places)
+        if beyond.max(initial=0.0) > self._leeway:
+            worst = int(beyond.argmax())
+            raise ValueError(
+                f"{name}[{worst}]={places[worst].tolist()} is {beyond[worst]:.3g} m outside the workspace, "
+                f"planner.workspace_low={self.planner.workspace_low} to "
+                f"planner.workspace_high={self.planner.workspace_high}: choose a point inside, or enlarge it"
+            )
+
+    def _check_apart(self, name: str, places: np.ndarray, least: float, why: str) -> None:
+        i, j, distance = _closest(places)
+        if distance < least:
+            raise ValueError(
+                f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart, where {why}: place them at least "
+                f"{least + self.collision_tolerance:.3g} m apart"
+            )
+
+    def _check_clear(
+        self,
+        name: str,
+        places: np.ndarray,
+        around: Surroundings,
+        least: float,
+        why: str,
+        which: np.ndarray | None = None,
+    ) -> None:
+        """Check the distances of points to obstacles, or only to some of them, (K,) bool."""
+        there = around.radius > 0 if which is None else which & (around.radius > 0)
+        if not there.any() or not len(places):
+            return
+        found = np.where(there, clearances(places, around), np.inf)
+        robot, number = np.unravel_index(found.argmin(), found.shape)
+        if found[robot, number] < least:
+            raise ValueError(
+                f"{name}[{robot}]={places[robot].tolist()} is {found[robot, number]:.3g} m from the surface of "
+                f"obstacle {number}, where {why}: choose a point at least {least:.3g} m away"
+            )
 
     def check_room(self, scenario: str, extent: Extent) -> None:
         """Check that the starts and goals of a scenario lie in the workspace.
@@ -389,29 +426,6 @@ def _edges(space: ScenarioSpace, sign: int) -> tuple[float, float, float]:
     radius = sign * max(bound.radius for bound in bounds)
     height = max(bound.high for bound in bounds) if sign > 0 else min(bound.low for bound in bounds)
     return radius, radius, height
-
-
-def points(name: str, values: Any, count: int) -> np.ndarray:
-    """Convert points to an array, (count, 3) (m).
-
-    :raises ValueError: if the points have another shape, are not numbers, or are farther away than `LARGEST_LENGTH`
-    """
-    try:
-        array = np.asarray(values, dtype=float)
-        valid = (
-            not np.ma.is_masked(values)
-            and not np.iscomplexobj(values)
-            and array.shape == (count, 3)
-            and bool((np.abs(array) <= LARGEST_LENGTH).all())
-        )
-    except (TypeError, ValueError, OverflowError):
-        valid = False
-    if not valid:
-        raise ValueError(
-            f"{name} must be {count} finite points, shape ({count}, 3), within {LARGEST_LENGTH:.0f} m; got "
-            f"{shown(values)}."
-        )
-    return array
 
 
 def _closest(places: np.ndarray) -> tuple[int, int, float]:

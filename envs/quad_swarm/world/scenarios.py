@@ -1,8 +1,8 @@
-"""Starts and goals of robots (Sec. V-B), and obstacles between them.
+"""Starts and goals of robots (Sec. V-B), obstacles between them, waypoints, and goals that move.
 
-A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m), or ``(starts,
-goals, obstacles)``. To add a scenario, write a function and add it to `SCENARIOS`, and one with obstacles to
-`MOST_OBSTACLES`, too.
+A scenario is a function ``(n_robots, space, rng) -> (starts, goals)``, both (n, 3), world frame (m), or a `Scene`. To
+add a scenario, write a function and add it to `SCENARIOS`, one with obstacles to `MOST_OBSTACLES`, too, and one whose
+goals change to `CHANGING_GOALS`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,8 @@ class ScenarioSpace:
     :param traffic: minimum and maximum number of spheres that cross in `crossing_traffic`
     :param traffic_radius: minimum and maximum of their radius (m)
     :param traffic_speed: minimum and maximum of their speed (m/s)
+    :param waypoints: minimum and maximum number of a robot's waypoints in `tour`
+    :param goal_speed: minimum and maximum speed of the goals in `moving_goals` (m/s)
     :param whole_sectors: whether sectors of `asymmetric_swap` start at the x axis and are used completely, as in the
         paper (for four robots, one anywhere in each quadrant). By default they are centred on the x axis and used to
         80 %
@@ -71,12 +73,14 @@ class ScenarioSpace:
     traffic: tuple[Count, Count] = (2, 4)
     traffic_radius: Range = (0.2, 0.3)
     traffic_speed: Range = (0.5, 1.0)
+    waypoints: tuple[Count, Count] = (1, 2)
+    goal_speed: Range = (0.2, 0.4)
 
     def __post_init__(self) -> None:
-        for name in ("pillars", "traffic"):
+        for name in ("pillars", "traffic", "waypoints"):
             if getattr(self, name)[0] > getattr(self, name)[1]:
                 raise ValueError(f"space.{name}={getattr(self, name)}: it must be the lowest number first")
-        for name in ("pillar_radius", "traffic_radius", "doorway", "traffic_speed"):
+        for name in ("pillar_radius", "traffic_radius", "doorway", "traffic_speed", "goal_speed"):
             if not getattr(self, name)[0] > 0:
                 raise ValueError(f"space.{name}={getattr(self, name)}: both must be positive")
         for name in ("circle_radius", "sector_radius"):
@@ -96,11 +100,16 @@ class Scene(NamedTuple):
     :param starts: starts, (n, 3), world frame (m)
     :param goals: goals, (n, 3), world frame (m)
     :param obstacles: obstacles
+    :param velocities: velocities of the goals, (n, 3), world frame (m/s); None for goals that stand
+    :param waypoints: what each robot passes on the way to its goal, n sequences (k, 3), world frame (m); None for
+        nothing
     """
 
     starts: np.ndarray
     goals: np.ndarray
     obstacles: tuple[Obstacle, ...] = ()
+    velocities: Any = None
+    waypoints: Any = None
 
 
 class Extent(NamedTuple):
@@ -260,6 +269,26 @@ def crossing_traffic(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
     return Scene(starts, goals, place_obstacles((count, count), draw, starts, space.spacing))
 
 
+def tour(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
+    """Tour: as random, but each robot passes waypoints on its way, all robots the same number."""
+    starts, goals = random(n_robots, space, rng)
+    number = int(rng.integers(space.waypoints[0], space.waypoints[1], endpoint=True))
+    waypoints = np.array([_in_box(n_robots, space, rng) for _ in range(number)]).reshape(number, n_robots, 3)
+    return Scene(starts, goals, waypoints=waypoints.swapaxes(0, 1))
+
+
+def moving_goals(n_robots: int, space: ScenarioSpace, rng: Rng) -> Scene:
+    """Moving goals: goals in one half of the room move together to the other half, at a constant speed."""
+    starts, axis, way = _in_box(n_robots, space, rng), int(rng.integers(2)), int(rng.choice([-1, 1]))
+    low = np.array([-space.half_width, -space.half_width, space.heights[0]])
+    high = np.array([space.half_width, space.half_width, space.heights[1]])
+    (high if way > 0 else low)[axis] = 0.0
+    goals = _place(n_robots, lambda _: rng.uniform(low, high), space.spacing)
+    velocities = np.zeros((n_robots, 3))
+    velocities[:, axis] = way * rng.uniform(*space.goal_speed)
+    return Scene(starts, goals, velocities=velocities)
+
+
 def place_obstacles(
     number: tuple[int, int],
     draw: Callable[[], Obstacle],
@@ -295,7 +324,7 @@ def place_obstacles(
     return tuple(placed[len(present) :])
 
 
-# In the order of the curriculum, by the number of requests needed (docs/method.md), then those with obstacles
+# In the order of the curriculum, by the number of requests needed (docs/method.md), then those that are in no mixture
 SCENARIOS: dict[str, Scenario] = {
     "random": random,
     "random_swap": random_swap,
@@ -304,6 +333,8 @@ SCENARIOS: dict[str, Scenario] = {
     "forest": forest,
     "doorway": doorway,
     "crossing_traffic": crossing_traffic,
+    "tour": tour,
+    "moving_goals": moving_goals,
 }
 # Largest number of obstacles that scenarios place themselves
 MOST_OBSTACLES: dict[str, Callable[[ScenarioSpace], int]] = {
@@ -311,13 +342,15 @@ MOST_OBSTACLES: dict[str, Callable[[ScenarioSpace], int]] = {
     "doorway": lambda space: 2,
     "crossing_traffic": lambda space: space.traffic[1],
 }
+# Scenarios whose goals change in flight
+CHANGING_GOALS = {"tour", "moving_goals"}
 MIXTURES = ("mixed", "curriculum")
 
 
 def extent(scenario: Scenario, space: ScenarioSpace) -> Extent | None:
     """Return the bounds of a scenario, None if it is not one of this module."""
     low, high = space.heights
-    if scenario in (random, random_swap, doorway):
+    if scenario in (random, random_swap, doorway, tour, moving_goals):
         return Extent("half_width", space.half_width, low, high)
     if scenario is asymmetric_swap:
         return Extent("sector_radius", space.sector_radius[1], low, high)
@@ -328,8 +361,8 @@ def extent(scenario: Scenario, space: ScenarioSpace) -> Extent | None:
 
 
 def without_obstacles() -> list[str]:
-    """Return the names of the scenarios that place no obstacles, those of mixtures."""
-    return [name for name in SCENARIOS if name not in MOST_OBSTACLES]
+    """Return the names of the scenarios of mixtures, which place no obstacles and whose goals stay."""
+    return [name for name in SCENARIOS if name not in MOST_OBSTACLES and name not in CHANGING_GOALS]
 
 
 def most_obstacles(names: Sequence[str], world: SwarmConfig) -> int:
@@ -386,7 +419,7 @@ class ScenarioSampler:
 
     Draws that fail, or that the world refuses, are repeated. The obstacles of the world follow those of the scenario.
 
-    :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among those without obstacles; "curriculum" to draw
+    :param name: a name of `SCENARIOS`; "mixed" to draw uniformly among `without_obstacles`; "curriculum" to draw
         uniformly among the first ``level + 1`` of them; or a mapping of names to weights, such as
         ``{"symmetric_swap": 3, "random": 1}``
     :param n_robots: number of robots, at least 2
@@ -484,16 +517,19 @@ class ScenarioSampler:
                 raise ValueError
         except (TypeError, ValueError):
             raise ValueError(
-                f"Scenario {name!r} returns {shown(drawn)}: it must return starts and goals, and may return a sequence "
-                "of `Obstacle`."
+                f"Scenario {name!r} returns {shown(drawn)}: it must return starts and goals, or a `Scene`, whose "
+                "obstacles are a sequence of `Obstacle`."
             ) from None
         if self.world is None:
             return scene
         if not ours:
             try:
-                scene = Scene(*self.world.check_flight(scene.starts, scene.goals, obstacles), obstacles)
+                starts, targets = self.world.check_flight(
+                    scene.starts, scene.goals, obstacles, scene.velocities, scene.waypoints
+                )
             except ValueError as error:
                 raise ValueError(f"Scenario {name!r}: {error}") from None
+            scene = Scene(starts, targets.goals, obstacles, targets.velocities, targets.waypoints)
         return self._with_obstacles(scene, self.world, rng)
 
     def _with_obstacles(self, scene: Scene, world: SwarmConfig, rng: Rng) -> Scene:
@@ -506,7 +542,7 @@ class ScenarioSampler:
         if not config.least:
             return scene
         if config.listed:
-            world.check_flight(scene.starts, scene.goals, config.listed)
+            world.check_flight(scene.starts, scene.goals, config.listed, scene.velocities, scene.waypoints)
         present = (*scene.obstacles, *config.listed)
         low, high = (-self.space.half_width, self.space.heights[0]), (self.space.half_width, self.space.heights[1])
 
@@ -518,7 +554,7 @@ class ScenarioSampler:
 
         spacing = self.space.spacing if config.spacing is None else config.spacing
         count = int(rng.integers(config.number[0], config.number[1], endpoint=True))
-        free = np.concatenate([scene.starts, scene.goals])
+        free = np.concatenate([scene.starts, scene.goals, *(() if scene.waypoints is None else scene.waypoints)])
         drawn = place_obstacles((config.number[0], count), draw, free, spacing, present)
         return scene._replace(obstacles=(*present, *drawn))
 
@@ -548,8 +584,13 @@ class ScenarioSampler:
         self.level = level
 
     def sample(self, rng: Rng) -> tuple[str, np.ndarray, np.ndarray, tuple[Obstacle, ...]]:
-        """Draw an episode and return the scenario's name, starts (n, 3) and goals (n, 3), world frame (m), and
-        obstacles.
+        """Draw an episode as `draw`, and return the scenario's name, starts (n, 3) and goals (n, 3), world frame (m),
+        and obstacles."""
+        name, scene = self.draw(rng)
+        return name, scene.starts, scene.goals, scene.obstacles
+
+    def draw(self, rng: Rng) -> tuple[str, Scene]:
+        """Draw an episode and return the scenario's name and the episode.
 
         :raises ValueError: if a registered scenario returns starts or goals that the world refuses again and again
         """
@@ -560,7 +601,7 @@ class ScenarioSampler:
             name = active[int(rng.integers(len(active)))] if len(active) > 1 else active[0]
         for _ in range(_MOST_ATTEMPTS - 1):
             try:
-                return name, *self._attempt(name, rng)
+                return name, self._attempt(name, rng)
             except ValueError:
                 continue
-        return name, *self._attempt(name, rng)
+        return name, self._attempt(name, rng)

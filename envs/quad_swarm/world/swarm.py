@@ -5,24 +5,28 @@ If the neighbourhood is limited, axes of length n - 1 have fewer entries, one pe
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from quad_swarm.errors import shown
 from quad_swarm.native.steps import measure
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
+from quad_swarm.validation import points
 from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
-from quad_swarm.world.obstacles import Obstacle, Obstacles
-from quad_swarm.world.presets import SwarmConfig, points
+from quad_swarm.world.obstacles import Obstacle, Obstacles, Surroundings, surroundings
+from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.radio import make_channel
 from quad_swarm.world.realisation import Realisation
+from quad_swarm.world.route import Route, Targets
 from quad_swarm.world.swarm_state import SwarmState
 
 # Distance (in separations) at which an empty slot shows a robot, far beyond all plans
@@ -69,7 +73,7 @@ class StepReport(NamedTuple):
     :param changed: whether another robot, or none, is in the slot after the step, (E, n, n - 1) bool; None if slots
         never change
     :param moved: distance that each robot flew, (E, n) (m)
-    :param at_goal: whether each robot is within the goal radius, (E, n) bool
+    :param at_goal: whether each robot is within the goal radius of its goal, and no waypoint is ahead, (E, n) bool
     :param belief_source: `BeliefSource` of each believed trajectory, (E, n, n - 1)
     :param plan_age: age of each believed plan (steps), (E, n, n - 1); meaningless where no plan is believed
     :param plan_status: `PlanStatus` of each robot's plan, (E, n)
@@ -104,7 +108,8 @@ class Swarm(SwarmState):
     """State, plans and beliefs of E independent swarms, which share one planner call.
 
     :ivar state: true states, (E, n, 9)
-    :ivar goal: goals, (E, n, 3), world frame (m)
+    :ivar goal: where the robots fly to now, goals or waypoints before them, (E, n, 3), world frame (m)
+    :ivar route: velocities of goals and waypoints, None where no goal changes
     :ivar neighbours: which others each robot perceives
     :ivar disturbances: realisation of the disturbances
     :ivar beliefs: beliefs of each robot about the others
@@ -156,6 +161,11 @@ class Swarm(SwarmState):
     def n_swarms(self) -> int:
         """Number of swarms E."""
         return self.state.shape[0]
+
+    @property
+    def final_goal(self) -> np.ndarray:
+        """Goals now, whether or not waypoints are ahead, (E, n, 3), world frame (m)."""
+        return self.goal if self.route is None else self.route.final
 
     @property
     def pos(self) -> np.ndarray:
@@ -246,8 +256,11 @@ class Swarm(SwarmState):
         obstacles: Sequence[Obstacle] | None = None,
         noise_seed: int = 0,
         checked: bool = False,
+        velocities: Any = None,
+        waypoints: Any = None,
     ) -> None:
-        """Place the robots of one swarm at rest.
+        """Place the robots of one swarm at rest. Robots pass their waypoints, each as soon as they are within the goal
+        radius of it, and then fly to their goals, which may move.
 
         :param swarm: index of the swarm
         :param starts: starts, (n, 3), world frame (m)
@@ -255,18 +268,20 @@ class Swarm(SwarmState):
         :param obstacles: the obstacles, by default those that the world lists
         :param noise_seed: seed of the disturbances, unused without any
         :param checked: whether the starts and goals are known to fit the world, as those of a `ScenarioSampler` are
+        :param velocities: velocities of the goals, (n, 3), world frame (m/s), by default 0
+        :param waypoints: waypoints of each robot, n sequences (k, 3), world frame (m), by default none
         :raises ValueError: if robots cannot fly from these starts to these goals, see `SwarmConfig.check_flight`, or
             there are more obstacles than the world has room for
         """
         n = self.config.n_robots
         obstacles = self.config.obstacles.listed if obstacles is None else tuple(obstacles)
         if checked:
-            starts, goals = points("starts", starts, n), points("goals", goals, n)
+            starts, targets = points("starts", starts, n), Targets.of(goals, velocities, waypoints, n)
         else:
-            starts, goals = self.config.check_flight(starts, goals, obstacles)
+            starts, targets = self.config.check_flight(starts, goals, obstacles, velocities, waypoints)
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
-        self.goal[swarm] = goals
+        self._fly_to(swarm, slice(None), targets)
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(swarm, obstacles)
         for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
@@ -282,11 +297,68 @@ class Swarm(SwarmState):
         if self.neighbours.limited:
             estimate = self._estimate()[swarm]
             self.neighbours.reset(swarm, estimate[:, POSITION], estimate[:, VELOCITY])
+        self._pass_waypoints()
+
+    def set_goals(
+        self,
+        swarm: int,
+        goals: Any,
+        velocities: Any = None,
+        waypoints: Any = None,
+        robots: Sequence[int] | None = None,
+    ) -> None:
+        """Let k robots of one swarm fly to other goals from now on. Their former goals and waypoints are forgotten.
+
+        :param swarm: index of the swarm
+        :param goals: goals, (k, 3), world frame (m)
+        :param velocities: velocities of the goals, (k, 3), world frame (m/s), by default 0. Goals that leave the
+            workspace move on, while robots stay inside
+        :param waypoints: what each of the robots passes before, k sequences (any number, 3), world frame (m), by
+            default nothing
+        :param robots: indices of the robots, (k,), by default all
+        :raises ValueError: if there are no such robots, or goals do not fit, see `SwarmConfig.check_goals`
+        """
+        n = self.config.n_robots
+        which = _indices(robots, n)
+        given = Targets.of(goals, velocities, waypoints, len(which))
+        places, moving = self.final_goal[swarm].copy(), np.zeros((n, 3))
+        places[which], moving[which] = given.goals, given.velocities
+        passed = [np.zeros((0, 3))] * n
+        for robot, one in zip(which, given.waypoints, strict=True):
+            passed[robot] = one
+        checked = self.config.check_goals(self.pos[swarm], places, self._surroundings(swarm), moving, passed)
+        self._fly_to(swarm, which, Targets(checked.goals[which], given.velocities, given.waypoints))
+        self._pass_waypoints()
+
+    def _surroundings(self, swarm: int) -> Surroundings:
+        """Return the obstacles of a swarm, where they are now."""
+        one = self.obstacles
+        if one is None:
+            return surroundings(())
+        return Surroundings(one.position[swarm], one.velocity[swarm], one.radius[swarm], one.factors[swarm])
+
+    def _fly_to(self, swarm: int, robots: Any, targets: Targets) -> None:
+        if self.route is None and targets.change:
+            self.route = Route(self.goal)
+        if self.route is None:
+            self.goal[swarm, robots] = targets.goals
+        else:
+            self.route.set(swarm, robots, targets)
+
+    def _pass_waypoints(self) -> None:
+        """Let robots pass the waypoints at which they believe to be. Where no goal changes any more, there is no
+        route."""
+        if self.route is not None:
+            self.route.take(self._estimate()[..., POSITION], self.config.goal_radius)
+            self.goal = self.route.current()
+            if not self.route.changes:
+                self.route = None
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
         super().keep(swarms)
         self._plant.keep(swarms)
+        self._pass_waypoints()
 
     def part(self, swarms: np.ndarray) -> Swarm:
         """Return a copy of the given swarms (mask), which shares the planner and the random number generators."""
@@ -322,7 +394,11 @@ class Swarm(SwarmState):
         started = time.perf_counter()
         self._plans = self.planner.plan(self._problems(believed, source), self._plans)
         solve_seconds = time.perf_counter() - started
-        report = self._report(self._fly(), source, solve_seconds)
+        positions = self._fly()
+        if self.route is not None:
+            self.route.advance(self.config.planner.dt)
+            self._pass_waypoints()
+        report = self._report(positions, source, solve_seconds)
         return report if self.neighbours.present is None else report._replace(changed=self._look_around())
 
     def _look_around(self) -> np.ndarray:
@@ -358,7 +434,8 @@ class Swarm(SwarmState):
         """Return the robots' planning problems, which start when their inputs take effect."""
         start = self.disturbances.start
         late = None if start is None else start / self.config.substeps
-        arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles)
+        goal_velocity = None if self.route is None else self.route.current_velocity()
+        arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles, goal_velocity)
         return make_problems(self.config, self.planner.model, *arguments)
 
     def _fly(self) -> np.ndarray:
@@ -382,7 +459,8 @@ class Swarm(SwarmState):
         others = self.neighbours.others if self.neighbours.limited else None
         contact = 2 * self.config.radius - self.config.collision_tolerance
         # Of all pairs, including those that do not perceive each other
-        measured = measure(positions, self.goal, contact, self.config.goal_radius, others, self.config.planner.downwash)
+        radius, downwash = self.config.goal_radius, self.config.planner.downwash
+        measured = measure(positions, self.final_goal, contact, radius, others, downwash)
         collision, collision_continuous = (
             one < contact for one in (measured.min_separation, measured.min_separation_continuous)
         )
@@ -402,7 +480,7 @@ class Swarm(SwarmState):
             collision_continuous=collision_continuous,
             changed=None,
             moved=measured.moved,
-            at_goal=measured.at_goal,
+            at_goal=measured.at_goal if self.route is None else measured.at_goal & self.route.at_last,
             belief_source=source,
             plan_age=self.beliefs.age.copy(),  # a later reset writes into it
             plan_status=self._plans.status.reshape(shape).copy(),  # a later reset writes into the plans
@@ -424,3 +502,19 @@ class Swarm(SwarmState):
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...k,...k->...", a, b)
+
+
+def _indices(robots: Any, count: int) -> list[int]:
+    """Check indices of robots, all of them by default.
+
+    :raises ValueError: if there are no such robots, or one is named twice
+    """
+    if robots is None:
+        return list(range(count))
+    try:
+        found = [operator.index(one) for one in robots]
+    except TypeError:
+        found = []
+    if not found or len(set(found)) < len(found) or not all(0 <= one < count for one in found):
+        raise ValueError(f"robots={shown(robots)}: they must be different numbers of robots, from 0 to {count - 1}.")
+    return found

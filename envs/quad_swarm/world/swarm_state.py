@@ -16,6 +16,7 @@ from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.radio import RadioChannel
 from quad_swarm.world.realisation import Realisation
+from quad_swarm.world.route import Route
 
 S = TypeVar("S", bound="SwarmState")
 
@@ -45,6 +46,7 @@ class SwarmState:
     disturbances: Realisation
     neighbours: Neighbours
     obstacles: Obstacles | None
+    route: Route | None = None  # comes and goes in flight, and is not in states of before it existed
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
@@ -74,7 +76,10 @@ class SwarmState:
         :raises ValueError: if the state belongs to other swarms
         """
         for name, key, value in self._fields():
-            if isinstance(value, np.ndarray):
+            if name == "route":
+                route = state.get(key)
+                self.route = None if route is None else Route.of_state(route, self.goal)
+            elif isinstance(value, np.ndarray):
                 setattr(self, name, like(value, state[key], key))
             elif isinstance(value, Plans):
                 arrays = {

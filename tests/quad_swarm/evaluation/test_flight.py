@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, fly_steps, run_episodes
+from quad_swarm.evaluation.recordings import Recording
 from quad_swarm.world.presets import make_config
 
 
@@ -135,3 +136,19 @@ def test_contact_with_an_obstacle_is_a_collision_of_a_flight():
         touching = flight.min_obstacle_distance < -config.collision_tolerance
         np.testing.assert_array_equal(flight.colliding, touching | (flight.min_separation < 0.599))
         assert row["collided"] == (flight.collision is not None)
+
+
+@pytest.mark.parametrize(("scenario", "final"), [("tour", False), ("moving_goals", True)])
+def test_flights_to_goals_that_change_arrive_at_the_last(scenario, final):
+    condition = Condition("full", scenario, make_config("paper", n_robots=2, max_steps=150))
+    flight = fly(condition, 0)
+    assert flight.goals.shape == (151, 2, 3)
+    assert flight.at_goal.shape == (150, 2)
+    (row,) = run_episodes(condition, [first_episode(0)])
+    assert row["arrived"]
+    assert flight.arrival == row["steps_counted"]
+    there = np.linalg.norm(flight.pos[1:] - flight.goal, axis=-1) <= flight.config.goal_radius
+    assert np.array_equal(there.all(axis=1), flight.at_goal.all(axis=1)) == (not final), "goals move on"
+    recording = Recording.of(flight, "full")
+    assert recording.guessed == {"goal"}, "which nobody judges arrivals by"
+    assert fly(Condition("full", "random", condition.config), 0).goals is None

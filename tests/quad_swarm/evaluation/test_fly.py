@@ -22,6 +22,12 @@ def test_episodes_are_those_of_evaluate():
         np.testing.assert_array_equal(task.swarm.goal[k], goals)
 
 
+@pytest.mark.parametrize("scenario", ["tour", "moving_goals"])
+def test_goals_that_change_are_not_flown_in_real_time(scenario):
+    with pytest.raises(ValueError, match=f"scenario='{scenario}': its goals change in flight"):
+        next(episodes(make_config("flight", n_robots=2), scenario, [0]))
+
+
 def test_flights_in_virtual_time(tmp_path, capsys):
     words = ["--policy", "none", "full", "--n-robots", "3", "--link", "virtual", "--loss", "0.1", "--episodes", "2"]
     words += ["--most", "5", "--record", str(tmp_path / "flight.npz")]

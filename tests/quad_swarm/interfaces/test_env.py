@@ -158,6 +158,7 @@ def test_refuses_senseless_arguments(kwargs, message):
     [
         ({"start": np.zeros((4, 3))}, "reset option 'start'"),
         ({"starts": np.zeros((4, 3))}, "pass both"),
+        ({"waypoints": [[]] * 4, "goals": np.zeros((4, 3))}, "name only 'waypoints', 'goals'; pass both"),
         ({"starts": np.full((4, 3), np.nan), "goals": np.zeros((4, 3))}, "finite points"),
     ],
 )
@@ -250,6 +251,45 @@ def test_options_that_are_no_mapping_of_names_are_refused(options):
     ):
         with pytest.raises(ValueError, match="the options of reset"):
             env.reset(options=options)
+
+
+STARTS, GOALS = np.array([[0.0, -2, 1.5], [0, 2, 1.5]]), np.array([[3.0, -2, 1.5], [3, 2, 1.5]])
+
+
+def test_reset_takes_waypoints_and_goals_that_move():
+    env = gymnasium.make("QuadSwarm-v0", n_robots=2)
+    options = {
+        "starts": STARTS,
+        "goals": GOALS,
+        "waypoints": [[[1, -3, 1]], []],
+        "velocities": [[0, 0, 0], [0, 0.2, 0]],
+    }
+    observation, _ = env.reset(seed=0, options=options)
+    np.testing.assert_allclose(observation[:, 3:6], [[1, -1, -0.5], [3, 0, 0]])
+    for _ in range(10):
+        *_, info = env.step(np.zeros(2, np.int8))
+    swarm = env.unwrapped.task.swarm
+    np.testing.assert_allclose(swarm.final_goal[0], GOALS + np.array([[0, 0, 0], [0, 0.2, 0]]))
+    assert not info["at_goal"].any()
+
+
+def test_an_episode_whose_goals_change_arrives_again():
+    env = gymnasium.make("QuadSwarm-v0", n_robots=2, max_steps=90).unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded, match="set_goals"):
+        env.set_goals(GOALS)
+    for robots in ([0, 1], [0]):
+        env.reset(seed=0, options={"starts": STARTS, "goals": GOALS})
+        for _ in range(50):
+            *_, info = env.step(np.zeros(2, np.int8))
+        assert info["at_goal"].all()
+        assert env.task.statistics.arrived[0]
+        observation, swarm = env.set_goals(STARTS[robots], robots=robots), env.task.swarm
+        np.testing.assert_allclose(observation[:, 3:6], swarm.goal[0] - swarm.pos[0], atol=1e-6)
+        assert np.linalg.norm(observation[robots, 3:6], axis=1).min() > 2
+        for step in range(40):
+            *_, terminated, truncated, info = env.step(np.zeros(2, np.int8))
+            assert not env.task.statistics.arrived[0] or step > 5
+        assert (terminated, truncated, info["is_success"]) == (False, True, True)
 
 
 def test_points_beyond_any_number_are_refused_in_one_line():

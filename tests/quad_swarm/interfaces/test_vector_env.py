@@ -7,6 +7,9 @@ from gymnasium.vector import AutoresetMode
 
 import quad_swarm
 from quad_swarm.interfaces.env import QuadSwarmEnv, info_of
+from quad_swarm.world.scenarios import without_obstacles
+
+GOALS = [[3.0, -2, 1.5], [3, 2, 1.5]]
 
 
 def plain(info: dict) -> dict:
@@ -92,7 +95,25 @@ def test_curriculum_reaches_every_swarm():
     assert set(env.reset(seed=0)[1]["scenario"]) == {"random"}
     env.set_curriculum_level(env.n_curriculum_levels - 1)
     names = [env.reset()[1]["scenario"] for _ in range(8)]
-    assert set(np.concatenate(names)) == set(quad_swarm.SCENARIOS)
+    assert set(np.concatenate(names)) == set(without_obstacles())
+
+
+def test_goals_of_a_swarm_change_until_its_episode_ends():
+    env = gymnasium.make_vec("QuadSwarm-v0", num_envs=2, n_robots=2, scenario="random", max_steps=3).unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"set_goals\(\) was called before reset"):
+        env.set_goals(0, GOALS)
+    before, _ = env.reset(seed=3)
+    observation = env.set_goals(1, GOALS, waypoints=[[[0, 0, 1]], []])
+    np.testing.assert_array_equal(observation[:, 6:], before[1, :, 6:])
+    aims = observation[:, 3:6] + env.task.swarm.pos[1]
+    np.testing.assert_allclose(aims, [[0, 0, 1], GOALS[1]], atol=1e-5)
+    for _ in range(3):
+        _, _, _, truncated, _ = env.step(np.zeros((2, 2), np.int8))
+    assert truncated.all()
+    assert env.task.swarm.route is None, "the next episode has its own"
+    for swarm in (2, -1, True, "a"):
+        with pytest.raises(ValueError, match=r"swarm=.*from 0 to 1"):
+            env.set_goals(swarm, GOALS)
 
 
 @pytest.mark.parametrize(

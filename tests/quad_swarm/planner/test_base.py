@@ -237,6 +237,20 @@ def test_a_large_body_far_away_takes_the_place_of_a_small_one_nearby(solver):
     assert_same(limited.plan(problems, last), nearest.plan(problems.chosen(np.array([[2, 3]])), last))
 
 
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_with_a_cruise_distance_far_goals_are_as_good_as_near_ones(solver):
+    config = PlannerConfig(cruise_distance=6.0)
+    problems = crossing(4, config, 1)._replace(others=np.full((4, 1, 10, 3), 99.0))
+    way = np.array([[0.6, 0.8, 0], [-1, 0, 0], [0, 0, 1], [1, 0, 0]])
+    reach = np.array([[1000.0], [50.0], [7.0], [3.0]])
+    last, pos = hover(problems, config), problems.x[:, :3]
+    capped = make_planner(config, QUADROTOR, 2, solver).plan(problems._replace(goal=pos + reach * way), last)
+    nearby = problems._replace(goal=pos + np.minimum(reach, 6.0) * way)
+    expected = make_planner(PlannerConfig(), QUADROTOR, 2, solver).plan(nearby, last)
+    np.testing.assert_allclose(capped.u, expected.u, atol=1e-5)
+    np.testing.assert_array_equal(capped.u[3], expected.u[3], "a goal that is near stays as it is")
+
+
 def test_a_limit_above_the_number_of_others_changes_nothing():
     problems, _, _ = scattered(PlannerConfig(), 4, 2)
     last = Plans.hover(problems.x, 10)

@@ -204,6 +204,23 @@ def test_who_gets_no_answers_hovers_and_asks_everybody():
     np.testing.assert_array_equal(loop.robot.goal[0, 0], [3.0, 0, 1.5])
 
 
+def test_another_goal_counts_from_the_next_period_on():
+    loop, _link, _vehicle = make()
+    periods(loop, 1)
+    loop.fly_to([-3.0, 0, 1.5], [0.5, 0, 0], [[0, 3.0, 1.5]])
+    np.testing.assert_array_equal(loop.robot.goal[0, 0], [3.0, 0, 1.5])
+    periods(loop, 1)
+    np.testing.assert_array_equal(loop.robot.goal[0, 0], [0, 3.0, 1.5])
+    loop.fly_to([-3.0, 0, 1.5], [0.5, 0, 0])
+    periods(loop, 2)
+    np.testing.assert_allclose(loop.robot.goal[0, 0], [-3.0 + 2 * 0.5 * PERIOD * 1e-6, 0, 1.5])
+    loop.fly_to([2.0, 0, 1.5])
+    with pytest.raises(ValueError, match="goals"):
+        loop.fly_to([np.nan, 0, 1.5])
+    periods(loop, 1)
+    np.testing.assert_array_equal(loop.robot.goal[0, 0], [2.0, 0, 1.5])
+
+
 def test_silence_that_nobody_broke_is_no_fault():
     loop, _, _ = make("none")
     assert periods(loop, 60) == [Mode.FLY] * 60

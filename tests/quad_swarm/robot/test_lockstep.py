@@ -34,11 +34,13 @@ def differences(config, policies, rule, scenario, model=None, steps=60, episode=
     seed, config = first_episode(0) + episode, for_scenario(config, scenario)
     policy, task, rngs = begin(Condition(rule, scenario, config), [seed], model)
     swarm, rng = task.swarm, np.random.default_rng(seed)
-    _, starts, goals, obstacles = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
+    _, (starts, goals, obstacles, *changing) = ScenarioSampler(scenario, config.n_robots, config.space, config).draw(
+        rng
+    )
     noise_seed = int(rng.integers(2**63)) if config.is_random else 0
     robots = [make_robot(config, k, one, planner_of(config)) for k, one in enumerate(policies)]
     world = LockstepWorld(config, robots)
-    world.reset(starts, goals, noise_seed, obstacles)
+    world.reset(starts, goals, noise_seed, obstacles, *changing)
     columns = [k for k, column in enumerate(task.observation.columns) if ".critic." not in column.name]
     for step in range(steps):
         observed = task.observe()[0][:, columns] if model else None
@@ -72,7 +74,13 @@ def differences(config, policies, rule, scenario, model=None, steps=60, episode=
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize(
     ("preset", "n", "scenario"),
-    [("paper", 4, "random"), ("flight-hard", 3, "symmetric_swap"), ("flight", 3, "crossing_traffic")],
+    [
+        ("paper", 4, "random"),
+        ("flight-hard", 3, "symmetric_swap"),
+        ("flight", 3, "crossing_traffic"),
+        ("flight-hard", 4, "tour"),
+        ("flight", 3, "moving_goals"),
+    ],
 )
 def test_robots_with_rules_fly_as_the_swarm(preset, n, scenario, rule):
     config = make_config(preset, n_robots=n)

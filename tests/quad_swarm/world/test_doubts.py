@@ -63,21 +63,31 @@ def test_who_is_blown_away_stands_nowhere():
 
 
 @pytest.mark.parametrize("preset", ["paper", "flight"])
-def test_far_goals_are_reached_at_full_speed_with_the_weight_that_is_said(preset):
+def test_far_goals_are_approached_at_full_speed_with_the_cruise_distance_that_is_said(preset):
     calm = {"noise": {"wind": 0, "gust": 0, "vel": 0, "attitude": 0}, "n_robots": 2}
     config = make_config(preset, planner=HUGE, **calm)
     distance, warning = far_goals(config)
-    per_metre = float(warning.split("raise it to ")[1].split()[0])
+    cruise = float(warning.split("planner.cruise_distance=")[1].split(",")[0])
+    assert cruise == 6.0, "one and a half times what robots fly within the horizon"
     steps = round(12 / config.planner.dt)
     near = flown(config, distance, steps)
     assert near.vel[0, :, 0].min() > 1.8, "half of the possible 4 m/s"
     with pytest.warns(DoubtfulWorld, match=r"planner\.goal_weight=8 is divided by the squared distance"):
         slow = flown(config, 6 * distance, steps)
-    fast = flown(
-        make_config(preset, planner={**HUGE, "goal_weight": 6 * distance * per_metre}, **calm), 6 * distance, steps
-    )
     assert slow.vel[0, :, 0].max() < 1.2
-    assert fast.vel[0, :, 0].min() > 3.5
+    config = make_config(preset, planner={**HUGE, "cruise_distance": cruise}, **calm)
+    assert math.isinf(far_goals(config)[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DoubtfulWorld)
+        fast = flown(config, 6 * distance, steps)
+        farthest = flown(config, 1900.0, steps)
+    assert fast.vel[0, :, 0].min() > 3.9
+    np.testing.assert_allclose(fast.vel[0, :, 0], farthest.vel[0, :, 0], atol=0.01)
+
+
+def test_a_cruise_distance_that_is_too_far_is_no_remedy():
+    config = make_config("paper", planner={**HUGE, "cruise_distance": 100.0})
+    assert far_goals(config)[0] == far_goals(make_config("paper"))[0]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +120,7 @@ def test_far_goals_are_reached_at_full_speed_with_the_weight_that_is_said(preset
         ("paper", {"planner": {"max_speed": 0.01}}, r"max_steps=100: episodes of 10 s are too short"),
         ("paper", {"planner": {"max_climb_rate": 1e-6}}, r"max_steps=100: .* vertically"),
         ("paper", {"planner": {"goal_weight": 0}}, r"goal_weight=0: robots do not fly to their goals"),
-        ("paper", {"space": {"half_width": 60}, "max_steps": 999}, r"goals are more than 41 m away.* 0\.39 per metre"),
+        ("paper", {"space": {"half_width": 60}, "max_steps": 999}, r"more than 41 m away.*cruise_distance=6,"),
         ("paper", {"neighbourhood": {"range": 1}}, r"neighbourhood\.range=1: .* use at least 2\.4"),
         ("paper", {"planner": {"separation": 3}, "space": {"spacing": 1}}, r"space\.spacing=1: .* use at least 2\.6"),
     ],

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from quad_swarm import QuadSwarmEnv, QuadSwarmParallelEnv, QuadSwarmVectorEnv
 from quad_swarm.evaluation.flight import Condition
 from quad_swarm.world.presets import PRESETS, make_config
-from quad_swarm.world.scenarios import SCENARIOS, DoesNotFit, ScenarioSampler, ScenarioSpace, without_obstacles
+from quad_swarm.world.scenarios import (
+    SCENARIOS,
+    DoesNotFit,
+    ScenarioSampler,
+    ScenarioSpace,
+    extent,
+    without_obstacles,
+)
 
 SPACE = ScenarioSpace()
 
@@ -57,6 +64,26 @@ def test_symmetric_swap_is_antipodal_but_for_the_jitter():
     exact = ScenarioSpace(circle_jitter=0.0)
     starts, goals = SCENARIOS["symmetric_swap"](6, exact, np.random.default_rng(0))
     np.testing.assert_allclose(goals[:, :2], -starts[:, :2], atol=1e-12)
+
+
+def test_tours_have_waypoints_and_goals_that_move_cross_the_room():
+    space = replace(SPACE, waypoints=(2, 3))
+    lengths = set()
+    for seed in range(20):
+        name, scene = ScenarioSampler("tour", 3, space, make_config("paper", n_robots=3)).draw(
+            np.random.default_rng(seed)
+        )
+        assert (name, scene.velocities) == ("tour", None)
+        assert np.shape(scene.waypoints)[::2] == (3, 3)
+        lengths.add(np.shape(scene.waypoints)[1])
+        assert min(spacing(points) for points in np.swapaxes(scene.waypoints, 0, 1)) >= space.spacing
+        _, scene = ScenarioSampler("moving_goals", 3, space).draw(np.random.default_rng(seed))
+        assert scene.waypoints is None
+        velocity = scene.velocities[0]
+        assert (scene.velocities == velocity).all()
+        assert space.goal_speed[0] <= np.linalg.norm(velocity) <= space.goal_speed[1]
+        assert (scene.goals @ velocity <= 0).all(), "towards the other half"
+    assert lengths == {2, 3}
 
 
 def test_mixed_draws_all_scenarios_alike():
@@ -167,7 +194,7 @@ def test_draws_that_succeed_at_once_are_as_they_were():
             expected = SCENARIOS["symmetric_swap"](16, space, np.random.default_rng(seed))
         except DoesNotFit:
             continue
-        found = sampler.sample(np.random.default_rng(seed))[1:]
+        found = sampler.sample(np.random.default_rng(seed))[1:3]
         assert np.array_equal(found, expected)
         same += 1
     assert 5 < same < 20, "the others were drawn again"
@@ -183,7 +210,7 @@ def test_the_number_and_the_room_that_are_named_fit(name, n_robots):
         return
     except DoesNotFit as error:
         told = str(error)
-    field = {"asymmetric_swap": "sector_radius", "symmetric_swap": "circle_radius"}.get(name, "half_width")
+    field = extent(SCENARIOS[name], space).field
     found = re.fullmatch(rf"{n_robots} robots .* of '{name}'; about (\d+) do\. .* space\.{field}=(.*)\.", told)
     assert found, told
     ScenarioSampler(name, int(found[1]), space)
