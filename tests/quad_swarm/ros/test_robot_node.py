@@ -42,6 +42,12 @@ def make(monkeypatch):
         one.close()
 
 
+def goal_of(robot):
+    """Where a robot flies to from the next period on."""
+    loop = robot.loop
+    return loop.robot.goal[0, 0] if loop._next is None else loop._next[0]
+
+
 def topics(robot):
     services = (one.srv_name for one in robot.node.services)
     return {*services, *(one.topic_name for one in (*robot.node.publishers, *robot.node.subscriptions))}
@@ -152,7 +158,7 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
     see(robot)
     assert node.trigger_activate() == transitions.SUCCESS
     assert robot.flies
-    np.testing.assert_allclose(robot.loop._goal, [[[0, 0, 1.5]]])
+    np.testing.assert_allclose(goal_of(robot), [0, 0, 1.5])
 
     for message, reason in (
         (goal(1, 0, 1, "odom"), "its frame is 'odom': give it in 'map'"),
@@ -163,9 +169,9 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
     ):
         robot._take_goal(message, None)
         assert reason in capfd.readouterr().err
-        np.testing.assert_allclose(robot.loop._goal, [[[0, 0, 1.5]]])
+        np.testing.assert_allclose(goal_of(robot), [0, 0, 1.5])
     robot._take_goal(goal(1, 0.5, 1.2), None)
-    np.testing.assert_allclose(robot.loop._goal, [[[1, 0.5, 1.2]]])
+    np.testing.assert_allclose(goal_of(robot), [1, 0.5, 1.2])
 
     assert node.trigger_deactivate() == transitions.SUCCESS
     assert robot.loop.supervisor.shall_land
@@ -198,7 +204,7 @@ def test_a_robot_that_has_landed_is_inactive_and_may_begin_again(make, transitio
     for _ in range(2):
         see(robot)
         assert node.trigger_activate() == transitions.SUCCESS
-        np.testing.assert_allclose(robot.loop._goal, [[[1, 0.5, 1.2]]])
+        np.testing.assert_allclose(goal_of(robot), [1, 0.5, 1.2])
         assert robot._take_wish(None, Trigger.Response()).success
         see(robot, height=0.05)
         robot._leaves = True
