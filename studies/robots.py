@@ -111,8 +111,8 @@ def fly(fault: str, policy: str, seeds: range, folder: str) -> list[dict[str, An
     policies = [team.robot(k).policy for k in range(N_ROBOTS)]
     flight = VirtualFlight(team.config, policies, conditions, timing, checked=checked)
     rows = []
-    for starts, goals, seed in episodes(team.config, "symmetric_swap", seeds):
-        flight.reset(starts, goals, seed)
+    for scene, seed in episodes(team.config, "symmetric_swap", seeds):
+        flight.reset(scene.starts, scene.goals, seed)
         happens(flight)
         flight.fly(MOST)
         lives, vehicles = ~flight.dead, flight.vehicles

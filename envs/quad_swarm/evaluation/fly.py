@@ -38,9 +38,9 @@ from quad_swarm.realtime.vehicles import Flight
 from quad_swarm.realtime.virtual import VirtualFlight
 from quad_swarm.ros.world import RosWorld
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
 from quad_swarm.world.route import Targets
-from quad_swarm.world.scenarios import ScenarioSampler, without_obstacles
+from quad_swarm.world.scenarios import CHANGING_GOALS, SCENARIOS, ScenarioSampler, Scene
 
 EXAMPLES = "  sb3-maddpg fly --n-robots 8 --policy none full pretrained:quad-swarm-flight --episodes 3 --loss 0.1"
 LINKS = ("udp", "ros2", "virtual")
@@ -68,7 +68,7 @@ class Flown:
         done = total(flight.total for flight in flights)
         counts, durations = done.counts, done.durations
         traffic = [one for flight in flights for one in flight.traffic if one is not None]
-        collided = sum(bool(flight.collisions) for flight in flights)
+        collided = sum(flight.collided for flight in flights)
         low, high = wilson_interval(collided, n)
         arrived = np.array([flight.arrived.max() for flight in flights])
         periods = counts["periods"] + counts["missed"]
@@ -78,6 +78,7 @@ class Flown:
             "collided": collided,
             "collision_low": low,
             "collision_high": high,
+            "struck": sum(bool(flight.struck) for flight in flights),
             "closest": min(flight.closest for flight in flights),
             "arrived": int(np.isfinite(arrived).sum()),
             "seconds_to_arrival": float(np.nanmean(arrived)) if np.isfinite(arrived).any() else None,
@@ -139,8 +140,8 @@ def format_table(rows: Sequence[dict[str, Any]]) -> str:
     return aligned(texts, 1)
 
 
-def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
-    """Return starts and goals, (n, 3) each, and the seed of the disturbances of episodes, as `evaluate` flies them.
+def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterator[tuple[Scene, int]]:
+    """Return episodes as `evaluate` flies them, and the seeds of their disturbances.
 
     :param config: the world
     :param scenario: a name of `SCENARIOS`
@@ -150,20 +151,20 @@ def episodes(config: SwarmConfig, scenario: str, seeds: Iterable[int]) -> Iterat
     sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        name, (starts, goals, _, velocities, waypoints) = sampler.draw(rng)
-        if Targets.of(goals, velocities, waypoints, config.n_robots).change:
+        name, scene = sampler.draw(rng)
+        if Targets.of(scene.goals, scene.velocities, scene.waypoints, config.n_robots).change:
             raise ValueError(f"scenario={name!r}: its goals change in flight, which only simulated swarms fly.")
-        yield starts, goals, int(rng.integers(2**63)) if config.is_random else 0
+        yield scene, int(rng.integers(2**63)) if config.is_random else 0
 
 
 class Watcher(Protocol):
     """Follows flights."""
 
-    def begin(self, policy: str, goals: np.ndarray) -> None:
+    def begin(self, policy: str, scene: Scene) -> None:
         """Begin to follow a flight.
 
         :param policy: what flies
-        :param goals: goals, (n, 3) (m)
+        :param scene: the episode
         """
 
     def add(self, sample: Sample) -> None:
@@ -175,7 +176,7 @@ class Watcher(Protocol):
 
 def fly(
     team: Team,
-    flown: Iterable[tuple[np.ndarray, np.ndarray, int]],
+    flown: Iterable[tuple[Scene, int]],
     link: str,
     most: float,
     watchers: Sequence[Watcher] = (),
@@ -196,28 +197,30 @@ def fly(
         for watcher in watchers:
             watcher.add(sample)
 
-    def tell(goals: np.ndarray | None) -> None:
+    def tell(scene: Scene | None) -> None:
         for watcher in watchers:
-            if goals is None:
+            if scene is None:
                 watcher.end()
             else:
-                watcher.begin(name, goals)
+                watcher.begin(name, scene)
 
     if link == "virtual":
         virtual = _virtual(team)
-        for starts, goals, seed in flown:
-            tell(goals)
-            virtual.reset(starts, goals, seed)
+        for scene, seed in flown:
+            tell(scene)
+            virtual.reset(scene.starts, scene.goals, seed, scene.obstacles)
             virtual.fly(most, _LINGER, sees if watchers else None)
             tell(None)
             yield virtual.result(), True
         return
     exchange: Exchange = RosWorld(team.config.n_robots) if link == "ros2" else UdpWorld()
     with Arena(team, exchange) as arena:
-        for starts, goals, seed in flown:
+        for scene, seed in flown:
+            places = scene.starts, scene.goals
             for attempt in range(_ATTEMPTS):
-                tell(goals)
-                flight = arena.fly(starts, goals, seed, most, _LINGER, sees=sees if watchers else None)
+                tell(scene)
+                watched = sees if watchers else None
+                flight = arena.fly(*places, seed, most, _LINGER, sees=watched, obstacles=scene.obstacles)
                 tell(None)
                 counts = not flight.pauses or attempt == _ATTEMPTS - 1
                 yield flight, counts
@@ -227,7 +230,7 @@ def fly(
 
 def _virtual(team: Team) -> VirtualFlight:
     config = team.config
-    planner = make_planner(config.planner, config.quadrotor, config.n_robots)
+    planner = make_planner(config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots)
     policies = [team.robot(k, planner).policy for k in range(config.n_robots)]
     times = (team.wait, team.late)
     return VirtualFlight(config, policies, team.conditions, None, team.limits, *times, team.checked, planner)
@@ -245,7 +248,7 @@ def main(argv: list[str] | None = None) -> int:
         "--world", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="fields of the preset"
     )
     parser.add_argument("--plant", help="simulated vehicle, such as crazyflow:cf21B_500 (default: the preset's)")
-    names = without_obstacles()
+    names = [name for name in SCENARIOS if name not in CHANGING_GOALS]
     parser.add_argument("--scenario", choices=names, default="symmetric_swap", help="(default %(default)s)")
     parser.add_argument("--episodes", type=int, default=1, help="number of flights of each policy (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="set of episodes, see `sb3-maddpg evaluate` (default 0)")
@@ -278,6 +281,7 @@ def _main(args: argparse.Namespace) -> None:
     models = {one: trained_in(load_model(one, args.algo)) for one in args.policy if is_model(one)}
     preset = args.preset or (preset_of(models) if models else "flight")
     config = make_config(preset, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
+    config = for_scenario(config, args.scenario)
     if not 0 <= args.priority <= 99:
         raise ValueError(f"--priority {args.priority}: it must be from 1 to 99, or 0 for none.")
     if not set_priority(args.priority):
@@ -286,11 +290,11 @@ def _main(args: argparse.Namespace) -> None:
         check_suffix(args.record)
         check_writable(args.record, "--record")
     rows, first = [], first_episode(args.seed)
-    places = list(episodes(config, args.scenario, range(first, first + args.episodes)))
+    scenes = list(episodes(config, args.scenario, range(first, first + args.episodes)))
     about = {"scenario": args.scenario, "n_robots": config.n_robots, "preset": preset, "plant": config.plant}
     about |= {"link": args.link, "loss": args.loss, "wait": args.wait, "acts_after": args.late, "seed": args.seed}
     names = short_names(args.policy)
-    recorder = None if args.record is None else _Recorder(args.record, config, len(places) * len(args.policy))
+    recorder = None if args.record is None else _Recorder(args.record, config, len(scenes) * len(args.policy))
     options = {"wait": args.wait, "late": args.late, "priority": args.priority}
     with contextlib.ExitStack() as stack:
         watchers: list[Watcher] = [] if recorder is None else [recorder]
@@ -306,7 +310,7 @@ def _main(args: argparse.Namespace) -> None:
                 flown_as = stack.enter_context(tempfile.TemporaryDirectory(prefix="quad-swarm-"))
                 export(policy, config, Path(flown_as), args.algo)
             team = Team(config, flown_as, conditions=Conditions(args.loss), **options)
-            flown = _fly(team, places, args, names[policy], recorder, watchers)
+            flown = _fly(team, scenes, args, names[policy], recorder, watchers)
             rows.append({"policy": names[policy], **about, **flown.row()})
             if args.link == "virtual":  # one process flies all robots
                 rows[-1]["cpu"] = None
@@ -318,7 +322,7 @@ def _main(args: argparse.Namespace) -> None:
 
 def _fly(
     team: Team,
-    places: Sequence[tuple[np.ndarray, np.ndarray, int]],
+    scenes: Sequence[tuple[Scene, int]],
     args: argparse.Namespace,
     policy: str,
     recorder: _Recorder | None,
@@ -326,7 +330,7 @@ def _fly(
 ) -> Flown:
     """Fly episodes, and tell how each ended."""
     flown = Flown(team.config.n_robots)
-    for flight, counts in fly(team, places, args.link, args.most, watchers, policy):
+    for flight, counts in fly(team, scenes, args.link, args.most, watchers, policy):
         if counts:
             flown.flights.append(flight)
             print(_line(policy, len(flown.flights), flight), file=sys.stderr, flush=True)
@@ -347,9 +351,9 @@ class _Recorder:
     def __init__(self, path: Path, config: SwarmConfig, count: int):
         self._path, self._config, self._count, self._written = path, config, count, 0
 
-    def begin(self, policy: str, goals: np.ndarray) -> None:
+    def begin(self, policy: str, scene: Scene) -> None:
         """See `Watcher`."""
-        self._policy, self._goals, self._samples = policy, goals, list[Sample]()
+        self._policy, self._scene, self._samples = policy, scene, list[Sample]()
 
     def add(self, sample: Sample) -> None:
         """See `Watcher`."""
@@ -364,18 +368,18 @@ class _Recorder:
         :param flight: how it ended
         """
         self._written += 1
-        recording = recorded(self._samples, self._config, self._goals, self._policy)
+        recording = recorded(self._samples, self._config, self._scene, self._policy)
         row = Flown(self._config.n_robots, [flight]).row()
         recording = dataclasses.replace(recording, measured={name: row[name] for name in MEASURED})
         write(numbered(self._path, self._written, self._count), recording)
 
 
-def recorded(samples: Sequence[Sample], config: SwarmConfig, goals: np.ndarray, policy: str) -> Recording:
+def recorded(samples: Sequence[Sample], config: SwarmConfig, scene: Scene, policy: str) -> Recording:
     """Return the recording of a flight.
 
     :param samples: the flight
     :param config: the world
-    :param goals: goals, (n, 3) (m)
+    :param scene: the episode
     :param policy: what flew
     """
     n, times = config.n_robots, len(samples)
@@ -388,13 +392,15 @@ def recorded(samples: Sequence[Sample], config: SwarmConfig, goals: np.ndarray, 
             asked[k, report.robot] |= (np.uint64(report.asked) & bits) > 0
             told[k, report.robot] |= (np.uint64(report.told) & bits) > 0
     time, state, setpoint = map(np.array, zip(*((one.time, one.state, one.setpoint) for one in samples), strict=True))
-    world, arrays = dataclasses.asdict(config), (time, state, setpoint, plan, asked, told, goals)
-    obstacles = tuple(one.after(float(time[0])) for one in config.obstacles.listed)
+    world, arrays = dataclasses.asdict(config), (time, state, setpoint, plan, asked, told, scene.goals)
+    obstacles = tuple(one.after(float(time[0])) for one in scene.obstacles)
     return Recording(*arrays, world, policy, obstacles=obstacles)
 
 
 def _line(policy: str, number: int, flight: Flight) -> str:
     met = f"collided: {flight.collisions}" if flight.collisions else "no collision"
+    if flight.struck:
+        met += f", touched obstacles: {flight.struck}"
     there = np.isfinite(flight.arrived)
     when = f"all arrived after {flight.arrived.max():.2f} s" if there.all() else f"{there.sum()} arrived"
     paused = ", the machine stood still meanwhile" if flight.pauses else ""

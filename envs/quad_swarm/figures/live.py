@@ -9,12 +9,11 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs, urlsplit
 
-import numpy as np
-
 from quad_swarm.evaluation.fly import recorded
 from quad_swarm.figures.replay import live_page, live_step
 from quad_swarm.realtime.process import Sample
 from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.scenarios import Scene
 
 _WAIT = 1.0  # s after which a connection without news is tested
 _FIRST = 60.0  # s that a page waits for a flight to begin
@@ -46,15 +45,15 @@ class LivePage:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def begin(self, policy: str, goals: np.ndarray) -> None:
+    def begin(self, policy: str, scene: Scene) -> None:
         """Begin to show a flight.
 
         :param policy: what flies
-        :param goals: goals, (n, 3) (m)
+        :param scene: the episode
         """
         with self._news:
             self._number, self._over, self._samples = self._number + 1, False, []
-            self._policy, self._goals = policy, goals
+            self._policy, self._scene = policy, scene
             self._news.notify_all()
 
     def add(self, sample: Sample) -> None:
@@ -84,7 +83,7 @@ class LivePage:
             if not self._news.wait_for(lambda: len(self._samples) > 1 or self._closed, _FIRST) or self._closed:
                 return None
             samples, policy, number = list(self._samples), self._policy, self._number
-        return live_page(policy, recorded(samples, self._config, self._goals, policy).flight(), number)
+        return live_page(policy, recorded(samples, self._config, self._scene, policy).flight(), number)
 
     def events(self, number: int, known: int) -> Iterator[str]:
         """Yield events: the steps of a flight, its end, and the beginning of the next; or an empty one now and then.
@@ -103,7 +102,7 @@ class LivePage:
                 samples, over = self._samples[known : known + 2], self._over
             if len(samples) == 2:
                 known += 1
-                step = live_step(recorded(samples, self._config, self._goals, "").flight())
+                step = live_step(recorded(samples, self._config, self._scene, "").flight())
                 yield f"id: {known}\ndata: {json.dumps(step, separators=(',', ':'))}\n\n"
             elif over:
                 yield "event: end\ndata: \n\n"

@@ -9,6 +9,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,6 +21,7 @@ from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.team import Team
 from quad_swarm.realtime.udp_world import UdpWorld
 from quad_swarm.realtime.vehicles import Flight, Vehicles
+from quad_swarm.world.obstacles import Obstacle
 
 _US = 1_000_000
 _MOST_ROBOTS = 64  # which reports have bits for
@@ -143,6 +145,7 @@ class Arena:
         linger: float = 1.0,
         events: Sequence[tuple[float, Callable[[Arena], None]]] = (),
         sees: Callable[[Sample], None] | None = None,
+        obstacles: Sequence[Obstacle] | None = None,
     ) -> Flight:
         """Fly until everybody who lives is at its goal and some time has passed.
 
@@ -153,6 +156,8 @@ class Arena:
         :param linger: time to fly on after that (s)
         :param events: what else happens, and when (s)
         :param sees: called after each period
+        :param obstacles: the obstacles, where they are at the start; by default those that the world lists
+        :raises ValueError: if there are more obstacles than the world has room for
         :raises RobotEndedError: if a process ends that nobody ended
         """
         team, vehicles, n = self.team, self.vehicles, self.team.config.n_robots
@@ -160,14 +165,16 @@ class Arena:
         self._done, self._reports, self._frozen, self._pace = {}, [], set(), Pace()
         killed = self._ended()
         begins = monotonic() + round(_LEAD * _US)
-        vehicles.reset(starts, goals, noise_seed, begins)
+        there = team.config.obstacles.listed if obstacles is None else obstacles
+        vehicles.reset(starts, goals, noise_seed, begins, there)
         for k in range(n):
             places = {"start": list(starts[k]), "goal": list(goals[k])}
             # Robots that nobody synchronises begin their periods at any time; on one machine, they share its cores so
             first = begins + round(k * team.config.planner.dt * _US / n)
-            self._exchange.say(k, says="fly", flight=self._flight, first=of_day(first), **places)
+            around = [asdict(one.after((first - begins) / _US)) for one in there]
+            self._exchange.say(k, says="fly", flight=self._flight, first=of_day(first), obstacles=around, **places)
         todo, period = sorted(events, key=lambda event: event[0]), team.config.substeps
-        steps, there, pace = 0, None, self._pace
+        steps, arrived, pace = 0, None, self._pace
         while vehicles.now - begins < most * _US:
             for k in range(n):
                 if k not in self._frozen:
@@ -188,8 +195,8 @@ class Arena:
                 sees(Sample(time_flown, vehicles.state.copy(), vehicles.setpoint.copy(), self._reports))
             self._reports = []
             lives = np.array([k not in killed for k in range(n)])
-            there = None if not vehicles.at_goal[lives].all() else there or vehicles.now
-            if there is not None and vehicles.now - there >= linger * _US and not todo:
+            arrived = None if not vehicles.at_goal[lives].all() else arrived or vehicles.now
+            if arrived is not None and vehicles.now - arrived >= linger * _US and not todo:
                 break
         return self._land(begins, killed)
 

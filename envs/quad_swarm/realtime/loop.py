@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from quad_swarm.realtime.supervisor import HOVERING, Mode, SafetyLimits, Supervi
 from quad_swarm.robot import Plan, Robot
 from quad_swarm.robot.robot import target_of
 from quad_swarm.world.beliefs import resampled
+from quad_swarm.world.obstacles import Obstacle
 
 _US = 1e6
 _AHEAD = 0.05  # s by which clocks may differ before a plan comes from the future
@@ -106,14 +107,18 @@ class Loop:
             self.robot.receive(int(self.robot.others[0]), Plan(0, self.robot.newest.positions + pos[0]))
             self.robot.plan()
 
-    def start(self, start: np.ndarray, goal: np.ndarray, first: int) -> None:
+    def start(
+        self, start: np.ndarray, goal: np.ndarray, first: int, obstacles: Sequence[Obstacle] | None = None
+    ) -> None:
         """Begin a flight.
 
         :param start: where the robot hovers, (3,), world frame (m)
         :param goal: goal, (3,), world frame (m)
         :param first: start of the first period (us); the others' may differ by part of a period
+        :param obstacles: the obstacles, where they are then; by default those that the world lists
+        :raises ValueError: if there are more obstacles than the world has room for
         """
-        self.robot.reset(start, goal, self.late, now=first)
+        self.robot.reset(start, goal, self.late, now=first, obstacles=obstacles)
         self.supervisor.reset()
         self.statistics = Statistics()
         self._forget()

@@ -19,6 +19,7 @@ from quad_swarm.realtime.link import Channel, Link, Traffic, Vehicle
 from quad_swarm.realtime.loop import Loop, freeze_garbage
 from quad_swarm.realtime.supervisor import Mode, Watchdog
 from quad_swarm.realtime.team import Team, load
+from quad_swarm.world.obstacles import Obstacle
 
 _SAYS_HELLO = 0.2  # s
 _GIVES_UP = 15.0  # s without any word of the world
@@ -140,7 +141,9 @@ class RobotProcess:
         link, loop, vehicle = self.link, self.loop, self.vehicle
         before = replace(link.traffic)
         vehicle.begin(words)
-        loop.start(np.array(words["start"]), np.array(words["goal"]), link.own(words["first"]) + link.clock_error)
+        obstacles = tuple(Obstacle(**one) for one in words["obstacles"])
+        first = link.own(words["first"]) + link.clock_error
+        loop.start(np.array(words["start"]), np.array(words["goal"]), first, obstacles)
         statistics = loop.run(self._is_ended, self._after_period)
         self.watchdog.beat(armed=False)
         statistics.counts["watchdog"] += self.watchdog.barks

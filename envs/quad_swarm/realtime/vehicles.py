@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from quad_swarm.geometry import closest_approach
+from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.plants import make_plant
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.link import Sensed, Traffic
 from quad_swarm.realtime.statistics import Statistics, total
 from quad_swarm.world.beliefs import other_indices
+from quad_swarm.world.obstacles import Obstacle, Obstacles
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.realisation import Realisation
 
@@ -26,6 +28,7 @@ class Flight:
     """What happened in a flight.
 
     :param collisions: pairs of robots that collided
+    :param struck: robots that touched an obstacle, and the number of the obstacle
     :param closest: smallest distance of two robots (m)
     :param arrived: when each robot was at its goal for the first time (s); NaN if it never was
     :param at_goal: which robots were at their goals at the end, (n,) bool
@@ -37,6 +40,7 @@ class Flight:
     """
 
     collisions: list[tuple[int, int]]
+    struck: list[tuple[int, int]]
     closest: float
     arrived: np.ndarray
     at_goal: np.ndarray
@@ -45,6 +49,11 @@ class Flight:
     traffic: list[Traffic | None]
     killed: list[int]
     pauses: int = 0
+
+    @property
+    def collided(self) -> bool:
+        """Whether robots collided, with each other or an obstacle."""
+        return bool(self.collisions or self.struck)
 
     @property
     def total(self) -> Statistics:
@@ -60,6 +69,9 @@ class Vehicles:
     :ivar step_us: length of a sub-step (us)
     :ivar state: true states, (n, 9)
     :ivar closest: smallest distance of each pair of robots while both were flying, (n, n) (m)
+    :ivar obstacles: the obstacles, None without any
+    :ivar clearance: smallest distance between the surfaces of each robot and each of K obstacles while it was flying,
+        (n, K) (m)
     :ivar flying: which robots are in the air, (n,) bool
     :ivar held: which robots are held where they are until their first command, (n,) bool; `reset` holds nobody
 
@@ -75,6 +87,7 @@ class Vehicles:
         self._realisation = Realisation(config, 1)
         self._plant = make_plant(config.plant, config.quadrotor, step, 1, n)
         self._others = other_indices(n)
+        self.obstacles = Obstacles.of(config.obstacles, 1)
         self._state = np.zeros((1, n, N_STATES))
 
     @property
@@ -86,13 +99,22 @@ class Vehicles:
         """The last commands, (n, 4)."""
         return self._u[0]
 
-    def reset(self, starts: np.ndarray, goals: np.ndarray, noise_seed: int, now: int) -> None:
+    def reset(
+        self,
+        starts: np.ndarray,
+        goals: np.ndarray,
+        noise_seed: int,
+        now: int,
+        obstacles: Sequence[Obstacle] | None = None,
+    ) -> None:
         """Begin a flight.
 
         :param starts: starts, where robots hover, (n, 3), world frame (m)
         :param goals: goals, (n, 3), world frame (m)
         :param noise_seed: seed of the disturbances
         :param now: the time (us)
+        :param obstacles: the obstacles, where they are then; by default those that the world lists
+        :raises ValueError: if there are more obstacles than the world has room for
         """
         n = self.config.n_robots
         self.now, self._steps, self.goals = now, 0, np.array(goals, float)
@@ -105,6 +127,10 @@ class Vehicles:
         self._commanded = np.full(n, now)
         self.flying, self.held = np.ones(n, dtype=bool), np.zeros(n, dtype=bool)
         self.closest = np.full((n, n), np.inf)
+        listed = self.config.obstacles.listed if obstacles is None else obstacles
+        if self.obstacles is not None or listed:
+            (self.obstacles or Obstacles(1, 0)).reset(0, listed)
+        self.clearance = np.full((n, 0 if self.obstacles is None else self.obstacles.slots), np.inf)
         self.arrived = np.full(n, -1)
         self._sense()
 
@@ -172,6 +198,10 @@ class Vehicles:
             met &= among[:, None] & among
         return [(int(i), int(j)) for i, j in np.argwhere(met)]
 
+    def struck(self) -> list[tuple[int, int]]:
+        """Return the robots that touched an obstacle, with the number of the obstacle."""
+        return [(int(i), int(k)) for i, k in np.argwhere(self.clearance < -self.config.collision_tolerance)]
+
     def flight(
         self,
         began: int,
@@ -184,17 +214,24 @@ class Vehicles:
         arrived = np.where(self.arrived < 0, np.nan, (self.arrived - began) / _US)
         closest = float(self.closest.min())
         seconds = (self.now - began) / _US
-        return Flight(self.collisions(), closest, arrived, self.at_goal, seconds, statistics, traffic, killed, pauses)
+        met = self.collisions(), self.struck()
+        return Flight(*met, closest, arrived, self.at_goal, seconds, statistics, traffic, killed, pauses)
 
     def _meet(self, before: np.ndarray) -> None:
         """Update the smallest distances with straight motion during the sub-step."""
         after = self.state[:, POSITION]
         start, end = before[:, None] - before, after[:, None] - after
         between, _ = closest_approach(start, end - start, 1.0)
-        distance = np.linalg.norm(between, axis=-1)
+        distance = length(flattened(between, self.config.planner.downwash))
         both = self.flying[:, None] & self.flying
         np.fill_diagonal(both, False)
         self.closest[both] = np.minimum(self.closest, distance)[both]
+        if self.obstacles is not None:
+            seconds = self.step_us / _US
+            moved = np.stack([before, after])[:, None]
+            _, during = self.obstacles.measure(moved, self.config.radius, seconds)
+            self.clearance[self.flying] = np.minimum(self.clearance, during[0])[self.flying]
+            self.obstacles.advance(seconds)
 
     def _sense(self) -> None:
         estimate = self._realisation.estimate(self._state)

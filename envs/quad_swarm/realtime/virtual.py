@@ -21,6 +21,7 @@ from quad_swarm.realtime.process import Sample, report_of
 from quad_swarm.realtime.supervisor import SafetyLimits
 from quad_swarm.realtime.vehicles import Flight, Vehicles
 from quad_swarm.robot import Plan, Policy, Robot
+from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import SwarmConfig
 
 _US = 1e6
@@ -78,19 +79,25 @@ class VirtualFlight:
         self.config, self.vehicles = config, Vehicles(config)
         self.conditions, self.timing = conditions or Conditions(), timing or Timing()
         self.now, self._events, self._count = 0, list[tuple[int, bool, int, Callable[[], None]]](), 0
-        planner = planner or make_planner(config.planner, config.quadrotor, config.n_robots)
+        planner = planner or make_planner(
+            config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots
+        )
         self.links = [_VirtualLink(self, k, checked) for k in range(config.n_robots)]
         self.loops = [
             Loop(Robot(config, k, policy, planner), self.links[k], _VirtualVehicle(self, k), limits, wait, late)
             for k, policy in enumerate(policies)
         ]
 
-    def reset(self, starts: np.ndarray, goals: np.ndarray, seed: int = 0) -> None:
+    def reset(
+        self, starts: np.ndarray, goals: np.ndarray, seed: int = 0, obstacles: Sequence[Obstacle] | None = None
+    ) -> None:
         """Begin a flight.
 
         :param starts: starts, (n, 3), world frame (m)
         :param goals: goals, (n, 3), world frame (m)
         :param seed: seed of everything that is drawn
+        :param obstacles: the obstacles, where they are at the start; by default those that the world lists
+        :raises ValueError: if there are more obstacles than the world has room for
         """
         n = self.config.n_robots
         self._rng = np.random.default_rng(seed)
@@ -105,13 +112,15 @@ class VirtualFlight:
         self._mailbox: list[list[bytes]] = [[] for _ in range(n)]
         self._seen: list[Sensed | None] = [None] * n
         self._waits = np.zeros(n, dtype=bool)
-        self.vehicles.reset(starts, goals, seed, 0)
+        there = self.config.obstacles.listed if obstacles is None else obstacles
+        self.vehicles.reset(starts, goals, seed, 0, there)
         self._look()
         for k, (loop, link) in enumerate(zip(self.loops, self.links, strict=True)):
             link.traffic = Traffic()
             link.error = round(self._draw(self.timing.clock))
             first = round(self._draw(self.timing.phase))
-            loop.start(starts[k], goals[k], first + link.error)
+            around = tuple(one.after(first / _US) for one in there)
+            loop.start(starts[k], goals[k], first + link.error, around)
             self.at(first, partial(self._begin, k))
         self.at(self.vehicles.step_us, self._advance, first=True)
 

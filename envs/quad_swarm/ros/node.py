@@ -13,6 +13,7 @@ import numpy as np
 from quad_swarm.errors import shown, unknown_name
 from quad_swarm.realtime.link import Handler, monotonic
 from quad_swarm.robot import Plan
+from quad_swarm.world.presets import SwarmConfig
 
 # Wheels name no middleware, and nothing shall leave this machine unless the user says so
 DEFAULTS = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -142,6 +143,19 @@ def checked_names(value: Any) -> list[str]:
     if wrong := [name for name in names if re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) is None]:
         raise ValueError(f"names: {shown(wrong[0])} is no name: use letters, digits and underscores, a letter first")
     return names
+
+
+def standing(config: SwarmConfig) -> None:
+    """Check that the obstacles of a world stand, since nodes start at different times.
+
+    :raises ValueError: if one moves
+    """
+    for k, obstacle in enumerate(config.obstacles.listed):
+        if obstacle.moves:
+            raise ValueError(
+                f"obstacles.listed[{k}].velocity={obstacle.velocity}: nodes that start at different times do not agree "
+                "where it is; leave out obstacles that move"
+            )
 
 
 def entities(node: Any) -> list[tuple[Callable[[Any], Any], Any]]:

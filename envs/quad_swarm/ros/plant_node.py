@@ -38,12 +38,13 @@ from quad_swarm.ros.node import (
     make_node,
     numbers,
     quality,
+    standing,
     texts,
     values_of,
 )
 from quad_swarm.ros.world import VehicleTopics
 from quad_swarm.validation import read_assignments
-from quad_swarm.world.presets import make_config, points
+from quad_swarm.world.presets import for_scenario, make_config, points
 from quad_swarm.world.scenarios import ScenarioSampler
 
 PARAMETERS: dict[str, Any] = {
@@ -80,6 +81,12 @@ class PlantNode:
         world = read_assignments("world", texts("world", values["world"]))
         config = make_config(values["preset"], world, n_robots=len(self.names), plant=values["plant"] or None)
         rng = np.random.default_rng(seed)
+        if for_scenario(config, values["scenario"]).obstacles.slots > len(config.obstacles.listed):
+            raise ValueError(
+                f"scenario={values['scenario']!r}: robots cannot know obstacles that are drawn here; list them in the "
+                "world of all nodes, as in world:=['obstacles.listed=[{position: [0, 0, 0], radius: 0.3}]']"
+            )
+        standing(config)
         sampler = ScenarioSampler(values["scenario"], config.n_robots, config.space, config)
         starts, drawn = numbers("starts", values["starts"], 3), sampler.sample(rng)[1]
         self._starts = points("starts", starts, config.n_robots) if len(starts) else drawn
@@ -96,7 +103,8 @@ class PlantNode:
         """Put everybody back to their starts, where they are held."""
         self.vehicles.reset(self._starts, self._starts, self._noise, monotonic())
         self.vehicles.held[:] = True
-        self._pace, self._told, self._met = Pace(), 0, set[tuple[int, int]]()
+        self._pace, self._told = Pace(), 0
+        self._met, self._struck = set[tuple[int, int]](), set[tuple[int, int]]()
 
     def run(self) -> None:
         """Fly until `end`, and until everybody has landed then, for ten seconds at most."""
@@ -109,6 +117,9 @@ class PlantNode:
             self._mailbox.wait(due, Nobody())
             pace.notice(due)
             vehicles.advance()
+            for i, k in set(vehicles.struck()) - self._struck:
+                self._struck.add((i, k))
+                self._node.get_logger().warning(f"{self.names[i]} touched obstacle {k}")
             for i, j in set(vehicles.collisions()) - self._met:
                 self._met.add((i, j))
                 self._node.get_logger().warning(f"{self.names[i]} and {self.names[j]} collided")

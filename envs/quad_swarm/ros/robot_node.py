@@ -55,6 +55,7 @@ from quad_swarm.ros.node import (
     make_context,
     numbers,
     quality,
+    standing,
     texts,
     values_of,
 )
@@ -270,6 +271,7 @@ class RobotNode:
         config = make_config(
             values["preset"], read_assignments("world", texts("world", values["world"])), n_robots=len(names)
         )
+        standing(config)
         limits = SafetyLimits(**read_assignments("limits", texts("limits", values["limits"])))
         team = Team(config, values["policy"], limits, values["wait"], values["late"], priority=values["priority"])
         if index == -1 and (place := self.node.get_namespace().strip("/")) in names:

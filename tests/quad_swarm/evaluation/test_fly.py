@@ -17,9 +17,23 @@ def test_episodes_are_those_of_evaluate():
     config = make_config("flight", n_robots=3)
     seeds = [first_episode(2) + k for k in range(2)]
     _, task, _ = begin(Condition("none", "asymmetric_swap", config), seeds)
-    for k, (starts, goals, _) in enumerate(episodes(config, "asymmetric_swap", seeds)):
-        np.testing.assert_array_equal(task.swarm.pos[k], starts)
-        np.testing.assert_array_equal(task.swarm.goal[k], goals)
+    for k, (scene, _) in enumerate(episodes(config, "asymmetric_swap", seeds)):
+        np.testing.assert_array_equal(task.swarm.pos[k], scene.starts)
+        np.testing.assert_array_equal(task.swarm.goal[k], scene.goals)
+
+
+def test_flights_among_obstacles(tmp_path, capsys):
+    words = ["--policy", "full", "--n-robots", "3", "--link", "virtual", "--scenario", "crossing_traffic"]
+    words += ["--most", "5", "--record", str(tmp_path / "flight.npz"), "--json", str(tmp_path / "rows.json")]
+    assert main(words) == 0
+    assert "touched" not in capsys.readouterr().err
+    (row,) = json.loads((tmp_path / "rows.json").read_text())
+    assert (row["collided"], row["struck"], row["arrived"]) == (0, 0, 1)
+    recording = read(tmp_path / "flight.npz")
+    assert recording.obstacles
+    assert all(one.moves for one in recording.obstacles)
+    distance = recording.flight().min_obstacle_distance
+    assert 0 < distance.min() < 1
 
 
 @pytest.mark.parametrize("scenario", ["tour", "moving_goals"])

@@ -10,7 +10,8 @@ import pytest
 from quad_swarm.evaluation.flight import Condition, fly
 from quad_swarm.figures.live import LivePage
 from quad_swarm.realtime.process import Report, Sample
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.presets import for_scenario, make_config
+from quad_swarm.world.scenarios import Scene
 
 CONFIG = make_config("paper", n_robots=3)
 
@@ -35,6 +36,10 @@ def samples(flight):
         yield Sample(0.1 * k, state, np.zeros((n, 4)), reports)
 
 
+def scene(flight):
+    return Scene(flight.pos[0], flight.goal, flight.obstacles)
+
+
 def get(live, path=""):
     with urllib.request.urlopen(live.url + path, timeout=500) as answer:
         assert answer.headers["Content-Type"].startswith("text/html")
@@ -42,7 +47,7 @@ def get(live, path=""):
 
 
 def test_steps_are_those_of_the_replay_page(live, flown):
-    live.begin("full", flown.goal)
+    live.begin("full", scene(flown))
     every = list(samples(flown))
     for sample in every[:5]:
         live.add(sample)
@@ -68,7 +73,7 @@ def test_steps_are_those_of_the_replay_page(live, flown):
 
 
 def test_the_next_flight_begins_anew(live, flown):
-    live.begin("full", flown.goal)
+    live.begin("full", scene(flown))
     for sample in samples(flown):
         live.add(sample)
     events = live.events(1, 68)
@@ -77,9 +82,20 @@ def test_the_next_flight_begins_anew(live, flown):
     assert next(events) == ": nothing yet\n\n"
     live.end()
     assert next(events) == "event: end\ndata: \n\n"
-    live.begin("none", flown.goal)
+    live.begin("none", scene(flown))
     assert next(events) == "event: begin\ndata: \n\n"
     assert list(events) == []
+
+
+def test_obstacles_are_shown_where_they_are(live):
+    flight = fly(Condition("full", "crossing_traffic", for_scenario(CONFIG, "crossing_traffic"), 10), 0)
+    live.begin("full", scene(flight))
+    for sample in list(samples(flight))[:4]:
+        live.add(sample)
+    page = get(live)
+    data = json.loads(page.split('<script id="data" type="application/json">')[1].split("</script>")[0])
+    shown = np.array([one["positions"] for one in data["flights"][0]["obstacles"]])
+    np.testing.assert_allclose(shown, flight.obstacle_pos[:4].transpose(1, 0, 2), atol=2e-3)
 
 
 @pytest.mark.parametrize(("path", "status"), [("other", 404), ("events", 400), ("events?flight=one&from=0", 400)])
@@ -96,7 +112,7 @@ def test_only_this_machine_is_served(live):
 @pytest.mark.slow
 def test_a_browser_follows(live, flown, browser):
     every = list(samples(flown))
-    live.begin("full", flown.goal)
+    live.begin("full", scene(flown))
     for sample in every[:3]:
         live.add(sample)
     page = browser.new_page()
@@ -116,7 +132,7 @@ def test_a_browser_follows(live, flown, browser):
     page.wait_for_function("document.body.dataset.live === 'landed'")
     page.wait_for_function("document.getElementById('time').max === '70'")
     assert page.inner_text(".summary").startswith("70 steps")
-    live.begin("none", flown.goal)
+    live.begin("none", scene(flown))
     for sample in every[:3]:
         live.add(sample)
     page.wait_for_function("document.getElementById('subtitle').textContent === 'flight 2, live'")

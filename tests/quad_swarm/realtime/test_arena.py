@@ -10,7 +10,8 @@ from quad_swarm.realtime import Conditions, Mode
 from quad_swarm.realtime.arena import Arena, Pace, RobotEndedError
 from quad_swarm.realtime.link import monotonic, of_day
 from quad_swarm.realtime.team import Team
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.obstacles import Obstacle
+from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 
 # On a busy machine, the whole flight takes place in slow motion, see `Arena.pauses`: nothing here depends on time
@@ -54,6 +55,20 @@ def test_four_processes_swap_places():
     assert any(report.asked for report in reports)
     assert any(report.arrived for report in reports)
     assert reports[-1].plan.shape == (CONFIG.planner.horizon + 1, 3)
+
+
+@pytest.mark.slow
+def test_processes_know_the_obstacles_of_a_flight():
+    """Plans lead around a pillar, to which the robots would fly straight."""
+    config, samples = for_scenario(make_config("flight", n_robots=2), "doorway"), []
+    starts = np.array([[-2.0, 0, 1.5], [2.0, 0, 1.5]])
+    pillar = Obstacle((-0.2, 0, 0), 0.6, velocity=(0.05, 0, 0))
+    with Arena(Team(config, "full")) as arena:
+        flight = arena.fly(starts, starts[::-1], most=6.0, sees=samples.append, obstacles=[pillar])
+        assert arena.vehicles.obstacles.position[0, 0, 0] == pytest.approx(-0.2 + 0.05 * flight.seconds)
+    plans = np.array([report.plan for sample in samples for report in sample.reports])
+    assert len(plans) > 60
+    assert np.hypot(*plans[..., :2].reshape(-1, 2).T).min() > 0.5
 
 
 @pytest.mark.parametrize("field", ["range", "half_distance"])

@@ -1,10 +1,13 @@
 """Simulated vehicles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.vehicles import Vehicles
+from quad_swarm.world.obstacles import Obstacle, ObstacleConfig
 from quad_swarm.world.presets import make_config
 
 CALM = {
@@ -51,6 +54,26 @@ def test_robots_that_meet_between_two_states_collide():
     assert vehicles.collisions(np.array([True, False])) == []
     assert vehicles.closest[0, 1] == pytest.approx(0.0, abs=1e-9), "they passed through each other"
     assert (vehicles.state[0, 0] - vehicles.state[1, 0]) > 0
+
+
+def test_robots_that_touch_a_pillar_collide_with_it():
+    def towards(vehicles):
+        vehicles.command(0, np.array([0.0, 0.3, 0.0, 0.0]))
+        vehicles.command(1, np.array([0.0, 0.0, 0.5, 0.0]))
+
+    pillars = [{"position": (0, 0, 0), "radius": 0.3}, {"position": (9, 9, 0), "radius": 0.3, "velocity": (0, -1, 0)}]
+    config = replace(CONFIG, obstacles=ObstacleConfig(tuple(Obstacle(**one) for one in pillars)))
+    vehicles = flown(2.5, towards, config)
+    assert vehicles.struck() == [(0, 0)]
+    assert vehicles.clearance[0, 0] == pytest.approx(-0.6, abs=0.02), "it flew through its axis"
+    assert vehicles.clearance[1, 0] == pytest.approx(2 - 0.6, abs=0.02)
+    np.testing.assert_allclose(vehicles.obstacles.position[0, 1], (9, 6.5, 0))
+    flight = vehicles.flight(0, [None] * 2, [None] * 2, [])
+    assert flight.collided
+    assert (flight.collisions, flight.struck) == ([], [(0, 0)])
+    vehicles.reset(STARTS, GOALS, 3, 0, ())
+    vehicles.advance()
+    assert np.isinf(vehicles.clearance).all(), "no obstacle in this flight"
 
 
 def test_what_is_not_finite_is_no_command():

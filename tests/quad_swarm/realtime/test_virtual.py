@@ -8,23 +8,23 @@ from quad_swarm.realtime import Conditions
 from quad_swarm.realtime.virtual import Timing, VirtualFlight
 from quad_swarm.robot import Plan, Robot, RulePolicy
 from quad_swarm.robot.lockstep import LockstepWorld
-from quad_swarm.world.presets import make_config
+from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 
 RULE = "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
 S = 1_000_000
 
 
-def flight_of(n=8, rule=RULE, **options):
-    config = make_config("flight", n_robots=n)
+def flight_of(n=8, rule=RULE, scenario="symmetric_swap", **options):
+    config = for_scenario(make_config("flight", n_robots=n), scenario)
     return VirtualFlight(config, [RulePolicy(rule) for _ in range(n)], **options)
 
 
 def begin(flight, episode, scenario="symmetric_swap"):
     config = flight.config
     rng = np.random.default_rng([12, episode])
-    _, starts, goals, _ = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
-    flight.reset(starts, goals, episode)
+    _, starts, goals, obstacles = ScenarioSampler(scenario, config.n_robots, config.space, config).sample(rng)
+    flight.reset(starts, goals, episode, obstacles)
 
 
 class Rounding(Robot):
@@ -34,23 +34,38 @@ class Rounding(Robot):
         super().receive(sender, Plan(plan.stamp, np.rint(plan.positions * 1e3) * 1e-3))
 
 
-@pytest.mark.parametrize("n", [2, 4, 8])
-def test_without_delays_it_is_the_flight_in_lock_step(n):
+@pytest.mark.parametrize(
+    ("n", "scenario"),
+    [(2, "symmetric_swap"), (4, "symmetric_swap"), (8, "symmetric_swap"), (4, "forest"), (4, "crossing_traffic")],
+)
+def test_without_delays_it_is_the_flight_in_lock_step(n, scenario):
     """If everybody asks; a robot that asks nobody plans at once, and its answer is then the newer plan."""
     world = {"clock_skew": 0.0, "radio": {"loss": 0.0, "delay": 0, "jitter": 0, "round_trip": 0}}
-    config = make_config("flight", world, n_robots=n)
+    config = for_scenario(make_config("flight", world, n_robots=n), scenario)
     full = RulePolicy("full")
     flight = VirtualFlight(config, [full] * n, timing=Timing(*[(0.0, 0.0)] * 5), late=0.0)
     lockstep = LockstepWorld(config, [Rounding(config, k, full) for k in range(n)])
-    _, starts, goals, _ = ScenarioSampler("symmetric_swap", n, config.space, config).sample(np.random.default_rng(3))
-    lockstep.reset(starts, goals, 7)
-    flight.reset(starts, goals, 7)
+    sampler = ScenarioSampler(scenario, n, config.space, config)
+    _, starts, goals, obstacles = sampler.sample(np.random.default_rng(3))
+    lockstep.reset(starts, goals, 7, obstacles)
+    flight.reset(starts, goals, 7, obstacles)
     for k in range(1, 61):
         lockstep.step()
         flight.run(k * config.planner.dt)
         assert flight.vehicles.state.tobytes() == lockstep.state[0].tobytes()
     assert np.linalg.norm(lockstep.state[0, :, POSITION] - starts, axis=1).min() > 1.0, "they flew"
     assert flight.result().total.counts["plans received"] >= 60 * n * (n - 1)
+
+
+@pytest.mark.parametrize("scenario", ["forest", "doorway", "crossing_traffic"])
+def test_robots_avoid_obstacles_though_messages_are_lost(scenario):
+    flight = flight_of(4, "full", scenario, conditions=Conditions(0.1))
+    begin(flight, 1, scenario)
+    flight.fly(8.0)
+    result = flight.result()
+    assert not result.collided
+    assert result.at_goal.all()
+    assert np.isfinite(flight.vehicles.clearance).any(), "there were obstacles"
 
 
 FAULTS = {

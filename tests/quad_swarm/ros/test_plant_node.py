@@ -13,6 +13,7 @@ from quad_swarm.ros.node import make_context, make_node, quality
 from quad_swarm.ros.plant_node import PlantNode
 
 GOOD = {"names": ["a", "b"], "seed": 3}
+MOVING = "obstacles.listed=[{position: [0, 3, 0], radius: 0.2, velocity: [1, 0, 0]}]"
 
 
 @pytest.fixture
@@ -42,6 +43,9 @@ def make(monkeypatch):
         ({"plant": "gazebo:x"}, "gazebo"),
         ({"starts": [1.0, 2.0]}, "give finite numbers, 3 for each point"),
         ({"starts": [1.0, 2.0, 1.0]}, "starts"),
+        ({"scenario": "doorway"}, "obstacles that are drawn here"),
+        ({"world": ["obstacles.number=[1,1]"]}, "obstacles that are drawn here"),
+        ({"world": [MOVING]}, "nodes that start at different times do not agree"),
         ({"policy": "full"}, "Unknown parameter 'policy'"),
     ],
 )

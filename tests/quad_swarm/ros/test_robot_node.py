@@ -24,6 +24,7 @@ from quad_swarm.ros.robot_node import PARAMETERS, RobotNode
 
 ROOT = Path(__file__).parents[3]
 GOOD = {"policy": "full", "names": ["robot_0", "robot_1"], "index": 0}
+MOVING = "obstacles.listed=[{position: [0, 3, 0], radius: 0.2, velocity: [1, 0, 0]}]"
 
 
 @pytest.fixture
@@ -57,6 +58,7 @@ def topics(robot):
     ("wrong", "reason"),
     [
         ({"policy": "ful"}, "ful"),
+        ({"world": [MOVING]}, "nodes that start at different times do not agree"),
         ({"policy": 3}, "policy"),
         ({"preset": "fligth"}, "Did you mean 'flight'"),
         ({"world": ["radius"]}, "world 'radius': write NAME=VALUE"),
