@@ -60,10 +60,10 @@ class Recorder(Robot):
 def recorded(config: SwarmConfig, policies: list[Policy], count: int) -> Iterator[Recorder]:
     """Fly episodes in lock-step, and yield the first robot after each."""
     planner = make_planner(config.planner, config.quadrotor, config.n_robots)
-    for starts, goals, seed in episodes(config, "symmetric_swap", range(first_episode(0), first_episode(0) + count)):
+    for scene, seed in episodes(config, "symmetric_swap", range(first_episode(0), first_episode(0) + count)):
         robots = [(Recorder if k == 0 else Robot)(config, k, one, planner) for k, one in enumerate(policies)]
         world = LockstepWorld(config, robots)
-        world.reset(starts, goals, seed)
+        world.reset(scene.starts, scene.goals, seed)
         for _ in range(STEPS):
             world.step()
         first = robots[0]

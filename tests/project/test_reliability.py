@@ -144,7 +144,7 @@ def test_random_worlds_find_steps_and_resets_that_fail(monkeypatch):
     def fails(self, rng):
         raise ValueError("late")
 
-    monkeypatch.setattr(ScenarioSampler, "sample", fails)
+    monkeypatch.setattr(ScenarioSampler, "draw", fails)
     outcome, told = random_worlds.attempt({"n_robots": 2, "preset": "paper"}, 0, steps=3)
     assert outcome == "wrong"
     assert "late" in told[0]

@@ -193,10 +193,10 @@ class EpisodeStatistics:
             "planner/failure_rate": self.planner_failures / plans,
             "planner/solve_us": 1e6 * self.solve_seconds / plans,
         } | (
-            {}
-            if self._names is _STATE
-            else {
+            {
                 "swarm/obstacle_collision_rate": self.collided_obstacle.astype(float),
                 "swarm/min_obstacle_distance": self.min_obstacle_distance.copy(),
             }
+            if self.config.obstacles.slots
+            else {}
         )

@@ -1,5 +1,8 @@
 """What is counted of an episode, and until when."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -135,3 +138,16 @@ def test_contact_between_steps_is_told_from_contact_at_them():
     put(task, [[-0.1, 0, 1], [0.1, 0, 1]])
     task.step(ALL)
     assert task.statistics.collided_at_steps[0]
+
+
+@pytest.mark.parametrize("world", [{}, {"obstacles": {"number": [1, 2]}}])
+def test_copies_have_the_same_metrics(world):
+    task = make_task(n_robots=2, scenario="symmetric_swap", world=world)
+    task.reset(0, np.random.default_rng(0))
+    task.step(ALL)
+    expected = task.statistics.metrics()
+    assert ("swarm/min_obstacle_distance" in expected) == bool(world)
+    for statistics in (copy.deepcopy(task.statistics), pickle.loads(pickle.dumps(task.statistics))):
+        metrics = statistics.metrics()
+        assert metrics.keys() == expected.keys()
+        assert all(np.array_equal(metrics[name], expected[name]) for name in expected)
