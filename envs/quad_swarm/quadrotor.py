@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from types import SimpleNamespace
 from typing import Annotated, Any
@@ -208,6 +208,34 @@ class QuadrotorModel:
 
     def __reduce__(self) -> tuple:
         return QuadrotorModel, (self.params, self.dt)  # call buffers hold raw memory: rebuilt on demand
+
+
+class MixedModel:
+    """Discrete dynamics of teams of n unlike quadrotors, each bit for bit as its own `QuadrotorModel` computes it.
+
+    :param models: the kinds
+    :param kind_of: which of them each robot is, (n,)
+    """
+
+    def __init__(self, models: Sequence[QuadrotorModel], kind_of: Sequence[int]):
+        self._robots = [(model, np.flatnonzero(np.equal(kind_of, kind))) for kind, model in enumerate(models)]
+
+    def step(
+        self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None, factors: np.ndarray | None = None
+    ) -> np.ndarray:
+        """See `QuadrotorModel.step`; the axis before the last is that of the n robots."""
+        return self._each(QuadrotorModel.step, x, u, wind, factors)
+
+    def ahead(self, x: np.ndarray, u: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """See `QuadrotorModel.ahead`: (..., n, 9), (..., n, 4), (..., n) (s) -> (..., n, 9)."""
+        return self._each(lambda model, *some: model.ahead(*some[:2], some[2][..., 0]), x, u, time[..., None])
+
+    def _each(self, call: Callable[..., np.ndarray], *arrays: np.ndarray | None) -> np.ndarray:
+        result = np.empty_like(arrays[0])
+        for model, robots in self._robots:
+            some = (None if array is None else array.take(robots, axis=-2) for array in arrays)
+            result[..., robots, :] = call(model, *some)
+        return result
 
 
 class _BufferedCall:

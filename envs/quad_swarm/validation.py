@@ -13,7 +13,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_type_hints
 
 import numpy as np
 import pydantic
@@ -352,5 +352,13 @@ def _names(owner: Any, path: Sequence[str] = ()) -> list[str]:
     if not dataclasses.is_dataclass(owner):
         return list(inspect.signature(owner).parameters)
     for name in path:
-        owner = next(field.default_factory for field in dataclasses.fields(owner) if field.name == name)
+        if not name.isdigit():  # an entry of a list
+            owner = _dataclass_in(get_type_hints(owner)[name])
     return [field.name for field in dataclasses.fields(owner)]
+
+
+def _dataclass_in(annotation: Any) -> Any:
+    """Return the dataclass that a field holds, as in ``tuple[Obstacle, ...]``."""
+    if dataclasses.is_dataclass(annotation):
+        return annotation
+    return next((found for one in get_args(annotation) if (found := _dataclass_in(one))), None)

@@ -23,11 +23,12 @@ from quad_swarm.evaluation.policies import is_model, make_policy, name_of
 from quad_swarm.jobs import Journal, make_executor
 from quad_swarm.jobs.cluster import other_code
 from quad_swarm.jobs.journal import differences, origin
-from quad_swarm.planner import SOLVERS, make_planner
+from quad_swarm.planner import SOLVERS
 from quad_swarm.plants.base import MODEL, SIMULATORS, PlantDied, parse_plant, simulator_of
 from quad_swarm.task.episode_statistics import exchange_bytes, is_row
 from quad_swarm.task.observation import GROUPS
 from quad_swarm.task.rules import RULES
+from quad_swarm.world.kinds import make_planner_of
 from quad_swarm.world.presets import SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -269,7 +270,7 @@ def _depends_on(condition: Condition) -> tuple[set[str], list[Path]]:
 def _solver(condition: Condition) -> str:
     """Return the name of the solver that flies, which for "auto" depends on whether there is a compiler."""
     config = condition.config
-    return make_planner(config.planner, config.quadrotor, config.n_others + 1, condition.solver).solver.name
+    return make_planner_of(config, 0, condition.solver).solver.name
 
 
 def _origin(condition: Condition) -> dict[str, str]:

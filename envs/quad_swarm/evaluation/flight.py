@@ -209,7 +209,8 @@ class Flight:
         this never changed
     :param at_goal: which robots were at their goals after each step, (T, n) bool; None if the goals tell
 
-    With `PlannerConfig.downwash`, distances between robots are those in the ellipsoids' metric.
+    With `PlannerConfig.downwash`, distances between robots are those in the ellipsoids' metric. Those of robots whose
+    radii are not the world's count as in `SwarmConfig`.
     """
 
     config: SwarmConfig
@@ -260,7 +261,12 @@ class Flight:
     @cached_property
     def separation(self) -> np.ndarray:
         """Distances of each robot to the others, (T + 1, n, n - 1) (m)."""
-        return length(flattened(self.relative_pos, self.config.planner.downwash))
+        return self._less(length(flattened(self.relative_pos, self.config.planner.downwash)))
+
+    def _less(self, distance: np.ndarray) -> np.ndarray:
+        """Return distances between centres as distances of robots of the world's radius, (T + 1, n, n - 1) (m)."""
+        excess, others = self.config.excess, other_indices(self.n_robots)
+        return distance if excess is None else distance - np.take_along_axis(excess, others, axis=1)
 
     @cached_property
     def closest_approach(self) -> tuple[np.ndarray, np.ndarray]:
@@ -268,7 +274,7 @@ class Flight:
         limit, both (T + 1, n, n - 1)."""
         downwash = self.config.planner.downwash
         nearest, time = closest_approach(flattened(self.relative_pos, downwash), flattened(self.relative_vel, downwash))
-        return length(nearest), time
+        return self._less(length(nearest)), time
 
     @cached_property
     def arrival(self) -> int | None:
@@ -342,8 +348,11 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         at_goal.append(report.at_goal[0].copy())
         goal = task.swarm.final_goal[0].copy()
     start, config = state[0][:, POSITION], condition.config
-    apart = flattened(start[other_indices(len(start))] - start[:, None], config.planner.downwash)
-    closest.insert(0, length(apart).min())
+    others = other_indices(len(start))
+    apart = length(flattened(start[others] - start[:, None], config.planner.downwash))
+    if config.excess is not None:
+        apart = apart - np.take_along_axis(config.excess, others, axis=1)
+    closest.insert(0, apart.min())
     flight = Flight(
         config,
         np.array(state),
@@ -359,5 +368,5 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
         flight = replace(flight, goals=np.array(goals), at_goal=np.array(at_goal))
     if not obstacles:
         return flight
-    beside.insert(0, clearances(start, surroundings(obstacles)).min() - config.radius)
+    beside.insert(0, (clearances(start, surroundings(obstacles)) - config.radii[:, None]).min())
     return replace(flight, obstacles=obstacles, obstacle_pos=np.array(centres), min_obstacle_distance=np.array(beside))

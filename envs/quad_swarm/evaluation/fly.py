@@ -27,7 +27,6 @@ from quad_swarm.evaluation.policies import is_model, load_model, short_names, tr
 from quad_swarm.evaluation.recordings import MEASURED, Recording, check_suffix, numbered, write
 from quad_swarm.evaluation.rows import aligned, check_writable, write_rows
 from quad_swarm.parsing import Parser
-from quad_swarm.planner import make_planner
 from quad_swarm.realtime.arena import Arena, Exchange
 from quad_swarm.realtime.link import Conditions
 from quad_swarm.realtime.process import Sample, set_priority
@@ -38,6 +37,7 @@ from quad_swarm.realtime.vehicles import Flight
 from quad_swarm.realtime.virtual import VirtualFlight
 from quad_swarm.ros.world import RosWorld
 from quad_swarm.validation import read_assignments
+from quad_swarm.world.kinds import make_planners
 from quad_swarm.world.presets import PRESETS, SwarmConfig, for_scenario, make_config
 from quad_swarm.world.route import Targets
 from quad_swarm.world.scenarios import CHANGING_GOALS, SCENARIOS, ScenarioSampler, Scene
@@ -230,10 +230,10 @@ def fly(
 
 def _virtual(team: Team) -> VirtualFlight:
     config = team.config
-    planner = make_planner(config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots)
-    policies = [team.robot(k, planner).policy for k in range(config.n_robots)]
+    planners = make_planners(config)
+    policies = [team.robot(k, planner).policy for k, planner in enumerate(planners)]
     times = (team.wait, team.late)
-    return VirtualFlight(config, policies, team.conditions, None, team.limits, *times, team.checked, planner)
+    return VirtualFlight(config, policies, team.conditions, None, team.limits, *times, team.checked, planners)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -32,13 +32,14 @@ def judge(name: str, recording: Recording) -> Row:
         ``requests``, ``announcements`` and their share of what is possible, until arrival, collision or end; values of
         `MEASURED`, of the whole flight. What the file does not tell is None. With obstacles also
         ``obstacle_collisions``, the pairs of robot and obstacle, which count as collisions, too, and the smallest
-        distance between the surfaces of two, ``closest_obstacle`` (m), of whom and when
+        distance between the surfaces of two, ``closest_obstacle`` (m), of whom and when. Distances of robots whose
+        radii are not the world's count as in `SwarmConfig`
     """
     flight, config, time = recording.flight(), recording.config(), recording.time - recording.time[0]
     contact, downwash = 2 * config.radius - config.collision_tolerance, config.planner.downwash
-    found = [recording.meetings(continuous, downwash) for continuous in (False, True)]
-    beside = [recording.encounters(continuous) for continuous in (False, True)]
-    touch = config.radius - config.collision_tolerance
+    found = [recording.meetings(continuous, downwash, config.excess) for continuous in (False, True)]
+    beside = [recording.encounters(config.radii, continuous) for continuous in (False, True)]
+    touch = -config.collision_tolerance
     at_samples, at_any_time = (
         bool((one.closest < contact).any() or (other.closest < touch).any())
         for one, other in zip(found, beside, strict=True)
@@ -94,8 +95,8 @@ def _among_obstacles(recording: Recording, config: SwarmConfig, beside: Sequence
     encounters, counted = beside[True], beside[config.continuous_collisions]
     least = int(encounters.closest.argmin())
     return {
-        "obstacle_collisions": counted.pairs[counted.closest < config.radius - config.collision_tolerance].tolist(),
-        "closest_obstacle": float(encounters.closest[least] - config.radius),
+        "obstacle_collisions": counted.pairs[counted.closest < -config.collision_tolerance].tolist(),
+        "closest_obstacle": float(encounters.closest[least]),
         "closest_obstacle_pair": encounters.pairs[least].tolist(),
         "closest_obstacle_after": float(encounters.when[least] - recording.time[0]),
     }

@@ -134,38 +134,44 @@ class Recording:
         """Number of robots n."""
         return len(self.goal)
 
-    def separation(self, continuous: bool = True, downwash: float = 1.0) -> np.ndarray:
+    def separation(
+        self, continuous: bool = True, downwash: float = 1.0, excess: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the smallest distance of two robots at each time, (T,) (m); infinity for a single robot.
 
         :param continuous: whether also since the time before, if robots moved in straight lines
         :param downwash: see `PlannerConfig`
+        :param excess: see `SwarmConfig.excess`
         """
-        return self._smallest(self._apart(continuous, downwash))
+        return self._smallest(self._apart(continuous, downwash, excess))
 
-    def meetings(self, continuous: bool = True, downwash: float = 1.0) -> Meetings:
+    def meetings(self, continuous: bool = True, downwash: float = 1.0, excess: np.ndarray | None = None) -> Meetings:
         """Return how close each pair of robots came, and when.
 
         :param continuous: see `separation`
         :param downwash: see `PlannerConfig`
+        :param excess: see `SwarmConfig.excess`
         """
         pairs = np.transpose(np.triu_indices(self.n_robots, k=1))
-        return self._met(pairs, self._apart(continuous, downwash))
+        return self._met(pairs, self._apart(continuous, downwash, excess))
 
-    def clearance(self, continuous: bool = True) -> np.ndarray:
-        """Return the smallest distance between a robot's centre and an obstacle's surface at each time, (T,) (m);
+    def clearance(self, radii: np.ndarray, continuous: bool = True) -> np.ndarray:
+        """Return the smallest distance between the surfaces of a robot and an obstacle at each time, (T,) (m);
         infinity without obstacles.
 
+        :param radii: radii of the robots, (n,) (m)
         :param continuous: see `separation`
         """
-        return self._smallest(self._beside(continuous))
+        return self._smallest(self._beside(continuous, radii))
 
-    def encounters(self, continuous: bool = True) -> Meetings:
-        """Return how close each robot's centre came to the surface of each obstacle, and when.
+    def encounters(self, radii: np.ndarray, continuous: bool = True) -> Meetings:
+        """Return how close the surface of each robot came to that of each obstacle, and when.
 
+        :param radii: radii of the robots, (n,) (m)
         :param continuous: see `separation`
         """
         pairs = np.transpose(np.divmod(np.arange(self.n_robots * len(self.obstacles)), max(len(self.obstacles), 1)))
-        return self._met(pairs, self._beside(continuous))
+        return self._met(pairs, self._beside(continuous, radii))
 
     @property
     def obstacle_pos(self) -> np.ndarray:
@@ -191,7 +197,9 @@ class Recording:
             closest, when = np.where(shorter, nearest, closest), np.where(shorter, met, when)
         return Meetings(pairs, closest, when)
 
-    def _apart(self, continuous: bool, downwash: float) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    def _apart(
+        self, continuous: bool, downwash: float, excess: np.ndarray | None
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yield some times after the other: the index of the first, the distances of the pairs at and since the time
         before (m), and how long before each time they were so close, as a share of the step, both (times, P)."""
         one, other = np.triu_indices(self.n_robots, k=1)
@@ -200,18 +208,20 @@ class Recording:
             pos = self.state[times, :, POSITION]
             return flattened(pos[:, other] - pos[:, one], downwash)
 
-        return self._distances(apart, len(one), continuous)
+        for first, distance, back in self._distances(apart, len(one), continuous):
+            yield first, distance if excess is None else distance - excess[one, other], back
 
-    def _beside(self, continuous: bool) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Yield the same of the pairs of a robot and an obstacle's surface, those of the first robot first."""
+    def _beside(self, continuous: bool, radii: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Yield the same of the pairs of a robot's and an obstacle's surface, those of the first robot first."""
         among, centres, count = self._among, self.obstacle_pos, self.n_robots * len(self.obstacles)
+        reach, own = np.tile(among.radius, self.n_robots), np.repeat(radii, len(self.obstacles))
 
         def away(times: slice) -> np.ndarray:
             pos = self.state[times, :, POSITION]
             return between(pos, centres[times], among.factors).reshape(len(pos), count, 3)
 
         for first, distance, back in self._distances(away, count, continuous):
-            yield first, distance - np.tile(among.radius, self.n_robots), back
+            yield first, distance - reach - own, back
 
     def _distances(
         self, vectors: Callable[[slice], np.ndarray], count: int, continuous: bool
@@ -257,7 +267,7 @@ class Recording:
         asked = self.asked[:-1][:, rows, others]
         announced = self.told[:-1].swapaxes(1, 2)[:, rows, others] & ~asked
         continuous = config.continuous_collisions
-        none, separation = np.zeros_like(asked), self.separation(continuous, config.planner.downwash)
+        none, separation = np.zeros_like(asked), self.separation(continuous, config.planner.downwash, config.excess)
         flight = Flight(config, self.state, plans, self.goal, asked | announced, announced, none, separation)
         if not self.obstacles:
             return flight
@@ -265,7 +275,7 @@ class Recording:
             flight,
             obstacles=self.obstacles,
             obstacle_pos=self.obstacle_pos,
-            min_obstacle_distance=self.clearance(continuous) - config.radius,
+            min_obstacle_distance=self.clearance(config.radii, continuous),
         )
 
     @classmethod

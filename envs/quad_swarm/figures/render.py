@@ -150,22 +150,24 @@ class Renderer:
         assert self._camera is not None
         downwash, contact = self.config.planner.downwash, 2 * self.config.radius
         distance = length(flattened(pos[:, None] - pos, downwash)) + np.diag(np.full(len(pos), np.inf))
+        if self.config.excess is not None:
+            distance = distance - self.config.excess
         gaps = distance.min(axis=1) - contact
         if obstacles:
-            gaps = np.minimum(gaps, clearances(pos, surroundings(obstacles)).min(axis=1) - self.config.radius)
+            gaps = np.minimum(gaps, clearances(pos, surroundings(obstacles)).min(axis=1) - self.config.radii)
         for i, gap in enumerate(gaps):
             colour = _COLLISION if gap < -self.config.collision_tolerance else _NEAR if gap < 0.1 * contact else None
             if downwash != 1:
-                axes = self.config.radius * np.array([1.0, 1.0, downwash])
+                axes = self.config.radii[i] * np.array([1.0, 1.0, downwash])
                 rim = self._camera.silhouette(pos[i], axes)
                 pygame.draw.lines(self._surface, colour or _blend(colour_of(i), 0.5), True, rim, 2 if colour else 1)
             elif colour:
-                self._ring(pos[i], self.config.radius, colour)
+                self._ring(pos[i], self.config.radii[i], colour)
 
     def _draw_robot(self, state: np.ndarray, i: int) -> None:
         colour = colour_of(i)
         p, (phi, theta, psi) = state[POSITION], state[6:9]
-        arm = 0.6 * self.config.radius
+        arm = 0.6 * self.config.radii[i]
         rotation = _rotation(phi, theta, psi)
         tips = p + arm * (rotation @ np.array([[1, -1, 1, -1], [1, -1, -1, 1], [0, 0, 0, 0]], float)).T
         screen = self._project(np.vstack([tips, p, p * (1, 1, 0)]))

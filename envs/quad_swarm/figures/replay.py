@@ -213,8 +213,11 @@ def _colliding(flight: Flight) -> list[list[int]]:
     those on that line.
     """
     relative, config = flattened(flight.relative_pos, flight.config.planner.downwash), flight.config
-    touching = _touching(flight, relative, 2 * config.radius - config.collision_tolerance, flight.min_separation)
-    others = other_indices(flight.n_robots)
+    others, reach = other_indices(flight.n_robots), np.zeros(flight.n_robots - 1)
+    if config.excess is not None:
+        reach = np.take_along_axis(config.excess, others, axis=1)
+    limit = 2 * config.radius - config.collision_tolerance
+    touching = _touching(flight, relative, limit, flight.min_separation, reach)
     pairs = ([int(step) + 1, int(a), int(others[a, k])] for step, a, k in touching)
     return [pair for pair in pairs if pair[1] < pair[2]]
 
@@ -225,7 +228,7 @@ def _hitting(flight: Flight) -> list[list[int]]:
     assert flight.min_obstacle_distance is not None
     among, tolerance = surroundings(flight.obstacles), flight.config.collision_tolerance
     relative = between(flight.pos, flight.obstacle_pos, among.factors)
-    reach = among.radius + flight.config.radius
+    reach = among.radius + flight.config.radii[:, None]
     touching = _touching(flight, relative, -tolerance, flight.min_obstacle_distance, reach)
     return [[int(step) + 1, int(robot), int(obstacle)] for step, robot, obstacle in touching]
 

@@ -44,6 +44,7 @@ def measure(
     goal_radius: float,
     others: np.ndarray | None = None,
     height: float = 1.0,
+    excess: np.ndarray | None = None,
 ) -> Measured:
     """Measure a step, with straight motion between sub-steps.
 
@@ -54,7 +55,11 @@ def measure(
     :param others: indices of the others whose distances to return, the robot's own index for none, (E, n, m); None for
         all n - 1 others in ascending order
     :param height: height over width of the ellipsoids around robots: vertical parts of separations are divided by it
+    :param excess: what is taken off the separations of robots of other radii, (n, n) (m), see `SwarmConfig.excess`;
+        None for nothing
     """
+    if excess is not None:
+        return _less(measure(positions, goals, contact, goal_radius, None, height), excess, contact, others)
     if height != 1:
         flown = measure(positions, goals, contact, goal_radius, others)
         flat = np.array([1.0, 1.0, 1 / height])
@@ -88,6 +93,34 @@ def measure(
         *(after.min(axis=(1, 2)), during.min(axis=(1, 2))),
         *(separation, separation_continuous, separation < contact, separation_continuous < contact),
         *(np.sqrt(_einsum(moved, moved)), _einsum(to_goal, to_goal) <= goal_radius * goal_radius),
+    )
+
+
+def _less(flown: Measured, excess: np.ndarray, contact: float, others: np.ndarray | None) -> Measured:
+    """Take something off all separations.
+
+    :param flown: what was measured with all others
+    :param excess: what to take off, (n, n) (m)
+    :param contact: distance below which two robots collide (m)
+    :param others: indices of the others whose distances to return, see `measure`
+    """
+    n = len(excess)
+    off = excess[~np.eye(n, dtype=bool)].reshape(n, n - 1)
+    both = [separation - off for separation in (flown.separation, flown.separation_continuous)]
+    least = [separation.min(axis=(1, 2)) for separation in both]
+    if others is not None:
+        own = np.arange(n)[:, None]
+        # A robot's own index stands for nobody
+        slots = np.where(others == own, 0, others - (others > own))
+        both = [np.where(others == own, np.inf, np.take_along_axis(one, slots, axis=2)) for one in both]
+    after, during = both
+    return flown._replace(
+        min_separation=least[0],
+        min_separation_continuous=least[1],
+        separation=after,
+        separation_continuous=during,
+        colliding=after < contact,
+        colliding_continuous=during < contact,
     )
 
 

@@ -10,6 +10,7 @@ from quad_swarm.errors import shown, unknown_name
 from quad_swarm.native import BuildError
 from quad_swarm.planner.base import Planner, Plans, PlanStatus, Solution, Solver
 from quad_swarm.planner.fatrop import FatropSolver
+from quad_swarm.planner.mixed import MixedPlanner
 from quad_swarm.planner.problem import OptimalControlProblem, PlannerConfig, Problems
 from quad_swarm.planner.rti import RtiSolver
 from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
@@ -19,7 +20,12 @@ SOLVERS: dict[str, Callable[[OptimalControlProblem], Solver]] = {"rti": RtiSolve
 
 
 def make_planner(
-    config: PlannerConfig, quadrotor: QuadrotorParams, n_robots: int, solver: str = "auto", n_obstacles: int = 0
+    config: PlannerConfig,
+    quadrotor: QuadrotorParams,
+    n_robots: int,
+    solver: str = "auto",
+    n_obstacles: int = 0,
+    sizes: bool = False,
 ) -> Planner:
     """Create the planner of a swarm.
 
@@ -28,6 +34,7 @@ def make_planner(
     :param n_robots: number of robots in a swarm
     :param solver: one of `SOLVERS`, or "auto" for "rti" if it can be compiled, otherwise "fatrop" with a warning
     :param n_obstacles: number of obstacles; up to ``config.max_obstacles`` are considered
+    :param sizes: whether other robots may differ in size from the planning one
     :raises ValueError: if the solver is unknown, or what `SOLVERS` holds under its name creates no `Solver`
     :raises BuildError: if the solver is "rti" and cannot be compiled
     """
@@ -35,7 +42,7 @@ def make_planner(
         raise unknown_name("solver", solver, ["auto", *SOLVERS])
     n_others = n_robots - 1 if config.max_neighbours is None else min(n_robots - 1, config.max_neighbours)
     n_bodies = n_others + min(n_obstacles, config.max_obstacles)
-    problem = OptimalControlProblem(config, quadrotor, n_bodies, n_obstacles > 0 or config.downwash != 1)
+    problem = OptimalControlProblem(config, quadrotor, n_bodies, sizes or n_obstacles > 0 or config.downwash != 1)
     limit = None if n_bodies == n_robots - 1 + n_obstacles else n_bodies
     return Planner(_make_solver(problem, solver), QuadrotorModel(quadrotor, config.dt), config, limit)
 
@@ -69,6 +76,7 @@ __all__ = [
     "SOLVERS",
     "BuildError",
     "FatropSolver",
+    "MixedPlanner",
     "OptimalControlProblem",
     "PlanStatus",
     "Planner",

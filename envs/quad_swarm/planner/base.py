@@ -129,7 +129,7 @@ class Planner:
             are not finite; not without `checks`
         """
         if self.checks:
-            problems, previous = self._checked(problems, previous)
+            problems, previous = self.checked(problems, previous)
         if (cruise := self.config.cruise_distance) is not None:
             problems = problems._replace(goal=nearer(problems.x[:, POSITION], problems.goal, cruise))
         if problems.shape is None and self.config.downwash != 1:
@@ -157,8 +157,8 @@ class Planner:
         plans.u[rows], plans.x[rows] = u, self.model.rollout(problems.x[rows], u)
         return plans
 
-    def _checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
-        """Check the arrays of a call and convert them to their types."""
+    def checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
+        """Check the arrays of a call and convert them to their types, see `plan`."""
         stages, kept = self.config.horizon, self.n_others
         for name, value, kind in (("problems", problems, Problems), ("previous", previous, Plans)):
             if not isinstance(value, kind):

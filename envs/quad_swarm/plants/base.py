@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
+from quad_swarm.quadrotor import MixedModel, QuadrotorModel, QuadrotorParams
 
 MODEL = "model"
 
@@ -111,7 +112,7 @@ class ModelPlant:
     :param model: the dynamics over a sub-step
     """
 
-    def __init__(self, model: QuadrotorModel):
+    def __init__(self, model: QuadrotorModel | MixedModel):
         self._model = model
 
     def place(self, swarm: int, state: np.ndarray) -> None:
@@ -145,21 +146,31 @@ def parse_plant(name: str) -> tuple[str, str]:
     return simulator, vehicle or known.vehicles[0]
 
 
-def make_plant(name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int) -> Plant:
+def make_plant(
+    name: str, params: QuadrotorParams | Sequence[QuadrotorParams], dt: float, n_swarms: int, n_robots: int
+) -> Plant:
     """Create a plant.
 
     :param name: see `parse_plant`
-    :param params: parameters of our own model; other simulators only use the drag, for the force of the wind
+    :param params: parameters of our own model, of all robots or of each of the n; other simulators only use the drag,
+        for the force of the wind
     :param dt: length of a sub-step (s)
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
-    :raises ValueError: if the plant is unknown, or the simulator does not support sub-steps of this length
+    :raises ValueError: if the plant is unknown, another simulator is to fly unlike vehicles, or does not support
+        sub-steps of this length
     :raises ImportError: if the simulator is not installed
     :raises PlantError: if the simulator's process dies, or its adapter raises another error
     """
     simulator, vehicle = parse_plant(name)
+    kinds = tuple(dict.fromkeys([params] if isinstance(params, QuadrotorParams) else params))
+    if simulator == MODEL and len(kinds) > 1:
+        models = [QuadrotorModel(kind, dt) for kind in kinds]
+        return ModelPlant(MixedModel(models, [kinds.index(one) for one in params]))  # type: ignore[union-attr]
     if simulator == MODEL:
-        return ModelPlant(QuadrotorModel(params, dt))
+        return ModelPlant(QuadrotorModel(kinds[0], dt))
+    if len(kinds) > 1:
+        raise ValueError(f"plant={name!r} flies vehicles that are all alike: only plant={MODEL!r} flies unlike ones.")
     from quad_swarm.plants.remote import RemotePlant
 
-    return RemotePlant(simulator, vehicle, params, dt, n_swarms, n_robots)
+    return RemotePlant(simulator, vehicle, kinds[0], dt, n_swarms, n_robots)

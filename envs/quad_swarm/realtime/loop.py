@@ -90,7 +90,7 @@ class Loop:
     ):
         check_times(wait, late, robot.config.planner.dt)
         self.robot, self.link, self.vehicle, self.late = robot, link, vehicle, late
-        self.supervisor = Supervisor(robot.config, limits or SafetyLimits())
+        self.supervisor = Supervisor(robot.config, limits or SafetyLimits(), robot.index)
         self.statistics = Statistics()
         self._wait = round(wait * _US)
         self._flying = False

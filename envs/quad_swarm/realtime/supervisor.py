@@ -40,7 +40,8 @@ class SafetyLimits:
     :param frozen: time after which a state that stays the same to the last bit is none, unless the robot is at rest
     :param unanswered: time without any message in spite of requests after which the robot hovers, and asks everybody
     :param silence: the same, after which it lands
-    :param separation: distance to another robot below which it hovers; None for that of a collision
+    :param separation: distance to another robot below which it hovers, see `SwarmConfig` for robots of unlike radii;
+        None for that of a collision
     :param fence: how far it may leave the workspace to the sides and upwards, before it lands
     :param hung: time without a sign of life of the loop after which the watchdog hovers
     :param landing: climb rate of a landing (m/s), negative
@@ -80,10 +81,12 @@ class Supervisor:
 
     :param config: the world
     :param limits: when to hover and when to land
+    :param robot: number of the robot
     """
 
-    def __init__(self, config: SwarmConfig, limits: SafetyLimits):
+    def __init__(self, config: SwarmConfig, limits: SafetyLimits, robot: int = 0):
         self.limits = limits
+        self._excess = 0.0 if config.excess is None else np.delete(config.excess[robot], robot)
         contact = 2 * config.radius - config.collision_tolerance
         self._apart = contact if limits.separation is None else limits.separation
         low, high = np.array(config.planner.workspace_low), np.array(config.planner.workspace_high)
@@ -127,7 +130,7 @@ class Supervisor:
             own = sensed.state[POSITION]
             if (own < self._low).any() or (own > self._high).any():
                 why["outside the fence"] = Mode.LAND
-            if len(sensed.pos) and np.linalg.norm(sensed.pos - own, axis=1).min() < self._apart:
+            if len(sensed.pos) and (np.linalg.norm(sensed.pos - own, axis=1) - self._excess).min() < self._apart:
                 why["too close"] = Mode.HOVER
         if unanswered > limits.unanswered:
             why["no answers"] = Mode.LAND if unanswered > limits.silence else Mode.HOVER

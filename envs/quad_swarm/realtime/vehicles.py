@@ -68,7 +68,8 @@ class Vehicles:
     :ivar now: time (us)
     :ivar step_us: length of a sub-step (us)
     :ivar state: true states, (n, 9)
-    :ivar closest: smallest distance of each pair of robots while both were flying, (n, n) (m)
+    :ivar closest: smallest distance of each pair of robots while both were flying, (n, n) (m), see `SwarmConfig` for
+        unlike radii
     :ivar obstacles: the obstacles, None without any
     :ivar clearance: smallest distance between the surfaces of each robot and each of K obstacles while it was flying,
         (n, K) (m)
@@ -85,7 +86,7 @@ class Vehicles:
         if abs(self.step_us - step * _US) > 1e-6:
             raise ValueError(f"planner.dt / substeps = {step} s: in real time, it must be whole microseconds.")
         self._realisation = Realisation(config, 1)
-        self._plant = make_plant(config.plant, config.quadrotor, step, 1, n)
+        self._plant = make_plant(config.plant, config.quadrotors, step, 1, n)
         self._others = other_indices(n)
         self.obstacles = Obstacles.of(config.obstacles, 1)
         self._state = np.zeros((1, n, N_STATES))
@@ -223,13 +224,15 @@ class Vehicles:
         start, end = before[:, None] - before, after[:, None] - after
         between, _ = closest_approach(start, end - start, 1.0)
         distance = length(flattened(between, self.config.planner.downwash))
+        if self.config.excess is not None:
+            distance = distance - self.config.excess
         both = self.flying[:, None] & self.flying
         np.fill_diagonal(both, False)
         self.closest[both] = np.minimum(self.closest, distance)[both]
         if self.obstacles is not None:
             seconds = self.step_us / _US
             moved = np.stack([before, after])[:, None]
-            _, during = self.obstacles.measure(moved, self.config.radius, seconds)
+            _, during = self.obstacles.measure(moved, self.config.radii, seconds)
             self.clearance[self.flying] = np.minimum(self.clearance, during[0])[self.flying]
             self.obstacles.advance(seconds)
 

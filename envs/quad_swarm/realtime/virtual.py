@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from quad_swarm.planner import base, make_planner
+from quad_swarm.planner import Planner
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.link import Channel, Conditions, Handler, Sensed, Traffic, WireLink
 from quad_swarm.realtime.loop import Loop
@@ -21,6 +21,7 @@ from quad_swarm.realtime.process import Sample, report_of
 from quad_swarm.realtime.supervisor import SafetyLimits
 from quad_swarm.realtime.vehicles import Flight, Vehicles
 from quad_swarm.robot import Plan, Policy, Robot
+from quad_swarm.world.kinds import make_planners
 from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import SwarmConfig
 
@@ -61,7 +62,7 @@ class VirtualFlight:
     :param wait: see `Loop`
     :param late: see `Loop`
     :param checked: see `WireLink`
-    :param planner: the planner that all robots share; by default a new one
+    :param planners: a planner for each robot, see `make_planners`; by default new ones
     """
 
     def __init__(
@@ -74,17 +75,15 @@ class VirtualFlight:
         wait: float = 0.005,
         late: float = 0.25,
         checked: bool = False,
-        planner: base.Planner | None = None,
+        planners: Sequence[Planner] | None = None,
     ):
         self.config, self.vehicles = config, Vehicles(config)
         self.conditions, self.timing = conditions or Conditions(), timing or Timing()
         self.now, self._events, self._count = 0, list[tuple[int, bool, int, Callable[[], None]]](), 0
-        planner = planner or make_planner(
-            config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots
-        )
+        planners = planners or make_planners(config)
         self.links = [_VirtualLink(self, k, checked) for k in range(config.n_robots)]
         self.loops = [
-            Loop(Robot(config, k, policy, planner), self.links[k], _VirtualVehicle(self, k), limits, wait, late)
+            Loop(Robot(config, k, policy, planners[k]), self.links[k], _VirtualVehicle(self, k), limits, wait, late)
             for k, policy in enumerate(policies)
         ]
 

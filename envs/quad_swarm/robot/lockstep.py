@@ -35,7 +35,7 @@ class LockstepWorld:
         n = config.n_robots
         self.config, self.robots = config, list(robots)
         self.realisation = Realisation(config, 1)
-        self.plant = make_plant(config.plant, config.quadrotor, config.planner.dt / config.substeps, 1, n)
+        self.plant = make_plant(config.plant, config.quadrotors, config.planner.dt / config.substeps, 1, n)
         self.state, self.now = np.zeros((1, n, N_STATES)), 0
         self._u = np.zeros((1, n, N_INPUTS))
         self._others = other_indices(n)

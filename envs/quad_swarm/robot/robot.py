@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.native.pairs import advance
-from quad_swarm.planner import Plans, base, make_planner
+from quad_swarm.planner import Plans, base
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, resampled
+from quad_swarm.world.kinds import bodies_of, make_planner_of
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.obstacles import Obstacle, Obstacles
 from quad_swarm.world.presets import SwarmConfig
@@ -65,14 +66,17 @@ class Robot:
     :ivar others: numbers of the others in ascending order, (n - 1,)
     :ivar period: length of a period (us)
     :ivar now: start of the current period (us)
+    :ivar bodies: how large the robot and the others are
     :ivar hold: where it stays instead of flying to its goal, (1, 1, 3), world frame (m); None to fly
     :ivar late: time from the start of a period until its command takes effect (periods)
 
     :param config: the world as far as robots know it: team, vehicle, planner and memory
     :param index: number of the robot, from 0
     :param policy: whom to ask and whom to tell
-    :param planner: planner for a team of this size, which robots in one process may share; by default a new one
-    :raises ValueError: if there is no such robot, or the world limits whom robots perceive
+    :param planner: planner for a team of this size, which robots of a kind in one process may share, see
+        `quad_swarm.world.kinds.make_planners`; by default a new one
+    :raises ValueError: if there is no such robot, the world limits whom robots perceive, or the planner is that of
+        another kind of vehicle
     """
 
     def __init__(self, config: SwarmConfig, index: int, policy: Policy, planner: base.Planner | None = None):
@@ -85,9 +89,13 @@ class Robot:
         self.config, self.index, self.policy = config, index, policy
         self.others = np.array([other for other in range(config.n_robots) if other != index], dtype=np.int64)
         self.neighbours = _Others(self.others)
-        self.planner = planner or make_planner(
-            config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots
-        )
+        self.planner = planner or make_planner_of(config, index)
+        if config.vehicles and self.planner.config != config.kinds[config.kind_of[index]].planner:
+            raise ValueError(
+                f"planner: it is not that of robot {index}, whose vehicle differs from others; see "
+                "quad_swarm.world.kinds.make_planners, or leave it out."
+            )
+        self.bodies = bodies_of(config, index, self.others[None])
         self.obstacles = Obstacles.of(config.obstacles, 1)
         self.period = round(1e6 * config.planner.dt)
         self.beliefs: Beliefs = make_beliefs(config, 1, 1)
@@ -247,7 +255,7 @@ class Robot:
         if self._route is not None and self.hold is None:
             goal_velocity = self._route.current_velocity()
         arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles, goal_velocity)
-        problems = make_problems(self.config, self.planner.model, *arguments)
+        problems = make_problems(self.config, self.planner.model, *arguments, self.bodies)
         self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
         self._pass_time()

@@ -227,7 +227,7 @@ class RobotNode:
             raise ValueError("the own state is not finite")
         if own[2] <= limits.ground:
             raise ValueError(f"the robot is on the ground ({own[2]:.2f} m high): take off first")
-        guards = Supervisor(loop.robot.config, limits)
+        guards = Supervisor(loop.robot.config, limits, loop.robot.index)
         if guards.check(now, sensed, HOVERING) is not Mode.FLY:
             raise ValueError(f"the robot would not fly: {', '.join(sorted(guards.why))}")
         if absent := self._link.absent():

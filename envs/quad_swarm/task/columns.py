@@ -134,6 +134,10 @@ COLUMNS: dict[str, list[Column]] = {
             *_vector(f"{whose}_way", "", "pair", "direction of that obstacle then; 0 without obstacles"),
         )
     ],
+    "radius": [
+        Column("own_radius", "m", "", "radius of the robot"),
+        Column("other_radius", "m", "", "radius of the other"),
+    ],
     "mask": [Column("mask", "", "", "whether the two may come close, 1 or 0: otherwise there is nothing to ask for")],
     "critic": [
         *(

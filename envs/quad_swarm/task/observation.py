@@ -178,7 +178,7 @@ def _state(pair: PairView) -> np.ndarray:
     to_goal = goal / np.maximum(length(goal)[..., None], 1.0)
     parts = (
         np.stack([distance / POSITION_SCALE, view.pos[..., 2]], axis=-1),
-        pair.closeness(distance)[..., 1:],
+        pair.closeness(view.distance)[..., 1:],
         pair.turn(view.vel) / SPEED,
         pair.turn(own_vel) / SPEED,
         pair.turn(to_goal),
@@ -264,6 +264,12 @@ def _obstacles(pair: PairView) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
+def _radius(pair: PairView) -> np.ndarray:
+    """Return the radii of the robot and of the other."""
+    bodies, shape = pair.view.bodies, pair.view.pos.shape[:3]
+    return np.stack([np.broadcast_to(one, shape) for one in (bodies.radius[:, None], bodies.others)], axis=-1)
+
+
 def _mask(pair: PairView) -> np.ndarray:
     """Return the action mask: whether the other's predicted motion comes close to the robot's own plan, or the two
     would soon meet at constant velocities. Otherwise, communication is of no use."""
@@ -300,6 +306,7 @@ GROUPS: dict[str, Callable[[PairView], np.ndarray]] = {
     "plan": _plan,
     "told": _known_by_other,
     "obstacles": _obstacles,
+    "radius": _radius,
     "mask": _mask,
     "critic": _critic,
 }

@@ -34,7 +34,7 @@ def full() -> Rule:
 
 def distance(threshold: float) -> Rule:
     """Request from robots closer than ``threshold`` (m) (the paper's DBCP)."""
-    return lambda view: length(view.pos) < threshold
+    return lambda view: view.distance < threshold
 
 
 def cpa(threshold: float, look_ahead: float) -> Rule:

@@ -35,7 +35,9 @@ class ObstacleApproach(NamedTuple):
 
 class View:
     """The knowledge of the robots of E swarms before they make requests. Positions are relative to the robot, along the
-    world's axes.
+    world's axes. Distances between robots whose radii are not the world's count as in `SwarmConfig`.
+
+    :ivar bodies: how large the robots and their others are
 
     :param knowledge: the swarms, or a robot of its own
     :param rngs: one random number generator per swarm, so that an episode does not depend on the batch it is in
@@ -48,6 +50,7 @@ class View:
         self.horizon = knowledge.config.planner.horizon
         self.separation = knowledge.config.planner.separation
         self._downwash = knowledge.config.planner.downwash
+        self.bodies = knowledge.bodies
 
     @cached_property
     def _observed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -71,6 +74,15 @@ class View:
     def pos(self) -> np.ndarray:
         """Relative positions of the others, (E, n, n - 1, 3) (m)."""
         return self._observed[0] - self.own_pos[:, :, None]
+
+    @cached_property
+    def distance(self) -> np.ndarray:
+        """Distances to the others, (E, n, n - 1) (m)."""
+        return self._less(length(self.pos))
+
+    def _less(self, distance: np.ndarray) -> np.ndarray:
+        """Return distances between centres as distances of robots of the world's radius, (E, n, n - 1) (m)."""
+        return distance if self.bodies.excess is None else distance - self.bodies.excess
 
     @cached_property
     def vel(self) -> np.ndarray:
@@ -155,7 +167,10 @@ class View:
 
     def approach_of(self, prediction: Prediction) -> PlanApproach:
         """Return the closest approach of the robot's own plan to other predictions, in the same metric."""
-        return prediction.flattened(1 / self._downwash).approach(self._flat(self.own_pos), self._flat(self.plan))
+        found = prediction.flattened(1 / self._downwash).approach(self._flat(self.own_pos), self._flat(self.plan))
+        if self.bodies.excess is None:
+            return found
+        return found._replace(least=self._less(found.least), last=self._less(found.last))
 
     def _flat(self, vectors: np.ndarray) -> np.ndarray:
         return flattened(vectors, self._downwash)
@@ -163,15 +178,18 @@ class View:
     @cached_property
     def own_obstacle(self) -> ObstacleApproach:
         """The nearest obstacle to the robot's own plan, (E, n) each."""
-        return self._nearest_obstacle(self.absolute_plans[:, :, None, 1:], 0)
+        return self._nearest_obstacle(self.absolute_plans[:, :, None, 1:], self.bodies.radius[:, None], 0)
 
     @cached_property
     def their_obstacle(self) -> ObstacleApproach:
         """The nearest obstacle to the predicted motion of each of the others, (E, n, n - 1) each."""
-        return self._nearest_obstacle(self.prediction.believed(), None)
+        return self._nearest_obstacle(self.prediction.believed(), self.bodies.others, None)
 
-    def _nearest_obstacle(self, trajectories: np.ndarray, chosen: int | None) -> ObstacleApproach:
-        """Return the nearest obstacles to trajectories, (E, n, m, N, 3), of all m or of a chosen one."""
+    def _nearest_obstacle(self, trajectories: np.ndarray, radii: np.ndarray, chosen: int | None) -> ObstacleApproach:
+        """Return the nearest obstacles to trajectories, (E, n, m, N, 3), of all m or of a chosen one.
+
+        :param radii: radii of the robots that fly them, (n, m) or (E, n, m) (m)
+        """
         obstacles, config, shape = self._knowledge.obstacles, self._knowledge.config, trajectories.shape[:3]
         if obstacles is None:
             found = ObstacleApproach(np.full(shape, np.inf), np.zeros(shape, np.int64), np.zeros((*shape, 3)))
@@ -180,7 +198,7 @@ class View:
             centres = obstacles.ahead(np.broadcast_to(times, (*shape[:2], self.horizon)))[:, :, None]
             between = obstacles.factors[:, None, None, :, None] * (centres - trajectories[:, :, :, None])
             distance = length(between)
-            gaps = distance - (obstacles.radius + config.radius)[:, None, None, :, None]
+            gaps = distance - (obstacles.radius[:, None, None] + radii[..., None])[..., None]
             gaps[np.broadcast_to(~obstacles.present[:, None, None, :, None], gaps.shape)] = np.inf
             flat = gaps.reshape(*shape, -1)
             nearest = flat.argmin(axis=-1)[..., None]
@@ -198,4 +216,4 @@ class View:
         :return: distance (m) and time from now (s), both (E, n, n - 1)
         """
         nearest, time = closest_approach(self._flat(self.pos), self._flat(self.vel), look_ahead)
-        return length(nearest), time
+        return self._less(length(nearest)), time

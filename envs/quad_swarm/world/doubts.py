@@ -134,16 +134,21 @@ def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
     :param config: the world
     :param velocities: velocities of goals, (n, 3) (m/s)
     """
-    planner = config.planner
-    fastest = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
-    climb = min(planner.max_vertical_speed, planner.max_climb_rate * config.quadrotor.climb_gain)
-    beyond = np.abs(velocities) / [*fastest, climb]
+    speeds = np.array([_speeds(kind) for kind in config.kinds])[list(config.kind_of)]
+    beyond = np.abs(velocities) / speeds
     if beyond.max(initial=0.0) > 1:
         robot, axis = np.unravel_index(beyond.argmax(), beyond.shape)
         yield (
             f"velocities[{robot}]={velocities[robot].tolist()}: the goal moves faster than the "
-            f"{[*fastest, climb][axis]:.2g} m/s of robots along {'xyz'[axis]}, which fall behind"
+            f"{speeds[robot, axis]:.2g} m/s of robots along {'xyz'[axis]}, which fall behind"
         )
+
+
+def _speeds(config: SwarmConfig) -> list[float]:
+    """Return how fast robots fly along x, y and z (m/s)."""
+    planner = config.planner
+    fastest = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
+    return [*fastest, min(planner.max_vertical_speed, planner.max_climb_rate * config.quadrotor.climb_gain)]
 
 
 def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:
@@ -291,9 +296,10 @@ def _usual_flight(config: SwarmConfig) -> float:
 def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
     """Yield a sentence if robots cannot fly a usual distance, with detours, or climb two thirds of the room's height in
     time."""
-    planner, space, vehicle = config.planner, config.space, config.quadrotor
-    speed = max(min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle))), _TINIEST)
-    climb = max(min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain), _TINIEST)
+    planner, space = config.planner, config.space
+    speeds = [_speeds(kind) for kind in config.kinds]
+    speed = max(min(min(one[:2]) for one in speeds), _TINIEST)
+    climb = max(min(one[2] for one in speeds), _TINIEST)
     needed = max(
         1.5 * (_usual_flight(config) - config.goal_radius) / speed,
         (2 / 3 * (space.heights[1] - space.heights[0]) - config.goal_radius) / climb,

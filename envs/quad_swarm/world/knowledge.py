@@ -13,8 +13,9 @@ import numpy as np
 
 from quad_swarm.native.pairs import resample
 from quad_swarm.planner import Problems
-from quad_swarm.quadrotor import QuadrotorModel
+from quad_swarm.quadrotor import MixedModel, QuadrotorModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
+from quad_swarm.world.kinds import Bodies, bodies_of
 from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.presets import SwarmConfig
 
@@ -71,6 +72,10 @@ class Knowledge(Protocol):
         """Where the robots fly to now, goals or waypoints before them, (E, n, 3), world frame (m)."""
 
     @property
+    def bodies(self) -> Bodies:
+        """How large the robots and their others are, which all robots know."""
+
+    @property
     def beliefs(self) -> Beliefs:
         """Beliefs about the others."""
 
@@ -107,13 +112,13 @@ def make_beliefs(config: SwarmConfig, n_swarms: int, n_robots: int) -> Beliefs:
     :param n_swarms: number of swarms E
     :param n_robots: number of robots whose beliefs these are
     """
-    horizon, dt, separation = config.planner.horizon, config.planner.dt, config.planner.separation
-    return Beliefs(n_swarms, n_robots, horizon, dt, config.memory, config.n_others, _MISFIT * separation)
+    horizon, dt, misfit = config.planner.horizon, config.planner.dt, _MISFIT * config.least_separation
+    return Beliefs(n_swarms, n_robots, horizon, dt, config.memory, config.n_others, misfit)
 
 
 def make_problems(
     config: SwarmConfig,
-    model: QuadrotorModel,
+    model: QuadrotorModel | MixedModel,
     estimate: np.ndarray,
     goal: np.ndarray,
     believed: np.ndarray,
@@ -122,6 +127,7 @@ def make_problems(
     late: np.ndarray | None,
     obstacles: Obstacles | None,
     goal_velocity: np.ndarray | None = None,
+    bodies: Bodies | None = None,
 ) -> Problems:
     """Return robots' planning problems, which start when their inputs take effect.
 
@@ -137,7 +143,9 @@ def make_problems(
     :param obstacles: obstacles, which follow the others among the bodies of a problem, None for none
     :param goal_velocity: velocities of the goals, (E, n, 3), world frame (m/s), None for goals that stand. Robots fly
         to where their goals will be at the end of the horizon, so that they do not fall behind
+    :param bodies: how large the robots and their others are, by default as all robots of the world perceive all others
     """
+    bodies = bodies_of(config) if bodies is None else bodies
     if goal_velocity is not None:
         ahead = config.planner.dt * (config.planner.horizon + (0.0 if late is None else late[..., None]))
         goal = goal + ahead * goal_velocity
@@ -151,10 +159,15 @@ def make_problems(
     others = believed.reshape(-1, *believed.shape[2:])
     # Copies: a solver that writes into its problem must not move robots or goals
     problems = Problems(x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced)
-    return problems if obstacles is None else _among(obstacles, problems, config, late)
+    if bodies.larger is not None:
+        sizes = np.broadcast_to(bodies.larger, believed.shape[:3]).reshape(others.shape[:2])
+        problems = problems._replace(size=sizes)
+    return problems if obstacles is None else _among(obstacles, problems, config, late, bodies)
 
 
-def _among(obstacles: Obstacles, problems: Problems, config: SwarmConfig, late: np.ndarray | None) -> Problems:
+def _among(
+    obstacles: Obstacles, problems: Problems, config: SwarmConfig, late: np.ndarray | None, bodies: Bodies
+) -> Problems:
     """Add obstacles to problems, see `make_problems`."""
     planner, (n_swarms, k) = config.planner, obstacles.radius.shape
     count, m = problems.others.shape[:2]
@@ -165,9 +178,10 @@ def _among(obstacles: Obstacles, problems: Problems, config: SwarmConfig, late: 
     expected = obstacles.ahead(times).reshape(count, k, planner.horizon, 3)
     shape, size = np.ones((n_swarms, n, m + k, 3)), np.zeros((n_swarms, n, m + k))
     shape[..., :m, 2] = 1 / planner.downwash
-    kept = config.radius + config.obstacle_margin
     shape[..., m:, :] = obstacles.factors[:, None]
-    size[..., m:] = (obstacles.radius + kept - planner.separation)[:, None]
+    if bodies.larger is not None:
+        size[..., :m] = bodies.larger
+    size[..., m:] = obstacles.radius[:, None] + bodies.clear[:, None] - bodies.separation[:, None]
     announced = problems.announced
     if announced is not None:
         announced = np.concatenate([announced, np.zeros((count, k), bool)], axis=1)

@@ -224,12 +224,12 @@ class Obstacles:
         """Let time pass (s)."""
         self.position = self.position + time * self.velocity
 
-    def measure(self, positions: np.ndarray, radius: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    def measure(self, positions: np.ndarray, radii: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Measure the distances between the surfaces of robots and obstacles, which both move in straight lines between
         sub-steps. Call this before `advance`.
 
         :param positions: positions of the robots before a step and after each of its S sub-steps, (S + 1, E, n, 3) (m)
-        :param radius: radius of a robot (m)
+        :param radii: radii of the robots, (n,) (m)
         :param dt: length of the step (s)
         :return: distances after the step and the smallest during it, (E, n, K) each (m), infinity for obstacles that
             are not there, negative where bodies overlap
@@ -239,7 +239,7 @@ class Obstacles:
         centres = self.position + times[:, None, None, None] * self.velocity
         away = between(positions, centres, self.factors)
         closest, _ = closest_approach(away[:-1], away[1:] - away[:-1], 1.0)
-        reach = (self.radius + radius)[:, None]
+        reach = self.radius[:, None] + radii[:, None]
         after, during = np.sqrt(dot(away[-1], away[-1])), np.sqrt(dot(closest, closest).min(axis=0))
         there = self.present[:, None]
         return np.where(there, after - reach, np.inf), np.where(there, during - reach, np.inf)

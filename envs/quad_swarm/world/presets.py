@@ -6,8 +6,8 @@ import contextlib
 import functools
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, checke
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
 from quad_swarm.world.doubts import doubts, far_goals, farthest, fast_goals, short_horizon, warn
+from quad_swarm.world.kinds import LIMITS, VehicleConfig, read_vehicles
 from quad_swarm.world.neighbours import Neighbourhood
 from quad_swarm.world.obstacles import Obstacle, ObstacleConfig, Surroundings, clearances, surroundings
 from quad_swarm.world.route import Targets
@@ -37,6 +38,11 @@ class SwarmConfig:
     """Complete definition of a world, except for the scenario.
 
     Fields that do not fit each other, though each may be right, cause a `DoubtfulWorld` warning, see `world.doubts`.
+
+    With ``vehicles``, robots differ. Two robots i and j then collide if their centres are closer than r_i + r_j minus
+    the tolerance, and robot i keeps r_i + r_j + (separation - 2r) from robot j. All distances between robots that are
+    reported, or that thresholds apply to, count from surface to surface, plus 2r: they are as if both had the world's
+    radius, so that 2r, the separation and the thresholds of rules mean the same for all pairs.
 
     :param n_robots: number of robots n, 2 to 1000
     :param radius: radius r of the sphere around a robot (m)
@@ -63,9 +69,12 @@ class SwarmConfig:
     :param clock_skew: latest time in a step, as a fraction of its length, at which a robot's new input takes effect,
         drawn uniformly among the sub-steps for each robot and episode. A robot knows its own time and plans from its
         state at that time
+    :param vehicles: what is different about the robots, at most one entry for each: robot i is the i-th, and where
+        there are fewer entries than robots, they repeat. By default, all robots are alike
     :raises ValueError: if a value is out of range, the planner's separation or the spacing of starts and goals is less
         than 2r, the tolerance hides every collision, a step is too long for the vehicle's dynamics, or robots could
-        tilt or turn too far
+        tilt or turn too far; with ``vehicles``, if this holds for a team of one of them, the message names which, there
+        are more than robots, or a simulator would have to fly several kinds
     """
 
     n_robots: Annotated[int, Field(ge=2, le=1000)] = 4
@@ -87,20 +96,121 @@ class SwarmConfig:
     plant: str = MODEL
     mismatch: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     clock_skew: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    vehicles: tuple[VehicleConfig, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.planner.separation < 2 * self.radius:
+            raise ValueError(
+                f"planner.separation={self.planner.separation}: it must be at least 2 * radius = {2 * self.radius}, "
+                "or left out of `make_config` to follow the radius"
+            )
+        if self.vehicles:
+            self._check_vehicles()
+            return
         self._check_distances()
         self._check_vehicle()
         for sentence in doubts(self):
             warn(sentence)
 
+    def _check_vehicles(self) -> None:
+        """Check that robots of each kind could fly as a team of their own, and warn of what is doubtful about it."""
+        if len(self.vehicles) > self.n_robots:
+            raise ValueError(
+                f"vehicles: there are {len(self.vehicles)} for n_robots={self.n_robots}; use at most as many as robots"
+            )
+        simulator = parse_plant(self.plant)[0] != MODEL
+        kinds = set[SwarmConfig]()
+        told: dict[str, list[int]] = {}
+        for number, vehicle in enumerate(self.vehicles):
+            if simulator and vehicle.quadrotor is not None:
+                raise ValueError(
+                    f"vehicles.{number}.quadrotor: plant={self.plant!r} flies vehicles that are all alike; leave it "
+                    f"out, or use plant={MODEL!r}"
+                )
+            try:
+                kind = self._of_kind(vehicle)
+                if kind in kinds:
+                    continue
+                kinds.add(kind)
+                kind._check_distances()
+                kind._check_vehicle()
+            except ValueError as error:
+                raise ValueError(f"vehicles.{number}: {error}") from None
+            for sentence in doubts(kind):
+                told.setdefault(sentence, []).append(number)
+        for sentence, numbers in told.items():
+            warn(sentence if len(numbers) == len(kinds) else f"vehicles.{numbers[0]}: {sentence}")
+
+    @property
+    def kinds(self) -> tuple[SwarmConfig, ...]:
+        """This world with a team of each kind of robot, in the order of `vehicles`; itself where all are alike."""
+        return self._kinds if self.vehicles else (self,)
+
+    @functools.cached_property
+    def _kinds(self) -> tuple[SwarmConfig, ...]:
+        return tuple(dict.fromkeys(map(self._of_kind, self.vehicles)))
+
+    @functools.cached_property
+    def kind_of(self) -> tuple[int, ...]:
+        """Which of `kinds` each robot is, (n,)."""
+        found = [self._kinds.index(self._of_kind(one)) for one in self.vehicles] or [0]
+        return tuple(found[robot % len(found)] for robot in range(self.n_robots))
+
+    def _of_kind(self, vehicle: VehicleConfig) -> SwarmConfig:
+        """Return the world in which all robots are such vehicles, not yet checked.
+
+        :raises ValueError: if the vehicle has limits that no planner may have
+        """
+        limits: dict[str, Any] = {name: value for name in LIMITS if (value := getattr(vehicle, name)) is not None}
+        radius, separation = self.radius, self.planner.separation
+        if vehicle.radius is not None and vehicle.radius != radius:
+            radius, separation = vehicle.radius, 2 * vehicle.radius + (separation - 2 * radius)
+        kind = object.__new__(SwarmConfig)
+        kind.__dict__.update(
+            {one.name: getattr(self, one.name) for one in fields(self)},
+            radius=radius,
+            quadrotor=self.quadrotor if vehicle.quadrotor is None else vehicle.quadrotor,
+            planner=replace(self.planner, separation=separation, **limits),
+            vehicles=(),
+        )
+        return kind
+
+    def per_robot(self, value: Callable[[SwarmConfig], float]) -> np.ndarray:
+        """Return a value of the world of each robot's kind, (n,)."""
+        return np.array([value(kind) for kind in self.kinds])[list(self.kind_of)]
+
+    @functools.cached_property
+    def radii(self) -> np.ndarray:
+        """Radius of each robot, (n,) (m), read-only."""
+        radii = self.per_robot(lambda kind: kind.radius)
+        radii.setflags(write=False)
+        return radii
+
+    @functools.cached_property
+    def excess(self) -> np.ndarray | None:
+        """By how much the radii of two robots together exceed twice the world's, which is taken off their distance,
+        (n, n) (m), read-only, 0 for a robot and itself; None if it is 0 for all."""
+        if not self.vehicles or (self.radii == self.radius).all():
+            return None
+        excess = self.radii[:, None] + self.radii - 2 * self.radius
+        np.fill_diagonal(excess, 0.0)
+        excess.setflags(write=False)
+        return excess
+
+    @property
+    def quadrotors(self) -> tuple[QuadrotorParams, ...]:
+        """Physical parameters of each robot, (n,)."""
+        return tuple(self.kinds[kind].quadrotor for kind in self.kind_of)
+
+    @property
+    def least_separation(self) -> float:
+        """Smallest distance that two robots of this team keep (m)."""
+        if self.excess is None:
+            return self.planner.separation
+        return self.planner.separation + float(self.excess[~np.eye(self.n_robots, dtype=bool)].min())
+
     def _check_distances(self) -> None:
         contact, planner = 2 * self.radius, self.planner
-        if planner.separation < contact:
-            raise ValueError(
-                f"planner.separation={planner.separation}: it must be at least 2 * radius = {contact}, "
-                "or left out of `make_config` to follow the radius"
-            )
         if not self.collision_tolerance < contact:
             raise ValueError(
                 f"collision_tolerance={self.collision_tolerance}: it must be less than 2 * radius = {contact}, "
@@ -184,10 +294,10 @@ class SwarmConfig:
             goal radius, robots start in contact with each other or an obstacle, or goals do not fit, see `check_goals`
         """
         starts, around = points("starts", starts, self.n_robots), surroundings(obstacles)
-        touching = 2 * self.radius - self.collision_tolerance
+        tolerance = self.collision_tolerance
         self._check_inside("starts", starts)
-        self._check_apart("starts", starts, touching, "robots touch")
-        self._check_clear("starts", starts, around, self.radius - self.collision_tolerance, "the robot touches it")
+        self._check_apart("starts", starts, lambda kind: 2 * kind.radius - tolerance, "robots touch")
+        self._check_clear("starts", starts, around, self.radii - tolerance, "the robot touches it")
         return starts, self.check_goals(starts, goals, around, velocities, waypoints)
 
     def check_goals(
@@ -206,19 +316,25 @@ class SwarmConfig:
             for two robots to be at both
         """
         targets = Targets.of(goals, velocities, waypoints, self.n_robots)
-        apart = self.least_spacing - self.collision_tolerance
-        kept = self.radius + max(self.obstacle_margin - self.goal_radius, -self.collision_tolerance)
+        tolerance, goal_radius = self.collision_tolerance, self.goal_radius
+        kept = self.per_robot(lambda kind: kind.radius + max(kind.obstacle_margin - goal_radius, -tolerance))
         stands = np.logical_not(around.velocity.any(axis=1))
         self._check_inside("goals", targets.goals)
-        self._check_apart("goals", targets.goals, apart, "robots that keep their distance cannot be at both goals")
-        named = {"goals": targets.goals} | {f"waypoints[{k}]": one for k, one in enumerate(targets.waypoints)}
-        for name, one in named.items():
+        why = "robots that keep their distance cannot be at both goals"
+        self._check_apart("goals", targets.goals, lambda kind: kind.least_spacing - tolerance, why)
+        passed = ((f"waypoints[{k}]", one, kept[k : k + 1]) for k, one in enumerate(targets.waypoints))
+        for name, one, clear in (("goals", targets.goals, kept), *passed):
             self._check_inside(name, one)
-            self._check_clear(name, one, around, kept, "a robot that keeps its distance cannot be there", stands)
-        distance, warning = far_goals(self)
-        legs = zip(places, targets.waypoints, targets.goals, strict=True)
-        if any((length(np.diff(np.vstack([place, *one, goal]), axis=0)) > distance).any() for place, one, goal in legs):
-            warn(warning)
+            self._check_clear(name, one, around, clear, "a robot that keeps its distance cannot be there", stands)
+        far = [far_goals(kind) for kind in self.kinds]
+        legs = zip(self.kind_of, places, targets.waypoints, targets.goals, strict=True)
+        doubtful = {
+            kind
+            for kind, place, one, goal in legs
+            if (length(np.diff(np.vstack([place, *one, goal]), axis=0)) > far[kind][0]).any()
+        }
+        for kind in sorted(doubtful):
+            warn(far[kind][1])
         for sentence in fast_goals(self, targets.velocities):
             warn(sentence)
         return targets
@@ -233,12 +349,18 @@ class SwarmConfig:
                 f"planner.workspace_high={self.planner.workspace_high}: choose a point inside, or enlarge it"
             )
 
-    def _check_apart(self, name: str, places: np.ndarray, least: float, why: str) -> None:
-        i, j, distance = _closest(places)
-        if distance < least:
+    def _check_apart(self, name: str, places: np.ndarray, least: Callable[[SwarmConfig], float], why: str) -> None:
+        """Check that no two points are closer than a distance between robots of a kind allows."""
+        needed: Any = least(self)
+        if self.vehicles:  # what a robot needs beyond contact, it needs from all others
+            beyond = self.per_robot(lambda kind: least(kind) - 2 * kind.radius)
+            needed = self.radii[:, None] + self.radii + np.maximum(beyond[:, None], beyond)
+        i, j, distance = _closest(places, needed)
+        needed = np.broadcast_to(needed, (len(places), len(places)))[i, j]
+        if distance < needed:
             raise ValueError(
                 f"{name}[{i}] and {name}[{j}] are {distance:.3g} m apart, where {why}: place them at least "
-                f"{least + self.collision_tolerance:.3g} m apart"
+                f"{needed + self.collision_tolerance:.3g} m apart"
             )
 
     def _check_clear(
@@ -246,20 +368,24 @@ class SwarmConfig:
         name: str,
         places: np.ndarray,
         around: Surroundings,
-        least: float,
+        least: np.ndarray,
         why: str,
         which: np.ndarray | None = None,
     ) -> None:
-        """Check the distances of points to obstacles, or only to some of them, (K,) bool."""
+        """Check the distances of points to obstacles, or only to some of them, (K,) bool.
+
+        :param least: the least distance of each point, or of all, (n,) or (1,) (m)
+        """
         there = around.radius > 0 if which is None else which & (around.radius > 0)
         if not there.any() or not len(places):
             return
         found = np.where(there, clearances(places, around), np.inf)
-        robot, number = np.unravel_index(found.argmin(), found.shape)
-        if found[robot, number] < least:
+        robot, number = np.unravel_index((found - least[:, None]).argmin(), found.shape)
+        needed = least[robot % len(least)]
+        if found[robot, number] < needed:
             raise ValueError(
                 f"{name}[{robot}]={places[robot].tolist()} is {found[robot, number]:.3g} m from the surface of "
-                f"obstacle {number}, where {why}: choose a point at least {least:.3g} m away"
+                f"obstacle {number}, where {why}: choose a point at least {needed:.3g} m away"
             )
 
     def check_room(self, scenario: str, extent: Extent) -> None:
@@ -351,8 +477,9 @@ def make_config(
 
     What depends on other fields follows them, unless it is given: the planner's separation keeps the preset's margin
     beyond twice the radius; the spacing of starts and goals keeps the preset's margin beyond the separation if robots
-    would start closer than that; and the workspace grows with a room that exceeds it. ``quadrotor`` may also be a name
-    of `VEHICLES` or the path of a vehicle file. With another ``plant`` than the model, ``mismatch`` defaults to 0.
+    would start closer than that; and the workspace grows with a room that exceeds it. With ``vehicles``, the largest
+    robot counts. ``quadrotor``, also that of a vehicle, may be a name of `VEHICLES` or the path of a vehicle file. With
+    another ``plant`` than the model, ``mismatch`` defaults to 0.
 
     :param preset: a name of `PRESETS`, or a world
     :param world: fields of `SwarmConfig` to replace, nested ones as mappings
@@ -365,6 +492,10 @@ def make_config(
     base = preset if isinstance(preset, SwarmConfig) else PRESETS[preset]
     if isinstance(vehicle := changes.get("quadrotor"), (str, os.PathLike)):
         changes = {**changes, "quadrotor": load_vehicle(vehicle)}
+    if "vehicles" in changes:
+        given = changes.get("quadrotor", {})
+        quadrotor = replaced(base.quadrotor, given, "quadrotor") if isinstance(given, Mapping) else given
+        changes = {**changes, "vehicles": read_vehicles(changes["vehicles"], quadrotor)}
     if changes.get("plant", MODEL) != MODEL:
         changes = {"mismatch": 0.0, **changes}
     with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError):  # the check of the fields tells
@@ -394,15 +525,30 @@ def _with_followers(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any
         separation = 2 * float(changes["radius"]) + (base.planner.separation - 2 * base.radius)
         given = {**given, "separation": separation}
     planner = replaced(base.planner, given) if isinstance(given, Mapping) else given
+    vehicles, radius = changes.get("vehicles", base.vehicles), float(changes.get("radius", base.radius))
+    separation, usual = planner.separation, base.planner.separation
+    if vehicles or base.vehicles:
+        separation += _larger(vehicles, radius)
+        usual += _larger(base.vehicles, base.radius)
     room = changes.get("space", {})
-    if isinstance(room, Mapping) and "spacing" not in room and base.space.spacing < planner.separation:
-        spacing = planner.separation + (base.space.spacing - base.planner.separation)
+    if isinstance(room, Mapping) and "spacing" not in room and base.space.spacing < separation:
+        spacing = separation + (base.space.spacing - usual)
         room = {**room, "spacing": min(round(spacing, 6), LARGEST_LENGTH)}
     space = replaced(base.space, room) if isinstance(room, Mapping) else room
     if isinstance(given, Mapping):
         given = {**_workspace(base, space), **given}
     followers = {"planner": given, "space": room}
     return {**changes, **{name: value for name, value in followers.items() if value != {}}}
+
+
+def _larger(vehicles: Sequence[Any], radius: float) -> float:
+    """Return how much farther apart than others robots must be because of their radii (m).
+
+    :param vehicles: see `SwarmConfig`, not yet checked
+    :param radius: radius of the others (m)
+    """
+    given = (one.get("radius") if isinstance(one, Mapping) else one.radius for one in vehicles)
+    return 2 * (max((radius if one is None else float(one) for one in given), default=radius) - radius)
 
 
 def _workspace(base: SwarmConfig, space: ScenarioSpace) -> dict[str, Any]:
@@ -428,12 +574,13 @@ def _edges(space: ScenarioSpace, sign: int) -> tuple[float, float, float]:
     return radius, radius, height
 
 
-def _closest(places: np.ndarray) -> tuple[int, int, float]:
-    """Return the indices of the closest two points, and their distance (m)."""
-    squares = ((places[:, None] - places) ** 2).sum(axis=-1)
-    np.fill_diagonal(squares, np.inf)
-    i, j = sorted(divmod(int(squares.argmin()), len(places)))
-    return i, j, float(np.sqrt(squares[i, j]))
+def _closest(places: np.ndarray, needed: Any) -> tuple[int, int, float]:
+    """Return the indices of the closest two points, compared with the distances that are needed, (n, n) or one for all
+    (m), and their distance (m)."""
+    distances = np.sqrt(((places[:, None] - places) ** 2).sum(axis=-1))
+    np.fill_diagonal(distances, np.inf)
+    i, j = sorted(divmod(int((distances - needed).argmin()), len(places)))
+    return i, j, float(distances[i, j])
 
 
 def _joined(first: Mapping[str, Any], second: Mapping[str, Any], path: str = "") -> dict[str, Any]:

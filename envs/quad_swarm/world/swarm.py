@@ -14,12 +14,13 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.native.steps import measure
-from quad_swarm.planner import Planner, Plans, Problems, make_planner
+from quad_swarm.planner import MixedPlanner, Planner, Plans, Problems
 from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.validation import points
 from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
+from quad_swarm.world.kinds import Bodies, bodies_of, make_team_planner
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacle, Obstacles, Surroundings, surroundings
@@ -82,7 +83,8 @@ class StepReport(NamedTuple):
     :param obstacles: what robots met among obstacles, None in a world without any
 
     With `PlannerConfig.downwash`, separations are those in the ellipsoids' metric, in which vertical distances count
-    less.
+    less. Separations of robots whose radii are not those of the world are taken from surface to surface, plus twice the
+    world's radius, see `SwarmConfig`.
     """
 
     min_separation: np.ndarray
@@ -121,12 +123,10 @@ class Swarm(SwarmState):
 
     def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
         self.config = config
-        self.planner: Planner = make_planner(
-            config.planner, config.quadrotor, config.n_others + 1, solver, config.obstacles.slots
-        )
+        self.planner: Planner | MixedPlanner = make_team_planner(config, solver)
         self.planner.checks = False
         n, horizon = config.n_robots, config.planner.horizon
-        self._plant = make_plant(config.plant, config.quadrotor, config.planner.dt / config.substeps, n_swarms, n)
+        self._plant = make_plant(config.plant, config.quadrotors, config.planner.dt / config.substeps, n_swarms, n)
         state = np.zeros((n_swarms, n, 9))
         plans = Plans.hover(state.reshape(-1, 9), horizon)
         plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
@@ -144,6 +144,8 @@ class Swarm(SwarmState):
             neighbours=Neighbours(n_swarms, n, config.neighbourhood),
             obstacles=Obstacles.of(config.obstacles, n_swarms),
         )
+        # Where others change, `bodies` follow
+        self._bodies = bodies_of(config, others=self.neighbours.others)
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
             number = np.zeros((n, n), dtype=int)
@@ -156,6 +158,13 @@ class Swarm(SwarmState):
         """Beliefs of each robot as the others see them, who assume that all their answers arrived: its own if they
         always arrive and everybody observes the same."""
         return self.beliefs if self._other_beliefs is None else self._other_beliefs
+
+    @property
+    def bodies(self) -> Bodies:
+        """How large the robots and their others are."""
+        if (self._bodies.excess is None and self._bodies.larger is None) or not self.neighbours.limited:
+            return self._bodies
+        return bodies_of(self.config, others=self.neighbours.others)
 
     @property
     def n_swarms(self) -> int:
@@ -235,18 +244,22 @@ class Swarm(SwarmState):
 
     def planned_separation(self, steps: int, others: np.ndarray) -> np.ndarray:
         """Return the planned distances of each robot to each of the others in the ``steps`` after the current one,
-        (E, n, n - 1, steps) (m), infinity for an empty slot.
+        (E, n, n - 1, steps) (m), infinity for an empty slot, see `StepReport`.
 
         :param steps: number of steps
         :param others: indices of the others, see `StepReport`
         """
-        plans = self.planned_positions()[..., 2 : 2 + steps, :]
+        plans, excess = self.planned_positions()[..., 2 : 2 + steps, :], self.config.excess
         if self.neighbours.limited:
             between = of_others(plans, np.maximum(others, 0)) - plans[:, :, None]
-            return np.where(others[..., None] >= 0, np.sqrt(_dot(between, between)), np.inf)
-        i, j = self._pairs
-        between = plans[:, i] - plans[:, j]
-        return np.sqrt(_dot(between, between))[:, self._pair_of]
+            distance = np.where(others[..., None] >= 0, np.sqrt(_dot(between, between)), np.inf)
+        else:
+            i, j = self._pairs
+            between = plans[:, i] - plans[:, j]
+            distance = np.sqrt(_dot(between, between))[:, self._pair_of]
+        if excess is not None:
+            distance -= excess[np.arange(len(excess))[:, None], np.maximum(others, 0)][..., None]
+        return distance
 
     def reset(
         self,
@@ -436,7 +449,7 @@ class Swarm(SwarmState):
         late = None if start is None else start / self.config.substeps
         goal_velocity = None if self.route is None else self.route.current_velocity()
         arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles, goal_velocity)
-        return make_problems(self.config, self.planner.model, *arguments)
+        return make_problems(self.config, self.planner.model, *arguments, self.bodies)
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""
@@ -460,7 +473,7 @@ class Swarm(SwarmState):
         contact = 2 * self.config.radius - self.config.collision_tolerance
         # Of all pairs, including those that do not perceive each other
         radius, downwash = self.config.goal_radius, self.config.planner.downwash
-        measured = measure(positions, self.final_goal, contact, radius, others, downwash)
+        measured = measure(positions, self.final_goal, contact, radius, others, downwash, self.config.excess)
         collision, collision_continuous = (
             one < contact for one in (measured.min_separation, measured.min_separation_continuous)
         )
@@ -494,7 +507,7 @@ class Swarm(SwarmState):
         config, obstacles = self.config, self.obstacles
         if obstacles is None:
             return None
-        after, during = obstacles.measure(positions, config.radius, config.planner.dt)
+        after, during = obstacles.measure(positions, config.radii, config.planner.dt)
         obstacles.advance(config.planner.dt)
         contact = -config.collision_tolerance
         return ObstacleReport(after, during, after < contact, during < contact)

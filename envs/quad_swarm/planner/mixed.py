@@ -1,0 +1,59 @@
+"""The planner of a team of unlike vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quad_swarm.planner.base import Planner, Plans, Solver
+from quad_swarm.planner.problem import Problems
+from quad_swarm.quadrotor import MixedModel
+
+
+class MixedPlanner:
+    """Planners of several kinds of vehicles as one, which plans for whole teams of n robots. Each robot's plan is bit
+    for bit that of its own planner.
+
+    :ivar checks: see `Planner`
+    :ivar model: discrete dynamics of the n robots
+
+    :param planners: a planner for each kind, all with the same horizon, length of a stage and number of bodies
+    :param kind_of: which of them each robot is, (n,)
+    """
+
+    def __init__(self, planners: Sequence[Planner], kind_of: Sequence[int]):
+        self.planners, self._kind_of = tuple(planners), np.array(kind_of)
+        self.model = MixedModel([planner.model for planner in planners], kind_of)
+        self.checks = True
+        for planner in self.planners:
+            planner.checks = False  # `plan` checks for all
+
+    @property
+    def solver(self) -> Solver:
+        """The solver of the first kind; those of all kinds have the same name."""
+        return self.planners[0].solver
+
+    def plan(self, problems: Problems, previous: Plans) -> Plans:
+        """Solve problems of E teams, a batch of B = E n in the order of teams and robots; solver failures never raise.
+
+        :param problems: the batch
+        :param previous: plans of the same robots in the previous step
+        :return: the new plans
+        :raises ValueError: if arrays do not fit, see `Planner.plan`, or these are no whole teams; not without `checks`
+        """
+        if self.checks:
+            problems, previous = self.planners[0].checked(problems, previous)
+            if len(problems.x) % len(self._kind_of):
+                raise ValueError(
+                    f"problems: there are {len(problems.x)}, but this planner plans for teams of "
+                    f"{len(self._kind_of)} robots."
+                )
+        kinds = np.tile(self._kind_of, len(problems.x) // len(self._kind_of))
+        plans = Plans(*(np.empty_like(array) for array in previous))
+        for kind, planner in enumerate(self.planners):
+            rows = np.flatnonzero(kinds == kind)
+            found = planner.plan(problems.part(rows), Plans(*(array[rows] for array in previous)))
+            for whole, some in zip(plans, found, strict=True):
+                whole[rows] = some
+        return plans
