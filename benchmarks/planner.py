@@ -104,7 +104,7 @@ def record(config: SwarmConfig, n_envs: int, seed: int = 0) -> list[Call]:
             return super().solve(problems, x_guess, u_guess)
 
     n = config.n_robots
-    swarm.planner.solver = Recorder(swarm.planner.solver.problem)  # type: ignore[attr-defined]
+    swarm.planner.solver = Recorder(swarm.planner.solver.problem)  # type: ignore[attr-defined,misc]
     requests = np.zeros((n_envs, n, n - 1), dtype=bool)
     requests[: n_envs // 2] = True
     for _ in range(STEPS):

@@ -115,6 +115,13 @@ _PLAIN: dict[str, Any] = {
     "memory": _real(0, 1e4), "substeps": _whole(1, 10), "continuous_collisions": _FLAG, "mismatch": _real(0, 0.5),
     "clock_skew": _real(0, 0.99),
 }  # fmt: skip
+_VEHICLE: dict[str, Any] = {
+    "quadrotor": lambda rng: str(rng.choice(list(VEHICLES))) if rng.random() < 0.5 else _some(
+        rng, _FIELDS["quadrotor"], 0.3
+    ),
+    "radius": _real(1e-2, 1), "max_tilt": _real(0.05, 1), "max_climb_rate": _real(0.1, 10), "max_speed": _real(0.1, 20),
+    "max_yaw_rate": _real(0, 10), "max_vertical_speed": _real(0.1, 10),
+}  # fmt: skip
 
 
 def draw_world(seed: int, number: int) -> dict[str, Any]:
@@ -130,6 +137,10 @@ def draw_world(seed: int, number: int) -> dict[str, Any]:
         world["quadrotor"] = str(shared.choice(list(VEHICLES)))
     if shared.random() < 0.2:
         world["radius"] = _between(shared, 1e-3, 3)
+    kinds = np.random.default_rng([seed, number // 10, 2])
+    if kinds.random() < 0.2:
+        share = float(kinds.choice([0.3, 0.6]))
+        world["vehicles"] = [_some(kinds, _VEHICLE, share) for _ in range(kinds.integers(1, min(n_robots, 3) + 1))]
     return {
         "preset": preset,
         "n_robots": n_robots,
@@ -156,6 +167,7 @@ def _misreports(swarm: Any, info: Mapping[str, Any]) -> list[str]:
     pos = swarm.state[..., POSITION]
     flat = np.array([1.0, 1.0, 1 / config.planner.downwash])
     distances = np.linalg.norm(flat * (pos[:, :, None] - pos[:, None]), axis=-1)
+    distances -= 0.0 if config.excess is None else config.excess
     distances[:, np.arange(config.n_robots), np.arange(config.n_robots)] = np.inf
     least = distances.min(axis=(1, 2))
     contact = 2 * config.radius - config.collision_tolerance
@@ -166,7 +178,7 @@ def _misreports(swarm: Any, info: Mapping[str, Any]) -> list[str]:
     if swarm.obstacles is not None:
         obstacles = swarm.obstacles
         between = obstacles.factors[:, None] * (pos[:, :, None] - obstacles.position[:, None])
-        gaps = np.linalg.norm(between, axis=-1) - (obstacles.radius + config.radius)[:, None]
+        gaps = np.linalg.norm(between, axis=-1) - obstacles.radius[:, None] - config.radii[:, None]
         nearest = np.where(obstacles.radius[:, None] > 0, gaps, np.inf).min(axis=(1, 2))
         if not np.allclose(nearest, info["min_obstacle_distance"], rtol=_TOLERANCE, atol=scale):
             found.append(f"min_obstacle_distance is {info['min_obstacle_distance']}, but {nearest}")

@@ -18,7 +18,7 @@ import numpy as np
 from quad_swarm.evaluation.command import workers
 from quad_swarm.evaluation.evaluation import Rows, summarise
 from quad_swarm.evaluation.flight import begin, first_episode, fly_steps
-from quad_swarm.planner import Problems, Solution, Solver
+from quad_swarm.planner import Planner, Problems, Solution, Solver
 from quad_swarm.world.presets import make_config
 from studies.swarm.experiment import Experiment, Row, absolute_path, command_line, condition
 from studies.swarm.protocol import VALIDATION
@@ -70,6 +70,7 @@ def fly(scenario: str, share: float, kind: str, episodes: Sequence[int]) -> Rows
     for start in range(0, len(episodes), _BATCH):
         policy, task, rngs = begin(one, episodes[start : start + _BATCH])
         planner = task.swarm.planner
+        assert isinstance(planner, Planner)  # all robots are alike
         if share:
             planner.solver = FailingSolver(planner.solver, share, kind, np.random.default_rng(start))
         found: dict[int, dict[str, Any]] = {}

@@ -18,7 +18,7 @@ from quad_swarm.evaluation.evaluation import Rows
 from quad_swarm.evaluation.flight import fly_steps
 from quad_swarm.geometry import length
 from quad_swarm.native.pairs import advance
-from quad_swarm.planner import Plans, Problems, make_planner
+from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.quadrotor import N_INPUTS, POSITION, QuadrotorModel
 from quad_swarm.task.request_task import RequestTask, RewardConfig
 from quad_swarm.world.beliefs import BeliefSource, resampled
@@ -47,7 +47,7 @@ class DelayCheckedSwarm(Swarm):
         super().__init__(config, n_swarms, solver)
         n, horizon = config.n_robots, config.planner.horizon
         # Each of the others counts twice, with its committed and its candidate plan
-        self.planner = make_planner(config.planner, config.quadrotor, 2 * n - 1, solver)
+        self.planner: Planner = make_planner(config.planner, config.quadrotor, 2 * n - 1, solver)
         self.clearance = clearance
         self.wait = 1 + config.radio.delay  # steps until all robots know each other's candidates
         self._stages = 2 * horizon + self.wait  # number of stages of a plan that ends at rest, from now on

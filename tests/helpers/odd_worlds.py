@@ -15,6 +15,7 @@ from cases import Case, Silent
 
 import quad_swarm
 from quad_swarm.planner import BuildError
+from quad_swarm.world.kinds import VehicleConfig
 from quad_swarm.world.presets import PRESETS, SwarmConfig
 from quad_swarm.world.scenarios import SCENARIOS
 
@@ -42,6 +43,8 @@ def odd_world(rng: random.Random, preset: str) -> dict[str, Any]:
 def _other(rng: random.Random, name: str, value: Any) -> Any:
     if name == "plant":
         return rng.choice(PLANTS)
+    if name == "vehicles":
+        return [_vehicle(rng) for _ in range(rng.choice((0, 1, 2, 2, 3, 5)))]
     if isinstance(value, str):  # shapes of obstacles
         return rng.choice(("sphere", "cylinder", "cube", ""))
     if isinstance(value, tuple):
@@ -56,6 +59,17 @@ def _other(rng: random.Random, name: str, value: Any) -> Any:
     return rng.choice(FROM_ZERO) if not value else value * rng.choice(FACTORS)
 
 
+def _vehicle(rng: random.Random) -> dict[str, Any]:
+    paper, found = PRESETS["paper"], dict[str, Any]()
+    for name in rng.sample([field.name for field in dataclasses.fields(VehicleConfig)], rng.choice((1, 1, 2, 3))):
+        usual = paper.radius if name == "radius" else getattr(paper.planner, name, 0)
+        found[name] = usual * rng.choice(FACTORS) if usual else rng.choice(FROM_ZERO)
+        if name == "quadrotor":
+            drag = paper.quadrotor.drag_x * rng.choice(FACTORS)
+            found[name] = rng.choice(("x500", "bebop2", "x", "", {"drag_x": drag}, {"drag": drag}))
+    return found
+
+
 def check_flight(env: gymnasium.Env, options: dict[str, Any] | None = None, n_steps: int = 8) -> None:
     """
     :param env: QuadSwarm-v0
@@ -67,13 +81,17 @@ def check_flight(env: gymnasium.Env, options: dict[str, Any] | None = None, n_st
     config: SwarmConfig = swarm.config
     rng = np.random.default_rng(0)
     contact = 2 * config.radius - config.collision_tolerance
-    planner, vehicle = config.planner, config.quadrotor
-    lean = planner.max_tilt * max(vehicle.roll_gain, vehicle.pitch_gain) * (1 + config.mismatch)
+    excess = np.zeros(1) if config.excess is None else config.excess[np.triu_indices(config.n_robots, 1)]
+    lean = max(
+        kind.planner.max_tilt * max(kind.quadrotor.roll_gain, kind.quadrotor.pitch_gain) * (1 + config.mismatch)
+        for kind in config.kinds
+    )
     steepest = np.hypot(lean, lean) + 8 * config.noise.attitude * np.sqrt(n_steps) + 1e-6
     for seed in range(2):
         obs, _ = env.reset(seed=seed, options=options)
         for name, points in (("starts", swarm.pos[0]), ("goals", swarm.goal[0])):
-            apart = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(len(points), 1)].min()
+            apart = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(len(points), 1)]
+            apart = (apart - excess).min()
             if name == "starts" and apart < contact - 1e-9:
                 raise Silent(f"robots begin {apart} m apart, and touch at {contact}")
             if config.outside(points).max() > config.goal_radius:
@@ -85,7 +103,8 @@ def check_flight(env: gymnasium.Env, options: dict[str, Any] | None = None, n_st
                 raise Silent("observation, reward or state is not finite")
             if config.plant == "model" and np.abs(swarm.state[..., 6:8]).max() > steepest:
                 raise Silent(f"robots tilt by {np.abs(swarm.state[..., 6:8]).max()} rad, at most {lean} are possible")
-            apart = np.linalg.norm(pos[:, None] - pos, axis=-1)[np.triu_indices(len(pos), 1)].min()
+            apart = np.linalg.norm(pos[:, None] - pos, axis=-1)[np.triu_indices(len(pos), 1)]
+            apart = (apart - excess).min()
             if not config.continuous_collisions and (apart < contact) != terminated:
                 raise Silent(
                     f"robots are {apart} m apart, touch at {contact}, and the episode goes on: {not terminated}"

@@ -55,13 +55,20 @@ def plant_name(config: SwarmConfig) -> str:
 
 
 def _changes(preset: Any, config: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass that differ from those of another, nested ones as dictionaries."""
+    """Return the fields of a dataclass that differ from those of another, nested ones and entries of lists as
+    dictionaries."""
     changes = {}
     for field in dataclasses.fields(config):
         old, new = getattr(preset, field.name), getattr(config, field.name)
         if old != new:
-            changes[field.name] = _changes(old, new) if dataclasses.is_dataclass(new) else new
+            changes[field.name] = _changes(old, new) if dataclasses.is_dataclass(new) else _plain(new)
     return changes
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_plain, value))
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
 
 
 def _versions(condition: Condition) -> dict[str, str]:

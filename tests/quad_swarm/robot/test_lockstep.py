@@ -9,10 +9,10 @@ import torch as th
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import Condition, begin, first_episode
 from quad_swarm.evaluation.policies import fitted, load_model
-from quad_swarm.planner import make_planner
 from quad_swarm.robot import Plan, Robot, RulePolicy
 from quad_swarm.robot.lockstep import LockstepWorld
 from quad_swarm.task.request_task import requests_of
+from quad_swarm.world.kinds import make_planners
 from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from sb3_maddpg.hub.pretrained import pretrained_folder
@@ -22,9 +22,7 @@ EDGE = 1e-5  # of a probability to the threshold, within which a robot alone and
 RULES = ["none", "full", "cpa:1.2s:3&stale:4", "event:0.05|push:0.1"]
 
 
-@functools.cache
-def planner_of(config):
-    return make_planner(config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots)
+planners_of = functools.cache(make_planners)
 
 
 def differences(config, policies, rule, scenario, model=None, steps=60, episode=0, make_robot=Robot, at_edge=None):
@@ -38,7 +36,8 @@ def differences(config, policies, rule, scenario, model=None, steps=60, episode=
         rng
     )
     noise_seed = int(rng.integers(2**63)) if config.is_random else 0
-    robots = [make_robot(config, k, one, planner_of(config)) for k, one in enumerate(policies)]
+    planners = planners_of(config)
+    robots = [make_robot(config, k, one, planners[k]) for k, one in enumerate(policies)]
     world = LockstepWorld(config, robots)
     world.reset(starts, goals, noise_seed, obstacles, *changing)
     columns = [k for k, column in enumerate(task.observation.columns) if ".critic." not in column.name]
@@ -92,6 +91,16 @@ def test_robots_with_rules_fly_as_the_swarm(preset, n, scenario, rule):
 def test_robots_fly_as_the_swarm_with_a_radio_that_distance_limits(radio, rule):
     config = make_config("flight", {"radio": {"range": 3.0, "half_distance": 2.0, **radio}}, n_robots=3)
     assert not list(differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap"))
+
+
+UNLIKE = [{"radius": 0.2, "max_speed": 1.0, "max_yaw_rate": 1.0}, {"quadrotor": "x500"}, {"radius": 0.5}]
+
+
+@pytest.mark.parametrize("rule", ["full", "cpa:1.2s:3&stale:4", "blocked:0.3|push:0.1"])
+@pytest.mark.parametrize(("preset", "scenario"), [("flight", "crossing_traffic"), ("flight-hard", "symmetric_swap")])
+def test_unlike_robots_fly_as_the_swarm(preset, scenario, rule):
+    config = make_config(preset, {"vehicles": UNLIKE}, n_robots=4)
+    assert not list(differences(config, [RulePolicy(rule) for _ in range(4)], rule, scenario))
 
 
 @pytest.mark.slow
@@ -199,3 +208,33 @@ def test_mistakes_are_noticed(mistake, name):
     found = differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap", make_robot=mistake)
     first = next(found)[0]
     assert name in {what for step, what in [(first, name), *found] if step == first}
+
+
+class Blind(Robot):
+    """A robot that takes all others for as large as itself."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.bodies = self.bodies._replace(larger=None)
+
+
+class Confused(Robot):
+    """A robot that takes itself for the one before it in the team."""
+
+    def __init__(self, config, index, policy, planner):
+        super().__init__(config, index, policy)
+        before = index - 1 if index else config.n_robots - 1
+        self.planner = make_planners(config)[before]
+
+
+@pytest.mark.parametrize("mistake", [Blind, Confused])
+def test_mistakes_about_unlike_robots_are_noticed(mistake):
+    config, rule = make_config("flight", {"vehicles": UNLIKE}, n_robots=3), "full"
+    found = differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap", make_robot=mistake)
+    assert next(found)[1] in ("plans", "states")
+
+
+def test_a_robot_refuses_the_planner_of_another_kind():
+    config = make_config("flight", {"vehicles": UNLIKE}, n_robots=3)
+    with pytest.raises(ValueError, match="it is not that of robot 1"):
+        Robot(config, 1, RulePolicy("full"), planners_of(config)[0])
