@@ -194,3 +194,16 @@ def test_an_environment_draws_its_obstacles():
         shots.append(env.render())
         env.close()
     assert (shots[0] != shots[1]).any(axis=-1).mean() > 0.01
+
+
+def test_unlike_robots_are_drawn_with_their_own_radii():
+    state, *rest = scene(0.9)
+    seen = {}
+    for radii in ((0.3, 0.3), (0.3, 0.6), (0.5, 0.5)):
+        config = make_config("paper", {"vehicles": [{"radius": one} for one in radii]}, n_robots=2)
+        seen[radii] = Renderer(config).draw(state, *rest, [])
+        ring = {0.6: None, 0.9: _NEAR, 1.0: _COLLISION}[round(sum(radii), 1)]
+        for colour in (_NEAR, _COLLISION):
+            assert (pixels_of(seen[radii], colour) > 0) == (colour == ring)
+    assert pixels_of(seen[0.3, 0.6], _NEAR) > 0
+    assert np.array_equal(seen[0.3, 0.3], Renderer(CONFIG).draw(state, *rest, []))

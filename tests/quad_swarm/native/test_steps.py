@@ -67,3 +67,26 @@ def test_contact_and_arrival_are_measured(either):
     assert measured.colliding_continuous.all()
     assert measured.moved.tolist() == [[2.0, 2.0]]
     assert measured.at_goal.tolist() == [[True, False]]
+
+
+@pytest.mark.parametrize("n_swarms", [0, 1, 3])
+@pytest.mark.parametrize("height", [1.0, 2.0])
+def test_what_is_taken_off_separations_changes_nothing_else(n_swarms, height, either):
+    rng, n = np.random.default_rng(1), 4
+    path, goals = rng.normal(size=(3, n_swarms, n, 3)), rng.normal(size=(n_swarms, n, 3))
+    excess = rng.normal(size=(n, n))
+    excess += excess.T
+    np.fill_diagonal(excess, 0.0)
+    everybody = np.broadcast_to(np.arange(n), (n_swarms, n, n))
+    plain, less = (steps.measure(path, goals, 0.5, 1.0, everybody, height, one) for one in (None, excess))
+    assert np.array_equal(less.separation, plain.separation - excess)
+    assert np.array_equal(less.separation_continuous, plain.separation_continuous - excess)
+    assert np.array_equal(less.min_separation, (plain.separation - excess).min(axis=(1, 2)))
+    assert np.array_equal(less.min_separation_continuous, (plain.separation_continuous - excess).min(axis=(1, 2)))
+    assert np.array_equal(less.colliding, less.separation < 0.5)
+    assert np.array_equal(less.colliding_continuous, less.separation_continuous < 0.5)
+    assert np.array_equal(less.moved, plain.moved)
+    assert np.array_equal(less.at_goal, plain.at_goal)
+    whole = steps.measure(path, goals, 0.5, 1.0, None, height, excess)
+    off = ~np.eye(n, dtype=bool)
+    assert np.array_equal(whole.separation, less.separation[:, off].reshape(n_swarms, n, n - 1))
