@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from quad_swarm.quadrotor import VEHICLE_PARAMETERS, QuadrotorModel, QuadrotorParams, state_derivative
+from quad_swarm.quadrotor import VEHICLE_PARAMETERS, MixedModel, QuadrotorModel, QuadrotorParams, state_derivative
 
 PARAMS = QuadrotorParams()
 
@@ -145,3 +145,17 @@ def test_a_heading_in_the_batch_leaves_the_other_rows_as_they_are(count):
     rest = np.setdiff1d(np.arange(count), [1, 2])
     assert np.array_equal(mixed[rest], level[rest])
     assert not np.array_equal(mixed[1, 3:5], level[1, 3:5])
+
+
+def test_unlike_quadrotors_of_a_team_move_as_alone():
+    rng = np.random.default_rng(0)
+    models = [QuadrotorModel(PARAMS, 0.1), QuadrotorModel(QuadrotorParams(drag_x=1.0, climb_gain=0.9), 0.1)]
+    mixed, kind_of = MixedModel(models, [1, 0, 1, 1]), [1, 0, 1, 1]
+    for n_teams in (1, 30):
+        x, u = (one.reshape(n_teams, 4, -1) for one in random_states(4 * n_teams, rng))
+        time = rng.uniform(0, 0.1, (n_teams, 4))
+        step, ahead = mixed.step(x, u), mixed.ahead(x, u, time)
+        for robot, kind in enumerate(kind_of):
+            one = slice(robot, robot + 1)
+            assert np.array_equal(step[:, one], models[kind].step(x[:, one], u[:, one]))
+            assert np.array_equal(ahead[:, one], models[kind].ahead(x[:, one], u[:, one], time[:, one]))

@@ -33,6 +33,8 @@ def test_a_preset_has_no_changes(preset):
         ({"radius": 0.4}, {"radius": 0.4, "planner": {"separation": 0.8}}),
         ({"quadrotor": "hummingbird"}, None),
         ({"space": {"circle_radius": [2.0, 2.5]}}, {"space": {"circle_radius": [2.0, 2.5]}}),
+        ({"obstacles": {"listed": [{"position": [0, 0, 0], "radius": 0.1}]}}, None),
+        ({"vehicles": [{"radius": 0.2, "quadrotor": "x500"}, {"max_speed": 2}]}, None),
         ({"plant": "rotorpy"}, {"plant": "rotorpy:crazyflie"}),
     ],
 )

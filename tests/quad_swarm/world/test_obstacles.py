@@ -144,7 +144,7 @@ def test_contact_is_found_at_any_time_of_a_step():
     for k, some in enumerate(listed):
         obstacles.reset(k, some)
     positions = rng.normal(size=(5, 3, 4, 3))
-    after, during = obstacles.measure(positions, 0.2, 0.4)
+    after, during = obstacles.measure(positions, np.full(positions.shape[2], 0.2), 0.4)
     assert np.isinf(after[..., 2]).all()
     grid = np.linspace(0, 4, 1001)
     for k, robot in np.ndindex(3, 4):
