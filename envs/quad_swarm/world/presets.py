@@ -119,8 +119,9 @@ class SwarmConfig:
                 f"vehicles: there are {len(self.vehicles)} for n_robots={self.n_robots}; use at most as many as robots"
             )
         simulator = parse_plant(self.plant)[0] != MODEL
-        kinds = set[SwarmConfig]()
         told: dict[str, list[int]] = {}
+        refused: dict[int, str] = {}
+        kinds = set[SwarmConfig]()
         for number, vehicle in enumerate(self.vehicles):
             if simulator and vehicle.quadrotor is not None:
                 raise ValueError(
@@ -135,9 +136,14 @@ class SwarmConfig:
                 kind._check_distances()
                 kind._check_vehicle()
             except ValueError as error:
-                raise ValueError(f"vehicles.{number}: {error}") from None
+                refused[number] = str(error)
+                continue
             for sentence in doubts(kind):
                 told.setdefault(sentence, []).append(number)
+        if refused:
+            number, message = next(iter(refused.items()))
+            general = 1 < len(refused) == len(kinds) and len(set(refused.values())) == 1
+            raise ValueError(message if general else f"vehicles.{number}: {message}")
         for sentence, numbers in told.items():
             warn(sentence if len(numbers) == len(kinds) else f"vehicles.{numbers[0]}: {sentence}")
 

@@ -116,6 +116,17 @@ def test_robots_that_touch_hover():
     assert modes(supervisor, [lambda now: sensed(now, others=np.array([[1.9, 0, 1.5], [3, 0, 1.5]]))]) == [Mode.HOVER]
 
 
+@pytest.mark.parametrize(("robot", "reach"), [(0, (0.5, 0.7)), (1, (0.5, 0.8)), (2, (0.7, 0.8))])
+def test_unlike_robots_touch_where_their_surfaces_do(robot, reach):
+    config = make_config("flight", {"vehicles": [{"radius": 0.2}, {}, {"radius": 0.5}]}, n_robots=3)
+    for near, contact in enumerate(reach):
+        for gap, mode in ((0.01, Mode.FLY), (-0.01, Mode.HOVER)):
+            others = np.array([[0, 3, 1.5], [3, 0, 1.5]])
+            others[near, :2] *= (contact + gap - config.collision_tolerance) / 3
+            supervisor = Supervisor(config, SafetyLimits(), robot)
+            assert modes(supervisor, [lambda now, others=others: sensed(now, others=others)]) == [mode]
+
+
 @pytest.mark.parametrize(("unanswered", "mode"), [(0.9, Mode.FLY), (1.1, Mode.HOVER), (10.1, Mode.LAND)])
 def test_nobody_answers(unanswered, mode):
     supervisor = Supervisor(CONFIG, SafetyLimits())

@@ -35,12 +35,19 @@ class Rounding(Robot):
 
 
 @pytest.mark.parametrize(
-    ("n", "scenario"),
-    [(2, "symmetric_swap"), (4, "symmetric_swap"), (8, "symmetric_swap"), (4, "forest"), (4, "crossing_traffic")],
+    ("n", "scenario", "more"),
+    [
+        (2, "symmetric_swap", {}),
+        (4, "symmetric_swap", {}),
+        (8, "symmetric_swap", {}),
+        (4, "forest", {}),
+        (4, "crossing_traffic", {}),
+        (3, "symmetric_swap", {"vehicles": [{"radius": 0.2}, {"radius": 0.5, "quadrotor": "x500"}]}),
+    ],
 )
-def test_without_delays_it_is_the_flight_in_lock_step(n, scenario):
+def test_without_delays_it_is_the_flight_in_lock_step(n, scenario, more):
     """If everybody asks; a robot that asks nobody plans at once, and its answer is then the newer plan."""
-    world = {"clock_skew": 0.0, "radio": {"loss": 0.0, "delay": 0, "jitter": 0, "round_trip": 0}}
+    world = {"clock_skew": 0.0, "radio": {"loss": 0.0, "delay": 0, "jitter": 0, "round_trip": 0}, **more}
     config = for_scenario(make_config("flight", world, n_robots=n), scenario)
     full = RulePolicy("full")
     flight = VirtualFlight(config, [full] * n, timing=Timing(*[(0.0, 0.0)] * 5), late=0.0)

@@ -115,6 +115,11 @@ def test_vehicles_that_are_none_are_refused(vehicles, message):
         make_config("paper", {"vehicles": vehicles})
 
 
+def test_what_is_wrong_with_the_world_is_no_vehicle_s_fault():
+    with pytest.raises(ValueError, match=r"^clock_skew=0.5 is shorter than one of the substeps=1 of a step"):
+        make_config("paper", UNLIKE, clock_skew=0.5)
+
+
 def test_simulators_refuse_unlike_vehicles_but_not_unlike_radii():
     assert make_config("paper", {"vehicles": [{"radius": 0.2}, {}], "plant": "crazyflow"}).radii[0] == 0.2
     with pytest.raises(ValueError, match=r"vehicles.0.quadrotor: plant='crazyflow' flies vehicles that are all alike"):
