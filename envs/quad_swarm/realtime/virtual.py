@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from quad_swarm.planner import Planner
+from quad_swarm.planner import base
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.link import Channel, Conditions, Handler, Sensed, Traffic, WireLink
 from quad_swarm.realtime.loop import Loop
@@ -75,7 +75,7 @@ class VirtualFlight:
         wait: float = 0.005,
         late: float = 0.25,
         checked: bool = False,
-        planners: Sequence[Planner] | None = None,
+        planners: Sequence[base.Planner] | None = None,
     ):
         self.config, self.vehicles = config, Vehicles(config)
         self.conditions, self.timing = conditions or Conditions(), timing or Timing()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from quad_swarm.planner import MixedPlanner, Planner, make_planner
+from quad_swarm.planner import MixedPlanner, base, make_planner
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.validation import PositiveLength, checked, replaced
 from quad_swarm.vehicles import load_vehicle
@@ -116,7 +116,7 @@ def bodies_of(config: SwarmConfig, robot: int | None = None, others: np.ndarray 
     )
 
 
-def make_planner_of(config: SwarmConfig, robot: int, solver: str = "auto") -> Planner:
+def make_planner_of(config: SwarmConfig, robot: int, solver: str = "auto") -> base.Planner:
     """Create the planner of one robot.
 
     :param config: the world
@@ -127,7 +127,7 @@ def make_planner_of(config: SwarmConfig, robot: int, solver: str = "auto") -> Pl
     return make_planner(kind.planner, kind.quadrotor, config.n_others + 1, solver, config.obstacles.slots, sizes)
 
 
-def make_planners(config: SwarmConfig, solver: str = "auto") -> list[Planner]:
+def make_planners(config: SwarmConfig, solver: str = "auto") -> list[base.Planner]:
     """Create the planners of a world: one for each robot, (n,), which robots of a kind share.
 
     :param config: the world
@@ -137,7 +137,7 @@ def make_planners(config: SwarmConfig, solver: str = "auto") -> list[Planner]:
     return [of_kinds[kind] for kind in config.kind_of]
 
 
-def make_team_planner(config: SwarmConfig, solver: str = "auto") -> Planner | MixedPlanner:
+def make_team_planner(config: SwarmConfig, solver: str = "auto") -> base.Planner | MixedPlanner:
     """Create the planner of whole teams.
 
     :param config: the world
