@@ -275,9 +275,12 @@ def test_folders_of_killed_builds_are_removed(cache, stub_compiler):
     assert young.exists(), "another process may be at work in it"
 
 
-def run_harness(folder: Path, main: str, *flags: str) -> str:
-    """Compile a program around the sources and run it."""
-    model = generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2))
+def run_harness(folder: Path, main: str, *flags: str, **parts: bool) -> str:
+    """Compile a program around the sources and run it.
+
+    :param parts: further arguments of the problem
+    """
+    model = generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2, **parts))
     (folder / "model.hpp").write_text(model)
     (folder / "main.cpp").write_text(main)
     command = [*build_module.compiler(), *build_module._FLAGS, build_module._native_flag(), "-DREAL=float", *flags]
@@ -301,14 +304,15 @@ int main() {
   long solved = 0;
   for (int count : {0, 1, 2, 3, 5, 8, 9, 16, 17, 33, 50}) {
     std::vector<double> x(count * 9), goal(count * 3), others(count * N_OTHERS * N * 3), guess(count * N * 4);
-    std::vector<double> clearance(count * N_OTHERS * N);
-    for (auto* array : {&x, &goal, &others, &guess, &clearance})
+    std::vector<double> clearance(count * N_OTHERS * N), shape(count * N_OTHERS * 3), size(count * N_OTHERS);
+    for (auto* array : {&x, &goal, &others, &guess, &clearance, &shape, &size})
       for (double& value : *array) value = normal(random);
     for (int k = 0; k < count; k += 4) x[k * 9] = bad[k / 4 % 3];
     std::vector<double> x_plan(count * (N + 1) * 9), u_plan(count * N * 4);
     std::vector<std::uint8_t> success(count);
     std::vector<std::int64_t> iterations(count);
-    quad_swarm_rti(count, x.data(), goal.data(), others.data(), count % 2 ? clearance.data() : nullptr, guess.data(),
+    const auto some = [count](const std::vector<double>& array) { return count % 2 ? array.data() : nullptr; };
+    quad_swarm_rti(count, x.data(), goal.data(), others.data(), some(clearance), some(shape), some(size), guess.data(),
                    x_plan.data(), u_plan.data(), success.data(), iterations.data(), 2, 6, 50, 1e-4);
     for (auto s : success) solved += s;
   }
@@ -318,8 +322,10 @@ int main() {
 
 
 @pytest.mark.slow
-def test_sanitizers_find_nothing(tmp_path):
-    solved = run_harness(tmp_path, SANITIZED, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+@pytest.mark.parametrize("parts", [{}, {"shaped": True}])
+def test_sanitizers_find_nothing(parts, tmp_path):
+    flags = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    solved = run_harness(tmp_path, SANITIZED, *flags, **parts)
     assert int(solved) > 70  # of 144 problems a quarter are absurd
 
 
