@@ -64,9 +64,13 @@ class FatropSolver:
         clearance = np.zeros(problems.others.shape[:3]) if problems.clearance is None else problems.clearance
         shape = np.ones((*problems.others.shape[:2], 3)) if problems.shape is None else problems.shape
         size = np.zeros(problems.others.shape[:2]) if problems.size is None else problems.size
+        reference, weight = problems.reference, problems.reference_weight
+        reference = np.zeros((count, horizon, 3)) if reference is None else reference
+        weight = np.zeros((count, horizon)) if weight is None else weight
         for b in range(count):
             about_others = (problems.others[b].ravel(), clearance[b].ravel(), shape[b].ravel(), size[b])
-            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others])
+            kept_to = (reference[b].ravel(), weight[b]) if self.problem.committed else ()
+            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others, *kept_to])
             variables[program.x_index] = x_guess[b, 1:, :nx] + _aside(problems, b, horizon)[:, :nx]
             variables[program.u_index] = u_guess[b, :, :nu]
             if not (_is_sane(parameters) and _is_sane(variables)):
@@ -139,7 +143,8 @@ def _is_sane(numbers: np.ndarray) -> bool:
 class Program(NamedTuple):
     """The problem as a nonlinear program.
 
-    :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance, shape, size), cost ``f`` and
+    :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance, shape, size, and with
+        commitment reference and its weights), cost ``f`` and
         constraints ``g``
     :param bounds: bounds of variables and constraints
     :param structure: fatrop's description of the stages
@@ -163,6 +168,8 @@ def transcribe(problem: OptimalControlProblem) -> Program:
     others = ca.SX.sym("others", 3, horizon * n_others)  # column j * N + k - 1: robot j at stage k
     clearance = ca.SX.sym("clearance", horizon, n_others)
     shape, size = ca.SX.sym("shape", 3, n_others), ca.SX.sym("size", n_others)
+    reference, weight = ca.SX.sym("reference", 3, horizon), ca.SX.sym("weight", horizon)
+    kept_to = [ca.vec(reference), weight] if problem.committed else []
     states = [x0] + [ca.SX.sym(f"x{k}", nx) for k in range(1, horizon + 1)]
     inputs = [ca.SX.sym(f"u{k}", nu) for k in range(horizon)]
     step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
@@ -189,6 +196,8 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             # At large distances, the repulsion is zero long before its exponential overflows. The overflow would make
             # derivatives NaN, with which fatrop regularises its Hessian forever.
             cost += sum((problem.repulsion_cost(ca.fmin(d, farthest)) for d in distances), start=ca.SX(0))
+            if problem.committed:
+                cost += weight[k - 1] * ca.sumsqr(states[k][:3] - reference[:, k - 1])
             cost += config.violation_weight * (
                 ca.sumsqr(slack) + ca.sumsqr(ca.fmax(problem.box_violations(states[k]), 0))
             )
@@ -214,7 +223,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             "x": ca.vertcat(*variables),
             "f": cost,
             "g": ca.vertcat(*constraints),
-            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size),
+            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size, *kept_to),
         },
         bounds={
             "lbx": bounds,

@@ -59,6 +59,9 @@ class PlannerConfig:
     :param cruise_distance: distance (m) beyond which a goal counts as if it were this far away, in its direction, so
         that robots fly to goals at any distance at the same speed; None for goals as they are, see
         `quad_swarm.planner.Planner`
+    :param commitment: weight W of the squared distance to the plan that a robot sent last, which it keeps to so that
+        others may rely on it (1/m^2); 0 for none, see `quad_swarm.world.commitment`
+    :param commitment_fade: how much less later stages weigh: W exp(-fade k / N) at stage k
     :raises ValueError: if a value is not finite or out of range, or the workspace is empty
     """
 
@@ -83,6 +86,8 @@ class PlannerConfig:
     max_obstacles: PositiveInt = 12
     downwash: Annotated[float, Field(ge=1, le=20)] = 1.0
     cruise_distance: PositiveLength | None = None
+    commitment: Annotated[float, Field(ge=0, le=1e4)] = 0.0
+    commitment_fade: NonNegativeFloat = 2.0
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
@@ -128,6 +133,8 @@ class Problems(NamedTuple):
         None for ellipsoids with the planner's ``downwash``
     :param size: how much larger than a robot each body is, (B, m) (m), added to the separation; smaller ones are
         negative. None for 0
+    :param reference: positions that each robot keeps to at stages 1..N, (B, N, 3), world frame (m); None for none
+    :param reference_weight: weights of the squared distances to them, (B, N) (1/m^2)
     """
 
     x: np.ndarray
@@ -137,6 +144,8 @@ class Problems(NamedTuple):
     announced: np.ndarray | None = None
     shape: np.ndarray | None = None
     size: np.ndarray | None = None
+    reference: np.ndarray | None = None
+    reference_weight: np.ndarray | None = None
 
     def part(self, which: Any) -> Problems:
         """Return some of the problems, selected by anything that indexes an array."""
@@ -144,8 +153,9 @@ class Problems(NamedTuple):
 
     def chosen(self, bodies: np.ndarray) -> Problems:
         """Return the problems with some of the bodies only, whose indices are (B, k)."""
-        rows, (x, goal, *about) = np.arange(len(bodies))[:, None], self
-        return Problems._make([x, goal, *(None if array is None else array[rows, bodies] for array in about)])
+        rows, about = np.arange(len(bodies))[:, None], ("others", "clearance", "announced", "shape", "size")
+        given = {name: array for name in about if (array := getattr(self, name)) is not None}
+        return self._replace(**{name: array[rows, bodies] for name, array in given.items()})
 
 
 class OptimalControlProblem:
@@ -157,15 +167,24 @@ class OptimalControlProblem:
     :param quadrotor: physical parameters
     :param n_others: number of bodies to avoid, other robots and obstacles
     :param shaped: whether they may have shapes and sizes, see `Problems`; otherwise, all are spheres of a robot's size
+    :param committed: whether robots may keep to references, see `Problems`
     :raises ValueError: if the planner does not fit the vehicle, see `check_vehicle`
     """
 
-    def __init__(self, config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int, shaped: bool = False):
+    def __init__(
+        self,
+        config: PlannerConfig,
+        quadrotor: QuadrotorParams,
+        n_others: int,
+        shaped: bool = False,
+        committed: bool = False,
+    ):
         check_vehicle(config, quadrotor)
         self.config = config
         self.quadrotor = quadrotor
         self.n_others = n_others
         self.shaped = shaped
+        self.committed = committed
         hold_yaw = config.max_yaw_rate == 0.0
         self.nx = N_STATES - 1 if hold_yaw else N_STATES
         self.nu = N_INPUTS - 1 if hold_yaw else N_INPUTS

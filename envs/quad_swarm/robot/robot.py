@@ -16,6 +16,7 @@ from quad_swarm.native.pairs import advance
 from quad_swarm.planner import Plans, base, make_planner
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, resampled
+from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.obstacles import Obstacle, Obstacles
 from quad_swarm.world.presets import SwarmConfig
@@ -89,6 +90,7 @@ class Robot:
             config.planner, config.quadrotor, config.n_robots, n_obstacles=config.obstacles.slots
         )
         self.obstacles = Obstacles.of(config.obstacles, 1)
+        self.commitment = Commitment.of(config.planner, 1, 1)
         self.period = round(1e6 * config.planner.dt)
         self.beliefs: Beliefs = make_beliefs(config, 1, 1)
         # What the others presumably believe about this robot, from what it sent
@@ -131,6 +133,8 @@ class Robot:
         self._plans = Plans.hover(x, self.config.planner.horizon)
         for beliefs in (self.beliefs, self.presumed):
             beliefs.forget(np.array([0]))
+        if self.commitment is not None:
+            self.commitment.forget(0)
         self._sent: dict[int, Plan] = {}
         self._inbox: dict[int, Plan] = {}
         self._own = [Plan(now - k * self.period, self.planned_positions()[0, 0]) for k in range(kept, 0, -1)]
@@ -241,13 +245,20 @@ class Robot:
         :return: set-point: roll, pitch (rad), climb rate (m/s) and yaw rate (rad/s), (4,)
         """
         self.presumed.receive(*self._message(self._sent, *self._own_motion()))
+        if self.commitment is not None:
+            self.commitment.advance()
+            if self._sent:
+                *_, plans, ages = self._message(self._sent, *self._own_motion())
+                newest = ages.argmin()
+                self.commitment.sent(np.ones((1, 1), bool), plans[None, None, newest], ages[newest])
         believed, self.source = self.beliefs.update(*self._message(self._inbox, self._pos, self._vel))
         late = np.full((1, 1), self.late) if self.late else None
         goal_velocity = None
         if self._route is not None and self.hold is None:
             goal_velocity = self._route.current_velocity()
         arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles, goal_velocity)
-        problems = make_problems(self.config, self.planner.model, *arguments)
+        kept_to = self.commitment if self.hold is None else None
+        problems = make_problems(self.config, self.planner.model, *arguments, kept_to)
         self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
         self._pass_time()
@@ -260,6 +271,8 @@ class Robot:
         self.now += self.period
         self.presumed.receive(*self._message({}, *self._own_motion()))
         self.beliefs.receive(*self._message({}, self._pos, self._vel))
+        if self.commitment is not None:
+            self.commitment.advance()
         plans = self._plans
         self._plans = plans._replace(x=base.shift(plans.x), u=base.shift(plans.u), age=plans.age + 1)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)

@@ -73,6 +73,27 @@ def _deviates(distance: float) -> Rule:
     return rule
 
 
+def stage(distance: float, drift: float) -> Rule:
+    """Event-triggered by the sender: a robot's plan is sent if at some stage it comes closer than ``distance`` (m) to
+    the predicted motion of the receiver, or what the receiver predicts of the sender does, and the two differ there by
+    more than ``drift`` (m)."""
+    tells = _differs_nearby(distance, drift)
+    return lambda view: view.of_the_other(tells(view))
+
+
+def _differs_nearby(distance: float, drift: float) -> Rule:
+    """Tell those who would meet the robot, or expect to, at a stage where they do not know its plan: `stage` for the
+    sender."""
+
+    def rule(view: View) -> np.ndarray:
+        mine, theirs = view.plan[:, :, None], view.expected()
+        believed = view.seen_by_others(range(view.horizon)).believed - view.own_pos[:, :, None, None]
+        near = np.minimum(length(mine - theirs), length(believed - theirs)) < distance
+        return (near & (length(mine - believed) > drift)).any(axis=-1)
+
+    return rule
+
+
 def stale(age: float) -> Rule:
     """Request if the newest received plan is at least ``age`` steps old or is no longer believed."""
     return lambda view: (view.age >= age) | ~view.prediction.remembers
@@ -108,6 +129,7 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
     "soon": (soon, ("TIME",)),
     "event": (event, ("EPS",)),
     "push": (push, ("EPS",)),
+    "stage": (stage, ("DIST", "EPS")),
     "stale": (stale, ("STEPS",)),
     "plan": (plan, ("DIST",)),
     "blocked": (blocked, ("DIST",)),
@@ -116,7 +138,7 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
 
 
 # Those of them by which the sender decides, as the sender sees it
-_SENDERS: dict[str, Callable[..., Rule]] = {"push": _deviates}
+_SENDERS: dict[str, Callable[..., Rule]] = {"push": _deviates, "stage": _differs_nearby}
 
 
 def parse_rule(text: str) -> Rule:

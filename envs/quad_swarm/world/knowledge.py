@@ -15,6 +15,7 @@ from quad_swarm.native.pairs import resample
 from quad_swarm.planner import Problems
 from quad_swarm.quadrotor import QuadrotorModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
+from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.presets import SwarmConfig
 
@@ -122,6 +123,7 @@ def make_problems(
     late: np.ndarray | None,
     obstacles: Obstacles | None,
     goal_velocity: np.ndarray | None = None,
+    commitment: Commitment | None = None,
 ) -> Problems:
     """Return robots' planning problems, which start when their inputs take effect.
 
@@ -137,6 +139,7 @@ def make_problems(
     :param obstacles: obstacles, which follow the others among the bodies of a problem, None for none
     :param goal_velocity: velocities of the goals, (E, n, 3), world frame (m/s), None for goals that stand. Robots fly
         to where their goals will be at the end of the horizon, so that they do not fall behind
+    :param commitment: the plans that robots sent, None if their planner does not keep to them
     """
     if goal_velocity is not None:
         ahead = config.planner.dt * (config.planner.horizon + (0.0 if late is None else late[..., None]))
@@ -151,6 +154,9 @@ def make_problems(
     others = believed.reshape(-1, *believed.shape[2:])
     # Copies: a solver that writes into its problem must not move robots or goals
     problems = Problems(x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced)
+    if commitment is not None:
+        reference, weight = commitment.reference(late)
+        problems = problems._replace(reference=reference, reference_weight=weight)
     return problems if obstacles is None else _among(obstacles, problems, config, late)
 
 

@@ -47,6 +47,13 @@ class RadioChannel:
         self._available = [*map(advance, self._earlier), advance(plans)]
         self._earlier = self._available[1:]
 
+    @property
+    def newest(self) -> tuple[np.ndarray, int]:
+        """The newest plans that robots can send in this step, from the current step on, (E, n, N + 1, 3) (m), and
+        their age (steps)."""
+        age = 1 + self._delay
+        return self._available[-age], age
+
     def answers(
         self, arriving: np.ndarray, others: np.ndarray, lateness: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | int]:
@@ -58,8 +65,8 @@ class RadioChannel:
         :return: the plans, from the current step on, in the order of ``arriving``, (number of answers, N + 1, 3) (m),
             and their ages (steps), (number of answers,), or one number for all
         """
-        age = 1 + self._delay
-        received = answered(arriving, self._available[-age], others)
+        newest, age = self.newest
+        received = answered(arriving, newest, others)
         if lateness is None:
             return received, age
         late = lateness[arriving]

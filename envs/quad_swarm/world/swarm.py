@@ -20,6 +20,7 @@ from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.validation import points
 from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
+from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacle, Obstacles, Surroundings, surroundings
@@ -143,6 +144,7 @@ class Swarm(SwarmState):
             disturbances=Realisation(config, n_swarms),
             neighbours=Neighbours(n_swarms, n, config.neighbourhood),
             obstacles=Obstacles.of(config.obstacles, n_swarms),
+            commitment=Commitment.of(config.planner, n_swarms, n),
         )
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
@@ -290,6 +292,8 @@ class Swarm(SwarmState):
         for mine, fresh in zip(self._plans, hover, strict=True):
             mine[swarm * n : (swarm + 1) * n] = fresh
         self._radio.reset(swarm, self.plans[swarm, ..., POSITION])
+        if self.commitment is not None:
+            self.commitment.forget(swarm)
         self._u[swarm] = 0.0
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
@@ -423,6 +427,10 @@ class Swarm(SwarmState):
         others = self.neighbours.others
         self._radio.send(self.planned_positions())
         carried = self.disturbances.carried(requests, self.pos, others)
+        if self.commitment is not None:
+            self.commitment.advance()
+            sent = carried if announced is None else carried | announced
+            self.commitment.sent(self.neighbours.of_the_other(sent).any(axis=2), *self._radio.newest)
         if self._other_beliefs is not None:
             sent = carried if announced is None else carried | announced
             self._other_beliefs.receive(sent, *self._seen_by_all(), *self._radio.answers(sent, others))
@@ -436,7 +444,7 @@ class Swarm(SwarmState):
         late = None if start is None else start / self.config.substeps
         goal_velocity = None if self.route is None else self.route.current_velocity()
         arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles, goal_velocity)
-        return make_problems(self.config, self.planner.model, *arguments)
+        return make_problems(self.config, self.planner.model, *arguments, self.commitment)
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""

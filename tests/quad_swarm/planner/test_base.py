@@ -221,6 +221,45 @@ def test_without_shapes_others_have_the_planners_downwash(solver):
 
 
 @pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_plans_keep_to_references_as_much_as_they_weigh(solver):
+    config = PlannerConfig(commitment=1.0)
+    problems, last = crossing(3, config), hover(crossing(3, config), config)
+    planner = make_planner(config, QUADROTOR, 3, solver)
+    problems.x[:, 3:] = 0.0
+    reference = problems.x[:, None, :3] + np.linspace(0.02, 0.2, config.horizon)[:, None] * [0, 0, 1]
+    off = []
+    for weight in (0.0, 1.0, 100.0):
+        plans, weights = last, np.full((3, config.horizon), weight)
+        for _ in range(4):
+            plans = planner.plan(problems._replace(reference=reference, reference_weight=weights), plans)
+        assert (plans.status == PlanStatus.SOLVED).all()
+        off.append(np.linalg.norm(plans.x[:, 1:, :3] - reference, axis=-1).mean())
+    assert off[2] < 0.5 * off[1] < 0.5 * off[0]
+    plain = make_planner(PlannerConfig(), QUADROTOR, 3, solver)
+    assert_same(planner.plan(problems, last), plain.plan(problems, last))
+    with pytest.raises(ValueError, match=r"reference: references need weights, and a planner with planner\.commitment"):
+        plain.plan(problems._replace(reference=reference, reference_weight=weights), last)
+    with pytest.raises(ValueError, match="reference: references need weights"):
+        planner.plan(problems._replace(reference=reference), last)
+    with pytest.raises(ValueError, match="reference_weight: weights must not be negative"):
+        planner.plan(problems._replace(reference=reference, reference_weight=-weights), last)
+
+
+def test_both_solvers_keep_to_references_alike():
+    config = PlannerConfig(commitment=1.0)
+    problems = crossing(3, config)
+    reference = problems.x[:, None, :3] + np.linspace(0.02, 0.2, config.horizon)[:, None] * [0, 1, 0]
+    problems = problems._replace(reference=reference, reference_weight=np.full((3, config.horizon), 3.0))
+    planned = []
+    for solver in ("rti", "fatrop"):
+        planner, plans = make_planner(config, QUADROTOR, 3, solver), hover(problems, config)
+        for _ in range(8):
+            plans = planner.plan(problems, plans)
+        planned.append(plans.x[..., :3])
+    np.testing.assert_allclose(*planned, atol=0.02)
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
 def test_a_large_body_far_away_takes_the_place_of_a_small_one_nearby(solver):
     """What counts is the distance to the surface, in the metric of the shape."""
     config = PlannerConfig(max_obstacles=1, max_neighbours=1)

@@ -48,6 +48,7 @@ def generate_model(problem: OptimalControlProblem) -> str:
     lines += [f"constexpr int {name} = {value};" for name, value in constants.items()]
     lines += [
         f"constexpr bool SHAPED = {str(problem.shaped).lower()};",
+        f"constexpr bool COMMITTED = {str(problem.committed).lower()};",
         f"constexpr double VIOLATION_WEIGHT = {problem.config.violation_weight!r};",
         _array("double", "MAX_INPUT", problem.max_input.full().ravel()),
         _array("int", "BOUNDED_STATE", state),
@@ -79,7 +80,7 @@ def formulas(problem: OptimalControlProblem) -> tuple[object, ...]:
         problem.box_violations(x),
     ]
     function = ca.Function("formulas", [x, u, x0, goal, others, distance], outputs)
-    sizes = problem.n_others, problem.shaped, *problem.max_input.full().ravel()
+    sizes = problem.n_others, problem.shaped, problem.committed, *problem.max_input.full().ravel()
     return problem.config, sizes, function.serialize()
 
 

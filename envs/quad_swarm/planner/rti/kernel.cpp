@@ -32,6 +32,8 @@ struct Batch {
   const double* clearance;  // (count, N_OTHERS, N), or null
   const double* shape;    // (count, N_OTHERS, 3), or null
   const double* size;     // (count, N_OTHERS), or null
+  const double* reference;         // (count, N, 3), or null
+  const double* reference_weight;  // (count, N), or null
   double* x_plan;         // (count, N + 1, 9)
   double* u_plan;         // (count, N, 4)
   std::uint8_t* success;  // (count,)
@@ -121,6 +123,7 @@ struct Stage {
   V clearance[N_OTHERS];     // distance to keep in addition to the separation
   V direction[N_OTHERS][3];  // from each other robot to this one
   V repulsion_gradient[N_OTHERS], repulsion_curvature[N_OTHERS];
+  V reference[COMMITTED ? 3 : 0], reference_weight[COMMITTED ? 1 : 0];  // twice the weight
   V bound_sign[N_BOUNDS];
   Inequality<V, false> input_low[NU], input_high[NU];
   Inequality<V, true> bound[N_BOUNDS], separation[N_OTHERS];
@@ -174,6 +177,7 @@ class LaneGroup {
       }
     }
     if constexpr (SHAPED) load_shapes(batch, problems, count);
+    if constexpr (COMMITTED) load_references(batch, problems, count);
     for (int k = 0; k < N; k++) {
       limit_inputs(stages_[k].u);
       for (int j = 0; j < N_OTHERS; j++) {
@@ -193,6 +197,19 @@ class LaneGroup {
         for (int i = 0; i < 3; i++)
           shape_[j][i][q] = static_cast<T>(batch.shape ? batch.shape[(first + j) * 3 + i] : 1.0);
         size_[j][q] = static_cast<T>(batch.size ? batch.size[first + j] : 0.0);
+      }
+    }
+  }
+
+  void load_references(const Batch& batch, const std::int64_t* problems, int count) {
+    const bool given = batch.reference && batch.reference_weight;
+    for (int k = 0; k < N; k++) {
+      Stage<V>& s = stages_[k];
+      s.reference[0] = s.reference[1] = s.reference[2] = s.reference_weight[0] = V{};
+      for (int q = 0; given && q < W; q++) {
+        const std::int64_t row = problems[q < count ? q : count - 1] * N + k;
+        for (int i = 0; i < 3; i++) s.reference[i][q] = static_cast<T>(batch.reference[row * 3 + i]);
+        s.reference_weight[0][q] = static_cast<T>(2 * batch.reference_weight[row]);
       }
     }
   }
@@ -291,6 +308,8 @@ class LaneGroup {
           for (int l = 0; l <= i; l++)
             p[packed(i, l)] = multiply_add(weight * s.direction[j][i], s.direction[j][l], p[packed(i, l)]);
       }
+      if constexpr (COMMITTED)
+        for (int i = 0; i < 3; i++) p[packed(i, i)] += s.reference_weight[0];
       V weight[NU];
       for (int i = 0; i < NU; i++) {
         s.input_low[i].eliminate();
@@ -332,6 +351,9 @@ class LaneGroup {
       const V force = s.separation[j].force() - s.repulsion_gradient[j];
       for (int i = 0; i < 3; i++) costate[i] = negative_multiply_add(s.direction[j][i], force, costate[i]);
     }
+    if constexpr (COMMITTED)
+      for (int i = 0; i < 3; i++)
+        costate[i] = multiply_add(s.reference_weight[0], s.x[i] - s.reference[i], costate[i]);
     V gradient[NU];
     for (int i = 0; i < NU; i++)
       gradient[i] = s.input_gradient[i] - s.input_low[i].force() + s.input_high[i].force();
@@ -474,10 +496,12 @@ void solve_all(const Batch& batch, const double* u_guess, const std::vector<std:
 
 extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
     std::int64_t count, const double* x, const double* goal, const double* others, const double* clearance,
-    const double* shape, const double* size, const double* u_guess, double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations,
+    const double* shape, const double* size, const double* reference, const double* reference_weight,
+    const double* u_guess, double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations,
     std::int64_t sqp_iterations, std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
   std::vector<std::uint8_t> moving(count);
-  const Batch batch{x, goal, others, clearance, shape, size, x_plan, u_plan, success, iterations, moving.data()};
+  const Batch batch{x,      goal,   others,  clearance,  shape,         size, reference, reference_weight,
+                    x_plan, u_plan, success, iterations, moving.data()};
   const Options options{max_iterations, tolerance};
   std::fill(iterations, iterations + count, 0);
   std::vector<std::int64_t> problems(count);
