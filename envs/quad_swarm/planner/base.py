@@ -185,16 +185,16 @@ class Planner:
             if given is not None and name in ("shape", "size") and not shaped:
                 raise ValueError(f"{name}: this planner avoids spheres only; create it with obstacles or downwash.")
         committed = getattr(getattr(self.solver, "problem", None), "committed", True)
-        for name, more in (("reference", (stages, 3)), ("reference_weight", (stages,))):
+        for name, per_robot in {"reference": (stages, 3), "reference_weight": (stages,)}.items():
             if (given := getattr(problems, name)) is None:
                 continue
-            about[name] = _array(name, given, (count, *more))
+            about[name] = _array(name, given, (count, *per_robot))
             if not committed or (problems.reference is None) != (problems.reference_weight is None):
                 raise ValueError(
                     f"{name}: references need weights, and a planner with planner.commitment above 0, whose value only "
                     "swarms use."
                 )
-        if problems.reference_weight is not None and (about["reference_weight"] < 0).any():
+        if (weights := about.get("reference_weight")) is not None and np.any(weights < 0):
             raise ValueError("reference_weight: weights must not be negative.")
         return Problems(x, goal, others, **about), Plans(
             # The last plan is a guess, so that numbers which are not finite only cost a retry

@@ -430,7 +430,8 @@ class Swarm(SwarmState):
         if self.commitment is not None:
             self.commitment.advance()
             sent = carried if announced is None else carried | announced
-            self.commitment.sent(self.neighbours.of_the_other(sent).any(axis=2), *self._radio.newest)
+            who = np.asarray(self.neighbours.of_the_other(sent).any(axis=2))
+            self.commitment.sent(who, *self._radio.newest)
         if self._other_beliefs is not None:
             sent = carried if announced is None else carried | announced
             self._other_beliefs.receive(sent, *self._seen_by_all(), *self._radio.answers(sent, others))
