@@ -71,6 +71,30 @@ class QuadrotorParams:
         lags = (1 / self.roll_time_constant, 1 / self.pitch_time_constant, 1 / self.climb_time_constant)
         return 2.785 / max(self.drag_x, self.drag_y, *lags)
 
+    def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return by how much an acceleration of 1 m/s^2 beside those of the model changes the position (m) and the
+        velocity (m/s) after some time, along x, y and z, as `rk4_step` integrates it.
+
+        :param time: times (s), (...)
+        :return: changes, (..., 3) each
+        """
+        decay = np.array([self.drag_x, self.drag_y, 1 / self.climb_time_constant])
+        t = np.asarray(time, float)[..., None]
+        z = decay * t
+        return t**2 / 2 * (1 - z / 3 + z**2 / 12), t * (1 - z / 2 + z**2 / 6 - z**3 / 24)
+
+    def steady_input(self, disturbance: np.ndarray) -> np.ndarray:
+        """Return the inputs with which a vehicle of heading 0 stays where it is in spite of constant accelerations.
+
+        :param disturbance: accelerations, (..., 3), world frame (m/s^2)
+        :return: inputs, (..., 4)
+        """
+        u = np.zeros((*disturbance.shape[:-1], N_INPUTS))
+        u[..., 0] = np.arctan(disturbance[..., 1] / self.gravity) / self.roll_gain
+        u[..., 1] = -np.arctan(disturbance[..., 0] / self.gravity) / self.pitch_gain
+        u[..., 2] = -disturbance[..., 2] * self.climb_time_constant / self.climb_gain
+        return u
+
 
 # The parameters that may vary between robots, in the order of the factors of `QuadrotorModel.step`.
 VEHICLE_PARAMETERS = tuple(field.name for field in fields(QuadrotorParams) if field.name != "gravity")
@@ -178,9 +202,22 @@ class QuadrotorModel:
             return self._call(x, [x, u, wind], self.dt, False)
         return self._call(x, [x, u, wind, factors], self.dt, True)
 
-    def ahead(self, x: np.ndarray, u: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Compute states after individual times, in still air: (..., 9), (..., 4), (...) (s) -> (..., 9)."""
-        return self._call(x, [x, u, None, time], None, False)
+    def ahead(
+        self, x: np.ndarray, u: np.ndarray, time: np.ndarray, disturbance: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Compute states after individual times, in still air: (..., 9), (..., 4), (...) (s) -> (..., 9).
+
+        :param disturbance: constant accelerations, (..., 3), world frame (m/s^2); None for none
+        """
+        return self._drifted(self._call(x, [x, u, None, time], None, False), time, disturbance)
+
+    def _drifted(self, x: np.ndarray, time: np.ndarray | float, disturbance: np.ndarray | None) -> np.ndarray:
+        """Add what constant accelerations do in some time to states, in place."""
+        if disturbance is not None:
+            position, velocity = self.params.drift(time)
+            x[..., POSITION] += position * disturbance
+            x[..., VELOCITY] += velocity * disturbance
+        return x
 
     def _call(self, x: np.ndarray, arguments: list[np.ndarray | None], dt: float | None, varied: bool) -> np.ndarray:
         count = x.size // N_STATES
@@ -198,12 +235,15 @@ class QuadrotorModel:
             calls[key] = _BufferedCall(step_function(self.params, dt, varied, heading), capacity)
         return calls[key](count, arguments).reshape(x.shape)
 
-    def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Roll out states from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
+    def rollout(self, x: np.ndarray, u: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
+        """Roll out states from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9).
+
+        :param disturbance: constant accelerations, (B, 3), world frame (m/s^2); None for none
+        """
         states = np.empty((x.shape[0], u.shape[1] + 1, N_STATES))
         states[:, 0] = x
         for k in range(u.shape[1]):
-            states[:, k + 1] = self.step(states[:, k], u[:, k])
+            states[:, k + 1] = self._drifted(self.step(states[:, k], u[:, k]), self.dt, disturbance)
         return states
 
     def __reduce__(self) -> tuple:

@@ -36,7 +36,8 @@ def make_planner(
     n_others = n_robots - 1 if config.max_neighbours is None else min(n_robots - 1, config.max_neighbours)
     n_bodies = n_others + min(n_obstacles, config.max_obstacles)
     shaped, committed = n_obstacles > 0 or config.downwash != 1, config.commitment > 0
-    problem = OptimalControlProblem(config, quadrotor, n_bodies, shaped, committed)
+    disturbed = config.disturbance_time is not None
+    problem = OptimalControlProblem(config, quadrotor, n_bodies, shaped, committed, disturbed)
     limit = None if n_bodies == n_robots - 1 + n_obstacles else n_bodies
     return Planner(_make_solver(problem, solver), QuadrotorModel(quadrotor, config.dt), config, limit)
 

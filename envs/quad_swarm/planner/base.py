@@ -132,6 +132,8 @@ class Planner:
             problems, previous = self._checked(problems, previous)
         if (cruise := self.config.cruise_distance) is not None:
             problems = problems._replace(goal=nearer(problems.x[:, POSITION], problems.goal, cruise))
+        if problems.disturbance is not None:
+            problems = problems._replace(steady_input=self.model.params.steady_input(problems.disturbance))
         if problems.shape is None and self.config.downwash != 1:
             flat = np.ones((*problems.others.shape[:2], 3))
             flat[..., 2] = 1 / self.config.downwash
@@ -154,7 +156,8 @@ class Planner:
         )
         u, limit = turned(plans.u[rows], planned, 0), self.config.max_tilt
         u[..., :2] = np.clip(u[..., :2], -limit, limit)
-        plans.u[rows], plans.x[rows] = u, self.model.rollout(problems.x[rows], u)
+        pushed = None if problems.disturbance is None else problems.disturbance[rows]
+        plans.u[rows], plans.x[rows] = u, self.model.rollout(problems.x[rows], u, pushed)
         return plans
 
     def _checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
@@ -194,6 +197,10 @@ class Planner:
                     f"{name}: references need weights, and a planner with planner.commitment above 0, whose value only "
                     "swarms use."
                 )
+        if problems.disturbance is not None:
+            about["disturbance"] = _array("disturbance", problems.disturbance, (count, 3))
+            if not getattr(getattr(self.solver, "problem", None), "disturbed", True):
+                raise ValueError("disturbance: this planner knows none; set planner.disturbance_time.")
         if (weights := about.get("reference_weight")) is not None and np.any(weights < 0):
             raise ValueError("reference_weight: weights must not be negative.")
         return Problems(x, goal, others, **about), Plans(
@@ -229,17 +236,19 @@ class Planner:
             lasts = age[failed] < self.config.horizon
             status[failed[lasts]] = PlanStatus.SHIFTED
             u[failed[lasts]] = u_guess[failed[lasts]]
-            u[failed[~lasts]] = self.braking_inputs(problems.x[failed[~lasts]])
-            x[failed] = self._rollout(problems.x[failed], u[failed])
+            hopeless = problems.part(failed[~lasts])
+            u[failed[~lasts]] = self.braking_inputs(hopeless.x, hopeless.disturbance)
+            pushed = None if problems.disturbance is None else problems.disturbance[failed]
+            x[failed] = self._rollout(problems.x[failed], u[failed], pushed)
         return Plans(x, u, age, status, iterations)
 
-    def _rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _rollout(self, x: np.ndarray, u: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
         """Roll out states with roll and pitch about the world's axes, see `QuadrotorModel.rollout`."""
         if not (np.count_nonzero(x[:, 8]) or np.count_nonzero(u[..., 3])):
-            return self.model.rollout(x, u)
+            return self.model.rollout(x, u, disturbance)
         held, still = x.copy(), u.copy()
         held[:, 8] = still[..., 3] = 0.0
-        states = self.model.rollout(held, still)
+        states = self.model.rollout(held, still, disturbance)
         states[..., 8] = x[:, 8:]
         states[:, 1:, 8] += self.config.dt * u[..., 3].cumsum(axis=1)
         return states
@@ -273,21 +282,28 @@ class Planner:
         nearest = np.sort(np.argsort(gaps, axis=1, kind="stable")[:, :kept], axis=1)
         return problems.chosen(nearest)
 
-    def braking_inputs(self, x: np.ndarray) -> np.ndarray:
+    def braking_inputs(self, x: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
         """Compute inputs that bring robots to hover from their states without a solver, (B, 9) -> (B, N, 4).
 
-        The commanded tilt, about the world's axes, opposes the velocity and saturates at its limit. The commanded climb
-        rate is zero.
+        The commanded tilt, about the world's axes, opposes the velocity and the disturbance and saturates at its limit.
+        The commanded climb rate only opposes the disturbance.
+
+        :param x: states, (B, 9)
+        :param disturbance: see `Problems`
         """
         # Tilt a = v / (g * 0.5 s) stops the linearised robot in about half a second without overshoot
         gain = 1.0 / (self.model.params.gravity * 0.5)
         limit = self.config.max_tilt
         u = np.zeros((x.shape[0], self.config.horizon, N_INPUTS))
-        state = x
+        state, hold = x, np.zeros((x.shape[0], N_INPUTS))
+        if disturbance is not None:
+            hold = self.model.params.steady_input(disturbance)
+            climb = self.config.max_climb_rate
+            u[..., 2] = np.clip(hold[:, None, 2], -climb, climb)
         for k in range(self.config.horizon):
-            u[:, k, 0] = np.clip(gain * state[:, 4], -limit, limit)
-            u[:, k, 1] = np.clip(-gain * state[:, 3], -limit, limit)
-            state = self._rollout(state, u[:, k : k + 1])[:, 1]
+            u[:, k, 0] = np.clip(gain * state[:, 4] + hold[:, 0], -limit, limit)
+            u[:, k, 1] = np.clip(-gain * state[:, 3] + hold[:, 1], -limit, limit)
+            state = self._rollout(state, u[:, k : k + 1], disturbance)[:, 1]
         return u
 
 

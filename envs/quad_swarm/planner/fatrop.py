@@ -67,10 +67,14 @@ class FatropSolver:
         reference, weight = problems.reference, problems.reference_weight
         reference = np.zeros((count, horizon, 3)) if reference is None else reference
         weight = np.zeros((count, horizon)) if weight is None else weight
+        disturbance, steady = problems.disturbance, problems.steady_input
+        disturbance = np.zeros((count, 3)) if disturbance is None else disturbance
+        steady = np.zeros((count, N_INPUTS)) if steady is None else steady
         for b in range(count):
             about_others = (problems.others[b].ravel(), clearance[b].ravel(), shape[b].ravel(), size[b])
             kept_to = (reference[b].ravel(), weight[b]) if self.problem.committed else ()
-            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others, *kept_to])
+            pushed = (disturbance[b], steady[b, :nu]) if self.problem.disturbed else ()
+            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others, *kept_to, *pushed])
             variables[program.x_index] = x_guess[b, 1:, :nx] + _aside(problems, b, horizon)[:, :nx]
             variables[program.u_index] = u_guess[b, :, :nu]
             if not (_is_sane(parameters) and _is_sane(variables)):
@@ -144,7 +148,7 @@ class Program(NamedTuple):
     """The problem as a nonlinear program.
 
     :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance, shape, size, and with
-        commitment reference and its weights), cost ``f`` and
+        commitment reference and its weights, with disturbances these and the steady inputs), cost ``f`` and
         constraints ``g``
     :param bounds: bounds of variables and constraints
     :param structure: fatrop's description of the stages
@@ -170,6 +174,10 @@ def transcribe(problem: OptimalControlProblem) -> Program:
     shape, size = ca.SX.sym("shape", 3, n_others), ca.SX.sym("size", n_others)
     reference, weight = ca.SX.sym("reference", 3, horizon), ca.SX.sym("weight", horizon)
     kept_to = [ca.vec(reference), weight] if problem.committed else []
+    disturbance, steady = ca.SX.sym("disturbance", 3), ca.SX.sym("steady", nu)
+    pushed = [disturbance, steady] if problem.disturbed else []
+    moved = problem.drift(disturbance) if problem.disturbed else ca.SX.zeros(nx)
+    free = steady if problem.disturbed else ca.SX.zeros(nu)
     states = [x0] + [ca.SX.sym(f"x{k}", nx) for k in range(1, horizon + 1)]
     inputs = [ca.SX.sym(f"u{k}", nu) for k in range(horizon)]
     step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
@@ -202,12 +210,12 @@ def transcribe(problem: OptimalControlProblem) -> Program:
                 ca.sumsqr(slack) + ca.sumsqr(ca.fmax(problem.box_violations(states[k]), 0))
             )
         if k < horizon:
-            cost += problem.input_cost(inputs[k])
+            cost += problem.input_cost(inputs[k] - free)
             variables.append(inputs[k])
             lower.append(-max_input)
             u_index.append(np.arange(offset, offset + nu))
             offset += nu
-            constraints.append(states[k + 1] - step(states[k], inputs[k]))
+            constraints.append(states[k + 1] - step(states[k], inputs[k]) - moved)
             constraint_lower.append(np.zeros(nx))
             equality += [True] * nx
         variables.append(slack)
@@ -223,7 +231,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             "x": ca.vertcat(*variables),
             "f": cost,
             "g": ca.vertcat(*constraints),
-            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size, *kept_to),
+            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size, *kept_to, *pushed),
         },
         bounds={
             "lbx": bounds,

@@ -62,6 +62,9 @@ class PlannerConfig:
     :param commitment: weight W of the squared distance to the plan that a robot sent last, which it keeps to so that
         others may rely on it (1/m^2); 0 for none, see `quad_swarm.world.commitment`
     :param commitment_fade: how much less later stages weigh: W exp(-fade k / N) at stage k
+    :param disturbance_time: time constant with which robots estimate a constant acceleration that their model does not
+        know, as by wind or a payload (s), so that they reach their goals in spite of it; None for no estimate, see
+        `quad_swarm.world.disturbance_estimate`
     :raises ValueError: if a value is not finite or out of range, or the workspace is empty
     """
 
@@ -88,6 +91,7 @@ class PlannerConfig:
     cruise_distance: PositiveLength | None = None
     commitment: Annotated[float, Field(ge=0, le=1e4)] = 0.0
     commitment_fade: NonNegativeFloat = 2.0
+    disturbance_time: Annotated[float, Field(ge=1e-3, le=1e4)] | None = None
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
@@ -135,6 +139,10 @@ class Problems(NamedTuple):
         negative. None for 0
     :param reference: positions that each robot keeps to at stages 1..N, (B, N, 3), world frame (m); None for none
     :param reference_weight: weights of the squared distances to them, (B, N) (1/m^2)
+    :param disturbance: constant accelerations that act on the robots beside what the model knows, (B, 3), world frame
+        (m/s^2); None for none
+    :param steady_input: inputs that hold the robots against them, which cost nothing, (B, 4); `Planner` sets them, with
+        roll and pitch about the world's axes
     """
 
     x: np.ndarray
@@ -146,6 +154,8 @@ class Problems(NamedTuple):
     size: np.ndarray | None = None
     reference: np.ndarray | None = None
     reference_weight: np.ndarray | None = None
+    disturbance: np.ndarray | None = None
+    steady_input: np.ndarray | None = None
 
     def part(self, which: Any) -> Problems:
         """Return some of the problems, selected by anything that indexes an array."""
@@ -168,6 +178,7 @@ class OptimalControlProblem:
     :param n_others: number of bodies to avoid, other robots and obstacles
     :param shaped: whether they may have shapes and sizes, see `Problems`; otherwise, all are spheres of a robot's size
     :param committed: whether robots may keep to references, see `Problems`
+    :param disturbed: whether there may be disturbances, see `Problems`
     :raises ValueError: if the planner does not fit the vehicle, see `check_vehicle`
     """
 
@@ -178,6 +189,7 @@ class OptimalControlProblem:
         n_others: int,
         shaped: bool = False,
         committed: bool = False,
+        disturbed: bool = False,
     ):
         check_vehicle(config, quadrotor)
         self.config = config
@@ -185,6 +197,7 @@ class OptimalControlProblem:
         self.n_others = n_others
         self.shaped = shaped
         self.committed = committed
+        self.disturbed = disturbed
         hold_yaw = config.max_yaw_rate == 0.0
         self.nx = N_STATES - 1 if hold_yaw else N_STATES
         self.nu = N_INPUTS - 1 if hold_yaw else N_INPUTS
@@ -197,6 +210,11 @@ class OptimalControlProblem:
         x_full = ca.vertcat(x, ca.SX.zeros(N_STATES - self.nx))
         u_full = ca.vertcat(u, ca.SX.zeros(N_INPUTS - self.nu))
         return ca.cse(rk4_step(x_full, u_full, ca.SX.zeros(2), self.quadrotor, self.config.dt, False))[: self.nx]
+
+    def drift(self, disturbance: ca.SX) -> ca.SX:
+        """Return what a constant acceleration adds to the next state, (nx,); see `QuadrotorParams.drift`."""
+        position, velocity = self.quadrotor.drift(self.config.dt)
+        return ca.vertcat(ca.DM(position) * disturbance, ca.DM(velocity) * disturbance, ca.SX.zeros(self.nx - 6))
 
     def input_cost(self, u: ca.SX) -> ca.SX:
         """Return the cost of the inputs of one stage, each divided by its limit."""

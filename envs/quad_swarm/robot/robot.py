@@ -17,6 +17,7 @@ from quad_swarm.planner import Plans, base, make_planner
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, resampled
 from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.obstacles import Obstacle, Obstacles
 from quad_swarm.world.presets import SwarmConfig
@@ -91,6 +92,7 @@ class Robot:
         )
         self.obstacles = Obstacles.of(config.obstacles, 1)
         self.commitment = Commitment.of(config.planner, 1, 1)
+        self.disturbance = DisturbanceEstimate.of(config.planner, self.planner.model, 1, 1)
         self.period = round(1e6 * config.planner.dt)
         self.beliefs: Beliefs = make_beliefs(config, 1, 1)
         # What the others presumably believe about this robot, from what it sent
@@ -135,6 +137,8 @@ class Robot:
             beliefs.forget(np.array([0]))
         if self.commitment is not None:
             self.commitment.forget(0)
+        if self.disturbance is not None:
+            self.disturbance.forget(0)
         self._sent: dict[int, Plan] = {}
         self._inbox: dict[int, Plan] = {}
         self._own = [Plan(now - k * self.period, self.planned_positions()[0, 0]) for k in range(kept, 0, -1)]
@@ -214,6 +218,8 @@ class Robot:
         for _ in range(min(missed, self.config.planner.horizon)):  # by then, plans and beliefs have expired
             self._miss()
         self._estimate = np.array(state, float).reshape(1, 1, N_STATES)
+        if self.disturbance is not None:
+            self.disturbance.update(self._estimate)
         self._pos, self._vel = (np.array(a, float).reshape(1, 1, -1, 3) for a in (pos, vel))
         self.now = now
         if self._route is not None:
@@ -258,9 +264,11 @@ class Robot:
             goal_velocity = self._route.current_velocity()
         arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles, goal_velocity)
         kept_to = self.commitment if self.hold is None else None
-        problems = make_problems(self.config, self.planner.model, *arguments, kept_to)
+        problems = make_problems(self.config, self.planner.model, *arguments, kept_to, self.disturbance)
         self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
+        if self.disturbance is not None:
+            self.disturbance.expect(problems.x[None], self._u, late)
         self._pass_time()
         self._sent, self._inbox = {}, {}
         self._own = [*self._own[1:], Plan(self.now, self.planned_positions()[0, 0].copy())]
@@ -273,6 +281,8 @@ class Robot:
         self.beliefs.receive(*self._message({}, self._pos, self._vel))
         if self.commitment is not None:
             self.commitment.advance()
+        if self.disturbance is not None:
+            self.disturbance.miss()
         plans = self._plans
         self._plans = plans._replace(x=base.shift(plans.x), u=base.shift(plans.u), age=plans.age + 1)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)

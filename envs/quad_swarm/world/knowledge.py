@@ -16,6 +16,7 @@ from quad_swarm.planner import Problems
 from quad_swarm.quadrotor import QuadrotorModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
 from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.presets import SwarmConfig
 
@@ -124,6 +125,7 @@ def make_problems(
     obstacles: Obstacles | None,
     goal_velocity: np.ndarray | None = None,
     commitment: Commitment | None = None,
+    disturbance: DisturbanceEstimate | None = None,
 ) -> Problems:
     """Return robots' planning problems, which start when their inputs take effect.
 
@@ -140,13 +142,15 @@ def make_problems(
     :param goal_velocity: velocities of the goals, (E, n, 3), world frame (m/s), None for goals that stand. Robots fly
         to where their goals will be at the end of the horizon, so that they do not fall behind
     :param commitment: the plans that robots sent, None if their planner does not keep to them
+    :param disturbance: accelerations that robots estimate, None for none
     """
     if goal_velocity is not None:
         ahead = config.planner.dt * (config.planner.horizon + (0.0 if late is None else late[..., None]))
         goal = goal + ahead * goal_velocity
     x = estimate
     if late is not None:
-        x = model.ahead(x, u, late * config.planner.dt)
+        pushed = None if disturbance is None else disturbance.acceleration
+        x = model.ahead(x, u, late * config.planner.dt, pushed)
         resample(believed, late)
     announced = None
     if config.planner.right_of_way:
@@ -154,6 +158,8 @@ def make_problems(
     others = believed.reshape(-1, *believed.shape[2:])
     # Copies: a solver that writes into its problem must not move robots or goals
     problems = Problems(x.reshape(-1, 9).copy(), goal.reshape(-1, 3).copy(), others, announced=announced)
+    if disturbance is not None:
+        problems = problems._replace(disturbance=disturbance.acceleration.reshape(-1, 3).copy())
     if commitment is not None:
         reference, weight = commitment.reference(late)
         problems = problems._replace(reference=reference, reference_weight=weight)

@@ -21,6 +21,7 @@ from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.validation import points
 from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
 from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacle, Obstacles, Surroundings, surroundings
@@ -145,6 +146,7 @@ class Swarm(SwarmState):
             neighbours=Neighbours(n_swarms, n, config.neighbourhood),
             obstacles=Obstacles.of(config.obstacles, n_swarms),
             commitment=Commitment.of(config.planner, n_swarms, n),
+            disturbance=DisturbanceEstimate.of(config.planner, self.planner.model, n_swarms, n),
         )
         if not self.neighbours.limited:
             self._pairs = np.triu_indices(n, k=1)
@@ -294,6 +296,8 @@ class Swarm(SwarmState):
         self._radio.reset(swarm, self.plans[swarm, ..., POSITION])
         if self.commitment is not None:
             self.commitment.forget(swarm)
+        if self.disturbance is not None:
+            self.disturbance.forget(swarm)
         self._u[swarm] = 0.0
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
@@ -395,9 +399,14 @@ class Swarm(SwarmState):
             assumes that it arrives, however far the receiver is
         """
         believed, source = self._believe(requests, announced)
+        if self.disturbance is not None:
+            self.disturbance.update(self._estimate())
         started = time.perf_counter()
-        self._plans = self.planner.plan(self._problems(believed, source), self._plans)
+        problems = self._problems(believed, source)
+        self._plans = self.planner.plan(problems, self._plans)
         solve_seconds = time.perf_counter() - started
+        if self.disturbance is not None:
+            self.disturbance.expect(problems.x.reshape(self.state.shape), self.inputs, self._late)
         positions = self._fly()
         if self.route is not None:
             self.route.advance(self.config.planner.dt)
@@ -441,11 +450,16 @@ class Swarm(SwarmState):
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""
-        start = self.disturbances.start
-        late = None if start is None else start / self.config.substeps
+        late = self._late
         goal_velocity = None if self.route is None else self.route.current_velocity()
         arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles, goal_velocity)
-        return make_problems(self.config, self.planner.model, *arguments, self.commitment)
+        return make_problems(self.config, self.planner.model, *arguments, self.commitment, self.disturbance)
+
+    @property
+    def _late(self) -> np.ndarray | None:
+        """When inputs take effect, as a fraction of a step, (E, n); None if all do so at once."""
+        start = self.disturbances.start
+        return None if start is None else start / self.config.substeps
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""

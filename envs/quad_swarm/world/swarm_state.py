@@ -13,6 +13,7 @@ from quad_swarm.planner import Plans, PlanStatus
 from quad_swarm.states import MOST_STEPS, like
 from quad_swarm.world.beliefs import Beliefs
 from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.radio import RadioChannel
@@ -48,6 +49,7 @@ class SwarmState:
     neighbours: Neighbours
     obstacles: Obstacles | None
     commitment: Commitment | None
+    disturbance: DisturbanceEstimate | None
     route: Route | None = None  # comes and goes in flight, and is not in states of before it existed
 
     def keep(self, swarms: np.ndarray) -> None:

@@ -49,6 +49,7 @@ def generate_model(problem: OptimalControlProblem) -> str:
     lines += [
         f"constexpr bool SHAPED = {str(problem.shaped).lower()};",
         f"constexpr bool COMMITTED = {str(problem.committed).lower()};",
+        f"constexpr bool DISTURBED = {str(problem.disturbed).lower()};",
         f"constexpr double VIOLATION_WEIGHT = {problem.config.violation_weight!r};",
         _array("double", "MAX_INPUT", problem.max_input.full().ravel()),
         _array("int", "BOUNDED_STATE", state),
@@ -60,6 +61,7 @@ def generate_model(problem: OptimalControlProblem) -> str:
     functions = [
         _emit("dynamics", {"x": x, "u": u}, {"x_next": x_next}),
         _emit("linearise", {"x": x, "u": u}, {"x_next": x_next, "a": a_values, "b": b_values}),
+        _emit("drift", {"disturbance": (push := ca.SX.sym("disturbance", 3))}, {"moved": problem.drift(push)}),
         *_costs(problem),
         *_riccati(problem, (a, a_symbols), (b, b_symbols)),
     ]
@@ -78,9 +80,10 @@ def formulas(problem: OptimalControlProblem) -> tuple[object, ...]:
         problem.repulsion_residual(distance),
         problem.repulsion_cost(distance),
         problem.box_violations(x),
+        problem.drift(goal),
     ]
     function = ca.Function("formulas", [x, u, x0, goal, others, distance], outputs)
-    sizes = problem.n_others, problem.shaped, problem.committed, *problem.max_input.full().ravel()
+    sizes = problem.n_others, problem.shaped, problem.committed, problem.disturbed, *problem.max_input.full().ravel()
     return problem.config, sizes, function.serialize()
 
 

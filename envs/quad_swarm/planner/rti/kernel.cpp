@@ -34,6 +34,8 @@ struct Batch {
   const double* size;     // (count, N_OTHERS), or null
   const double* reference;         // (count, N, 3), or null
   const double* reference_weight;  // (count, N), or null
+  const double* disturbance;       // (count, 3), or null
+  const double* steady_input;      // (count, 4), or null
   double* x_plan;         // (count, N + 1, 9)
   double* u_plan;         // (count, N, 4)
   std::uint8_t* success;  // (count,)
@@ -160,6 +162,7 @@ class LaneGroup {
   V x0_[NX], goal_[3];
   V shape_[SHAPED ? N_OTHERS : 0][3], size_[SHAPED ? N_OTHERS : 0];
   V goal_gradient_[NX], goal_hessian_[N_SYMMETRIC];
+  V moved_[DISTURBED ? NX : 0], steady_input_[DISTURBED ? NU : 0];
   Mask iterations_, converged_, moving_;
 
   void load(const Batch& batch, const double* u_guess, const std::int64_t* problems, int count) {
@@ -178,6 +181,7 @@ class LaneGroup {
     }
     if constexpr (SHAPED) load_shapes(batch, problems, count);
     if constexpr (COMMITTED) load_references(batch, problems, count);
+    if constexpr (DISTURBED) load_disturbances(batch, problems, count);
     for (int k = 0; k < N; k++) {
       limit_inputs(stages_[k].u);
       for (int j = 0; j < N_OTHERS; j++) {
@@ -214,6 +218,20 @@ class LaneGroup {
     }
   }
 
+  void load_disturbances(const Batch& batch, const std::int64_t* problems, int count) {
+    V disturbance[3] = {};
+    for (int i = 0; i < NU; i++) steady_input_[i] = V{};
+    for (int q = 0; q < W; q++) {
+      const std::int64_t problem = problems[q < count ? q : count - 1];
+      if (batch.disturbance)
+        for (int i = 0; i < 3; i++) disturbance[i][q] = static_cast<T>(batch.disturbance[problem * 3 + i]);
+      if (batch.steady_input)
+        for (int i = 0; i < NU; i++)
+          steady_input_[i][q] = static_cast<T>(batch.steady_input[problem * INPUT_STRIDE + i]);
+    }
+    ::drift<V>(disturbance, moved_);
+  }
+
   static void limit_inputs(V* u) {
     for (int i = 0; i < NU; i++) {
       const V limit = splat<V>(MAX_INPUT[i]);
@@ -228,7 +246,14 @@ class LaneGroup {
     for (int k = 0; k < N; k++) {
       Stage<V>& s = stages_[k];
       ::linearise<V>(x, s.u, s.x, s.a, s.b);
-      ::input_gradient<V>(s.u, s.input_gradient);
+      if constexpr (DISTURBED) {
+        V beyond[NU];
+        for (int i = 0; i < NX; i++) s.x[i] += moved_[i];
+        for (int i = 0; i < NU; i++) beyond[i] = s.u[i] - steady_input_[i];
+        ::input_gradient<V>(beyond, s.input_gradient);
+      } else {
+        ::input_gradient<V>(s.u, s.input_gradient);
+      }
       for (int i = 0; i < NU; i++) {
         const V limit = splat<V>(MAX_INPUT[i]);
         s.input_low[i].start(limit + s.u[i]);
@@ -445,18 +470,21 @@ class LaneGroup {
 template <int W>
 void roll_out(const Batch& batch, std::int64_t first, int count) {
   using V = typename LaneTypes<double, W>::Real;
-  V x[NX] = {}, u[NU] = {}, x_next[NX];
+  V x[NX] = {}, u[NU] = {}, x_next[NX], disturbance[3] = {}, moved[NX] = {};
   for (int q = 0; q < count; q++) {
     const double* from = batch.x + (first + q) * STATE_STRIDE;
     double* to = batch.x_plan + (first + q) * (N + 1) * STATE_STRIDE;
     for (int i = 0; i < STATE_STRIDE; i++) to[i] = from[i];
     for (int i = 0; i < NX; i++) x[i][q] = from[i];
+    if (DISTURBED && batch.disturbance)
+      for (int i = 0; i < 3; i++) disturbance[i][q] = batch.disturbance[(first + q) * 3 + i];
   }
+  if constexpr (DISTURBED) ::drift<V>(disturbance, moved);
   for (int k = 0; k < N; k++) {
     for (int q = 0; q < count; q++)
       for (int i = 0; i < NU; i++) u[i][q] = batch.u_plan[((first + q) * N + k) * INPUT_STRIDE + i];
     ::dynamics<V>(x, u, x_next);
-    for (int i = 0; i < NX; i++) x[i] = x_next[i];
+    for (int i = 0; i < NX; i++) x[i] = DISTURBED ? x_next[i] + moved[i] : x_next[i];
     for (int q = 0; q < count; q++) {
       double* to = batch.x_plan + ((first + q) * (N + 1) + k + 1) * STATE_STRIDE;
       for (int i = 0; i < STATE_STRIDE; i++) to[i] = i < NX ? x[i][q] : 0.0;
@@ -497,11 +525,12 @@ void solve_all(const Batch& batch, const double* u_guess, const std::vector<std:
 extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
     std::int64_t count, const double* x, const double* goal, const double* others, const double* clearance,
     const double* shape, const double* size, const double* reference, const double* reference_weight,
-    const double* u_guess, double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations,
+    const double* disturbance, const double* steady_input, const double* u_guess, double* x_plan, double* u_plan,
+    std::uint8_t* success, std::int64_t* iterations,
     std::int64_t sqp_iterations, std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
   std::vector<std::uint8_t> moving(count);
-  const Batch batch{x,      goal,   others,  clearance,  shape,         size, reference, reference_weight,
-                    x_plan, u_plan, success, iterations, moving.data()};
+  const Batch batch{x,           goal,         others, clearance, shape,   size,       reference,    reference_weight,
+                    disturbance, steady_input, x_plan, u_plan,    success, iterations, moving.data()};
   const Options options{max_iterations, tolerance};
   std::fill(iterations, iterations + count, 0);
   std::vector<std::int64_t> problems(count);

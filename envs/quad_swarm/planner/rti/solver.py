@@ -32,6 +32,8 @@ SIGNATURE = Signature(
     size="B m f8 optional",
     reference="B N 3 f8 optional",
     reference_weight="B N f8 optional",
+    disturbance="B 3 f8 optional",
+    steady_input=f"B {N_INPUTS} f8 optional",
     u_guess=f"B N {N_INPUTS} f8",
     x_plan=f"B N+1 {N_STATES} f8 out",
     u_plan=f"B N {N_INPUTS} f8 out",
@@ -108,7 +110,7 @@ class RtiSolver:
 
         :raises ValueError: if an array has another shape than the problem's
         """
-        names = ("clearance", "shape", "size", "reference", "reference_weight")
+        names = ("clearance", "shape", "size", "reference", "reference_weight", "disturbance", "steady_input")
         arrays = {name: getattr(problems, name) for name in names}
         given = {name: None if array is None else np.asarray(array, float) for name, array in arrays.items()}
         return self._compiled()(
