@@ -101,7 +101,7 @@ class DisturbanceEstimate:
 
 
 def _largest(config: PlannerConfig, model: QuadrotorModel) -> np.ndarray:
-    """Return the accelerations that robots can hold against with nine tenths of their tilt and climb rate, (3,) (m/s^2)."""
+    """Return the accelerations against which nine tenths of tilt and climb rate hold robots, (3,) (m/s^2)."""
     params = model.params
     sideways = params.gravity * np.tan(0.9 * config.max_tilt * np.array([params.pitch_gain, params.roll_gain]))
     return np.array([*sideways, 0.9 * config.max_climb_rate * params.climb_gain / params.climb_time_constant])

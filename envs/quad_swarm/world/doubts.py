@@ -147,14 +147,15 @@ def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
 
 
 def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:
-    """Return the distance to the goal (m) at which robots stand in a steady wind, which their planner does not know;
-    infinity if the wind blows them away.
+    """Return the distance to the goal (m) at which robots stand in a steady wind, 0 if they estimate it; infinity if
+    the wind blows them away.
 
     :param config: the world
     :param wind: speed of the wind (m/s), by default the world's
     """
     wind = config.noise.wind if wind is None else wind
-    return max(axis.offset(wind) for axis in axes(config.planner, config.quadrotor))
+    offset = max(axis.offset(wind) for axis in axes(config.planner, config.quadrotor))
+    return 0.0 if config.planner.disturbance_time is not None and math.isfinite(offset) else offset
 
 
 def arrival_radius(config: SwarmConfig) -> float:
@@ -167,9 +168,10 @@ def _unsteadiness(config: SwarmConfig) -> dict[str, float]:
     `flight` (docs/flight.md) and `paper`; what is added in each step adds up as a random walk."""
     noise, sensing = config.noise, config.sensing
     per_step = 1 / math.sqrt(config.planner.dt)
+    of_gusts = max(axis.offset(_LIGHT_AIR) for axis in axes(config.planner, config.quadrotor)) / _LIGHT_AIR
     return {
         "noise.wind": 1.1 * standing_offset(config),
-        "noise.gust": 1.1 * noise.gust * standing_offset(config, _LIGHT_AIR) / _LIGHT_AIR,
+        "noise.gust": 1.1 * noise.gust * of_gusts,
         "noise.vel": _SETTLING * noise.vel,
         "noise.attitude": 0.6 * per_step * noise.attitude,
         "sensing.vel": 0.6 * sensing.vel,

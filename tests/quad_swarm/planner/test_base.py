@@ -259,6 +259,41 @@ def test_both_solvers_keep_to_references_alike():
     np.testing.assert_allclose(*planned, atol=0.02)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_a_known_disturbance_moves_nobody_from_the_goal(solver, yaw):
+    config = PlannerConfig(disturbance_time=1.0)
+    planner, model = make_planner(config, QUADROTOR, 2, solver), QuadrotorModel(QUADROTOR, config.dt)
+    x, push = np.zeros((1, 9)), np.array([[0.6, -0.4, -0.5]])
+    x[0, :3], x[0, 8] = [0.2, 0, 1.5], yaw
+    others = np.full((1, 1, config.horizon, 3), 50.0)
+    problems = Problems(x, np.array([[0.0, 0.0, 1.5]]), others, disturbance=push)
+    plans = hover(problems, config)
+    for _ in range(70):
+        plans = planner.plan(problems, plans)
+        assert plans.status[0] == PlanStatus.SOLVED
+        x = model.step(problems.x, plans.u[:, 0])
+        for part, change in zip((slice(0, 3), slice(3, 6)), QUADROTOR.drift(config.dt), strict=True):
+            x[:, part] += change * push
+        np.testing.assert_allclose(x, plans.x[:, 1], atol=1e-6, err_msg="it flies as planned")
+        problems = problems._replace(x=x)
+    # With a yaw, the gains of roll and pitch, which differ a little, are those of a heading of 0
+    np.testing.assert_allclose(x[0, :6], [0, 0, 1.5, 0, 0, 0], atol=4e-3 if yaw else 1e-4)
+    plain = make_planner(PlannerConfig(), QUADROTOR, 2, solver)
+    with pytest.raises(ValueError, match=r"disturbance: this planner knows none; set planner\.disturbance_time"):
+        plain.plan(problems, plans)
+
+
+def test_robots_brake_against_a_disturbance():
+    planner = make_planner(PlannerConfig(disturbance_time=1.0, horizon=60), QUADROTOR, 2, "fatrop")
+    x, push = np.zeros((2, 9)), np.array([[0.6, -0.4, -0.5], [0.0, 0.0, 0.0]])
+    x[:, 2], x[:, 3] = 1.5, 1.0
+    u = planner.braking_inputs(x, push)
+    end = planner.model.rollout(x, u, push)[:, -1]
+    assert np.linalg.norm(end[:, 3:6], axis=1).max() < 0.01
+    np.testing.assert_array_equal(u[1], planner.braking_inputs(x)[1])
+
+
 @pytest.mark.parametrize("solver", ["rti", "fatrop"])
 def test_a_large_body_far_away_takes_the_place_of_a_small_one_nearby(solver):
     """What counts is the distance to the surface, in the metric of the shape."""

@@ -97,7 +97,8 @@ def test_robots_fly_as_the_swarm_with_a_radio_that_distance_limits(radio, rule):
 @pytest.mark.parametrize("rule", ["full", "stage:1.0:0.2", "cpa:1.2s:3&stale:4|stage:1.0:0.2"])
 @pytest.mark.parametrize("radio", [{}, {"delay": 0, "round_trip": 1}])
 def test_robots_keep_to_what_they_told_as_the_swarm_does(radio, rule):
-    config = make_config("flight", {"planner": {"commitment": 3.0}, "radio": radio}, n_robots=3)
+    planner = {"commitment": 3.0, "disturbance_time": 1.0}
+    config = make_config("flight", {"planner": planner, "radio": radio}, n_robots=3)
     assert not list(differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap"))
 
 
@@ -127,6 +128,7 @@ CHANGED = {
     "no memory": {"memory": 0.0},
     "few neighbours planned with": {"planner": {"max_neighbours": 2}},
     "yaw": {"planner": {"max_yaw_rate": 1.0}},
+    "a disturbance estimated": {"planner": {"disturbance_time": 1.0, "max_yaw_rate": 1.0}},
     "commitment": {"planner": {"commitment": 3.0}},
     "commitment in a network": {"planner": {"commitment": 3.0}, "radio": {"delay": 0, "round_trip": 1}},
     "no sensing errors": {"sensing": {"pos": 0.0, "vel": 0.0, "attitude": 0.0, "others_pos": 0.0, "others_vel": 0.0}},
