@@ -123,8 +123,10 @@ class DelayCheckedSwarm(Swarm):
             x = self.planner.model.ahead(x, self._u, start / self.config.substeps * self.config.planner.dt)
         inputs = self._inputs[:, :, COMMITTED].copy()
         inputs[:, :, 0] += (self._x[:, :, COMMITTED, 0] - x) @ self._feedback.T
-        limits = [self.config.planner.max_tilt] * 2 + [self.config.planner.max_climb_rate, 0.0]
-        inputs[:, :, 0] = np.clip(inputs[:, :, 0], -np.array(limits), limits)
+        planner = self.config.planner
+        most = np.array([planner.max_tilt, planner.max_tilt, planner.max_climb_rate, 0.0])
+        least = np.array([-planner.max_tilt, -planner.max_tilt, -planner.descent_rate, 0.0])
+        inputs[:, :, 0] = np.clip(inputs[:, :, 0], least, most)
         horizon, count = self.config.planner.horizon, self._pending.size
         flown, none = self._x[:, :, COMMITTED, : horizon + 1], np.zeros(count, dtype=np.int64)
         self._plans = Plans(

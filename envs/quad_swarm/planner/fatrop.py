@@ -183,9 +183,9 @@ def transcribe(problem: OptimalControlProblem) -> Program:
     step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
 
     cost = problem.goal_cost(states[-1], x0, goal)
-    variables, lower, x_index, u_index = [], [], [], []
+    variables, lower, upper, x_index, u_index = [], [], [], [], []
     constraints, constraint_lower, equality, n_slacks = [], [], [], []
-    max_input = problem.max_input.full().ravel()
+    min_input, max_input = problem.min_input.full().ravel(), problem.max_input.full().ravel()
     farthest = config.separation * (_LARGEST_EXPONENT / config.repulsion_steepness + config.repulsion_buffer)
     offset = 0
     for k in range(horizon + 1):
@@ -194,6 +194,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
         if k > 0:
             variables.append(states[k])
             lower.append(np.full(nx, -np.inf))
+            upper.append(np.full(nx, np.inf))
             x_index.append(np.arange(offset, offset + nx))
             offset += nx
             around = others[:, [j * horizon + k - 1 for j in range(n_others)]]
@@ -212,7 +213,8 @@ def transcribe(problem: OptimalControlProblem) -> Program:
         if k < horizon:
             cost += problem.input_cost(inputs[k] - free)
             variables.append(inputs[k])
-            lower.append(-max_input)
+            lower.append(min_input)
+            upper.append(max_input)
             u_index.append(np.arange(offset, offset + nu))
             offset += nu
             constraints.append(states[k + 1] - step(states[k], inputs[k]) - moved)
@@ -220,12 +222,12 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             equality += [True] * nx
         variables.append(slack)
         lower.append(np.full(n_slacks[k], -np.inf))
+        upper.append(np.full(n_slacks[k], np.inf))
         offset += n_slacks[k]
         if k > 0:
             constraints += [d - config.separation - clearance[k - 1, j] + slack[j] for j, d in enumerate(distances)]
             constraint_lower.append(np.zeros(n_others))
             equality += [False] * n_others
-    bounds = np.concatenate(lower)
     return Program(
         nlp={
             "x": ca.vertcat(*variables),
@@ -234,8 +236,8 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size, *kept_to, *pushed),
         },
         bounds={
-            "lbx": bounds,
-            "ubx": -bounds,
+            "lbx": np.concatenate(lower),
+            "ubx": np.concatenate(upper),
             "lbg": np.concatenate(constraint_lower),
             "ubg": np.where(equality, 0.0, np.inf),
         },

@@ -36,14 +36,17 @@ class PlannerConfig:
     :param separation: minimum distance between the centres of two robots (m), 2r in the paper; `make_config` adapts it
         when the radius changes
     :param max_tilt: limit of the commanded roll and pitch (rad)
-    :param max_climb_rate: limit of the commanded climb rate (m/s)
+    :param max_climb_rate: limit of the commanded climb rate, upwards (m/s)
+    :param max_descent_rate: limit of the commanded climb rate, downwards (m/s); None for that upwards
     :param max_yaw_rate: limit of the commanded yaw rate (rad/s); 0 fixes the yaw and removes it from the problem
     :param max_speed: soft limit of the velocity along x and along y (m/s)
-    :param max_vertical_speed: soft limit of the velocity along z (m/s)
+    :param max_vertical_speed: soft limit of the velocity along z, upwards (m/s)
+    :param max_descent_speed: soft limit of the velocity along z, downwards (m/s); None for that upwards
     :param workspace_low: lower corner of the workspace, a soft limit (m)
     :param workspace_high: upper corner of the workspace, a soft limit (m)
     :param goal_weight: weight of the terminal squared distance to the goal, divided by max(1, current squared distance)
-    :param input_weight: weight of the squared inputs, each divided by its limit
+    :param input_weight: weight of the squared inputs, each divided by its limit; the climb rate by the larger of its
+        two limits
     :param repulsion_weight: weight of the smooth repulsion from each other robot
     :param repulsion_buffer: distance at which the repulsion is at half of its maximum, in separations (-)
     :param repulsion_steepness: steepness of the repulsion, per separation (-)
@@ -92,6 +95,8 @@ class PlannerConfig:
     commitment: Annotated[float, Field(ge=0, le=1e4)] = 0.0
     commitment_fade: NonNegativeFloat = 2.0
     disturbance_time: Annotated[float, Field(ge=1e-3, le=1e4)] | None = None
+    max_descent_rate: _Rate | None = None
+    max_descent_speed: PositiveFloat | None = None
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.workspace_low, self.workspace_high, strict=True)):
@@ -99,6 +104,16 @@ class PlannerConfig:
                 f"Empty workspace: planner.workspace_low={self.workspace_low} must be below "
                 f"planner.workspace_high={self.workspace_high} along every axis"
             )
+
+    @property
+    def descent_rate(self) -> float:
+        """Limit of the commanded climb rate, downwards (m/s)."""
+        return self.max_climb_rate if self.max_descent_rate is None else self.max_descent_rate
+
+    @property
+    def descent_speed(self) -> float:
+        """Soft limit of the velocity along z, downwards (m/s)."""
+        return self.max_vertical_speed if self.max_descent_speed is None else self.max_descent_speed
 
 
 def check_vehicle(config: PlannerConfig, quadrotor: QuadrotorParams, mismatch: float = 0.0) -> None:
@@ -204,6 +219,14 @@ class OptimalControlProblem:
         limits = [config.max_tilt, config.max_tilt, config.max_climb_rate, config.max_yaw_rate]
         self.max_input = ca.DM(limits[: self.nu])
 
+    @property
+    def min_input(self) -> ca.DM:
+        """Lower limits of the inputs, (nu,): the negative upper ones, unless descents have their own."""
+        lowest = -self.max_input
+        if self.config.max_descent_rate is not None:
+            lowest[2] = -self.config.max_descent_rate
+        return lowest
+
     def dynamics(self, x: ca.SX, u: ca.SX) -> ca.SX:
         """Return the next state, (nx,), in still air (eq. 1). Roll and pitch are about the world's axes; `Planner.plan`
         converts them from and to those of the heading."""
@@ -217,8 +240,9 @@ class OptimalControlProblem:
         return ca.vertcat(ca.DM(position) * disturbance, ca.DM(velocity) * disturbance, ca.SX.zeros(self.nx - 6))
 
     def input_cost(self, u: ca.SX) -> ca.SX:
-        """Return the cost of the inputs of one stage, each divided by its limit."""
-        return self.config.input_weight * ca.sumsqr(u / self.max_input)
+        """Return the cost of the inputs of one stage, each divided by the larger of its two limits: the smaller one
+        only cuts it off, and the cost stays quadratic."""
+        return self.config.input_weight * ca.sumsqr(u / ca.fmax(self.max_input, -self.min_input))
 
     def goal_cost(self, x: ca.SX, x0: ca.SX, goal: ca.SX) -> ca.SX:
         """Return the terminal cost: the squared distance to the goal, divided by the current one, so that distant goals
@@ -254,7 +278,8 @@ class OptimalControlProblem:
     def box_violations(self, x: ca.SX) -> ca.SX:
         """Return the amounts by which a state violates the workspace (m) and the speed limits (m/s) if positive."""
         c = self.config
-        speed = ca.DM([c.max_speed, c.max_speed, c.max_vertical_speed])
+        highest = ca.DM([c.max_speed, c.max_speed, c.max_vertical_speed])
+        lowest = -ca.DM([c.max_speed, c.max_speed, c.descent_speed])
         return ca.vertcat(
-            ca.DM(c.workspace_low) - x[:3], x[:3] - ca.DM(c.workspace_high), -speed - x[3:6], x[3:6] - speed
+            ca.DM(c.workspace_low) - x[:3], x[:3] - ca.DM(c.workspace_high), lowest - x[3:6], x[3:6] - highest
         )

@@ -135,15 +135,24 @@ def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
     :param velocities: velocities of goals, (n, 3) (m/s)
     """
     planner = config.planner
-    fastest = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
-    climb = min(planner.max_vertical_speed, planner.max_climb_rate * config.quadrotor.climb_gain)
-    beyond = np.abs(velocities) / [*fastest, climb]
+    fastest = np.empty_like(velocities)
+    fastest[:, :2] = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
+    up, down = vertical_speeds(config)
+    fastest[:, 2] = np.where(velocities[:, 2] < 0, down, up)
+    beyond = np.abs(velocities) / fastest
     if beyond.max(initial=0.0) > 1:
         robot, axis = np.unravel_index(beyond.argmax(), beyond.shape)
         yield (
             f"velocities[{robot}]={velocities[robot].tolist()}: the goal moves faster than the "
-            f"{[*fastest, climb][axis]:.2g} m/s of robots along {'xyz'[axis]}, which fall behind"
+            f"{fastest[robot, axis]:.2g} m/s of robots along {'xyz'[axis]}, which fall behind"
         )
+
+
+def vertical_speeds(config: SwarmConfig) -> tuple[float, float]:
+    """Return how fast robots climb and how fast they descend (m/s)."""
+    planner, gain = config.planner, config.quadrotor.climb_gain
+    up = min(planner.max_vertical_speed, planner.max_climb_rate * gain)
+    return up, min(planner.descent_speed, planner.descent_rate * gain)
 
 
 def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:
@@ -219,11 +228,12 @@ def _doubts_about_the_vehicle(config: SwarmConfig) -> Iterator[str]:
             f"planner.max_speed={planner.max_speed:g} is in m/s: with planner.max_tilt={planner.max_tilt:.3g} rad, the "
             f"vehicle reaches {fastest:.2g} m/s; use at most twice that, or tilt more"
         )
-    fall = vehicle.climb_gain * planner.max_climb_rate / vehicle.climb_time_constant
+    fall = vehicle.climb_gain * planner.descent_rate / vehicle.climb_time_constant
     if fall > vehicle.gravity:
         slower = vehicle.gravity * vehicle.climb_time_constant / vehicle.climb_gain
+        name = "max_climb_rate" if planner.max_descent_rate is None else "max_descent_rate"
         yield (
-            f"planner.max_climb_rate={planner.max_climb_rate:g}: with quadrotor.climb_time_constant="
+            f"planner.{name}={planner.descent_rate:g}: with quadrotor.climb_time_constant="
             f"{vehicle.climb_time_constant:g}, robots descend with {fall:.0f} m/s^2, faster than they would fall; at "
             f"most {slower:.2g} m/s is plausible"
         )
@@ -295,7 +305,7 @@ def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
     time."""
     planner, space, vehicle = config.planner, config.space, config.quadrotor
     speed = max(min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle))), _TINIEST)
-    climb = max(min(planner.max_vertical_speed, planner.max_climb_rate * vehicle.climb_gain), _TINIEST)
+    climb = max(min(vertical_speeds(config)), _TINIEST)
     needed = max(
         1.5 * (_usual_flight(config) - config.goal_radius) / speed,
         (2 / 3 * (space.heights[1] - space.heights[0]) - config.goal_radius) / climb,

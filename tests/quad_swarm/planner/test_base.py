@@ -325,6 +325,40 @@ def test_with_a_cruise_distance_far_goals_are_as_good_as_near_ones(solver):
     np.testing.assert_array_equal(capped.u[3], expected.u[3], "a goal that is near stays as it is")
 
 
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+@pytest.mark.parametrize("rate", [0.3, 2.5])
+def test_climbs_and_descents_have_limits_of_their_own(solver, rate):
+    room = {"workspace_low": (-5, -5, -50), "workspace_high": (5, 5, 50)}
+    config = PlannerConfig(max_descent_rate=rate, max_descent_speed=4.0, **room)
+    problems = crossing(2, config, 1)
+    problems.x[:], problems.others[:] = 0.0, 50.0
+    problems.goal[:] = [[0, 0, 4], [0, 0, -4]]
+    planner = make_planner(config, QUADROTOR, 2, solver)
+    plans, commands = hover(problems, config), []
+    for _ in range(10):
+        plans = planner.plan(problems._replace(x=plans.x[:, 1]), plans)
+        commands.append(plans.u[..., 2])
+    up, down = np.max(commands), np.min(commands)
+    assert (up, down) == pytest.approx((1.0, -rate), rel=1e-3)
+    assert -rate <= down, up <= 1.0
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_a_vertical_speed_may_have_another_limit_downwards(solver):
+    room = {"workspace_low": (-5, -5, -50), "workspace_high": (5, 5, 50)}
+    config = PlannerConfig(max_descent_speed=0.5, **room)
+    problems = crossing(2, config, 1)
+    problems.x[:], problems.others[:] = 0.0, 50.0
+    problems.goal[:] = [[0, 0, 4], [0, 0, -4]]
+    planner = make_planner(config, QUADROTOR, 2, solver)
+    plans, speeds = hover(problems, config), []
+    for _ in range(30):
+        plans = planner.plan(problems._replace(x=plans.x[:, 1]), plans)
+        speeds.append(plans.x[:, 1, 5])
+    assert np.max(speeds) > 1.2
+    assert np.min(speeds) == pytest.approx(-0.5, abs=0.01)
+
+
 def test_a_limit_above_the_number_of_others_changes_nothing():
     problems, _, _ = scattered(PlannerConfig(), 4, 2)
     last = Plans.hover(problems.x, 10)

@@ -51,6 +51,7 @@ def generate_model(problem: OptimalControlProblem) -> str:
         f"constexpr bool COMMITTED = {str(problem.committed).lower()};",
         f"constexpr bool DISTURBED = {str(problem.disturbed).lower()};",
         f"constexpr double VIOLATION_WEIGHT = {problem.config.violation_weight!r};",
+        _array("double", "MIN_INPUT", problem.min_input.full().ravel()),
         _array("double", "MAX_INPUT", problem.max_input.full().ravel()),
         _array("int", "BOUNDED_STATE", state),
         _array("double", "STATE_LOW", low),
@@ -83,8 +84,9 @@ def formulas(problem: OptimalControlProblem) -> tuple[object, ...]:
         problem.drift(goal),
     ]
     function = ca.Function("formulas", [x, u, x0, goal, others, distance], outputs)
-    sizes = problem.n_others, problem.shaped, problem.committed, problem.disturbed, *problem.max_input.full().ravel()
-    return problem.config, sizes, function.serialize()
+    limits = (*problem.min_input.full().ravel(), *problem.max_input.full().ravel())
+    sizes = problem.n_others, problem.shaped, problem.committed, problem.disturbed
+    return problem.config, sizes, limits, function.serialize()
 
 
 def _check_form(problem: OptimalControlProblem) -> None:

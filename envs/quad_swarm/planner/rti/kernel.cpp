@@ -48,7 +48,7 @@ constexpr double START_SLACK = 0.05;  // least t at the start, where the guess i
 constexpr double RESIDUAL_TOLERANCE = 2e-3;  // of the linear conditions, over their residual at the start
 constexpr double COST_IN_TOLERANCE = 0.01;    // violations of metres cost thousands; see tolerance in Options
 constexpr double STEP_TO_BOUNDARY = 0.99;
-constexpr double STILL_MOVING = 0.3;  // change of an input over its limit in the last quadratic program
+constexpr double STILL_MOVING = 0.3;  // change of an input over half of its range in the last quadratic program
 
 // One inequality h + g z >= -s in the step z. A hard one has no violation s; a soft one pays rho s^2 / 2 for it, which
 // makes s = lambda / rho and lets it be eliminated.
@@ -234,9 +234,9 @@ class LaneGroup {
 
   static void limit_inputs(V* u) {
     for (int i = 0; i < NU; i++) {
-      const V limit = splat<V>(MAX_INPUT[i]);
-      u[i] = select<V>(u[i] > limit, limit, u[i]);  // written so that NaN stays NaN
-      u[i] = select<V>(u[i] < -limit, -limit, u[i]);
+      const V low = splat<V>(MIN_INPUT[i]), high = splat<V>(MAX_INPUT[i]);
+      u[i] = select<V>(u[i] > high, high, u[i]);  // written so that NaN stays NaN
+      u[i] = select<V>(u[i] < low, low, u[i]);
     }
   }
 
@@ -255,9 +255,8 @@ class LaneGroup {
         ::input_gradient<V>(s.u, s.input_gradient);
       }
       for (int i = 0; i < NU; i++) {
-        const V limit = splat<V>(MAX_INPUT[i]);
-        s.input_low[i].start(limit + s.u[i]);
-        s.input_high[i].start(limit - s.u[i]);
+        s.input_low[i].start(s.u[i] - splat<V>(MIN_INPUT[i]));
+        s.input_high[i].start(splat<V>(MAX_INPUT[i]) - s.u[i]);
         s.du[i] = V{};
       }
       x = s.x;
@@ -440,7 +439,7 @@ class LaneGroup {
     moving_ = Mask{};
     for (int k = 0; k < N; k++) {
       for (int i = 0; i < NU; i++) {
-        const V du = stages_[k].du[i], limit = splat<V>(STILL_MOVING * MAX_INPUT[i]);
+        const V du = stages_[k].du[i], limit = splat<V>(STILL_MOVING * (MAX_INPUT[i] - MIN_INPUT[i]) / 2);
         stages_[k].u[i] += du;
         moving_ |= (du > limit) | (du < -limit);
       }
@@ -456,7 +455,7 @@ class LaneGroup {
         for (int i = 0; i < INPUT_STRIDE; i++) {
           double value = i < NU ? static_cast<double>(stages_[k].u[i][q]) : 0.0;
           if (i < NU && value > MAX_INPUT[i]) value = MAX_INPUT[i];  // the limit itself rounds in single precision
-          if (i < NU && value < -MAX_INPUT[i]) value = -MAX_INPUT[i];
+          if (i < NU && value < MIN_INPUT[i]) value = MIN_INPUT[i];
           u[k * INPUT_STRIDE + i] = value;
         }
       batch.success[problem] = converged_[q] != 0;
