@@ -45,7 +45,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     Robots start at rest. The scenario draws starts and goals; `reset(options={"starts": ..., "goals": ...})` sets them,
     both (n, 3), m. They must lie in the workspace; robots must not start in contact, and goals must not be too close
     for two robots to be at both. With them, "velocities" (n, 3), m/s, lets goals move, and "waypoints", n sequences
-    (any number, 3), m, are what each robot passes on the way to its goal.
+    (any number, 3), m, are what each robot passes on the way to its goal. "headings" (n,), rad from the x axis
+    counter-clockwise, are what robots turn to, the short way, for which they need a `planner.max_yaw_rate`.
 
     ## Goals in Flight
     Gymnasium's `step` takes an action only, so goals are changed between steps: `env.unwrapped.set_goals(...)`.
@@ -92,7 +93,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
-    reset_options = ("starts", "goals", "velocities", "waypoints")
+    reset_options = ("starts", "goals", "velocities", "waypoints", "headings")
 
     @with_fields(TaskOptions)
     def __init__(self, options: TaskOptions, render_mode: str | None = None):
@@ -126,12 +127,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
                 f"reset options name only {', '.join(map(repr, options))}; pass both 'starts' and 'goals'."
             )
         if options:
-            velocities, waypoints = options.get("velocities"), options.get("waypoints")
-            self.task.place(
-                *(0, "custom", options["starts"], options["goals"], self.np_random),
-                velocities=velocities,
-                waypoints=waypoints,
-            )
+            starts, goals = options.pop("starts"), options.pop("goals")
+            self.task.place(0, "custom", starts, goals, self.np_random, **options)
         else:
             self.task.reset(0, self.np_random)
         self._requests = np.zeros_like(self._requests)
@@ -167,7 +164,12 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
 
     def set_goals(
-        self, goals: Any, velocities: Any = None, waypoints: Any = None, robots: Sequence[int] | None = None
+        self,
+        goals: Any,
+        velocities: Any = None,
+        waypoints: Any = None,
+        robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> np.ndarray:
         """Let k robots fly to other goals from now on. Their former goals and waypoints are forgotten, and the episode
         counts as arrived only when all robots are at the goals that they have now.
@@ -177,13 +179,15 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         :param waypoints: what each of the robots passes before, k sequences (any number, 3), world frame (m), by
             default nothing
         :param robots: indices of the robots, (k,), by default all
+        :param headings: headings that the robots turn to, (k,) (rad), by default as before
         :return: the observation of all robots, (n, size) float32, with the new goals
-        :raises ValueError: if there are no such robots, or goals do not fit, see `SwarmConfig.check_goals`
+        :raises ValueError: if there are no such robots, or goals or headings do not fit, see `SwarmConfig.check_goals`
+            and `SwarmConfig.check_headings`
         :raises gymnasium.error.ResetNeeded: if ``reset`` has not been called yet
         """
         if not self._is_reset:
             raise need_reset("set_goals")
-        self.task.set_goals(0, goals, velocities, waypoints, robots)
+        self.task.set_goals(0, goals, velocities, waypoints, robots, headings)
         return self.task.observe()[0]
 
     def state_dict(self) -> dict[str, Any]:

@@ -61,10 +61,15 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         return self._rows(observation), {agent: dict(info) for agent in self.agents}
 
     def set_goals(
-        self, goals: Any, velocities: Any = None, waypoints: Any = None, robots: Sequence[int] | None = None
+        self,
+        goals: Any,
+        velocities: Any = None,
+        waypoints: Any = None,
+        robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> dict[str, np.ndarray]:
         """See `QuadSwarmEnv.set_goals`. Returns the observations of all robots, with the new goals."""
-        return self._rows(self.team.set_goals(goals, velocities, waypoints, robots))
+        return self._rows(self.team.set_goals(goals, velocities, waypoints, robots, headings))
 
     def state_dict(self) -> dict[str, Any]:
         """See `QuadSwarmEnv.state_dict`."""

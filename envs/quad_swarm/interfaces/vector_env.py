@@ -106,6 +106,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         velocities: Any = None,
         waypoints: Any = None,
         robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> np.ndarray:
         """Let robots of one swarm fly to other goals from now on, until its episode ends; see `QuadSwarmEnv.set_goals`.
 
@@ -118,7 +119,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
             raise need_reset("set_goals")
         if isinstance(swarm, bool) or not isinstance(swarm, (int, np.integer)) or not 0 <= swarm < self.num_envs:
             raise ValueError(f"swarm={shown(swarm)}: it must be the number of a swarm, from 0 to {self.num_envs - 1}.")
-        self.task.set_goals(int(swarm), goals, velocities, waypoints, robots)
+        self.task.set_goals(int(swarm), goals, velocities, waypoints, robots, headings)
         return self.task.observe(np.arange(self.num_envs) == swarm)[0]
 
     def state_dict(self) -> dict[str, Any]:

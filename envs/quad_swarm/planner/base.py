@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from quad_swarm.errors import shown
-from quad_swarm.geometry import length
+from quad_swarm.geometry import length, wrapped
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, QuadrotorModel
@@ -61,6 +61,7 @@ class PlanStatus(IntEnum):
 
 
 _TYPES = (np.dtype(float), np.dtype(float), np.dtype(bool), np.dtype(np.int64))  # of a solution's arrays
+SAME_HEADING = 1e-6  # rad by which headings may differ that are the same
 _LARGEST = 1e9  # state or input, beyond which a solver has diverged
 _SOLVED, _BRAKING = int(PlanStatus.SOLVED), int(PlanStatus.BRAKING)  # NumPy is slow with enumerations
 
@@ -120,7 +121,8 @@ class Planner:
     def plan(self, problems: Problems, previous: Plans) -> Plans:
         """Solve a batch of B problems; solver failures never raise.
 
-        Robots may have any heading. Limits of roll and pitch hold along the heading.
+        Robots may have any heading, and turn to that of their problem the short way. Limits of roll and pitch hold
+        along the heading.
 
         :param problems: the batch
         :param previous: plans of the same robots in the previous step
@@ -138,22 +140,23 @@ class Planner:
             flat = np.ones((*problems.others.shape[:2], 3))
             flat[..., 2] = 1 / self.config.downwash
             problems = problems._replace(shape=flat)
-        if not np.count_nonzero(problems.x[:, 8]):
+        heading = problems.heading if self.config.max_yaw_rate else None
+        if not (np.count_nonzero(problems.x[:, 8]) or (heading is not None and np.count_nonzero(heading))):
             return self._plan(problems, previous)
-        # Within, roll and pitch are those about the world's axes, to which the problem has no yaw. Only robots with a
-        # yaw are turned, so that a plan does not depend on the batch it is in
-        rows = np.flatnonzero(problems.x[:, 8])
-        yaw, old = problems.x[rows, 8], previous.x[rows, :, 8]
+        # Within, roll and pitch are those about the world's axes, to which the problem has no yaw, and the yaw is that
+        # from the heading. Only robots with either are turned, so that a plan does not depend on the batch it is in
+        aims = np.zeros(len(problems.x)) if heading is None else heading
+        rows = np.flatnonzero((problems.x[:, 8] != 0) | (aims != 0))
+        yaw, old, aim = problems.x[rows, 8], previous.x[rows, :, 8], aims[rows]
         with np.errstate(invalid="ignore"):  # an infinite yaw fails like other states that are not finite
-            wrapped = np.remainder(yaw + np.pi, 2 * np.pi) - np.pi
+            left = wrapped(yaw - aim)
         start, before, u_before = problems.x.copy(), previous.x.copy(), previous.u.copy()
         start[rows], before[rows] = turned(start[rows], -yaw), turned(before[rows], -old)
-        start[rows, 8], before[rows, :, 8] = wrapped, old + (wrapped - yaw)[:, None]
+        start[rows, 8], before[rows, :, 8] = left, old + (left - yaw)[:, None]
         u_before[rows] = turned(u_before[rows], -old[:, :-1], 0)
         plans = self._plan(problems._replace(x=start), previous._replace(x=before, u=u_before))
-        planned = (
-            plans.x[rows, :-1, 8] if self.config.max_yaw_rate else np.repeat(wrapped[:, None], old.shape[1] - 1, 1)
-        )
+        planned = plans.x[rows, :-1, 8] if self.config.max_yaw_rate else np.repeat(left[:, None], old.shape[1] - 1, 1)
+        planned = planned + aim[:, None]
         u, limit = turned(plans.u[rows], planned, 0), self.config.max_tilt
         u[..., :2] = np.clip(u[..., :2], -limit, limit)
         pushed = None if problems.disturbance is None else problems.disturbance[rows]
@@ -203,7 +206,11 @@ class Planner:
                 raise ValueError("disturbance: this planner knows none; set planner.disturbance_time.")
         if (weights := about.get("reference_weight")) is not None and np.any(weights < 0):
             raise ValueError("reference_weight: weights must not be negative.")
-        return Problems(x, goal, others, **about), Plans(
+        if (heading := problems.heading) is not None:
+            heading = _array("heading", heading, (count,))
+            if not self.config.max_yaw_rate and np.abs(wrapped(heading - x[:, 8])).max(initial=0.0) > SAME_HEADING:
+                raise ValueError("heading: this planner holds the yaw of robots; create it with max_yaw_rate above 0.")
+        return Problems(x, goal, others, **about, heading=heading), Plans(
             # The last plan is a guess, so that numbers which are not finite only cost a retry
             _array("previous.x", previous.x, (count, stages + 1, N_STATES), finite=False),
             _array("previous.u", previous.u, (count, stages, N_INPUTS), finite=False),

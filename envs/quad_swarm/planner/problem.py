@@ -158,6 +158,8 @@ class Problems(NamedTuple):
         (m/s^2); None for none
     :param steady_input: inputs that hold the robots against them, which cost nothing, (B, 4); `Planner` sets them, with
         roll and pitch about the world's axes
+    :param heading: headings at which the yaw costs nothing, (B,) (rad); None for 0. They need a planner that may turn,
+        ``max_yaw_rate > 0``, and are `Planner`'s: it turns problems so that solvers see headings of 0
     """
 
     x: np.ndarray
@@ -171,6 +173,7 @@ class Problems(NamedTuple):
     reference_weight: np.ndarray | None = None
     disturbance: np.ndarray | None = None
     steady_input: np.ndarray | None = None
+    heading: np.ndarray | None = None
 
     def part(self, which: Any) -> Problems:
         """Return some of the problems, selected by anything that indexes an array."""
@@ -249,7 +252,7 @@ class OptimalControlProblem:
         do not dominate."""
         cost = self.config.goal_weight * ca.sumsqr(goal - x[:3]) / ca.fmax(ca.sumsqr(goal - x0[:3]), 1.0)
         if self.nx == N_STATES:
-            cost += self.config.goal_weight * x[8] ** 2  # the task prescribes no heading, so fly with yaw zero
+            cost += self.config.goal_weight * x[8] ** 2  # `Planner` turns problems to their headings
         return cost
 
     def distances(self, x: ca.SX, others: ca.SX) -> list[ca.SX]:

@@ -94,7 +94,7 @@ class Loop:
         self.statistics = Statistics()
         self._wait = round(wait * _US)
         self._flying = False
-        self._next: tuple[Any, Any, Any] | None = None  # where to fly to from the next period on
+        self._next: tuple[Any, Any, Any, Any] | None = None  # where to fly to from the next period on
         self._forget()
 
     def warm_up(self) -> None:
@@ -126,13 +126,14 @@ class Loop:
         self._flying = True
         self._began = time.perf_counter(), time.process_time()
 
-    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None) -> None:
+    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None, heading: Any = None) -> None:
         """Fly to another goal from the next period on, see `Robot.fly_to`.
 
-        :raises ValueError: if something has another shape, or is not finite
+        :raises ValueError: if something has another shape, or is not finite, or the robot cannot turn
         """
         target_of(goal, velocity, waypoints)
-        self._next = goal, velocity, waypoints
+        self.robot.check_heading(heading)
+        self._next = goal, velocity, waypoints, heading
 
     def _forget(self) -> None:
         self._next = None

@@ -52,6 +52,7 @@ class LockstepWorld:
         obstacles: Sequence[Obstacle] | None = None,
         velocities: Any = None,
         waypoints: Any = None,
+        headings: Any = None,
     ) -> None:
         """Begin an episode, see `Swarm.reset`."""
         self.state[:], self._u[:], self.now = 0.0, 0.0, 0
@@ -65,7 +66,9 @@ class LockstepWorld:
         for k, robot in enumerate(self.robots):
             goal, velocity, passed = (one[k] for one in targets)
             delay, kept = float(late[k]), 1 + radio.delay
-            robot.reset(starts[k], goal, delay, kept=kept, obstacles=obstacles, velocity=velocity, waypoints=passed)
+            heading = None if headings is None else headings[k]
+            target: dict[str, Any] = {"velocity": velocity, "waypoints": passed, "heading": heading}
+            robot.reset(starts[k], goal, delay, kept=kept, obstacles=obstacles, **target)
         causal = radio.round_trip is not None
         self._flying = deque([] for _ in range(1 + (radio.round_trip or 0) + radio.jitter))
         most = 1 + radio.delay + (0 if causal else radio.jitter)

@@ -69,6 +69,7 @@ class Robot:
     :ivar now: start of the current period (us)
     :ivar hold: where it stays instead of flying to its goal, (1, 1, 3), world frame (m); None to fly
     :ivar late: time from the start of a period until its command takes effect (periods)
+    :ivar heading: heading that it turns to, (1, 1) (rad)
 
     :param config: the world as far as robots know it: team, vehicle, planner and memory
     :param index: number of the robot, from 0
@@ -109,6 +110,7 @@ class Robot:
         obstacles: Sequence[Obstacle] | None = None,
         velocity: Any = None,
         waypoints: Any = None,
+        heading: Any = None,
     ) -> None:
         """Begin to fly.
 
@@ -120,6 +122,7 @@ class Robot:
         :param obstacles: the obstacles, where they are then; by default those that the world lists
         :param velocity: see `fly_to`
         :param waypoints: see `fly_to`
+        :param heading: see `fly_to`, by default that at the start
         :raises ValueError: if there are more obstacles than the world has room for, or goals do not fit, see `fly_to`
         """
         obstacles = self.config.obstacles.listed if obstacles is None else obstacles
@@ -129,7 +132,9 @@ class Robot:
         x[:, POSITION] = start
         self.late, self.now = late, now - self.period
         self.hold: np.ndarray | None = None
-        self.fly_to(goal, velocity, waypoints)
+        self._facing = 0.0
+        self.heading = np.full((1, 1), self._facing)
+        self.fly_to(goal, velocity, waypoints, heading)
         self._estimate, self._u = x[None], np.zeros((1, 1, N_INPUTS))
         self._pos = self._vel = np.zeros((1, 1, len(self.others), 3))
         self._plans = Plans.hover(x, self.config.planner.horizon)
@@ -144,22 +149,36 @@ class Robot:
         self._own = [Plan(now - k * self.period, self.planned_positions()[0, 0]) for k in range(kept, 0, -1)]
         self.source = np.zeros((1, 1, len(self.others)), dtype=np.int64)
 
-    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None) -> None:
+    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None, heading: Any = None) -> None:
         """Fly to another goal from now on. The former goal and waypoints are forgotten.
 
         :param goal: goal, (3,), world frame (m)
         :param velocity: velocity of the goal, (3,), world frame (m/s), by default 0
         :param waypoints: what the robot passes before, each as soon as it is within the goal radius of it, (any number,
             3), world frame (m), by default nothing
-        :raises ValueError: if something has another shape, or is not finite
+        :param heading: heading that the robot turns to, the short way, and keeps, from the x axis counter-clockwise
+            (rad), by default as before
+        :raises ValueError: if something has another shape, or is not finite, or the robot cannot turn, see
+            `check_heading`
         """
         targets = target_of(goal, velocity, waypoints)
+        self.check_heading(heading)
+        if heading is not None:
+            self.heading = np.full((1, 1), float(heading))
         self._goal = targets.goals[None]
         self._route: Route | None = None
         if targets.change:
             self._route = Route(self._goal)
             self._route.set(0, slice(None), targets)
             self._goal = self._route.current()
+
+    def check_heading(self, heading: Any) -> None:
+        """Check that the robot can turn to a heading (rad); None is one that it has.
+
+        :raises ValueError: if it is no finite angle, or not that at the start and the robot may not turn
+        """
+        if heading is not None:
+            self.config.check_headings("heading", [heading], np.array([self._facing]))
 
     @property
     def goal(self) -> np.ndarray:
@@ -263,8 +282,9 @@ class Robot:
         if self._route is not None and self.hold is None:
             goal_velocity = self._route.current_velocity()
         arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles, goal_velocity)
+        heading = self.heading if self.config.planner.max_yaw_rate else None
         kept_to = self.commitment if self.hold is None else None
-        problems = make_problems(self.config, self.planner.model, *arguments, kept_to, self.disturbance)
+        problems = make_problems(self.config, self.planner.model, *arguments, kept_to, self.disturbance, heading)
         self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
         if self.disturbance is not None:

@@ -17,7 +17,8 @@ activates itself once as soon as it may. Besides the topics of `RosLink` and tho
 ====================== =================================== ==================================================
 name                   type                                content
 ====================== =================================== ==================================================
-``/NAME/goal_pose``    geometry_msgs/PoseStamped           where to fly, in the frame "map"; no heading
+``/NAME/goal_pose``    geometry_msgs/PoseStamped           where to fly, in the frame "map", and with
+                                                           ``planner.max_yaw_rate`` which heading to turn to
 ``/NAME/status``       diagnostic_msgs/DiagnosticArray     once a second: what the robot does, why, and counts
 ``/NAME/robot/land``   std_srvs/Trigger (a service)        begins to land, as ``deactivate`` does
 ====================== =================================== ==================================================
@@ -36,6 +37,7 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
+from quad_swarm.geometry import from_quaternion
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.attitude import AttitudeController, AttitudeGains
 from quad_swarm.realtime.link import Handler, monotonic
@@ -366,12 +368,16 @@ class RobotNode:
             self._log(f"goal refused: {error}")
 
     def _fly_to(self, message: Any) -> None:
-        loop, place = self.loop, message.pose.position
+        loop, place, turned = self.loop, message.pose.position, message.pose.orientation
         if message.header.frame_id != FRAME:
             raise ValueError(f"its frame is {shown(message.header.frame_id)}: give it in {FRAME!r}")
         if loop is None or not self.flies or loop.supervisor.shall_land or loop.supervisor.mode >= Mode.LAND:
             raise ValueError("the robot does not fly: activate it first")
-        loop.fly_to(reachable([place.x, place.y, place.z], loop.robot.config))
+        config, heading = loop.robot.config, None
+        quaternion = np.array([turned.x, turned.y, turned.z, turned.w])
+        if config.planner.max_yaw_rate and quaternion.any():  # who leaves it out asks for no heading
+            heading = from_quaternion(quaternion)[2]
+        loop.fly_to(reachable([place.x, place.y, place.z], config), heading=heading)
 
     def _take_wish(self, request: Any, response: Any) -> Any:
         response.success = self.land()

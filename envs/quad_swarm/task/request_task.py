@@ -185,10 +185,11 @@ class RequestTask:
         obstacles: Sequence[Obstacle] | None = None,
         velocities: Any = None,
         waypoints: Any = None,
+        headings: Any = None,
     ) -> None:
         """Start a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
         noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
-        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked, velocities, waypoints)
+        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked, velocities, waypoints, headings)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
 
@@ -199,10 +200,11 @@ class RequestTask:
         velocities: Any = None,
         waypoints: Any = None,
         robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> None:
         """Let robots of one swarm fly to other goals from now on, see `Swarm.set_goals`. The episode counts as arrived
         only when all robots are at the goals that they have now."""
-        self.swarm.set_goals(swarm, goals, velocities, waypoints, robots)
+        self.swarm.set_goals(swarm, goals, velocities, waypoints, robots, headings)
         self.statistics.change_goals(swarm)
 
     def keep(self, swarms: np.ndarray) -> None:

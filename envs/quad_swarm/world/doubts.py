@@ -148,6 +148,16 @@ def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
         )
 
 
+def large_angles(name: str, headings: np.ndarray) -> Iterator[str]:
+    """Yield a sentence if headings are more than a turn, (k,) (rad), as degrees would be."""
+    if np.abs(headings).max(initial=0.0) > 2.01 * math.pi:
+        robot = int(np.abs(headings).argmax())
+        yield (
+            f"{name}[{robot}]={headings[robot]:g} is in rad and more than a turn: as degrees, it would be "
+            f"{math.radians(headings[robot]):.3g}"
+        )
+
+
 def vertical_speeds(config: SwarmConfig) -> tuple[float, float]:
     """Return how fast robots climb and how fast they descend (m/s)."""
     planner, gain = config.planner, config.quadrotor.climb_gain

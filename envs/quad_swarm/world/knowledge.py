@@ -126,6 +126,7 @@ def make_problems(
     goal_velocity: np.ndarray | None = None,
     commitment: Commitment | None = None,
     disturbance: DisturbanceEstimate | None = None,
+    heading: np.ndarray | None = None,
 ) -> Problems:
     """Return robots' planning problems, which start when their inputs take effect.
 
@@ -143,6 +144,7 @@ def make_problems(
         to where their goals will be at the end of the horizon, so that they do not fall behind
     :param commitment: the plans that robots sent, None if their planner does not keep to them
     :param disturbance: accelerations that robots estimate, None for none
+    :param heading: headings to turn to, (E, n) (rad), None for 0
     """
     if goal_velocity is not None:
         ahead = config.planner.dt * (config.planner.horizon + (0.0 if late is None else late[..., None]))
@@ -163,6 +165,8 @@ def make_problems(
     if commitment is not None:
         reference, weight = commitment.reference(late)
         problems = problems._replace(reference=reference, reference_weight=weight)
+    if heading is not None:
+        problems = problems._replace(heading=heading.reshape(-1).copy())
     return problems if obstacles is None else _among(obstacles, problems, config, late)
 
 

@@ -14,15 +14,16 @@ import numpy as np
 from pydantic import Field, PositiveInt
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.geometry import length
+from quad_swarm.geometry import length, wrapped
 from quad_swarm.planner import PlannerConfig
+from quad_swarm.planner.base import SAME_HEADING
 from quad_swarm.planner.problem import check_vehicle
 from quad_swarm.plants.base import MODEL, parse_plant
 from quad_swarm.quadrotor import QuadrotorParams
-from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, checked, points, replaced
+from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, angles, checked, points, replaced
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
-from quad_swarm.world.doubts import doubts, far_goals, farthest, fast_goals, short_horizon, warn
+from quad_swarm.world.doubts import doubts, far_goals, farthest, fast_goals, large_angles, short_horizon, warn
 from quad_swarm.world.neighbours import Neighbourhood
 from quad_swarm.world.obstacles import Obstacle, ObstacleConfig, Surroundings, clearances, surroundings
 from quad_swarm.world.route import Targets
@@ -222,6 +223,28 @@ class SwarmConfig:
         for sentence in fast_goals(self, targets.velocities):
             warn(sentence)
         return targets
+
+    def check_headings(self, name: str, values: Any, present: np.ndarray) -> np.ndarray:
+        """Check that k robots can turn to headings, and return these as an array.
+
+        :param name: name of the headings, for error messages
+        :param values: headings, (k,) (rad); None for those of now
+        :param present: headings of now, (k,) (rad)
+        :raises ValueError: if they have another shape, or are not finite, or robots would have to turn and may not
+        """
+        if values is None:
+            return present
+        found = angles(name, values, len(present))
+        turns = np.abs(wrapped(found - present)) > SAME_HEADING
+        if turns.any() and not self.planner.max_yaw_rate:
+            robot = int(turns.argmax())
+            raise ValueError(
+                f"{name}[{robot}]={found[robot]:g}: with planner.max_yaw_rate=0, robots keep their heading, here "
+                f"{present[robot]:g}; set planner.max_yaw_rate (rad/s)"
+            )
+        for sentence in large_angles(name, found):
+            warn(sentence)
+        return found
 
     def _check_inside(self, name: str, places: np.ndarray) -> None:
         beyond = self.outside(places)

@@ -112,6 +112,7 @@ class Swarm(SwarmState):
     :ivar state: true states, (E, n, 9)
     :ivar goal: where the robots fly to now, goals or waypoints before them, (E, n, 3), world frame (m)
     :ivar route: velocities of goals and waypoints, None where no goal changes
+    :ivar heading: headings that the robots turn to, (E, n) (rad), None where all of them are 0 or robots do not turn
     :ivar neighbours: which others each robot perceives
     :ivar disturbances: realisation of the disturbances
     :ivar beliefs: beliefs of each robot about the others
@@ -262,6 +263,7 @@ class Swarm(SwarmState):
         checked: bool = False,
         velocities: Any = None,
         waypoints: Any = None,
+        headings: Any = None,
     ) -> None:
         """Place the robots of one swarm at rest. Robots pass their waypoints, each as soon as they are within the goal
         radius of it, and then fly to their goals, which may move.
@@ -274,8 +276,11 @@ class Swarm(SwarmState):
         :param checked: whether the starts and goals are known to fit the world, as those of a `ScenarioSampler` are
         :param velocities: velocities of the goals, (n, 3), world frame (m/s), by default 0
         :param waypoints: waypoints of each robot, n sequences (k, 3), world frame (m), by default none
+        :param headings: headings that robots turn to, the short way, and keep, from the x axis counter-clockwise, (n,)
+            (rad), by default those at the start
         :raises ValueError: if robots cannot fly from these starts to these goals, see `SwarmConfig.check_flight`, or
-            there are more obstacles than the world has room for
+            there are more obstacles than the world has room for, or robots cannot turn to their headings, see
+            `SwarmConfig.check_headings`
         """
         n = self.config.n_robots
         obstacles = self.config.obstacles.listed if obstacles is None else tuple(obstacles)
@@ -283,8 +288,10 @@ class Swarm(SwarmState):
             starts, targets = points("starts", starts, n), Targets.of(goals, velocities, waypoints, n)
         else:
             starts, targets = self.config.check_flight(starts, goals, obstacles, velocities, waypoints)
+        headings = self.config.check_headings("headings", headings, np.zeros(n))
         self.state[swarm] = 0.0
         self.state[swarm, :, POSITION] = starts
+        self._turn_to(swarm, slice(None), headings)
         self._fly_to(swarm, slice(None), targets)
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(swarm, obstacles)
@@ -314,6 +321,7 @@ class Swarm(SwarmState):
         velocities: Any = None,
         waypoints: Any = None,
         robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> None:
         """Let k robots of one swarm fly to other goals from now on. Their former goals and waypoints are forgotten.
 
@@ -324,7 +332,9 @@ class Swarm(SwarmState):
         :param waypoints: what each of the robots passes before, k sequences (any number, 3), world frame (m), by
             default nothing
         :param robots: indices of the robots, (k,), by default all
-        :raises ValueError: if there are no such robots, or goals do not fit, see `SwarmConfig.check_goals`
+        :param headings: headings that the robots turn to, (k,) (rad), by default as before
+        :raises ValueError: if there are no such robots, goals do not fit, see `SwarmConfig.check_goals`, or robots
+            cannot turn to their headings, see `SwarmConfig.check_headings`
         """
         n = self.config.n_robots
         which = _indices(robots, n)
@@ -335,6 +345,8 @@ class Swarm(SwarmState):
         for robot, one in zip(which, given.waypoints, strict=True):
             passed[robot] = one
         checked = self.config.check_goals(self.pos[swarm], places, self._surroundings(swarm), moving, passed)
+        if headings is not None:
+            self._turn_to(swarm, which, self.config.check_headings("headings", headings, self.state[swarm, which, 8]))
         self._fly_to(swarm, which, Targets(checked.goals[which], given.velocities, given.waypoints))
         self._pass_waypoints()
 
@@ -352,6 +364,15 @@ class Swarm(SwarmState):
             self.goal[swarm, robots] = targets.goals
         else:
             self.route.set(swarm, robots, targets)
+
+    def _turn_to(self, swarm: int, robots: Any, headings: np.ndarray) -> None:
+        if not self.config.planner.max_yaw_rate or (self.heading is None and not headings.any()):
+            return
+        if self.heading is None:
+            self.heading = np.zeros(self.state.shape[:2])
+        self.heading[swarm, robots] = headings
+        if not self.heading.any():
+            self.heading = None
 
     def _pass_waypoints(self) -> None:
         """Let robots pass the waypoints at which they believe to be. Where no goal changes any more, there is no
@@ -453,7 +474,8 @@ class Swarm(SwarmState):
         late = self._late
         goal_velocity = None if self.route is None else self.route.current_velocity()
         arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles, goal_velocity)
-        return make_problems(self.config, self.planner.model, *arguments, self.commitment, self.disturbance)
+        beside = (self.commitment, self.disturbance, self.heading)
+        return make_problems(self.config, self.planner.model, *arguments, *beside)
 
     @property
     def _late(self) -> np.ndarray | None:

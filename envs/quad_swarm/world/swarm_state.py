@@ -11,6 +11,7 @@ import numpy as np
 
 from quad_swarm.planner import Plans, PlanStatus
 from quad_swarm.states import MOST_STEPS, like
+from quad_swarm.validation import LARGEST_ANGLE
 from quad_swarm.world.beliefs import Beliefs
 from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
@@ -50,7 +51,9 @@ class SwarmState:
     obstacles: Obstacles | None
     commitment: Commitment | None
     disturbance: DisturbanceEstimate | None
-    route: Route | None = None  # comes and goes in flight, and is not in states of before it existed
+    # These come and go in flight, and are not in states of before they existed
+    route: Route | None = None
+    heading: np.ndarray | None = None
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
@@ -83,6 +86,9 @@ class SwarmState:
             if name == "route":
                 route = state.get(key)
                 self.route = None if route is None else Route.of_state(route, self.goal)
+            elif name == "heading":
+                heading, none = state.get(key), np.zeros(self.state.shape[:2])
+                self.heading = None if heading is None else like(none, heading, key, -LARGEST_ANGLE, LARGEST_ANGLE)
             elif isinstance(value, np.ndarray):
                 setattr(self, name, like(value, state[key], key))
             elif isinstance(value, Plans):

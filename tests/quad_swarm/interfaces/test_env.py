@@ -273,6 +273,21 @@ def test_reset_takes_waypoints_and_goals_that_move():
     assert not info["at_goal"].any()
 
 
+def test_reset_and_new_goals_take_headings():
+    env = gymnasium.make("QuadSwarm-v0", n_robots=2, planner={"max_yaw_rate": 1.5}).unwrapped
+    env.reset(seed=0, options={"starts": STARTS, "goals": GOALS, "headings": [1.0, -1.0]})
+    for _ in range(30):
+        env.step(np.zeros(2, np.int8))
+    np.testing.assert_allclose(env.task.swarm.state[0, :, 8], [1, -1], atol=0.1)
+    env.set_goals(STARTS[:1], robots=[0], headings=[3.0])
+    assert env.task.swarm.heading.tolist() == [[3, -1]]
+    env.reset(seed=0)
+    assert env.task.swarm.heading is None
+    still = QuadSwarmEnv(n_robots=2)
+    with pytest.raises(ValueError, match=r"headings\[0\]=1: with planner\.max_yaw_rate=0"):
+        still.reset(options={"starts": STARTS, "goals": GOALS, "headings": [1.0, -1.0]})
+
+
 def test_an_episode_whose_goals_change_arrives_again():
     env = gymnasium.make("QuadSwarm-v0", n_robots=2, max_steps=90).unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded, match="set_goals"):

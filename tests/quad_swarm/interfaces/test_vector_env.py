@@ -114,6 +114,8 @@ def test_goals_of_a_swarm_change_until_its_episode_ends():
     for swarm in (2, -1, True, "a"):
         with pytest.raises(ValueError, match=r"swarm=.*from 0 to 1"):
             env.set_goals(swarm, GOALS)
+    with pytest.raises(ValueError, match=r"headings\[1\]=2: with planner\.max_yaw_rate=0"):
+        env.set_goals(1, GOALS, headings=[0, 2])
 
 
 @pytest.mark.parametrize(

@@ -477,6 +477,78 @@ def test_a_planned_yaw_turns_the_short_way(yaw):
     assert np.linalg.norm(path[-1, :3] - [1.5, 1.0, 1.8]) < 0.1
 
 
+def turn(planner, yaws, headings, steps=60):
+    """Let robots turn on their way to a goal aside; return their yaws at each step, and how far they are from it."""
+    state = np.zeros((len(yaws), 9))
+    state[:, 2], state[:, 8] = 1.5, yaws
+    goal, others = state[:, :3] + [1.0, 0.5, 0.0], np.full((len(yaws), 1, planner.config.horizon, 3), 50.0)
+    plans, path = Plans.hover(state, planner.config.horizon), [state[:, 8].copy()]
+    for _ in range(steps):
+        plans = planner.plan(Problems(state, goal, others, heading=np.array(headings)), plans)
+        np.testing.assert_allclose(plans.x, planner.model.rollout(state, plans.u), atol=1e-3)
+        assert (np.abs(plans.u[..., :2]) <= planner.config.max_tilt + 1e-6).all()
+        state = planner.model.step(state, plans.u[:, 0])
+        path.append(state[:, 8].copy())
+    return np.array(path), np.linalg.norm(state[:, :3] - goal, axis=-1)
+
+
+TURNS = {30: 30, 90: 90, 180: 180, 350: -10, 0: 0, -190: 170, 725: 5}  # heading from 0 -> how far robots turn (degrees)
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_robots_turn_to_headings_the_short_way_alone_and_in_a_batch(solver):
+    planner = make_planner(PlannerConfig(max_yaw_rate=1.5), QUADROTOR, 2, solver)
+    headings = np.radians(list(TURNS))
+    path, off = turn(planner, np.zeros(len(TURNS)), headings)
+    turned, expected = np.degrees(path[-1]), np.array(list(TURNS.values()))
+    expected[2] *= np.sign(turned[2])  # half a turn is as short either way
+    np.testing.assert_allclose(turned, expected, atol=1)
+    assert (np.abs(np.degrees(path)).max(axis=0) <= np.abs(expected) + 0.5).all(), "no robot turns too far"
+    assert off.max() < 0.02
+    for k, heading in enumerate(headings):
+        alone, _ = turn(planner, [0.0], [heading], steps=10)
+        assert_same(alone[:, 0], path[:11, k])
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_from_170_to_minus_170_degrees_are_20(solver):
+    planner = make_planner(PlannerConfig(max_yaw_rate=1.5), QUADROTOR, 2, solver)
+    path, _ = turn(planner, np.radians([170, -170, 530, 175]), np.radians([-170, 170, 190, 190]), steps=40)
+    np.testing.assert_allclose(np.degrees(path[-1]), [190, -190, 550, 190], atol=1)
+    assert np.abs(np.degrees(path - path[0])).max() < 20.5
+
+
+@pytest.mark.parametrize("solver", ["rti", "fatrop"])
+def test_only_the_yaw_of_a_robot_knows_its_heading(solver):
+    config = PlannerConfig(max_yaw_rate=1.5)
+    problems, planner = crossing(4, config), make_planner(config, QUADROTOR, 3, solver)
+    last = planner.plan(problems, hover(problems, config))
+    plain = planner.plan(problems, last)
+    same = planner.plan(problems._replace(heading=np.zeros(4)), last)
+    assert_same(same, plain)
+    aimed = planner.plan(problems._replace(heading=np.array([0.0, 1.0, 0.0, -2.0])), last)
+    assert_same([field[[0, 2]] for field in aimed], [field[[0, 2]] for field in plain])
+    assert (aimed.u[[1, 3], 0, 3] * [1, -1] > 0.9).all()
+
+
+@pytest.mark.parametrize(
+    ("rate", "heading", "message"),
+    [
+        (1.0, np.zeros(3), r"heading has shape \(3,\) and type float64; this planner takes \(2,\)"),
+        (1.0, np.array([0.0, np.nan]), r"heading\[1\] is nan"),
+        (0.0, np.array([0.0, 0.1]), r"heading: this planner holds the yaw of robots; .* max_yaw_rate above 0"),
+    ],
+)
+def test_headings_that_do_not_fit_are_refused(rate, heading, message):
+    config = PlannerConfig(max_yaw_rate=rate)
+    planner = Planner(foreign.Stay(OptimalControlProblem(config, QUADROTOR, 2)), QuadrotorModel(QUADROTOR, 0.1), config)
+    problems = crossing(2, config)
+    with pytest.raises(ValueError, match=message):
+        planner.plan(problems._replace(heading=heading), hover(problems, config))
+    held = planner.plan(problems._replace(heading=problems.x[:, 8] + 2 * math.pi), hover(problems, config))
+    assert (held.x[..., 8] == 0).all()
+
+
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
 def test_every_level_of_the_chain_knows_the_heading(yaw):
     config = PlannerConfig(horizon=30)
