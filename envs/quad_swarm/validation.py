@@ -62,6 +62,19 @@ def points(name: str, values: Any, count: int) -> np.ndarray:
     return array
 
 
+def vectors(name: str, values: Any, count: int) -> np.ndarray:
+    """Convert velocities to an array, (count, 3) (m/s).
+
+    :raises ValueError: if they have another shape, are not numbers, or are larger than `LARGEST_LENGTH`
+    """
+    array = _numbers(values, (count, 3), LARGEST_LENGTH)
+    if array is None:
+        raise ValueError(
+            f"{name} must be {count} finite vectors, shape ({count}, 3) (m/s), or None; got {shown(values)}."
+        )
+    return array
+
+
 def angles(name: str, values: Any, count: int) -> np.ndarray:
     """Convert angles to an array, (count,) (rad).
 

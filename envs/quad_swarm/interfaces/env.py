@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, checked_seed, need_reset
+from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_seed, checked_start, need_reset
 from quad_swarm.states import as_other_state, generator_of, generator_state, like
 from quad_swarm.task.options import TaskOptions
 from quad_swarm.task.request_task import requests_of, task_of
@@ -47,6 +47,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     for two robots to be at both. With them, "velocities" (n, 3), m/s, lets goals move, and "waypoints", n sequences
     (any number, 3), m, are what each robot passes on the way to its goal. "headings" (n,), rad from the x axis
     counter-clockwise, are what robots turn to, the short way, for which they need a `planner.max_yaw_rate`.
+    "initial_velocities" (n, 3), m/s, and "initial_headings" (n,), rad, are those of the robots at the start.
 
     ## Goals in Flight
     Gymnasium's `step` takes an action only, so goals are changed between steps: `env.unwrapped.set_goals(...)`.
@@ -93,7 +94,6 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
-    reset_options = ("starts", "goals", "velocities", "waypoints", "headings")
 
     @with_fields(TaskOptions)
     def __init__(self, options: TaskOptions, render_mode: str | None = None):
@@ -119,16 +119,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         :raises ValueError: if the seed or an option is invalid
         """
         super().reset(seed=checked_seed(seed))
-        options = checked_options(options)
-        if unknown := set(options).difference(self.reset_options):
-            raise unknown_name("reset option", unknown.pop(), self.reset_options)
-        if options and not {"starts", "goals"} <= set(options):
-            raise ValueError(
-                f"reset options name only {', '.join(map(repr, options))}; pass both 'starts' and 'goals'."
-            )
-        if options:
-            starts, goals = options.pop("starts"), options.pop("goals")
-            self.task.place(0, "custom", starts, goals, self.np_random, **options)
+        if start := checked_start(options):
+            self.task.place(0, "custom", rng=self.np_random, **start)
         else:
             self.task.reset(0, self.np_random)
         self._requests = np.zeros_like(self._requests)

@@ -13,7 +13,7 @@ from quad_swarm.errors import shown
 from quad_swarm.geometry import length, wrapped
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
-from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, QuadrotorModel
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY, QuadrotorModel
 
 
 class Solution(NamedTuple):
@@ -93,6 +93,22 @@ class Plans(NamedTuple):
             status=np.zeros(count, dtype=np.int64),
             iterations=np.zeros(count, dtype=np.int64),
         )
+
+    @classmethod
+    def steady(cls, x: np.ndarray, horizon: int, dt: float, late: np.ndarray | None = None) -> Plans:
+        """Return the plans of robots in flight before their first solve, made a step ago, which is to keep their
+        velocity, as others expect that know no plan.
+
+        :param x: states now, (B, 9)
+        :param horizon: number of stages N
+        :param dt: length of a stage (s)
+        :param late: when inputs take effect, as a fraction of a step, (B,); None if all do so at once
+        """
+        plans = cls.hover(x, horizon)
+        if np.count_nonzero(x[:, VELOCITY]):
+            times = dt * (np.arange(horizon + 1) - 1 + (np.zeros((len(x), 1)) if late is None else late[:, None]))
+            plans.x[..., POSITION] += times[..., None] * x[:, None, VELOCITY]
+        return plans
 
 
 class Planner:

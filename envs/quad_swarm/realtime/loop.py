@@ -108,7 +108,12 @@ class Loop:
             self.robot.plan()
 
     def start(
-        self, start: np.ndarray, goal: np.ndarray, first: int, obstacles: Sequence[Obstacle] | None = None
+        self,
+        start: np.ndarray,
+        goal: np.ndarray,
+        first: int,
+        obstacles: Sequence[Obstacle] | None = None,
+        heading: float = 0.0,
     ) -> None:
         """Begin a flight.
 
@@ -116,9 +121,10 @@ class Loop:
         :param goal: goal, (3,), world frame (m)
         :param first: start of the first period (us); the others' may differ by part of a period
         :param obstacles: the obstacles, where they are then; by default those that the world lists
+        :param heading: heading of the robot, which it keeps (rad)
         :raises ValueError: if there are more obstacles than the world has room for
         """
-        self.robot.reset(start, goal, self.late, now=first, obstacles=obstacles)
+        self.robot.reset(start, goal, self.late, now=first, obstacles=obstacles, initial_heading=heading)
         self.supervisor.reset()
         self.statistics = Statistics()
         self._forget()

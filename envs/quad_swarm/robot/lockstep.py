@@ -53,10 +53,13 @@ class LockstepWorld:
         velocities: Any = None,
         waypoints: Any = None,
         headings: Any = None,
+        initial_velocities: Any = None,
+        initial_headings: Any = None,
     ) -> None:
         """Begin an episode, see `Swarm.reset`."""
+        moving, facing = self.config.check_motion(initial_velocities, initial_headings)
         self.state[:], self._u[:], self.now = 0.0, 0.0, 0
-        self.state[0, :, POSITION] = starts
+        self.state[0, :, POSITION], self.state[0, :, VELOCITY], self.state[0, :, 8] = starts, moving, facing
         self.plant.place(0, self.state[0])
         if self.config.is_random:
             self.realisation.reset(0, noise_seed)
@@ -68,13 +71,16 @@ class LockstepWorld:
             delay, kept = float(late[k]), 1 + radio.delay
             heading = None if headings is None else headings[k]
             target: dict[str, Any] = {"velocity": velocity, "waypoints": passed, "heading": heading}
+            target |= {"initial_velocity": moving[k], "initial_heading": facing[k]}
             robot.reset(starts[k], goal, delay, kept=kept, obstacles=obstacles, **target)
         causal = radio.round_trip is not None
         self._flying = deque([] for _ in range(1 + (radio.round_trip or 0) + radio.jitter))
         most = 1 + radio.delay + (0 if causal else radio.jitter)
         self._plans = [
-            deque([Plan(-k * robot.period, robot.newest.positions) for k in range(most, 0, -1)], most)
-            for robot in self.robots
+            deque(
+                [Plan(-k * robot.period, robot.newest.positions - (k - 1) * stride) for k in range(most, 0, -1)], most
+            )
+            for robot, stride in zip(self.robots, self.config.planner.dt * moving, strict=True)
         ]
 
     def step(self) -> np.ndarray:

@@ -111,10 +111,12 @@ class Robot:
         velocity: Any = None,
         waypoints: Any = None,
         heading: Any = None,
+        initial_velocity: Any = None,
+        initial_heading: Any = None,
     ) -> None:
         """Begin to fly.
 
-        :param start: where the robot is commanded to hover, (3,), world frame (m)
+        :param start: where the robot is, commanded to hover unless it moves, (3,), world frame (m)
         :param goal: goal, (3,), world frame (m)
         :param late: time from the start of a period until its command takes effect (periods), less than 1
         :param kept: number of own plans that may still be sent, where the radio delays them by whole periods
@@ -123,21 +125,27 @@ class Robot:
         :param velocity: see `fly_to`
         :param waypoints: see `fly_to`
         :param heading: see `fly_to`, by default that at the start
-        :raises ValueError: if there are more obstacles than the world has room for, or goals do not fit, see `fly_to`
+        :param initial_velocity: velocity of the robot, (3,), world frame (m/s), by default 0
+        :param initial_heading: heading of the robot (rad), by default 0
+        :raises ValueError: if there are more obstacles than the world has room for, goals do not fit, see `fly_to`, or
+            something has another shape, or is not finite
         """
+        velocities = None if initial_velocity is None else [initial_velocity]
+        moving, facing = self.config.check_motion(velocities, None if initial_heading is None else [initial_heading], 1)
         obstacles = self.config.obstacles.listed if obstacles is None else obstacles
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(0, obstacles)
         x = np.zeros((1, N_STATES))
-        x[:, POSITION] = start
+        x[:, POSITION], x[:, VELOCITY], x[:, 8] = start, moving, facing
         self.late, self.now = late, now - self.period
         self.hold: np.ndarray | None = None
-        self._facing = 0.0
-        self.heading = np.full((1, 1), self._facing)
+        self._facing = facing
+        self.heading = facing[None].copy()
         self.fly_to(goal, velocity, waypoints, heading)
         self._estimate, self._u = x[None], np.zeros((1, 1, N_INPUTS))
         self._pos = self._vel = np.zeros((1, 1, len(self.others), 3))
-        self._plans = Plans.hover(x, self.config.planner.horizon)
+        planner = self.config.planner
+        self._plans = Plans.steady(x, planner.horizon, planner.dt, np.array([late]))
         for beliefs in (self.beliefs, self.presumed):
             beliefs.forget(np.array([0]))
         if self.commitment is not None:
@@ -146,7 +154,8 @@ class Robot:
             self.disturbance.forget(0)
         self._sent: dict[int, Plan] = {}
         self._inbox: dict[int, Plan] = {}
-        self._own = [Plan(now - k * self.period, self.planned_positions()[0, 0]) for k in range(kept, 0, -1)]
+        newest, stride = self.planned_positions()[0, 0], planner.dt * moving
+        self._own = [Plan(now - k * self.period, newest - (k - 1) * stride) for k in range(kept, 0, -1)]
         self.source = np.zeros((1, 1, len(self.others)), dtype=np.int64)
 
     def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None, heading: Any = None) -> None:
@@ -178,7 +187,7 @@ class Robot:
         :raises ValueError: if it is no finite angle, or not that at the start and the robot may not turn
         """
         if heading is not None:
-            self.config.check_headings("heading", [heading], np.array([self._facing]))
+            self.config.check_headings("heading", [heading], self._facing)
 
     @property
     def goal(self) -> np.ndarray:

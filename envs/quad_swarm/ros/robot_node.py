@@ -234,7 +234,8 @@ class RobotNode:
             raise ValueError(f"the robot would not fly: {', '.join(sorted(guards.why))}")
         if absent := self._link.absent():
             raise ValueError(f"{absent[0]} does not listen: configure all robots first")
-        loop.start(own, own if self._goal is None else self._goal, now + loop.robot.period)
+        goal, first = own if self._goal is None else self._goal, now + loop.robot.period
+        loop.start(own, goal, first, heading=float(sensed.state[8]))
         self._vehicle.engage()
         self._off, self._mode = 0, Mode.FLY
         self.flies = self._is_active = True

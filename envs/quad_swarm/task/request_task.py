@@ -186,10 +186,13 @@ class RequestTask:
         velocities: Any = None,
         waypoints: Any = None,
         headings: Any = None,
+        initial_velocities: Any = None,
+        initial_headings: Any = None,
     ) -> None:
         """Start a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
         noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
-        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked, velocities, waypoints, headings)
+        changing = (velocities, waypoints, headings, initial_velocities, initial_headings)
+        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked, *changing)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
 

@@ -134,6 +134,19 @@ def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
     :param config: the world
     :param velocities: velocities of goals, (n, 3) (m/s)
     """
+    yield from _too_fast(config, velocities, "velocities", "the goal moves", "which fall behind")
+
+
+def fast_starts(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
+    """Yield a sentence if robots start faster than they fly.
+
+    :param config: the world
+    :param velocities: velocities of robots, (n, 3) (m/s)
+    """
+    yield from _too_fast(config, velocities, "initial_velocities", "it starts", "which brake first")
+
+
+def _too_fast(config: SwarmConfig, velocities: np.ndarray, name: str, does: str, what: str) -> Iterator[str]:
     planner = config.planner
     fastest = np.empty_like(velocities)
     fastest[:, :2] = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
@@ -143,8 +156,8 @@ def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
     if beyond.max(initial=0.0) > 1:
         robot, axis = np.unravel_index(beyond.argmax(), beyond.shape)
         yield (
-            f"velocities[{robot}]={velocities[robot].tolist()}: the goal moves faster than the "
-            f"{fastest[robot, axis]:.2g} m/s of robots along {'xyz'[axis]}, which fall behind"
+            f"{name}[{robot}]={velocities[robot].tolist()}: {does} faster than the {fastest[robot, axis]:.2g} m/s of "
+            f"robots along {'xyz'[axis]}, {what}"
         )
 
 

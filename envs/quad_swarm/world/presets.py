@@ -20,10 +20,19 @@ from quad_swarm.planner.base import SAME_HEADING
 from quad_swarm.planner.problem import check_vehicle
 from quad_swarm.plants.base import MODEL, parse_plant
 from quad_swarm.quadrotor import QuadrotorParams
-from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, angles, checked, points, replaced
+from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, angles, checked, points, replaced, vectors
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
-from quad_swarm.world.doubts import doubts, far_goals, farthest, fast_goals, large_angles, short_horizon, warn
+from quad_swarm.world.doubts import (
+    doubts,
+    far_goals,
+    farthest,
+    fast_goals,
+    fast_starts,
+    large_angles,
+    short_horizon,
+    warn,
+)
 from quad_swarm.world.neighbours import Neighbourhood
 from quad_swarm.world.obstacles import Obstacle, ObstacleConfig, Surroundings, clearances, surroundings
 from quad_swarm.world.route import Targets
@@ -223,6 +232,26 @@ class SwarmConfig:
         for sentence in fast_goals(self, targets.velocities):
             warn(sentence)
         return targets
+
+    def check_motion(self, velocities: Any, headings: Any, count: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Check how robots start, and return their velocities, (n, 3) (m/s), and headings, (n,) (rad).
+
+        :param velocities: velocities, (n, 3), world frame (m/s); None for 0
+        :param headings: headings, (n,) (rad); None for 0
+        :param count: number of robots n, by default all
+        :raises ValueError: if they have other shapes, or are not finite
+        """
+        count = self.n_robots if count is None else count
+        moving, facing = np.zeros((count, 3)), np.zeros(count)
+        if velocities is not None:
+            moving = vectors("initial_velocities", velocities, count)
+            for sentence in fast_starts(self, moving):
+                warn(sentence)
+        if headings is not None:
+            facing = angles("initial_headings", headings, count)
+            for sentence in large_angles("initial_headings", facing):
+                warn(sentence)
+        return moving, facing
 
     def check_headings(self, name: str, values: Any, present: np.ndarray) -> np.ndarray:
         """Check that k robots can turn to headings, and return these as an array.

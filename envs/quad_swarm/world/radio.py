@@ -89,10 +89,19 @@ class RadioChannel:
     def forget(self, slots: np.ndarray) -> None:
         """Drop what is on its way to slots whose robot has changed, (E, n, n - 1) bool."""
 
-    def reset(self, swarm: int, plans: np.ndarray) -> None:
-        """Start one swarm with plans of robots at rest, (n, N + 1, 3) (m)."""
-        for earlier in self._earlier:
+    def reset(self, swarm: int, plans: np.ndarray, strides: np.ndarray | None = None) -> None:
+        """Start one swarm with plans of robots that keep their velocity.
+
+        :param swarm: index of the swarm
+        :param plans: planned positions of the last step, (n, N + 1, 3) (m)
+        :param strides: how far the robots fly in a step, (n, 3) (m); None for robots at rest
+        """
+        for steps, earlier in enumerate(reversed(self._earlier), start=1):
             earlier[swarm] = plans
+            if strides is not None:
+                earlier[swarm] -= steps * strides[:, None]
+                for _ in range(steps):
+                    earlier[swarm] = advance(earlier[swarm])
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
@@ -160,8 +169,8 @@ class CausalChannel(RadioChannel):
     def forget(self, slots: np.ndarray) -> None:
         self._ages[:, slots] = 0
 
-    def reset(self, swarm: int, plans: np.ndarray) -> None:
-        super().reset(swarm, plans)
+    def reset(self, swarm: int, plans: np.ndarray, strides: np.ndarray | None = None) -> None:
+        super().reset(swarm, plans, strides)
         self._ages[:, swarm] = 0
 
     def keep(self, swarms: np.ndarray) -> None:

@@ -264,9 +264,11 @@ class Swarm(SwarmState):
         velocities: Any = None,
         waypoints: Any = None,
         headings: Any = None,
+        initial_velocities: Any = None,
+        initial_headings: Any = None,
     ) -> None:
-        """Place the robots of one swarm at rest. Robots pass their waypoints, each as soon as they are within the goal
-        radius of it, and then fly to their goals, which may move.
+        """Place the robots of one swarm, by default at rest. Robots pass their waypoints, each as soon as they are
+        within the goal radius of it, and then fly to their goals, which may move.
 
         :param swarm: index of the swarm
         :param starts: starts, (n, 3), world frame (m)
@@ -278,9 +280,11 @@ class Swarm(SwarmState):
         :param waypoints: waypoints of each robot, n sequences (k, 3), world frame (m), by default none
         :param headings: headings that robots turn to, the short way, and keep, from the x axis counter-clockwise, (n,)
             (rad), by default those at the start
+        :param initial_velocities: velocities of the robots at the start, (n, 3), world frame (m/s), by default 0
+        :param initial_headings: headings of the robots at the start, (n,) (rad), by default 0
         :raises ValueError: if robots cannot fly from these starts to these goals, see `SwarmConfig.check_flight`, or
-            there are more obstacles than the world has room for, or robots cannot turn to their headings, see
-            `SwarmConfig.check_headings`
+            there are more obstacles than the world has room for, robots cannot turn to their headings, see
+            `SwarmConfig.check_headings`, or what they start with has another shape, or is not finite
         """
         n = self.config.n_robots
         obstacles = self.config.obstacles.listed if obstacles is None else tuple(obstacles)
@@ -288,19 +292,16 @@ class Swarm(SwarmState):
             starts, targets = points("starts", starts, n), Targets.of(goals, velocities, waypoints, n)
         else:
             starts, targets = self.config.check_flight(starts, goals, obstacles, velocities, waypoints)
-        headings = self.config.check_headings("headings", headings, np.zeros(n))
+        moving, facing = self.config.check_motion(initial_velocities, initial_headings)
+        headings = self.config.check_headings("headings", headings, facing)
         self.state[swarm] = 0.0
-        self.state[swarm, :, POSITION] = starts
+        self.state[swarm, :, POSITION], self.state[swarm, :, VELOCITY], self.state[swarm, :, 8] = starts, moving, facing
         self._turn_to(swarm, slice(None), headings)
         self._fly_to(swarm, slice(None), targets)
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(swarm, obstacles)
         for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
             beliefs.forget(np.array([swarm]))
-        hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
-        for mine, fresh in zip(self._plans, hover, strict=True):
-            mine[swarm * n : (swarm + 1) * n] = fresh
-        self._radio.reset(swarm, self.plans[swarm, ..., POSITION])
         if self.commitment is not None:
             self.commitment.forget(swarm)
         if self.disturbance is not None:
@@ -309,6 +310,15 @@ class Swarm(SwarmState):
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
             self.disturbances.reset(swarm, noise_seed)
+        start, planner = self.disturbances.start, self.config.planner
+        late = None if start is None else start[swarm] / self.config.substeps
+        steady = Plans.steady(self.state[swarm], planner.horizon, planner.dt, late)
+        for mine, fresh in zip(self._plans, steady, strict=True):
+            mine[swarm * n : (swarm + 1) * n] = fresh
+        sent, moves = self.plans[swarm, ..., POSITION], bool(moving.any())
+        if moves and late is not None:
+            sent = resampled(sent, -late)
+        self._radio.reset(swarm, sent, planner.dt * moving if moves else None)
         if self.neighbours.limited:
             estimate = self._estimate()[swarm]
             self.neighbours.reset(swarm, estimate[:, POSITION], estimate[:, VELOCITY])

@@ -288,6 +288,16 @@ def test_reset_and_new_goals_take_headings():
         still.reset(options={"starts": STARTS, "goals": GOALS, "headings": [1.0, -1.0]})
 
 
+def test_reset_takes_velocities_and_headings_of_the_robots():
+    env = gymnasium.make("QuadSwarm-v0", n_robots=2).unwrapped
+    motion = {"initial_velocities": [[1, 0, 0], [0, 0.5, 0]], "initial_headings": [0.5, -2]}
+    observation, _ = env.reset(seed=0, options={"starts": STARTS, "goals": GOALS, **motion})
+    np.testing.assert_allclose(observation[:, :3], motion["initial_velocities"])
+    np.testing.assert_array_equal(env.task.swarm.state[0, :, 8], motion["initial_headings"])
+    observation, _ = env.reset(seed=0, options={"starts": STARTS, "goals": GOALS})
+    assert not observation[:, :3].any()
+
+
 def test_an_episode_whose_goals_change_arrives_again():
     env = gymnasium.make("QuadSwarm-v0", n_robots=2, max_steps=90).unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded, match="set_goals"):

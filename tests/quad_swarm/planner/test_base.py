@@ -359,6 +359,19 @@ def test_a_vertical_speed_may_have_another_limit_downwards(solver):
     assert np.min(speeds) == pytest.approx(-0.5, abs=0.01)
 
 
+def test_robots_in_flight_begin_with_the_plan_to_keep_their_velocity():
+    x = np.zeros((3, 9))
+    x[:, :3], x[:2, 3:6] = 1.5, [[2.0, 0, -0.5], [0, -1, 0]]
+    plans = Plans.steady(x, 10, 0.1)
+    np.testing.assert_array_equal(plans.x[:, 1], x)
+    np.testing.assert_allclose(plans.x[0, -1, :3], [1.5 + 0.9 * 2, 1.5, 1.5 - 0.9 * 0.5])
+    np.testing.assert_allclose(plans.x[0, 0, :3], [1.3, 1.5, 1.55])
+    assert_same([field[2:] for field in plans], Plans.hover(x[2:], 10))
+    late = Plans.steady(x, 10, 0.1, np.array([0.0, 0.5, 0.5]))
+    assert_same([field[::2] for field in late], [field[::2] for field in plans])
+    np.testing.assert_allclose(late.x[1, 0, :3], [1.5, 1.55, 1.5])
+
+
 def test_a_limit_above_the_number_of_others_changes_nothing():
     problems, _, _ = scattered(PlannerConfig(), 4, 2)
     last = Plans.hover(problems.x, 10)

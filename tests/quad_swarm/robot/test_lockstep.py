@@ -15,6 +15,7 @@ from quad_swarm.robot.lockstep import LockstepWorld
 from quad_swarm.task.request_task import requests_of
 from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from quad_swarm.world.swarm import Swarm
 from sb3_maddpg.hub.pretrained import pretrained_folder
 
 MODEL = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -100,6 +101,28 @@ def test_robots_keep_to_what_they_told_as_the_swarm_does(radio, rule):
     planner = {"commitment": 3.0, "disturbance_time": 1.0}
     config = make_config("flight", {"planner": planner, "radio": radio}, n_robots=3)
     assert not list(differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap"))
+
+
+@pytest.mark.parametrize(
+    "world", [{}, {"radio": {"delay": 3, "jitter": 2}}, {"radio": {"delay": 0, "round_trip": 1}}, {"clock_skew": 0.0}]
+)
+def test_robots_that_start_in_flight_and_turn_fly_as_the_swarm(world):
+    config = make_config("flight", world, n_robots=2, planner={"max_yaw_rate": 1.0})
+    swarm = Swarm(config)
+    robots = [Robot(config, k, RulePolicy("full"), swarm.planner) for k in range(2)]
+    flown, starts = LockstepWorld(config, robots), np.array([[0.0, -2, 1.5], [0, 2, 1.5]])
+    motion = {"initial_velocities": [[1, 0.3, 0.2], [-1, 0, -0.3]], "initial_headings": [0.5, -3]}
+    goals = starts + np.array([2, 0, 0])
+    swarm.reset(0, starts, goals, noise_seed=7, headings=[2, 0], **motion)
+    flown.reset(starts, goals, 7, headings=[2, 0], **motion)
+    for _ in range(40):
+        flown.step()
+        swarm.step(np.ones((1, 2, 1), bool))
+        assert np.array_equal(flown.state, swarm.state)
+        believed = np.concatenate([robot.beliefs._remembered for robot in robots], axis=1)
+        assert np.array_equal(believed, swarm.beliefs._remembered)
+    assert (np.abs(swarm.state[0, :, 8]) > [1.2, 0]).all()
+    assert abs(swarm.state[0, 1, 8]) < 1.8
 
 
 @pytest.mark.slow

@@ -136,6 +136,76 @@ def test_headings_in_degrees_are_warned_of():
         turning().reset(0, STARTS, ENDS, headings=[0, 90])
 
 
+MOVING = np.array([[1.0, 0, 0.2], [0, -0.5, -0.3]])
+
+
+def test_robots_may_start_in_flight_with_headings():
+    swarm = turning()
+    swarm.reset(0, STARTS, ENDS, initial_velocities=MOVING, initial_headings=[0.5, -2])
+    np.testing.assert_array_equal(swarm.vel[0], MOVING)
+    fly(swarm, 1)
+    np.testing.assert_allclose(swarm.pos[0], STARTS + 0.1 * MOVING, atol=0.04)
+    fly(swarm, 60)
+    assert np.linalg.norm(swarm.pos - swarm.goal, axis=-1).max() < 0.1
+    np.testing.assert_allclose(swarm.state[0, :, 8], [0.5, -2], atol=1e-3)
+    swarm.reset(0, STARTS, ENDS, headings=[1, 1], initial_headings=[0.5, -2])
+    fly(swarm, 50)
+    np.testing.assert_allclose(swarm.state[0, :, 8], [1, 1], atol=0.1)
+    swarm.reset(0, STARTS, ENDS)
+    assert not swarm.state[0, :, 3:].any()
+    assert swarm.heading is None
+
+
+def test_robots_that_may_not_turn_keep_the_heading_that_they_start_with():
+    swarm = Swarm(make_config("paper", n_robots=2))
+    swarm.reset(0, STARTS, ENDS, initial_headings=[1.0, 0], headings=[1.0, 2 * np.pi])
+    fly(swarm, 40)
+    np.testing.assert_allclose(swarm.state[0, :, 8], [1, 0], atol=1e-12)
+    assert np.linalg.norm(swarm.pos - swarm.goal, axis=-1).max() < 0.1
+    with pytest.raises(ValueError, match=r"headings\[0\]=0: with planner\.max_yaw_rate=0, .* here 1; set"):
+        swarm.set_goals(0, STARTS, headings=[0, 0])
+
+
+@pytest.mark.parametrize("radio", [{}, {"delay": 2, "jitter": 1}, {"delay": 0, "round_trip": 1}])
+def test_first_plans_asked_for_are_to_keep_the_velocity(radio):
+    swarm = Swarm(make_config("flight", {"radio": {"loss": 0.0, **radio}}, n_robots=2))
+    swarm.reset(0, STARTS, ENDS, initial_velocities=MOVING, noise_seed=3)
+    times = 0.05 * np.arange(1, 21)[:, None]
+    believed, source = swarm._believe(all_ask(swarm))
+    if "round_trip" in radio:  # nothing has arrived yet
+        assert (source == BeliefSource.CONSTANT_VELOCITY).all()
+        return
+    assert (source == BeliefSource.REQUESTED).all()
+    for robot in range(2):
+        expected = STARTS[1 - robot] + times * MOVING[1 - robot]
+        np.testing.assert_allclose(believed[0, robot, 0], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"initial_velocities": [1, 0, 0]}, r"initial_velocities must be 2 finite vectors, shape \(2, 3\) \(m/s\)"),
+        ({"initial_velocities": [[0, 0, np.inf]] * 2}, "initial_velocities must be 2 finite vectors"),
+        ({"initial_headings": 1.0}, "initial_headings must be 2 finite angles"),
+        ({"initial_headings": [0, np.nan]}, "initial_headings must be 2 finite angles"),
+    ],
+)
+def test_what_robots_cannot_start_with_is_refused(arguments, message):
+    swarm = turning()
+    swarm.reset(0, STARTS, ENDS)
+    with pytest.raises(ValueError, match=message):
+        swarm.reset(0, ENDS, STARTS, **arguments)
+    np.testing.assert_array_equal(swarm.pos[0], STARTS)
+
+
+def test_starts_beyond_the_limits_are_warned_of():
+    message = r"initial_velocities\[1\]=\[0\.0, 5\.0, 0\.0\]: it starts faster than the 4 m/s .* along y, which brake"
+    with pytest.warns(DoubtfulWorld, match=message):
+        turning().reset(0, STARTS, ENDS, initial_velocities=[[0, 0, 0], [0, 5, 0]])
+    with pytest.warns(DoubtfulWorld, match=r"initial_headings\[0\]=-45 is in rad"):
+        turning().reset(0, STARTS, ENDS, initial_headings=[-45, 0])
+
+
 def test_first_plan_asked_for_is_to_stay():
     swarm = make_swarm(1)
     believed, source = swarm._believe(all_ask(swarm))
