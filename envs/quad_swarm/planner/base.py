@@ -206,27 +206,8 @@ class Planner:
             shaped = getattr(getattr(self.solver, "problem", None), "shaped", True)
             if given is not None and name in ("shape", "size") and not shaped:
                 raise ValueError(f"{name}: this planner avoids spheres only; create it with obstacles or downwash.")
-        committed = getattr(getattr(self.solver, "problem", None), "committed", True)
-        for name, per_robot in {"reference": (stages, 3), "reference_weight": (stages,)}.items():
-            if (given := getattr(problems, name)) is None:
-                continue
-            about[name] = _array(name, given, (count, *per_robot))
-            if not committed or (problems.reference is None) != (problems.reference_weight is None):
-                raise ValueError(
-                    f"{name}: references need weights, and a planner with planner.commitment above 0, whose value only "
-                    "swarms use."
-                )
-        if problems.disturbance is not None:
-            about["disturbance"] = _array("disturbance", problems.disturbance, (count, 3))
-            if not getattr(getattr(self.solver, "problem", None), "disturbed", True):
-                raise ValueError("disturbance: this planner knows none; set planner.disturbance_time.")
-        if (weights := about.get("reference_weight")) is not None and np.any(weights < 0):
-            raise ValueError("reference_weight: weights must not be negative.")
-        if (heading := problems.heading) is not None:
-            heading = _array("heading", heading, (count,))
-            if not self.config.max_yaw_rate and np.abs(wrapped(heading - x[:, 8])).max(initial=0.0) > SAME_HEADING:
-                raise ValueError("heading: this planner holds the yaw of robots; create it with max_yaw_rate above 0.")
-        return Problems(x, goal, others, **about, heading=heading), Plans(
+        about |= self._checked_of_robots(problems, x)
+        return Problems(x, goal, others, **about), Plans(
             # The last plan is a guess, so that numbers which are not finite only cost a retry
             _array("previous.x", previous.x, (count, stages + 1, N_STATES), finite=False),
             _array("previous.u", previous.u, (count, stages, N_INPUTS), finite=False),
@@ -234,6 +215,32 @@ class Planner:
             _array("previous.status", previous.status, (count,), np.dtype(np.int64)),
             _array("previous.iterations", previous.iterations, (count,), np.dtype(np.int64)),
         )
+
+    def _checked_of_robots(self, problems: Problems, x: np.ndarray) -> dict[str, np.ndarray]:
+        """Check the arrays of a call that some planners alone use, and return those that are given."""
+        count, stages = len(x), self.config.horizon
+        shapes = {"reference": (stages, 3), "reference_weight": (stages,), "disturbance": (3,), "heading": ()}
+        given = {
+            name: _array(name, array, (count, *shape))
+            for name, shape in shapes.items()
+            if (array := getattr(problems, name)) is not None
+        }
+        solved = getattr(self.solver, "problem", None)
+        if len(given.keys() & {"reference", "reference_weight"}) == 1 or (
+            "reference" in given and not getattr(solved, "committed", True)
+        ):
+            raise ValueError(
+                "reference: references need weights, and a planner with planner.commitment above 0, whose value only "
+                "swarms use."
+            )
+        if "reference" in given and (given["reference_weight"] < 0).any():
+            raise ValueError("reference_weight: weights must not be negative.")
+        if "disturbance" in given and not getattr(solved, "disturbed", True):
+            raise ValueError("disturbance: this planner knows none; set planner.disturbance_time.")
+        turns = np.abs(wrapped(given["heading"] - x[:, 8])).max(initial=0.0) if "heading" in given else 0.0
+        if turns > SAME_HEADING and not self.config.max_yaw_rate:
+            raise ValueError("heading: this planner holds the yaw of robots; create it with max_yaw_rate above 0.")
+        return given
 
     def _plan(self, problems: Problems, previous: Plans) -> Plans:
         """Do the same with roll and pitch about the world's axes, whatever the yaw."""
@@ -321,8 +328,7 @@ class Planner:
         state, hold = x, np.zeros((x.shape[0], N_INPUTS))
         if disturbance is not None:
             hold = self.model.params.steady_input(disturbance)
-            climb = self.config.max_climb_rate
-            u[..., 2] = np.clip(hold[:, None, 2], -climb, climb)
+            u[..., 2] = np.clip(hold[:, None, 2], -self.config.descent_rate, self.config.max_climb_rate)
         for k in range(self.config.horizon):
             u[:, k, 0] = np.clip(gain * state[:, 4] + hold[:, 0], -limit, limit)
             u[:, k, 1] = np.clip(-gain * state[:, 3] + hold[:, 1], -limit, limit)

@@ -104,4 +104,5 @@ def _largest(config: PlannerConfig, model: QuadrotorModel) -> np.ndarray:
     """Return the accelerations against which nine tenths of tilt and climb rate hold robots, (3,) (m/s^2)."""
     params = model.params
     sideways = params.gravity * np.tan(0.9 * config.max_tilt * np.array([params.pitch_gain, params.roll_gain]))
-    return np.array([*sideways, 0.9 * config.max_climb_rate * params.climb_gain / params.climb_time_constant])
+    climb = min(config.max_climb_rate, config.descent_rate)
+    return np.array([*sideways, 0.9 * climb * params.climb_gain / params.climb_time_constant])
