@@ -1,8 +1,8 @@
 """Robots keep to the plans that they sent, so that others may rely on them.
 
 A compatibility constraint of distributed receding-horizon control (Dunbar and Murray 2006, Automatica), here as a soft
-cost: w_k |p_k - r_k|^2 at stage k for leaving the plan r that was sent last, to anybody, with w_k = W exp(-fade k / N)
-at the stages that it still covers. Without a plan sent in the last N steps, there is no cost.
+cost: the squared distance at each stage k to the plan that was sent last, to anybody, as far as that plan reaches, with
+the weight ``W exp(-fade k / N)``. Without a plan sent in the last N steps, there is no cost.
 """
 
 from __future__ import annotations

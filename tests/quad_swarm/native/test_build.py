@@ -305,15 +305,17 @@ int main() {
   for (int count : {0, 1, 2, 3, 5, 8, 9, 16, 17, 33, 50}) {
     std::vector<double> x(count * 9), goal(count * 3), others(count * N_OTHERS * N * 3), guess(count * N * 4);
     std::vector<double> clearance(count * N_OTHERS * N), shape(count * N_OTHERS * 3), size(count * N_OTHERS);
-    for (auto* array : {&x, &goal, &others, &guess, &clearance, &shape, &size})
+    std::vector<double> reference(count * N * 3), weight(count * N, 2.0), push(count * 3), steady(count * 4);
+    for (auto* array : {&x, &goal, &others, &guess, &clearance, &shape, &size, &reference, &push, &steady})
       for (double& value : *array) value = normal(random);
     for (int k = 0; k < count; k += 4) x[k * 9] = bad[k / 4 % 3];
     std::vector<double> x_plan(count * (N + 1) * 9), u_plan(count * N * 4);
     std::vector<std::uint8_t> success(count);
     std::vector<std::int64_t> iterations(count);
     const auto some = [count](const std::vector<double>& array) { return count % 2 ? array.data() : nullptr; };
-    quad_swarm_rti(count, x.data(), goal.data(), others.data(), some(clearance), some(shape), some(size), guess.data(),
-                   x_plan.data(), u_plan.data(), success.data(), iterations.data(), 2, 6, 50, 1e-4);
+    quad_swarm_rti(count, x.data(), goal.data(), others.data(), some(clearance), some(shape), some(size),
+                   some(reference), some(weight), some(push), some(steady), guess.data(), x_plan.data(), u_plan.data(),
+                   success.data(), iterations.data(), 2, 6, 50, 1e-4);
     for (auto s : success) solved += s;
   }
   std::printf("%ld", solved);
@@ -322,7 +324,7 @@ int main() {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parts", [{}, {"shaped": True}])
+@pytest.mark.parametrize("parts", [{}, {"shaped": True, "committed": True, "disturbed": True}])
 def test_sanitizers_find_nothing(parts, tmp_path):
     flags = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     solved = run_harness(tmp_path, SANITIZED, *flags, **parts)
