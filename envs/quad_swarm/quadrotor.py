@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from types import SimpleNamespace
 from typing import Annotated, Any
@@ -140,10 +140,15 @@ def rk4_step(
     x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float | ca.SX, heading: bool = True
 ) -> ca.SX:
     """Take one classical Runge-Kutta step of length ``dt`` (s) with constant input (eq. 1), see `state_derivative`."""
-    k1 = state_derivative(x, u, wind, params, heading)
-    k2 = state_derivative(x + dt / 2 * k1, u, wind, params, heading)
-    k3 = state_derivative(x + dt / 2 * k2, u, wind, params, heading)
-    k4 = state_derivative(x + dt * k3, u, wind, params, heading)
+    return rk4(lambda state: state_derivative(state, u, wind, params, heading), x, dt)
+
+
+def rk4(derivative: Callable[[ca.SX], ca.SX], x: ca.SX, dt: float | ca.SX) -> ca.SX:
+    """Take one classical Runge-Kutta step of length ``dt`` (s) of any ordinary differential equation."""
+    k1 = derivative(x)
+    k2 = derivative(x + dt / 2 * k1)
+    k3 = derivative(x + dt / 2 * k2)
+    k4 = derivative(x + dt * k3)
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
@@ -175,15 +180,13 @@ def _compiled_step(params: QuadrotorParams, dt: float | None, varied: bool, head
         return None
 
 
-class QuadrotorModel:
-    """Discrete dynamics of a batch of quadrotors, on NumPy arrays. Thread-safe.
+class VehicleModel:
+    """Discrete dynamics of a batch of vehicles, on NumPy arrays. Thread-safe.
 
-    :param params: physical parameters
     :param dt: length of a step (s)
     """
 
-    def __init__(self, params: QuadrotorParams, dt: float):
-        self.params = params
+    def __init__(self, dt: float):
         self.dt = dt
         self._local = threading.local()  # calls write into buffers, so each thread has its own
 
@@ -214,10 +217,26 @@ class QuadrotorModel:
     def _drifted(self, x: np.ndarray, time: np.ndarray | float, disturbance: np.ndarray | None) -> np.ndarray:
         """Add what constant accelerations do in some time to states, in place."""
         if disturbance is not None:
-            position, velocity = self.params.drift(time)
+            position, velocity = self.drift(time)
             x[..., POSITION] += position * disturbance
             x[..., VELOCITY] += velocity * disturbance
         return x
+
+    def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return what an acceleration of 1 m/s^2 beside the model does in some time, see `QuadrotorParams.drift`."""
+        raise NotImplementedError
+
+    def _heading(self, x: np.ndarray, u: np.ndarray) -> bool:
+        """Return whether a function with headings is needed."""
+        return False
+
+    def _function(self, dt: float | None, varied: bool, heading: bool) -> ca.Function:
+        """Create the function of a step, see `step_function`."""
+        raise NotImplementedError
+
+    def _compiled(self, dt: float | None, varied: bool, heading: bool) -> RowFunction | None:
+        """Return the same, compiled for many rows, from a cache; None if it cannot be compiled."""
+        raise NotImplementedError
 
     def _call(self, x: np.ndarray, arguments: list[np.ndarray | None], dt: float | None, varied: bool) -> np.ndarray:
         count = x.size // N_STATES
@@ -225,14 +244,14 @@ class QuadrotorModel:
             return x.copy()
         u = arguments[1]
         assert u is not None
-        heading = bool(np.count_nonzero(x[..., 8]) or np.count_nonzero(u[..., 3]))
-        if count >= _WORTH_COMPILING and (compiled := _compiled_step(self.params, dt, varied, heading)) is not None:
+        heading = self._heading(x, u)
+        if count >= _WORTH_COMPILING and (compiled := self._compiled(dt, varied, heading)) is not None:
             return compiled(count, arguments).reshape(x.shape)
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches need few functions
         calls: dict[Any, _BufferedCall] = self._local.__dict__
         key = (dt, varied, heading, capacity)
         if key not in calls:
-            calls[key] = _BufferedCall(step_function(self.params, dt, varied, heading), capacity)
+            calls[key] = _BufferedCall(self._function(dt, varied, heading), capacity)
         return calls[key](count, arguments).reshape(x.shape)
 
     def rollout(self, x: np.ndarray, u: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
@@ -245,6 +264,30 @@ class QuadrotorModel:
         for k in range(u.shape[1]):
             states[:, k + 1] = self._drifted(self.step(states[:, k], u[:, k]), self.dt, disturbance)
         return states
+
+
+class QuadrotorModel(VehicleModel):
+    """Discrete dynamics of a batch of quadrotors, on NumPy arrays. Thread-safe.
+
+    :param params: physical parameters
+    :param dt: length of a step (s)
+    """
+
+    def __init__(self, params: QuadrotorParams, dt: float):
+        super().__init__(dt)
+        self.params = params
+
+    def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
+        return self.params.drift(time)
+
+    def _heading(self, x: np.ndarray, u: np.ndarray) -> bool:
+        return bool(np.count_nonzero(x[..., 8]) or np.count_nonzero(u[..., 3]))
+
+    def _function(self, dt: float | None, varied: bool, heading: bool) -> ca.Function:
+        return step_function(self.params, dt, varied, heading)
+
+    def _compiled(self, dt: float | None, varied: bool, heading: bool) -> RowFunction | None:
+        return _compiled_step(self.params, dt, varied, heading)
 
     def __reduce__(self) -> tuple:
         return QuadrotorModel, (self.params, self.dt)  # call buffers hold raw memory: rebuilt on demand

@@ -51,6 +51,7 @@ class DelayCheckedSwarm(Swarm):
         self.clearance = clearance
         self.wait = 1 + config.radio.delay  # steps until all robots know each other's candidates
         self._stages = 2 * horizon + self.wait  # number of stages of a plan that ends at rest, from now on
+        assert isinstance(self.planner.model, QuadrotorModel)
         self._feedback = _feedback(self.planner.model)
         # Plans and braking to rest, from now on, (E, n, committed or candidate, ...)
         self._x = np.zeros((n_swarms, n, 2, self._stages + 1, 9))

@@ -63,7 +63,10 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     step of an episode also `is_success` and further `metrics`. With a limited neighbourhood also `neighbours` (n, m),
     the index of the robot in each slot of the action and of the entries about others, -1 for an empty slot, and
     `pair_terminated` (n, m), whether another robot, or none, is in the slot after the step. With obstacles also
-    `min_obstacle_distance` and `min_obstacle_distance_continuous` (m, between surfaces, infinity without any).
+    `min_obstacle_distance` and `min_obstacle_distance_continuous` (m, between surfaces, infinity without any). With
+    `plans_in_info` also `plan`: `states` (n, N + 1, 9), the planned states at stages 0..N, the first of which are those
+    from which the inputs act; `inputs` (n, 4), chosen in the step; `cost` (n,), the problem's objective with the
+    violations of soft constraints; and `solve_seconds`, the wall-clock time of the planner's call for all robots.
 
     ## Arguments
     :param preset: a name of `presets.PRESETS`, such as "paper" or "dense"
@@ -86,6 +89,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         "quadrotor": {"drag_x": 0.3}}``; fields that are also arguments may be passed either way, but not both
     :param solver: "auto" or a name of `planner.SOLVERS`
     :param announcements: whether robots may also send their plans without a request, see the action space
+    :param plans_in_info: whether `info` holds plans, inputs, costs and solve times
     :param render_mode: None, "rgb_array", or "human" for a window that shows every step in real time
     :raises ValueError: if a value is invalid; the message names it and the remedy
 

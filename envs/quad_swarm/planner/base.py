@@ -11,9 +11,11 @@ import numpy as np
 
 from quad_swarm.errors import shown
 from quad_swarm.geometry import length, wrapped
+from quad_swarm.planner.cost import PlanCost
+from quad_swarm.planner.model import ProblemModel
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
-from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY, QuadrotorModel
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY, QuadrotorModel, VehicleModel
 
 
 class Solution(NamedTuple):
@@ -113,10 +115,12 @@ class Plans(NamedTuple):
 
 class Planner:
     """Planner with warm-started solves and a fallback chain: solve, retry cold, continue the last plan, brake
-    (Sec. III-B).
+    (Sec. III-B). All levels plan with the same dynamics.
 
     The level is chosen independently for each robot, so a failure never affects another robot's plan.
 
+    :ivar rate: what computes the costs of plans after each call, see `PlanCost`; None for nothing
+    :ivar costs: these costs, (B,)
     :ivar checks: whether `plan` refuses invalid arrays; otherwise, problems whose numbers are not finite fail and
         brake, as in the steps of swarms, which never raise
 
@@ -127,17 +131,19 @@ class Planner:
         closest to; None for all
     """
 
-    def __init__(self, solver: Solver, model: QuadrotorModel, config: PlannerConfig, n_others: int | None = None):
+    def __init__(self, solver: Solver, model: VehicleModel, config: PlannerConfig, n_others: int | None = None):
         self.solver = solver
         self.model = model
         self.config = config
         self.n_others = n_others
         self.checks = True
+        self.rate: PlanCost | None = None
+        self.costs: np.ndarray | None = None
 
     def plan(self, problems: Problems, previous: Plans) -> Plans:
         """Solve a batch of B problems; solver failures never raise.
 
-        Robots may have any heading, and turn to that of their problem the short way. Limits of roll and pitch hold
+        Quadrotors may have any heading, and turn to that of their problem the short way. Limits of roll and pitch hold
         along the heading.
 
         :param problems: the batch
@@ -150,14 +156,15 @@ class Planner:
             problems, previous = self._checked(problems, previous)
         if (cruise := self.config.cruise_distance) is not None:
             problems = problems._replace(goal=nearer(problems.x[:, POSITION], problems.goal, cruise))
-        if problems.disturbance is not None:
+        if problems.disturbance is not None and isinstance(self.model, QuadrotorModel):
             problems = problems._replace(steady_input=self.model.params.steady_input(problems.disturbance))
         if problems.shape is None and self.config.downwash != 1:
             flat = np.ones((*problems.others.shape[:2], 3))
             flat[..., 2] = 1 / self.config.downwash
             problems = problems._replace(shape=flat)
         heading = problems.heading if self.config.max_yaw_rate else None
-        if not (np.count_nonzero(problems.x[:, 8]) or (heading is not None and np.count_nonzero(heading))):
+        turns = np.count_nonzero(problems.x[:, 8]) or (heading is not None and np.count_nonzero(heading))
+        if isinstance(self.model, ProblemModel) or not turns:
             return self._plan(problems, previous)
         # Within, roll and pitch are those about the world's axes, to which the problem has no yaw, and the yaw is that
         # from the heading. Only robots with either are turned, so that a plan does not depend on the batch it is in
@@ -186,7 +193,7 @@ class Planner:
             if not isinstance(value, kind):
                 remedy = "; before the first solve, Plans.hover(x, horizon)" if kind is Plans else ""
                 raise ValueError(f"{name}={shown(value)}: pass {kind.__name__}{remedy}.")
-        count, *_ = (*_shape(problems.x), 0)
+        count = shape[0] if len(shape := _shape(problems.x)) == 2 else 1
         n_others = shape[1] if len(shape := _shape(problems.others)) == 4 else 0
         taken = n_others if kept is None else min(n_others, kept)
         if taken != (expected := getattr(getattr(self.solver, "problem", None), "n_others", taken)):
@@ -270,11 +277,14 @@ class Planner:
             u[failed[~lasts]] = self.braking_inputs(hopeless.x, hopeless.disturbance)
             pushed = None if problems.disturbance is None else problems.disturbance[failed]
             x[failed] = self._rollout(problems.x[failed], u[failed], pushed)
+        if self.rate is not None:
+            self.costs = self.rate(problems, x, u)
         return Plans(x, u, age, status, iterations)
 
     def _rollout(self, x: np.ndarray, u: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
         """Roll out states with roll and pitch about the world's axes, see `QuadrotorModel.rollout`."""
-        if not (np.count_nonzero(x[:, 8]) or np.count_nonzero(u[..., 3])):
+        turns = np.count_nonzero(x[:, 8]) or np.count_nonzero(u[..., 3])
+        if isinstance(self.model, ProblemModel) or not turns:
             return self.model.rollout(x, u, disturbance)
         held, still = x.copy(), u.copy()
         held[:, 8] = still[..., 3] = 0.0
@@ -316,11 +326,15 @@ class Planner:
         """Compute inputs that bring robots to hover from their states without a solver, (B, 9) -> (B, N, 4).
 
         The commanded tilt, about the world's axes, opposes the velocity and the disturbance and saturates at its limit.
-        The commanded climb rate only opposes the disturbance.
+        The commanded climb rate only opposes the disturbance. Vehicles with dynamics of their own follow
+        `OptimalControlProblem.braking` instead.
 
         :param x: states, (B, 9)
         :param disturbance: see `Problems`
         """
+        if isinstance(self.model, ProblemModel):
+            return self.model.braking_inputs(x)
+        assert isinstance(self.model, QuadrotorModel)
         # Tilt a = v / (g * 0.5 s) stops the linearised robot in about half a second without overshoot
         gain = 1.0 / (self.model.params.gravity * 0.5)
         limit = self.config.max_tilt

@@ -8,7 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
+from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams, VehicleModel
+from quad_swarm.registry import Registry
 
 MODEL = "model"
 
@@ -54,13 +55,19 @@ class Simulator:
         return str(self.adapter).partition(":")[0]
 
 
-SIMULATORS: dict[str, Simulator] = {
-    "crazyflow": Simulator(
-        "quad_swarm.plants.crazyflow:CrazyflowPlant",
-        ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
-    ),
-    "rotorpy": Simulator("quad_swarm.plants.rotorpy:RotorpyPlant", ("crazyflie", "crazyfliebrushless", "hummingbird")),
-}
+SIMULATORS: Registry[Simulator] = Registry(
+    "plant",
+    "quad_swarm.plants",
+    {
+        "crazyflow": Simulator(
+            "quad_swarm.plants.crazyflow:CrazyflowPlant",
+            ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
+        ),
+        "rotorpy": Simulator(
+            "quad_swarm.plants.rotorpy:RotorpyPlant", ("crazyflie", "crazyfliebrushless", "hummingbird")
+        ),
+    },
+)
 
 
 def simulated_vehicles() -> list[str]:
@@ -71,9 +78,10 @@ def simulated_vehicles() -> list[str]:
 def simulator_of(name: str) -> Simulator:
     """Return the entry of `SIMULATORS` for a name.
 
-    :raises ValueError: if it is no `Simulator`
+    :raises ValueError: if there is none, or it is no `Simulator`
+    :raises ImportError: if an installed package offers it, and it cannot be loaded
     """
-    if isinstance(known := SIMULATORS[name], Simulator):
+    if isinstance(known := SIMULATORS.find(name, (MODEL,)), Simulator):
         return known
     raise ValueError(
         f"SIMULATORS[{name!r}]={shown(known)}: it must be a quad_swarm.plants.Simulator, which names the adapter and "
@@ -111,7 +119,7 @@ class ModelPlant:
     :param model: the dynamics over a sub-step
     """
 
-    def __init__(self, model: QuadrotorModel):
+    def __init__(self, model: VehicleModel):
         self._model = model
 
     def place(self, swarm: int, state: np.ndarray) -> None:
@@ -137,15 +145,15 @@ def parse_plant(name: str) -> tuple[str, str]:
     simulator, _, vehicle = name.partition(":")
     if simulator == MODEL and not vehicle:
         return MODEL, ""
-    if simulator not in SIMULATORS:
-        raise unknown_name("plant", simulator, [MODEL, *SIMULATORS])
     known = simulator_of(simulator)
     if vehicle and vehicle not in known.vehicles:
         raise unknown_name(f"vehicle of {simulator}", vehicle, known.vehicles)
     return simulator, vehicle or known.vehicles[0]
 
 
-def make_plant(name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int) -> Plant:
+def make_plant(
+    name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int, model: VehicleModel | None = None
+) -> Plant:
     """Create a plant.
 
     :param name: see `parse_plant`
@@ -153,13 +161,14 @@ def make_plant(name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_r
     :param dt: length of a sub-step (s)
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
+    :param model: our own model over a sub-step, by default that of quadrotors
     :raises ValueError: if the plant is unknown, or the simulator does not support sub-steps of this length
     :raises ImportError: if the simulator is not installed
     :raises PlantError: if the simulator's process dies, or its adapter raises another error
     """
     simulator, vehicle = parse_plant(name)
     if simulator == MODEL:
-        return ModelPlant(QuadrotorModel(params, dt))
+        return ModelPlant(model or QuadrotorModel(params, dt))
     from quad_swarm.plants.remote import RemotePlant
 
     return RemotePlant(simulator, vehicle, params, dt, n_swarms, n_robots)

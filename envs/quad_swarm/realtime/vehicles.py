@@ -76,10 +76,15 @@ class Vehicles:
     :ivar held: which robots are held where they are until their first command, (n,) bool; `reset` holds nobody
 
     :param config: the world; its clock skew is not used, since commands take effect when they arrive
-    :raises ValueError: if a sub-step is no whole number of microseconds
+    :raises ValueError: if a sub-step is no whole number of microseconds, or the world's vehicles are no quadrotors
     """
 
     def __init__(self, config: SwarmConfig):
+        if not config.flies_quadrotors:
+            raise ValueError(
+                f"planner.problem={config.planner.problem!r}: vehicles in real time level and land as quadrotors do; "
+                "fly this world as a swarm, or give a quad_swarm.realtime.Loop a vehicle of your own."
+            )
         n, step = config.n_robots, config.planner.dt / config.substeps
         self.config, self.step_us = config, round(step * _US)
         if abs(self.step_us - step * _US) > 1e-6:

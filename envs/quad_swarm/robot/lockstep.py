@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.plants import make_plant
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.robot.robot import Plan, Robot
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.obstacles import Obstacle
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, plant_of
 from quad_swarm.world.realisation import Realisation
 from quad_swarm.world.route import Targets
 
@@ -35,7 +34,7 @@ class LockstepWorld:
         n = config.n_robots
         self.config, self.robots = config, list(robots)
         self.realisation = Realisation(config, 1)
-        self.plant = make_plant(config.plant, config.quadrotor, config.planner.dt / config.substeps, 1, n)
+        self.plant = plant_of(config, config.planner.dt / config.substeps, 1, n)
         self.state, self.now = np.zeros((1, n, N_STATES)), 0
         self._u = np.zeros((1, n, N_INPUTS))
         self._others = other_indices(n)
@@ -57,9 +56,9 @@ class LockstepWorld:
         initial_headings: Any = None,
     ) -> None:
         """Begin an episode, see `Swarm.reset`."""
-        moving, facing = self.config.check_motion(initial_velocities, initial_headings)
-        self.state[:], self._u[:], self.now = 0.0, 0.0, 0
-        self.state[0, :, POSITION], self.state[0, :, VELOCITY], self.state[0, :, 8] = starts, moving, facing
+        states = self.config.initial_states(np.asarray(starts), np.asarray(goals), initial_velocities, initial_headings)
+        moving, facing = states[:, VELOCITY], self.config.facing(states)
+        self.state[0], self._u[:], self.now = states, 0.0, 0
         self.plant.place(0, self.state[0])
         if self.config.is_random:
             self.realisation.reset(0, noise_seed)
@@ -71,7 +70,8 @@ class LockstepWorld:
             delay, kept = float(late[k]), 1 + radio.delay
             heading = None if headings is None else headings[k]
             target: dict[str, Any] = {"velocity": velocity, "waypoints": passed, "heading": heading}
-            target |= {"initial_velocity": moving[k], "initial_heading": facing[k]}
+            if self.config.flies_quadrotors:
+                target |= {"initial_velocity": moving[k], "initial_heading": facing[k]}
             robot.reset(starts[k], goal, delay, kept=kept, obstacles=obstacles, **target)
         causal = radio.round_trip is not None
         self._flying = deque([] for _ in range(1 + (radio.round_trip or 0) + radio.jitter))

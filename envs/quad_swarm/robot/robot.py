@@ -130,13 +130,13 @@ class Robot:
         :raises ValueError: if there are more obstacles than the world has room for, goals do not fit, see `fly_to`, or
             something has another shape, or is not finite
         """
-        velocities = None if initial_velocity is None else [initial_velocity]
-        moving, facing = self.config.check_motion(velocities, None if initial_heading is None else [initial_heading], 1)
+        initial_velocities = None if initial_velocity is None else [initial_velocity]
         obstacles = self.config.obstacles.listed if obstacles is None else obstacles
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(0, obstacles)
-        x = np.zeros((1, N_STATES))
-        x[:, POSITION], x[:, VELOCITY], x[:, 8] = start, moving, facing
+        initial_headings = None if initial_heading is None else [initial_heading]
+        x = self.config.initial_states(np.array([start]), np.array([goal]), initial_velocities, initial_headings)
+        moving, facing = x[:, VELOCITY], self.config.facing(x)
         self.late, self.now = late, now - self.period
         self.hold: np.ndarray | None = None
         self._facing = facing

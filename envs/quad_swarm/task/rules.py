@@ -146,6 +146,8 @@ def parse_rule(text: str) -> Rule:
 
     :raises ValueError: if the rule is unknown, or arguments are missing, superfluous or not numbers
     """
+    if not isinstance(text, str):
+        raise ValueError(f"rule={shown(text)}: it must be the text of a rule, such as 'cpa:0.7:1.5'.")
     return _either([[_parse_one(part) for part in joined] for joined in _split(text)])
 
 
@@ -206,17 +208,20 @@ def _parse_one(text: str, instead: Mapping[str, Callable[..., Rule]] = MappingPr
     if any(scaled and not length for scaled, length in zip(relative, lengths, strict=True)):
         raise ValueError(f"Rule {text!r}: only lengths ({', '.join(_LENGTHS)}) can be in separations, as in 1.2s.")
     if not any(relative):
-        return _checked(text, factory(*numbers))
+        return checked_rule(text, factory(*numbers))
 
     @functools.cache  # rules may have a state
     def scaled(separation: float) -> Rule:
         return factory(*(n * separation if r else n for n, r in zip(numbers, relative, strict=True)))
 
-    return _checked(text, lambda view: scaled(view.separation)(view))
+    return checked_rule(text, lambda view: scaled(view.separation)(view))
 
 
-def _checked(text: str, rule: Rule) -> Rule:
+def checked_rule(text: str, rule: Rule) -> Rule:
     """Return a rule that refuses what are no requests.
+
+    :param text: name of the rule, for the error message
+    :param rule: the rule
 
     :raises ValueError: in the rule, if it returned something else than True or False for each of the others
     """

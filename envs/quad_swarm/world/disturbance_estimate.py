@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.planner import PlannerConfig
-from quad_swarm.quadrotor import VELOCITY, QuadrotorModel
+from quad_swarm.quadrotor import VELOCITY, QuadrotorModel, VehicleModel
 from quad_swarm.states import like
 
 
@@ -37,16 +37,19 @@ class DisturbanceEstimate:
         self._expected = np.full((n_swarms, n_robots, 3), np.nan)  # velocities now
 
     @classmethod
-    def of(cls, config: PlannerConfig, model: QuadrotorModel, n_swarms: int, n_robots: int) -> Any:
+    def of(cls, config: PlannerConfig, model: VehicleModel, n_swarms: int, n_robots: int) -> DisturbanceEstimate | None:
         """Return the estimates at first, which are 0; None if robots estimate nothing."""
-        return None if config.disturbance_time is None else cls(config, model, n_swarms, n_robots)
+        if config.disturbance_time is None:
+            return None
+        assert isinstance(model, QuadrotorModel)  # problems of other vehicles refuse it
+        return cls(config, model, n_swarms, n_robots)
 
     def update(self, estimate: np.ndarray) -> None:
         """Compare states with those that were expected.
 
         :param estimate: estimated states now, (E, n, 9)
         """
-        _, velocity = self._model.params.drift(self._dt)
+        _, velocity = self._model.drift(self._dt)
         change = (estimate[..., VELOCITY] - self._expected) / velocity
         change = np.where(np.isfinite(change), change, 0.0)
         self.acceleration = np.clip(self.acceleration + self._gain * change, -self._largest, self._largest)

@@ -115,6 +115,8 @@ def farthest(config: SwarmConfig) -> float:
 def far_goals(config: SwarmConfig) -> tuple[float, str]:
     """Return the distance (m) from which on goals are approached at less than half of the possible speed, infinity with
     a cruise distance up to there, and the warning about it."""
+    if not config.flies_quadrotors:
+        return math.inf, ""
     planner, distance = config.planner, farthest(config)
     fastest = min(min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor))
     # Where robots aim beyond the end of the horizon, only their limits keep them from flying faster
@@ -147,6 +149,8 @@ def fast_starts(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
 
 
 def _too_fast(config: SwarmConfig, velocities: np.ndarray, name: str, does: str, what: str) -> Iterator[str]:
+    if not config.flies_quadrotors:
+        return
     planner = config.planner
     fastest = np.empty_like(velocities)
     fastest[:, :2] = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
@@ -217,7 +221,11 @@ def _up(number: float) -> float:
 
 
 def doubts(config: SwarmConfig) -> Iterator[str]:
-    """Yield a sentence about everything that is doubtful about a world, with a field and what to do."""
+    """Yield a sentence about everything that is doubtful about a world, with a field and what to do. How vehicles with
+    dynamics from outside move is not known here."""
+    if not config.flies_quadrotors:
+        yield from _doubts_about_the_others(config)
+        return
     short = short_horizon(config)
     if short is None:
         yield from _doubts_about_arriving(config)
@@ -326,6 +334,8 @@ def _usual_flight(config: SwarmConfig) -> float:
 def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
     """Yield a sentence if robots cannot fly a usual distance, with detours, or climb two thirds of the room's height in
     time."""
+    if not config.flies_quadrotors:
+        return
     planner, space, vehicle = config.planner, config.space, config.quadrotor
     speed = max(min(planner.max_speed, *(axis.fastest for axis in axes(planner, vehicle))), _TINIEST)
     climb = max(min(vertical_speeds(config)), _TINIEST)
@@ -362,12 +372,7 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
                 f"{name}={error:g} is in metres and too much for radius={config.radius:g}: robots cannot keep clear of "
                 f"each other, or stay at a goal; use at most {0.5 * most:.1g}"
             )
-    stride = planner.dt * min(planner.max_speed, *(axis.fastest for axis in axes(planner, config.quadrotor)))
-    if not config.continuous_collisions and stride > 4 * config.radius:
-        yield (
-            f"radius={config.radius:g}: robots fly up to {stride:.2g} m in a step and through "
-            "each other between steps, where collisions are not counted; use continuous_collisions=true"
-        )
+    yield from _doubts_about_speed(config) if config.flies_quadrotors else ()
     if planner.right_of_way > planner.separation:
         yield (
             f"planner.right_of_way={planner.right_of_way:g} is in metres and exceeds planner.separation="
@@ -377,6 +382,16 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
         yield (
             f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "
             f"touch, {2 * config.radius:g} m; use a few centimetres, as in the presets"
+        )
+
+
+def _doubts_about_speed(config: SwarmConfig) -> Iterator[str]:
+    planner = config.planner
+    stride = planner.dt * min(planner.max_speed, *(axis.fastest for axis in axes(planner, config.quadrotor)))
+    if not config.continuous_collisions and stride > 4 * config.radius:
+        yield (
+            f"radius={config.radius:g}: robots fly up to {stride:.2g} m in a step and through "
+            "each other between steps, where collisions are not counted; use continuous_collisions=true"
         )
     reach = config.neighbourhood.range
     if reach is not None and config.is_limited:

@@ -13,7 +13,7 @@ import numpy as np
 
 from quad_swarm.native.pairs import resample
 from quad_swarm.planner import Problems
-from quad_swarm.quadrotor import QuadrotorModel
+from quad_swarm.quadrotor import VehicleModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
 from quad_swarm.world.commitment import Commitment
 from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
@@ -115,7 +115,7 @@ def make_beliefs(config: SwarmConfig, n_swarms: int, n_robots: int) -> Beliefs:
 
 def make_problems(
     config: SwarmConfig,
-    model: QuadrotorModel,
+    model: VehicleModel,
     estimate: np.ndarray,
     goal: np.ndarray,
     believed: np.ndarray,

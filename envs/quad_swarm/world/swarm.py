@@ -15,7 +15,6 @@ import numpy as np
 from quad_swarm.errors import shown
 from quad_swarm.native.steps import measure
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
-from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.validation import points
@@ -25,7 +24,7 @@ from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacle, Obstacles, Surroundings, surroundings
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, plant_of
 from quad_swarm.world.radio import make_channel
 from quad_swarm.world.realisation import Realisation
 from quad_swarm.world.route import Route, Targets
@@ -120,16 +119,17 @@ class Swarm(SwarmState):
     :param config: the world
     :param n_swarms: number of swarms E
     :param solver: see `make_planner`
+    :param costs: see `make_planner`
     """
 
-    def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
+    def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto", costs: bool = False):
         self.config = config
         self.planner: Planner = make_planner(
-            config.planner, config.quadrotor, config.n_others + 1, solver, config.obstacles.slots
+            config.planner, config.quadrotor, config.n_others + 1, solver, config.obstacles.slots, costs
         )
         self.planner.checks = False
         n, horizon = config.n_robots, config.planner.horizon
-        self._plant = make_plant(config.plant, config.quadrotor, config.planner.dt / config.substeps, n_swarms, n)
+        self._plant = plant_of(config, config.planner.dt / config.substeps, n_swarms, n)
         state = np.zeros((n_swarms, n, 9))
         plans = Plans.hover(state.reshape(-1, 9), horizon)
         plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
@@ -267,8 +267,9 @@ class Swarm(SwarmState):
         initial_velocities: Any = None,
         initial_headings: Any = None,
     ) -> None:
-        """Place the robots of one swarm, by default at rest. Robots pass their waypoints, each as soon as they are
-        within the goal radius of it, and then fly to their goals, which may move.
+        """Place the robots of one swarm, by default at rest, or in motion as `OptimalControlProblem.start` says. Robots
+        pass their waypoints, each as soon as they are within the goal radius of it, and then fly to their goals, which
+        may move.
 
         :param swarm: index of the swarm
         :param starts: starts, (n, 3), world frame (m)
@@ -292,10 +293,10 @@ class Swarm(SwarmState):
             starts, targets = points("starts", starts, n), Targets.of(goals, velocities, waypoints, n)
         else:
             starts, targets = self.config.check_flight(starts, goals, obstacles, velocities, waypoints)
-        moving, facing = self.config.check_motion(initial_velocities, initial_headings)
-        headings = self.config.check_headings("headings", headings, facing)
-        self.state[swarm] = 0.0
-        self.state[swarm, :, POSITION], self.state[swarm, :, VELOCITY], self.state[swarm, :, 8] = starts, moving, facing
+        states = self.config.initial_states(starts, targets.goals, initial_velocities, initial_headings)
+        moving = states[:, VELOCITY]
+        headings = self.config.check_headings("headings", headings, self.config.facing(states))
+        self.state[swarm] = states
         self._turn_to(swarm, slice(None), headings)
         self._fly_to(swarm, slice(None), targets)
         if self.obstacles is not None or obstacles:

@@ -328,3 +328,44 @@ def test_points_beyond_any_number_are_refused_in_one_line():
 def test_a_level_that_is_none_is_refused(level):
     with pytest.raises(ValueError, match=r"Level .* does not exist"):
         QuadSwarmEnv(scenario="curriculum").set_curriculum_level(level)
+
+
+def test_plans_are_in_the_info_on_request():
+    """And nothing else changes."""
+    world = {"preset": "flight", "scenario": "random", "max_steps": 6}
+    plain, told = (gymnasium.make("QuadSwarm-v0", plans_in_info=on, **world).unwrapped for on in (False, True))
+    kind = {"vectorization_mode": "vector_entry_point", "plans_in_info": True}
+    batch = gymnasium.make_vec("QuadSwarm-v0", num_envs=2, **kind, **world).unwrapped
+    parallel = quad_swarm.parallel_env(plans_in_info=True, **world)
+    for env in (plain, told, batch, parallel):
+        env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for step in range(6):
+        action = rng.integers(0, 2, plain.action_space.shape)
+        expected, *_, without = plain.step(action)
+        observation, *_, info = told.step(action)
+        *_, infos = batch.step(np.stack([action, action]))
+        *_, of_agents = parallel.step(dict(zip(parallel.possible_agents, action.reshape(8, 7), strict=True)))
+        assert np.array_equal(observation, expected)
+        assert info.keys() - without.keys() == {"plan"}
+        plan, swarm = info["plan"], told.task.swarm
+        shapes = {"states": (8, 21, 9), "inputs": (8, 4), "cost": (8,), "solve_seconds": ()}
+        assert {name: np.shape(value) for name, value in plan.items()} == shapes
+        assert np.array_equal(plan["states"], swarm.plans[0])
+        assert np.array_equal(plan["inputs"], swarm.inputs[0])
+        assert (plan["cost"] > 0).all()
+        assert plan["solve_seconds"] > 0
+        for name in ("states", "inputs", "cost"):  # in the last step, too, after which the batch begins anew
+            assert np.array_equal(infos["plan"][name][0], plan[name]), (step, name)
+            assert np.array_equal(of_agents["robot_3"]["plan"][name], plan[name])
+    assert pickle.loads(pickle.dumps(told)).step(action)[-1]["plan"]["cost"].shape == (8,)
+
+
+def test_a_pickled_environment_reaches_the_end_of_its_episode():
+    env = gymnasium.make("QuadSwarm-v0", scenario="random", max_steps=30).unwrapped
+    env.reset(seed=0)
+    copied = pickle.loads(pickle.dumps(env))
+    for _ in range(30):
+        *_, over, truncated, info = copied.step(np.ones(12, np.int8))
+    assert over or truncated
+    assert "swarm/arrival_rate" in info["metrics"]

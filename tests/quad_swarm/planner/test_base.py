@@ -383,7 +383,7 @@ def test_a_limit_above_the_number_of_others_changes_nothing():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("x", np.zeros(9), r"x has shape \(9,\) and type float64; this planner takes \(9, 9\)"),
+        ("x", np.zeros(9), r"x has shape \(9,\) and type float64; this planner takes \(1, 9\)"),
         ("x", np.zeros((1, 12)), r"x has shape \(1, 12\) .* takes \(1, 9\)"),
         ("x", np.zeros((1, 9), complex), r"x has .* type complex128; .* and float64"),
         ("x", "state", r"x has shape \(\)"),

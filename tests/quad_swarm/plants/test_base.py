@@ -43,7 +43,7 @@ def test_our_own_model_is_the_model():
 
 def test_vehicles_of_others_cannot_be_varied():
     assert make_config("flight", plant="crazyflow").mismatch == 0
-    with pytest.raises(ValueError, match=r"mismatch=0\.1: it only applies to plant='model'"):
+    with pytest.raises(ValueError, match=r"mismatch=0\.1: it only applies to the quadrotors of plant='model'"):
         make_config("flight", plant="crazyflow", mismatch=0.1)
 
 

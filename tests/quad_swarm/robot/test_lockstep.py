@@ -2,6 +2,7 @@
 
 import functools
 
+import foreign
 import numpy as np
 import pytest
 import torch as th
@@ -9,7 +10,7 @@ import torch as th
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import Condition, begin, first_episode
 from quad_swarm.evaluation.policies import fitted, load_model
-from quad_swarm.planner import make_planner
+from quad_swarm.planner import PROBLEMS, make_planner
 from quad_swarm.robot import Plan, Robot, RulePolicy
 from quad_swarm.robot.lockstep import LockstepWorld
 from quad_swarm.task.request_task import requests_of
@@ -233,3 +234,13 @@ def test_mistakes_are_noticed(mistake, name):
     found = differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap", make_robot=mistake)
     first = next(found)[0]
     assert name in {what for step, what in [(first, name), *found] if step == first}
+
+
+@pytest.mark.parametrize("preset", ["paper", "flight"])
+@pytest.mark.parametrize("kind", [foreign.Boat, foreign.Drifter])
+def test_vehicles_from_outside_fly_alike(kind, preset, monkeypatch):
+    monkeypatch.setitem(PROBLEMS, "boat", kind)
+    config = make_config(preset, n_robots=3, planner={"problem": "boat"})
+    policies = [RulePolicy("full")] * 3
+    assert not list(differences(config, policies, "full", "random", steps=20))
+    planner_of.cache_clear()

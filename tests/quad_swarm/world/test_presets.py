@@ -5,13 +5,14 @@ import json
 import pickle
 from pathlib import Path
 
+import foreign
 import numpy as np
 import pytest
 
 from quad_swarm import QuadSwarmEnv, QuadSwarmParallelEnv
-from quad_swarm.planner import PlannerConfig
+from quad_swarm.planner import PROBLEMS, PlannerConfig
 from quad_swarm.world.doubts import DoubtfulWorld
-from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
+from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config, plant_of
 from quad_swarm.world.swarm import Swarm
 
 FROZEN = json.loads(Path(__file__).with_name(f"presets_v{PRESET_VERSION}.json").read_text())
@@ -269,3 +270,42 @@ def test_a_state_outside_is_no_reset():
     other = QuadSwarmEnv(n_robots=2)
     other.load_state_dict(env.state_dict())
     assert other.task.swarm.state[0, 0, 0] == 7.0
+
+
+@pytest.fixture
+def fleet(monkeypatch):
+    """Vehicles from outside."""
+    for name, kind in {"boat": foreign.Boat, "stepper": foreign.Stepper, "thrifty": foreign.Thrifty}.items():
+        monkeypatch.setitem(PROBLEMS, name, kind)
+
+
+@pytest.mark.parametrize("planner", [{"problem": "boat"}, PlannerConfig(problem="boat")])
+def test_vehicles_from_outside_are_not_judged_as_quadrotors(planner, fleet, recwarn):
+    config = make_config("flight", planner=planner, quadrotor={"roll_time_constant": 5.0}, max_steps=3)
+    assert (config.mismatch, config.flies_quadrotors) == (0.0, False)
+    assert not [one for one in recwarn if issubclass(one.category, DoubtfulWorld)]
+    costs = make_config("flight", planner={"problem": "thrifty"})
+    assert (costs.mismatch, costs.flies_quadrotors) == (0.1, True)
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        ({"planner": {"problem": "bote"}}, "Unknown problem 'bote'; known: .*Did you mean 'boat'"),
+        ({"planner": {"problem": "boat"}, "mismatch": 0.1}, "mismatch=0.1: .*'boat' has no such parameters"),
+        ({"planner": {"problem": "stepper"}, "substeps": 5}, "substeps: Stepper says how its vehicles move in a whole"),
+        ({"planner": {"problem": "stepper"}, "noise": {"wind": 1}}, "noise.wind or noise.gust: Stepper .*`derivative`"),
+        ({"planner": {"problem": 3}}, "planner.problem=3"),
+    ],
+)
+def test_worlds_that_a_vehicle_from_outside_cannot_fly_in_are_refused(world, message, fleet):
+    with pytest.raises(ValueError, match=message):
+        make_config("paper", world)
+
+
+def test_the_planner_s_model_is_what_flies(fleet):
+    state, u = np.zeros((1, 2, 9)), np.ones((1, 2, 4))
+    plant = plant_of(make_config("paper", planner={"problem": "boat"}), 0.02, 1, 2)
+    after = plant.step(state, u, np.zeros((1, 2, 2)), None)
+    np.testing.assert_allclose(after[..., 3:5], (1 - np.exp(-0.4 * 0.02)) / 0.4, rtol=1e-6)
+    assert not after[..., 5:].any()

@@ -7,6 +7,7 @@ zeros of the dynamics are never computed. The handwritten C++ source contains no
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 
 import casadi as ca
 import numpy as np
@@ -138,7 +139,10 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
     residual = problem.repulsion_residual(distance)
     slope = ca.jacobian(residual, distance)
     # With nobody, the kernel does not call the function
-    some = problem if problem.n_others else OptimalControlProblem(problem.config, problem.quadrotor, 1, problem.shaped)
+    some = problem
+    if not problem.n_others:
+        some = copy(problem)
+        some.n_others = 1
     columns = [other, *(ca.SX.sym(f"other{j}", 3) for j in range(1, some.n_others))]
     about_other = {"x": x, "other": other}
     if problem.shaped:
