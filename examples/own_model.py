@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from quad_swarm.evaluation import Condition, fly
-from quad_swarm.planner import PROBLEMS, FatropSolver, OptimalControlProblem, Problems, RtiSolver, make_planner
+from quad_swarm.planner import PROBLEMS, FatropSolver, OptimalControlProblem, Plans, Problems, RtiSolver, make_planner
 from quad_swarm.plants import SIMULATORS, Simulator
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.world.presets import make_config
@@ -145,7 +145,7 @@ def compare_solvers(config, count):
     starts, ahead = np.tile([0, 0, 50.0], (count, 1)), rng.uniform([15, -15, -5], [40, 15, 5], (count, 3))
     x, goals = problem.start(starts, starts + np.eye(3)[0]), starts + ahead  # behind, left and right are equally good
     others = np.tile(x[:, None, None, :3] + [0, 0, 25.0], (1, 1, horizon, 1))  # nobody in the way
-    call = Problems(x, goals, others), *planner.first(x)[:2]
+    call = Problems(x, goals, others), *Plans.steady(x, horizon, config.planner.dt)[:2]
     rti = RtiSolver(problem, sqp_iterations=10, precision="float64").solve(*call)
     fatrop = FatropSolver(problem).solve(*call)
     both = rti.success & fatrop.success
