@@ -23,6 +23,7 @@ _REGISTRIES = (
     ("quad_swarm.task.observation", "GROUPS"),
     ("quad_swarm.world.scenarios", "SCENARIOS"),
     ("quad_swarm.planner", "SOLVERS"),
+    ("quad_swarm.planner", "PROBLEMS"),
     ("quad_swarm.plants.base", "SIMULATORS"),
 )
 

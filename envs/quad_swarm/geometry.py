@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,11 @@ def flattened(vectors: np.ndarray, height: float) -> np.ndarray:
     return vectors if height == 1 else np.array([1.0, 1.0, 1 / height]) * vectors
 
 
+def wrapped(angle: Any) -> Any:
+    """Return angles, (...) (rad), as those between half a turn clockwise and half a turn counter-clockwise."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+
+
 def to_quaternion(attitude: np.ndarray) -> np.ndarray:
     """Return roll, pitch and yaw (rad), (3,), as a quaternion x, y, z, w, (4,)."""
     (sr, sp, sy), (cr, cp, cy) = np.sin(attitude / 2), np.cos(attitude / 2)
@@ -84,4 +90,4 @@ def to_frd(attitude: np.ndarray) -> np.ndarray:
     """Return roll, pitch and yaw (rad), (3,), with y left and z up as those with y right and z down, with the yaw from
     north; it is its own inverse."""
     roll, pitch, yaw = attitude
-    return np.array([roll, -pitch, (np.pi / 2 - yaw + np.pi) % (2 * np.pi) - np.pi])
+    return np.array([roll, -pitch, wrapped(np.pi / 2 - yaw)])

@@ -71,6 +71,30 @@ class QuadrotorParams:
         lags = (1 / self.roll_time_constant, 1 / self.pitch_time_constant, 1 / self.climb_time_constant)
         return 2.785 / max(self.drag_x, self.drag_y, *lags)
 
+    def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return by how much an acceleration of 1 m/s^2 beside those of the model changes the position (m) and the
+        velocity (m/s) after some time, along x, y and z, as `rk4_step` integrates it.
+
+        :param time: times (s), (...)
+        :return: changes, (..., 3) each
+        """
+        decay = np.array([self.drag_x, self.drag_y, 1 / self.climb_time_constant])
+        t = np.asarray(time, float)[..., None]
+        z = decay * t
+        return t**2 / 2 * (1 - z / 3 + z**2 / 12), t * (1 - z / 2 + z**2 / 6 - z**3 / 24)
+
+    def steady_input(self, disturbance: np.ndarray) -> np.ndarray:
+        """Return the inputs with which a vehicle of heading 0 stays where it is in spite of constant accelerations.
+
+        :param disturbance: accelerations, (..., 3), world frame (m/s^2)
+        :return: inputs, (..., 4)
+        """
+        u = np.zeros((*disturbance.shape[:-1], N_INPUTS))
+        u[..., 0] = np.arctan(disturbance[..., 1] / self.gravity) / self.roll_gain
+        u[..., 1] = -np.arctan(disturbance[..., 0] / self.gravity) / self.pitch_gain
+        u[..., 2] = -disturbance[..., 2] * self.climb_time_constant / self.climb_gain
+        return u
+
 
 # The parameters that may vary between robots, in the order of the factors of `QuadrotorModel.step`.
 VEHICLE_PARAMETERS = tuple(field.name for field in fields(QuadrotorParams) if field.name != "gravity")
@@ -116,10 +140,15 @@ def rk4_step(
     x: ca.SX, u: ca.SX, wind: ca.SX, params: QuadrotorParams, dt: float | ca.SX, heading: bool = True
 ) -> ca.SX:
     """Take one classical Runge-Kutta step of length ``dt`` (s) with constant input (eq. 1), see `state_derivative`."""
-    k1 = state_derivative(x, u, wind, params, heading)
-    k2 = state_derivative(x + dt / 2 * k1, u, wind, params, heading)
-    k3 = state_derivative(x + dt / 2 * k2, u, wind, params, heading)
-    k4 = state_derivative(x + dt * k3, u, wind, params, heading)
+    return rk4(lambda state: state_derivative(state, u, wind, params, heading), x, dt)
+
+
+def rk4(derivative: Callable[[ca.SX], ca.SX], x: ca.SX, dt: float | ca.SX) -> ca.SX:
+    """Take one classical Runge-Kutta step of length ``dt`` (s) of any ordinary differential equation."""
+    k1 = derivative(x)
+    k2 = derivative(x + dt / 2 * k1)
+    k3 = derivative(x + dt / 2 * k2)
+    k4 = derivative(x + dt * k3)
     return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
@@ -151,15 +180,13 @@ def _compiled_step(params: QuadrotorParams, dt: float | None, varied: bool, head
         return None
 
 
-class QuadrotorModel:
-    """Discrete dynamics of a batch of quadrotors, on NumPy arrays. Thread-safe.
+class VehicleModel:
+    """Discrete dynamics of a batch of vehicles, on NumPy arrays. Thread-safe.
 
-    :param params: physical parameters
     :param dt: length of a step (s)
     """
 
-    def __init__(self, params: QuadrotorParams, dt: float):
-        self.params = params
+    def __init__(self, dt: float):
         self.dt = dt
         self._local = threading.local()  # calls write into buffers, so each thread has its own
 
@@ -178,9 +205,38 @@ class QuadrotorModel:
             return self._call(x, [x, u, wind], self.dt, False)
         return self._call(x, [x, u, wind, factors], self.dt, True)
 
-    def ahead(self, x: np.ndarray, u: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Compute states after individual times, in still air: (..., 9), (..., 4), (...) (s) -> (..., 9)."""
-        return self._call(x, [x, u, None, time], None, False)
+    def ahead(
+        self, x: np.ndarray, u: np.ndarray, time: np.ndarray, disturbance: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Compute states after individual times, in still air: (..., 9), (..., 4), (...) (s) -> (..., 9).
+
+        :param disturbance: constant accelerations, (..., 3), world frame (m/s^2); None for none
+        """
+        return self._drifted(self._call(x, [x, u, None, time], None, False), time, disturbance)
+
+    def _drifted(self, x: np.ndarray, time: np.ndarray | float, disturbance: np.ndarray | None) -> np.ndarray:
+        """Add what constant accelerations do in some time to states, in place."""
+        if disturbance is not None:
+            position, velocity = self.drift(time)
+            x[..., POSITION] += position * disturbance
+            x[..., VELOCITY] += velocity * disturbance
+        return x
+
+    def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return what an acceleration of 1 m/s^2 beside the model does in some time, see `QuadrotorParams.drift`."""
+        raise NotImplementedError
+
+    def _heading(self, x: np.ndarray, u: np.ndarray) -> bool:
+        """Return whether a function with headings is needed."""
+        return False
+
+    def _function(self, dt: float | None, varied: bool, heading: bool) -> ca.Function:
+        """Create the function of a step, see `step_function`."""
+        raise NotImplementedError
+
+    def _compiled(self, dt: float | None, varied: bool, heading: bool) -> RowFunction | None:
+        """Return the same, compiled for many rows, from a cache; None if it cannot be compiled."""
+        raise NotImplementedError
 
     def _call(self, x: np.ndarray, arguments: list[np.ndarray | None], dt: float | None, varied: bool) -> np.ndarray:
         count = x.size // N_STATES
@@ -188,52 +244,90 @@ class QuadrotorModel:
             return x.copy()
         u = arguments[1]
         assert u is not None
-        heading = bool(np.count_nonzero(x[..., 8]) or np.count_nonzero(u[..., 3]))
-        if count >= _WORTH_COMPILING and (compiled := _compiled_step(self.params, dt, varied, heading)) is not None:
+        heading = self._heading(x, u)
+        if count >= _WORTH_COMPILING and (compiled := self._compiled(dt, varied, heading)) is not None:
             return compiled(count, arguments).reshape(x.shape)
         capacity = 1 << (count - 1).bit_length()  # powers of two, so that shrinking batches need few functions
         calls: dict[Any, _BufferedCall] = self._local.__dict__
         key = (dt, varied, heading, capacity)
         if key not in calls:
-            calls[key] = _BufferedCall(step_function(self.params, dt, varied, heading), capacity)
+            calls[key] = _BufferedCall(self._function(dt, varied, heading), capacity)
         return calls[key](count, arguments).reshape(x.shape)
 
-    def rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Roll out states from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9)."""
+    def rollout(self, x: np.ndarray, u: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
+        """Roll out states from ``x`` (B, 9) under the inputs ``u`` (B, N, 4), in still air: (B, N + 1, 9).
+
+        :param disturbance: constant accelerations, (B, 3), world frame (m/s^2); None for none
+        """
         states = np.empty((x.shape[0], u.shape[1] + 1, N_STATES))
         states[:, 0] = x
         for k in range(u.shape[1]):
-            states[:, k + 1] = self.step(states[:, k], u[:, k])
+            states[:, k + 1] = self._drifted(self.step(states[:, k], u[:, k]), self.dt, disturbance)
         return states
+
+
+class QuadrotorModel(VehicleModel):
+    """Discrete dynamics of a batch of quadrotors, on NumPy arrays. Thread-safe.
+
+    :param params: physical parameters
+    :param dt: length of a step (s)
+    """
+
+    def __init__(self, params: QuadrotorParams, dt: float):
+        super().__init__(dt)
+        self.params = params
+
+    def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
+        return self.params.drift(time)
+
+    def _heading(self, x: np.ndarray, u: np.ndarray) -> bool:
+        return bool(np.count_nonzero(x[..., 8]) or np.count_nonzero(u[..., 3]))
+
+    def _function(self, dt: float | None, varied: bool, heading: bool) -> ca.Function:
+        return step_function(self.params, dt, varied, heading)
+
+    def _compiled(self, dt: float | None, varied: bool, heading: bool) -> RowFunction | None:
+        return _compiled_step(self.params, dt, varied, heading)
 
     def __reduce__(self) -> tuple:
         return QuadrotorModel, (self.params, self.dt)  # call buffers hold raw memory: rebuilt on demand
 
 
-class MixedModel:
-    """Discrete dynamics of teams of n unlike quadrotors, each bit for bit as its own `QuadrotorModel` computes it.
+class MixedModel(VehicleModel):
+    """Discrete dynamics of teams of n unlike vehicles, each bit for bit as its own model computes it. In all arrays,
+    the axis before the last is that of the n robots.
 
     :param models: the kinds
     :param kind_of: which of them each robot is, (n,)
     """
 
-    def __init__(self, models: Sequence[QuadrotorModel], kind_of: Sequence[int]):
+    def __init__(self, models: Sequence[VehicleModel], kind_of: Sequence[int]):
+        super().__init__(models[0].dt)
         self._robots = [(model, np.flatnonzero(np.equal(kind_of, kind))) for kind, model in enumerate(models)]
 
     def step(
         self, x: np.ndarray, u: np.ndarray, wind: np.ndarray | None = None, factors: np.ndarray | None = None
     ) -> np.ndarray:
-        """See `QuadrotorModel.step`; the axis before the last is that of the n robots."""
-        return self._each(QuadrotorModel.step, x, u, wind, factors)
+        return self._each(lambda model, *some: model.step(*some), x, u, wind, factors)
 
-    def ahead(self, x: np.ndarray, u: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """See `QuadrotorModel.ahead`: (..., n, 9), (..., n, 4), (..., n) (s) -> (..., n, 9)."""
-        return self._each(lambda model, *some: model.ahead(*some[:2], some[2][..., 0]), x, u, time[..., None])
+    def ahead(
+        self, x: np.ndarray, u: np.ndarray, time: np.ndarray, disturbance: np.ndarray | None = None
+    ) -> np.ndarray:
+        def one(model: VehicleModel, x: Any, u: Any, time: Any, disturbance: Any) -> np.ndarray:
+            return model.ahead(x, u, time[..., 0], disturbance)
 
-    def _each(self, call: Callable[..., np.ndarray], *arrays: np.ndarray | None) -> np.ndarray:
-        result = np.empty_like(arrays[0])
+        return self._each(one, x, u, time[..., None], disturbance)
+
+    def drift(self, time: Any) -> tuple[np.ndarray, np.ndarray]:
+        """See `VehicleModel.drift`: () (s) -> (n, 3) each."""
+        drifts = {int(robot): model.drift(time) for model, robots in self._robots for robot in robots}
+        position, velocity = zip(*(drifts[robot] for robot in range(len(drifts))), strict=True)
+        return np.stack(position), np.stack(velocity)
+
+    def _each(self, call: Callable[..., np.ndarray], x: np.ndarray, *others: np.ndarray | None) -> np.ndarray:
+        result = np.empty_like(x)
         for model, robots in self._robots:
-            some = (None if array is None else array.take(robots, axis=-2) for array in arrays)
+            some = (None if array is None else array.take(robots, axis=-2) for array in (x, *others))
             result[..., robots, :] = call(model, *some)
         return result
 

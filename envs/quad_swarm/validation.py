@@ -32,6 +32,7 @@ _STRICT = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False)
 
 # Limit of lengths and coordinates (m), far beyond any flight and small enough for precise squares
 LARGEST_LENGTH = 1e4
+LARGEST_ANGLE = 1e4  # rad
 Length = Annotated[float, pydantic.Field(ge=0, le=LARGEST_LENGTH)]
 PositiveLength = Annotated[float, pydantic.Field(gt=0, le=LARGEST_LENGTH)]
 Coordinate = Annotated[float, pydantic.Field(ge=-LARGEST_LENGTH, le=LARGEST_LENGTH)]
@@ -52,22 +53,55 @@ def points(name: str, values: Any, count: int) -> np.ndarray:
 
     :raises ValueError: if the points have another shape, are not numbers, or are farther away than `LARGEST_LENGTH`
     """
-    try:
-        array = np.asarray(values, dtype=float)
-        valid = (
-            not np.ma.is_masked(values)
-            and not np.iscomplexobj(values)
-            and array.shape == (count, 3)
-            and bool((np.abs(array) <= LARGEST_LENGTH).all())
-        )
-    except (TypeError, ValueError, OverflowError):
-        valid = False
-    if not valid:
+    array = _numbers(values, (count, 3), LARGEST_LENGTH)
+    if array is None:
         raise ValueError(
             f"{name} must be {count} finite points, shape ({count}, 3), within {LARGEST_LENGTH:.0f} m; got "
             f"{shown(values)}."
         )
     return array
+
+
+def vectors(name: str, values: Any, count: int) -> np.ndarray:
+    """Convert velocities to an array, (count, 3) (m/s).
+
+    :raises ValueError: if they have another shape, are not numbers, or are larger than `LARGEST_LENGTH`
+    """
+    array = _numbers(values, (count, 3), LARGEST_LENGTH)
+    if array is None:
+        raise ValueError(
+            f"{name} must be {count} finite vectors, shape ({count}, 3) (m/s), or None; got {shown(values)}."
+        )
+    return array
+
+
+def angles(name: str, values: Any, count: int) -> np.ndarray:
+    """Convert angles to an array, (count,) (rad).
+
+    :raises ValueError: if the angles have another shape, are not numbers, or are larger than `LARGEST_ANGLE`
+    """
+    array = _numbers(values, (count,), LARGEST_ANGLE)
+    if array is None:
+        raise ValueError(
+            f"{name} must be {count} finite angles, shape ({count},) (rad), up to {LARGEST_ANGLE:.0f}; got "
+            f"{shown(values)}."
+        )
+    return array
+
+
+def _numbers(values: Any, shape: tuple[int, ...], most: float) -> np.ndarray | None:
+    """Convert numbers to an array, None if they have another shape, are no numbers, or larger than allowed."""
+    try:
+        array = np.asarray(values, dtype=float)
+        valid = (
+            not np.ma.is_masked(values)
+            and not np.iscomplexobj(values)
+            and array.shape == shape
+            and bool((np.abs(array) <= most).all())
+        )
+    except (TypeError, ValueError, OverflowError):
+        valid = False
+    return array if valid else None
 
 
 def checked(cls: type[T]) -> type[T]:

@@ -51,6 +51,7 @@ class DelayCheckedSwarm(Swarm):
         self.clearance = clearance
         self.wait = 1 + config.radio.delay  # steps until all robots know each other's candidates
         self._stages = 2 * horizon + self.wait  # number of stages of a plan that ends at rest, from now on
+        assert isinstance(self.planner.model, QuadrotorModel)
         self._feedback = _feedback(self.planner.model)
         # Plans and braking to rest, from now on, (E, n, committed or candidate, ...)
         self._x = np.zeros((n_swarms, n, 2, self._stages + 1, 9))
@@ -123,8 +124,10 @@ class DelayCheckedSwarm(Swarm):
             x = self.planner.model.ahead(x, self._u, start / self.config.substeps * self.config.planner.dt)
         inputs = self._inputs[:, :, COMMITTED].copy()
         inputs[:, :, 0] += (self._x[:, :, COMMITTED, 0] - x) @ self._feedback.T
-        limits = [self.config.planner.max_tilt] * 2 + [self.config.planner.max_climb_rate, 0.0]
-        inputs[:, :, 0] = np.clip(inputs[:, :, 0], -np.array(limits), limits)
+        planner = self.config.planner
+        most = np.array([planner.max_tilt, planner.max_tilt, planner.max_climb_rate, 0.0])
+        least = np.array([-planner.max_tilt, -planner.max_tilt, -planner.descent_rate, 0.0])
+        inputs[:, :, 0] = np.clip(inputs[:, :, 0], least, most)
         horizon, count = self.config.planner.horizon, self._pending.size
         flown, none = self._x[:, :, COMMITTED, : horizon + 1], np.zeros(count, dtype=np.int64)
         self._plans = Plans(

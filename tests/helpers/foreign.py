@@ -169,3 +169,65 @@ class Loaded(Asker):
         if Path(path).read_text() != "weights":
             raise ValueError("other weights")
         return cls()
+
+
+class Boat(OptimalControlProblem):
+    """A boat on a lake at the height of its start: pushed along x and y, against drag; it cannot leave its height."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.nx, self.nu = 6, 2
+        self.max_input = ca.DM([1.5, 1.0])
+
+    def derivative(self, x, u, wind):
+        push = ca.vertcat(u[0], u[1]) - 0.4 * (x[3:5] - wind)
+        return ca.vertcat(x[3:5], 0, push, 0)
+
+    def goal_cost(self, x, x0, goal):
+        """Where it is counts in the plane, and it should be slow there."""
+        along = goal[:2] - x[:2]
+        return self.config.goal_weight * ca.sumsqr(along) + 0.5 * ca.sumsqr(x[3:5])
+
+    def braking(self, x):
+        return -5 * x[3:5]
+
+    def box_violations(self, x):
+        return ca.vertcat(ca.DM(self.config.workspace_low[:2]) - x[:2], x[:2] - ca.DM(self.config.workspace_high[:2]))
+
+
+class Drifter(Boat):
+    """The same, begun in motion."""
+
+    def start(self, starts, goals):
+        states = super().start(starts, goals)
+        states[:, 3] = 0.5
+        return states
+
+
+class Stepper(OptimalControlProblem):
+    """A vehicle of which only whole steps are known: velocities are commanded."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.nx, self.nu = 6, 3
+        self.max_input = ca.DM([1, 1, 0.5])
+
+    def dynamics(self, x, u):
+        return ca.vertcat(x[:3] + self.config.dt * u, u)
+
+
+class Failing:
+    """A solver that never finds a plan."""
+
+    name = "failing"
+
+    def __init__(self, problem):
+        self.problem = problem
+
+    def solve(self, problems, x_guess, u_guess):
+        raise ArithmeticError("no plan")
+
+
+def lighter(problem):
+    """A solver of a vehicle that nobody flies."""
+    return RtiSolver(Lighter(problem.config, problem.quadrotor, problem.n_others))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import inspect
 import pickle
 import sys
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
@@ -17,13 +18,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from quad_swarm.evaluation.flight import Condition, first_episode, run_episodes
+from quad_swarm.errors import shown
+from quad_swarm.evaluation.flight import Condition, checked_condition, first_episode, run_episodes
 from quad_swarm.evaluation.inference import wilson_interval
 from quad_swarm.evaluation.policies import is_model, make_policy, name_of
 from quad_swarm.jobs import Journal, make_executor
 from quad_swarm.jobs.cluster import other_code
 from quad_swarm.jobs.journal import differences, origin
-from quad_swarm.planner import SOLVERS
+from quad_swarm.planner import PROBLEMS, SOLVERS
 from quad_swarm.plants.base import MODEL, SIMULATORS, PlantDied, parse_plant, simulator_of
 from quad_swarm.task.episode_statistics import exchange_bytes, is_row
 from quad_swarm.task.observation import GROUPS
@@ -180,6 +182,14 @@ def fly_all(
     :param skip: number of the first ``episodes`` to leave out, which have been flown before
     :raises ValueError: if there are no episodes or processes, or a policy is invalid
     """
+    if isinstance(conditions, (str, Condition)) or not isinstance(conditions, Iterable):
+        raise ValueError(f"conditions={shown(conditions)}: they must be a list of conditions.")
+    conditions = list(conditions)
+    for condition in conditions:
+        checked_condition(condition)
+    for name, number in (("episodes", episodes), ("jobs", jobs)):
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
+            raise ValueError(f"{name}={shown(number)}: it must be a whole number.")
     if episodes <= skip or jobs < 1:
         raise ValueError(f"episodes={episodes} must be at least {skip + 1}, jobs={jobs} at least 1.")
     for condition in conditions:
@@ -240,7 +250,7 @@ def _fly(
         if _pickled(condition) is None:
             raise ValueError(
                 f"The policy {name_of(condition.policy)} cannot be pickled and sent to other processes: choose jobs=1, "
-                "or define its class in a module."
+                "or define it, or its class, in a module."
             )
     additions = _additions()
     with make_pool(jobs) if executor is None else nullcontext(executor) as pool:
@@ -263,7 +273,8 @@ def _depends_on(condition: Condition) -> tuple[set[str], list[Path]]:
         packages.add(condition.algo.partition(":")[0])
         files.append(Path(condition.policy.partition("@")[0]))
     elif not isinstance(condition.policy, str):
-        packages.add(type(condition.policy).__module__)
+        of = condition.policy if inspect.isfunction(condition.policy) else type(condition.policy)
+        packages.add(of.__module__)
     return packages - {"__main__"}, files
 
 
@@ -328,13 +339,14 @@ def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixe
 
 def user_modules() -> list[str]:
     """Return the modules of what the registries hold, which other processes import first."""
-    made = [*SCENARIOS.values(), *(make for make, _ in RULES.values()), *GROUPS.values(), *SOLVERS.values()]
+    rules = (make for make, _ in RULES.values())
+    made = [*SCENARIOS.values(), *rules, *GROUPS.values(), *SOLVERS.values(), *PROBLEMS.values()]
     added = {getattr(one, "__module__", None) for one in made}
     return sorted(name for name in added if isinstance(name, str) and name != "__main__")
 
 
 # What users add to by name
-_REGISTRIES: tuple[dict[str, Any], ...] = (SCENARIOS, RULES, GROUPS, SOLVERS, SIMULATORS)
+_REGISTRIES: tuple[dict[str, Any], ...] = (SCENARIOS, RULES, GROUPS, SOLVERS, SIMULATORS, PROBLEMS)
 
 
 def _additions() -> list[bytes]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quad_swarm.errors import shown
-from quad_swarm.evaluation.policies import RequestPolicy, make_policy, name_of, policy_of
+from quad_swarm.evaluation.policies import RequestPolicy, is_policy, make_policy, name_of, policy_of
 from quad_swarm.geometry import closest_approach, flattened, length
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.task.request_task import Outcome, RequestTask, RewardConfig, requests_of
@@ -33,8 +33,9 @@ _FIRST_SEED = 10**9
 class Condition:
     """A policy in a scenario and a world.
 
-    :param policy: a rule or the path of a model's zip, as on the command line, or an object with ``predict``, see
-        `quad_swarm.evaluation.policies`. Conditions with objects are equal if their objects are the same
+    :param policy: a rule or the path of a model's zip, as on the command line, an object with ``predict``, or a
+        function of a view, see `quad_swarm.evaluation.policies`. Conditions with objects are equal if their objects are
+        the same
     :param scenario: a name of `SCENARIOS`
     :param config: the world
     :param max_steps: time limit (steps), by default the world's
@@ -42,7 +43,7 @@ class Condition:
     :param solver: see `make_planner`
     :param linger: number of steps to fly after all robots have reached their goals; None for flying until the time
         limit
-    :raises ValueError: if the policy is neither text nor an object with ``predict``, ``max_steps`` is less than 1,
+    :raises ValueError: if the policy, the scenario or the world is of another kind, ``max_steps`` is less than 1,
         ``linger`` is negative, or the scenario does not fit the world
     """
 
@@ -57,13 +58,15 @@ class Condition:
     def __post_init__(self) -> None:
         if isinstance(self.policy, os.PathLike):
             object.__setattr__(self, "policy", os.fspath(self.policy))
-        if not isinstance(self.policy, str) and (
-            isinstance(self.policy, type) or not callable(getattr(self.policy, "predict", None))
-        ):
+        if not is_policy(self.policy):
             raise ValueError(
-                f"policy={shown(self.policy)}: it must be a rule, the path of a model's zip, or an object with "
-                "predict(observation)."
+                f"policy={shown(self.policy)}: it must be a rule, the path of a model's zip, an object with "
+                "predict(observation), or a function of a view that returns requests."
             )
+        if not isinstance(self.scenario, str):
+            raise ValueError(f"scenario={shown(self.scenario)}: it must be the name of a scenario.")
+        if not isinstance(self.config, SwarmConfig):
+            raise ValueError(f"config={shown(self.config)}: it must be a world, as make_config('paper') returns.")
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps={self.max_steps}: an episode needs at least one step.")
         world = for_scenario(self.config, self.scenario)
@@ -83,6 +86,17 @@ class Condition:
 
     def __hash__(self) -> int:
         return hash(self._identity())
+
+
+def checked_condition(condition: Any) -> None:
+    """Check that something is a `Condition`.
+
+    :raises ValueError: if it is not
+    """
+    if not isinstance(condition, Condition):
+        raise ValueError(
+            f"{shown(condition)} is no condition: write quad_swarm.evaluation.Condition(policy, scenario, world)."
+        )
 
 
 def first_episode(seed: int) -> int:
@@ -311,9 +325,11 @@ def fly(condition: Condition, seed: int, number: int = 0, other_rule: str = "non
     :param seed: index of the set of held-out episodes
     :param number: index of the episode in the set
     :param other_rule: a rule whose requests are also recorded, but not executed
-    :param model: model that flies instead of the condition's policy, or any object with ``predict``, see
-        `quad_swarm.evaluation.policies`
+    :param model: model that flies instead of the condition's policy, or any object with ``predict`` or function of a
+        view, see `quad_swarm.evaluation.policies`
+    :raises ValueError: if an argument is of another kind
     """
+    checked_condition(condition)
     episode = first_episode(seed) + number
     policy, task, rngs = begin(condition, [episode], model)
     rule, other_rngs = parse_rule(other_rule), [np.random.default_rng([episode, 2])]

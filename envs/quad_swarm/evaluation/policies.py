@@ -1,7 +1,8 @@
 """Policies by their names on the command line: rules, and models by the path of their zip; or as objects.
 
 For rules see `quad_swarm.task.rules`. The class ``algo`` loads models. ``MODEL.zip@0.3`` sets the model's threshold to
-0.3. An object needs a method ``predict(observation)``, which maps the observations of E swarms, (E, n, size), to their
+0.3. A function is a rule: it maps a `quad_swarm.task.view.View` to requests, as those in `quad_swarm.task.rules` do.
+Another object needs a method ``predict(observation)``, which maps the observations of E swarms, (E, n, size), to their
 bits, (E, n (n - 1)), alone or as the first entry of a tuple as in Stable-Baselines3. Without the attributes of a model,
 ``observation_space`` and ``env_spec``, it receives the paper's observation.
 """
@@ -23,7 +24,7 @@ from gymnasium import spaces
 from quad_swarm.errors import shown
 from quad_swarm.task.observation import Observation, PaperObservation, make_observation
 from quad_swarm.task.request_task import RequestTask
-from quad_swarm.task.rules import as_bits, parse_decisions, parse_rule
+from quad_swarm.task.rules import Rule, as_bits, checked_rule, parse_decisions, parse_rule
 from quad_swarm.task.view import View
 from quad_swarm.world.presets import SwarmConfig
 
@@ -41,11 +42,19 @@ def is_model(policy: Any) -> bool:
 
 
 def name_of(policy: Any) -> str:
-    """Return a policy's name: text as it is, an object's ``name`` if that is text, or the name of its class."""
+    """Return a policy's name: text as it is, an object's ``name`` if that is text, a function's name, or the name of
+    its class."""
     if isinstance(policy, str):
         return policy
-    name = getattr(policy, "name", None)
-    return name if isinstance(name, str) else type(policy).__name__
+    names = (getattr(policy, name, None) for name in ("name", "__name__"))
+    return next((name for name in names if isinstance(name, str)), type(policy).__name__)
+
+
+def is_policy(policy: Any) -> bool:
+    """Return whether something may be a policy: text, an object with ``predict``, or a function of a view."""
+    if isinstance(policy, str):
+        return True
+    return not isinstance(policy, type) and (callable(getattr(policy, "predict", None)) or callable(policy))
 
 
 def short_name(policy: Any) -> str:
@@ -131,7 +140,7 @@ def _number(text: str, policy: str) -> float:
 def make_policy(policy: Any, config: SwarmConfig, algo: str) -> tuple[RequestPolicy, Observation]:
     """Create a policy and its observation by name.
 
-    :param policy: a rule, a model's zip or an object with ``predict``
+    :param policy: a rule, a model's zip, an object with ``predict`` or a function of a view
     :param config: the world
     :param algo: see `load_model`
     :raises ValueError: if the rule is unknown, or the model was trained for another number of robots or another space;
@@ -142,6 +151,7 @@ def make_policy(policy: Any, config: SwarmConfig, algo: str) -> tuple[RequestPol
     if is_model(policy):
         return policy_of(load_model(policy, algo), policy, config)
     try:
+        tells: Rule | None
         asks, tells = parse_decisions(policy) if config.radio.limits_distance else (parse_rule(policy), None)
     except ValueError as error:
         hint = "Pass a model as the path of its .zip"
@@ -149,15 +159,19 @@ def make_policy(policy: Any, config: SwarmConfig, algo: str) -> tuple[RequestPol
             hint += "; only `sb3-maddpg evaluate` also accepts latest:LOGDIR and pretrained:NAME"
         raise ValueError(f"{error} {hint}.") from None
 
+    return _by_rule(asks, tells), PaperObservation(config)
+
+
+def _by_rule(asks: Rule, tells: Rule | None = None) -> RequestPolicy:
     def decide(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
         view = View(task.swarm, rngs)
         return np.stack([asks(view)] if tells is None else [asks(view), tells(view)], axis=-1)
 
-    return decide, PaperObservation(config)
+    return decide
 
 
 def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy, Observation]:
-    """Create a policy and its observation from a model, or from any object with ``predict``.
+    """Create a policy and its observation from a model, any object with ``predict``, or a function of a view.
 
     :param model: the model
     :param name: name of the model, for error messages
@@ -165,6 +179,8 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
     :raises ValueError: if the model has no ``predict``, or was trained for another number of robots or another space.
         The policy raises it if ``predict`` raises or answers with something else than bits
     """
+    if callable(model) and not isinstance(model, type) and not callable(getattr(model, "predict", None)):
+        return _by_rule(_guarded(name, model)), PaperObservation(config)
     predictor, observation, n_bits = fitted(model, name, config)
     n, m = config.n_robots, config.n_others
     options = {"deterministic": True} if _accepts(predictor.predict, "deterministic") else {}
@@ -190,6 +206,18 @@ def policy_of(model: Any, name: str, config: SwarmConfig) -> tuple[RequestPolicy
     return request, observation
 
 
+def _guarded(name: str, rule: Rule) -> Rule:
+    """Return a rule from outside, which fails in one sentence."""
+
+    def guarded(view: View) -> np.ndarray:
+        try:
+            return rule(view)
+        except Exception as error:  # whatever a foreign function raises
+            raise ValueError(f"{name}: the rule failed ({type(error).__name__}: {error}).") from error
+
+    return checked_rule(name, guarded)
+
+
 def fitted(model: Any, name: str, config: SwarmConfig) -> tuple[Any, Observation, int]:
     """Return what predicts with a model for the robots of a world, its observation, and its number of bits for each of
     the others. See `policy_of`.
@@ -197,7 +225,9 @@ def fitted(model: Any, name: str, config: SwarmConfig) -> tuple[Any, Observation
     :raises ValueError: if the model has no ``predict``, or was trained for another number of robots or another space
     """
     if not callable(getattr(model, "predict", None)):
-        raise ValueError(f"{name}: {shown(model)} is no policy, since it has no predict(observation).")
+        raise ValueError(
+            f"{name}: {shown(model)} is no policy, since it has no predict(observation) and is no function of a view."
+        )
     arguments = {k: v for k, v in trained_in(model).items() if k in OBSERVATION_ARGUMENTS}
     n, m = config.n_robots, config.n_others
     observation = make_observation(config, **arguments, critics=False)

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from quad_swarm.errors import unknown_name
-from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, checked_seed, need_reset
+from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_seed, checked_start, need_reset
 from quad_swarm.states import as_other_state, generator_of, generator_state, like
 from quad_swarm.task.options import TaskOptions
 from quad_swarm.task.request_task import requests_of, task_of
@@ -45,7 +45,9 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     Robots start at rest. The scenario draws starts and goals; `reset(options={"starts": ..., "goals": ...})` sets them,
     both (n, 3), m. They must lie in the workspace; robots must not start in contact, and goals must not be too close
     for two robots to be at both. With them, "velocities" (n, 3), m/s, lets goals move, and "waypoints", n sequences
-    (any number, 3), m, are what each robot passes on the way to its goal.
+    (any number, 3), m, are what each robot passes on the way to its goal. "headings" (n,), rad from the x axis
+    counter-clockwise, are what robots turn to, the short way, for which they need a `planner.max_yaw_rate`.
+    "initial_velocities" (n, 3), m/s, and "initial_headings" (n,), rad, are those of the robots at the start.
 
     ## Goals in Flight
     Gymnasium's `step` takes an action only, so goals are changed between steps: `env.unwrapped.set_goals(...)`.
@@ -61,7 +63,10 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     step of an episode also `is_success` and further `metrics`. With a limited neighbourhood also `neighbours` (n, m),
     the index of the robot in each slot of the action and of the entries about others, -1 for an empty slot, and
     `pair_terminated` (n, m), whether another robot, or none, is in the slot after the step. With obstacles also
-    `min_obstacle_distance` and `min_obstacle_distance_continuous` (m, between surfaces, infinity without any).
+    `min_obstacle_distance` and `min_obstacle_distance_continuous` (m, between surfaces, infinity without any). With
+    `plans_in_info` also `plan`: `states` (n, N + 1, 9), the planned states at stages 0..N, the first of which are those
+    from which the inputs act; `inputs` (n, 4), chosen in the step; `cost` (n,), the problem's objective with the
+    violations of soft constraints; and `solve_seconds`, the wall-clock time of the planner's call for all robots.
 
     ## Arguments
     :param preset: a name of `presets.PRESETS`, such as "paper" or "dense"
@@ -84,6 +89,7 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         "quadrotor": {"drag_x": 0.3}}``; fields that are also arguments may be passed either way, but not both
     :param solver: "auto" or a name of `planner.SOLVERS`
     :param announcements: whether robots may also send their plans without a request, see the action space
+    :param plans_in_info: whether `info` holds plans, inputs, costs and solve times
     :param render_mode: None, "rgb_array", or "human" for a window that shows every step in real time
     :raises ValueError: if a value is invalid; the message names it and the remedy
 
@@ -92,7 +98,6 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's own convention
-    reset_options = ("starts", "goals", "velocities", "waypoints")
 
     @with_fields(TaskOptions)
     def __init__(self, options: TaskOptions, render_mode: str | None = None):
@@ -118,20 +123,8 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         :raises ValueError: if the seed or an option is invalid
         """
         super().reset(seed=checked_seed(seed))
-        options = checked_options(options)
-        if unknown := set(options).difference(self.reset_options):
-            raise unknown_name("reset option", unknown.pop(), self.reset_options)
-        if options and not {"starts", "goals"} <= set(options):
-            raise ValueError(
-                f"reset options name only {', '.join(map(repr, options))}; pass both 'starts' and 'goals'."
-            )
-        if options:
-            velocities, waypoints = options.get("velocities"), options.get("waypoints")
-            self.task.place(
-                *(0, "custom", options["starts"], options["goals"], self.np_random),
-                velocities=velocities,
-                waypoints=waypoints,
-            )
+        if start := checked_start(options):
+            self.task.place(0, "custom", rng=self.np_random, **start)
         else:
             self.task.reset(0, self.np_random)
         self._requests = np.zeros_like(self._requests)
@@ -167,7 +160,12 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         return self.task.observe()[0], float(outcome.reward[0]), terminated, truncated, info
 
     def set_goals(
-        self, goals: Any, velocities: Any = None, waypoints: Any = None, robots: Sequence[int] | None = None
+        self,
+        goals: Any,
+        velocities: Any = None,
+        waypoints: Any = None,
+        robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> np.ndarray:
         """Let k robots fly to other goals from now on. Their former goals and waypoints are forgotten, and the episode
         counts as arrived only when all robots are at the goals that they have now.
@@ -177,13 +175,15 @@ class QuadSwarmEnv(TaskAttributes, gym.Env[np.ndarray, np.ndarray]):
         :param waypoints: what each of the robots passes before, k sequences (any number, 3), world frame (m), by
             default nothing
         :param robots: indices of the robots, (k,), by default all
+        :param headings: headings that the robots turn to, (k,) (rad), by default as before
         :return: the observation of all robots, (n, size) float32, with the new goals
-        :raises ValueError: if there are no such robots, or goals do not fit, see `SwarmConfig.check_goals`
+        :raises ValueError: if there are no such robots, or goals or headings do not fit, see `SwarmConfig.check_goals`
+            and `SwarmConfig.check_headings`
         :raises gymnasium.error.ResetNeeded: if ``reset`` has not been called yet
         """
         if not self._is_reset:
             raise need_reset("set_goals")
-        self.task.set_goals(0, goals, velocities, waypoints, robots)
+        self.task.set_goals(0, goals, velocities, waypoints, robots, headings)
         return self.task.observe()[0]
 
     def state_dict(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pettingzoo import ParallelEnv
 
 from quad_swarm.errors import shown
 from quad_swarm.interfaces.env import QuadSwarmEnv
-from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, need_reset
+from quad_swarm.interfaces.shared import RESET_OPTIONS, TaskAttributes, checked_bits, checked_options, need_reset
 from quad_swarm.states import as_other_state
 
 
@@ -54,17 +54,22 @@ class QuadSwarmParallelEnv(TaskAttributes, ParallelEnv):
         self, seed: int | None = None, options: dict | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
         """See `QuadSwarmEnv.reset`. Unknown options are ignored, as PettingZoo's API test requires."""
-        known = {name: value for name, value in checked_options(options).items() if name in QuadSwarmEnv.reset_options}
+        known = {name: value for name, value in checked_options(options).items() if name in RESET_OPTIONS}
         observation, info = self.team.reset(seed=seed, options=known)
         self._is_reset = True
         self.agents = list(self.possible_agents)
         return self._rows(observation), {agent: dict(info) for agent in self.agents}
 
     def set_goals(
-        self, goals: Any, velocities: Any = None, waypoints: Any = None, robots: Sequence[int] | None = None
+        self,
+        goals: Any,
+        velocities: Any = None,
+        waypoints: Any = None,
+        robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> dict[str, np.ndarray]:
         """See `QuadSwarmEnv.set_goals`. Returns the observations of all robots, with the new goals."""
-        return self._rows(self.team.set_goals(goals, velocities, waypoints, robots))
+        return self._rows(self.team.set_goals(goals, velocities, waypoints, robots, headings))
 
     def state_dict(self) -> dict[str, Any]:
         """See `QuadSwarmEnv.state_dict`."""

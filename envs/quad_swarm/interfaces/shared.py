@@ -10,9 +10,20 @@ import casadi
 import gymnasium as gym
 import numpy as np
 
-from quad_swarm.errors import shown
+from quad_swarm.errors import shown, unknown_name
 from quad_swarm.task.request_task import RequestTask
 from quad_swarm.world.presets import SwarmConfig
+
+# What `RequestTask.place` takes
+RESET_OPTIONS = (
+    "starts",
+    "goals",
+    "velocities",
+    "waypoints",
+    "headings",
+    "initial_velocities",
+    "initial_headings",
+)
 
 
 class TaskAttributes:
@@ -97,6 +108,22 @@ def checked_options(options: Any) -> dict[str, Any]:
             f"options={shown(options)}: the options of reset() must be a mapping from names to values, or None."
         )
     return dict(options)
+
+
+def checked_start(options: Any, more: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Check the names of the options of an episode's start; their values are checked by the swarm.
+
+    :param options: options of ``reset``, or None
+    :param more: names of further options, for error messages
+    :return: the options, none for an episode that is drawn
+    :raises ValueError: if the options are no mapping, one is unknown, or starts or goals are missing
+    """
+    options = checked_options(options)
+    if unknown := set(options).difference(RESET_OPTIONS):
+        raise unknown_name("reset option", min(unknown), [*RESET_OPTIONS, *more])
+    if options and not {"starts", "goals"} <= set(options):
+        raise ValueError(f"reset options name only {', '.join(map(repr, options))}; pass both 'starts' and 'goals'.")
+    return options
 
 
 def need_reset(called: str = "step") -> gym.error.ResetNeeded:

@@ -13,7 +13,14 @@ from gymnasium.vector.utils import batch_space
 from pydantic import Field
 
 from quad_swarm.errors import shown
-from quad_swarm.interfaces.shared import TaskAttributes, checked_bits, checked_options, checked_seed, need_reset
+from quad_swarm.interfaces.shared import (
+    TaskAttributes,
+    checked_bits,
+    checked_options,
+    checked_seed,
+    checked_start,
+    need_reset,
+)
 from quad_swarm.states import as_other_state, generator_of, generator_state
 from quad_swarm.task.request_task import make_task
 from quad_swarm.validation import checked_arguments
@@ -54,11 +61,11 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """Start an episode in every swarm.
 
         :param seed: seed of swarm 0, from which the seeds of the others count up, or a list with one seed per swarm
-        :param options: must be empty; `set_goals` changes goals
-        :raises ValueError: if a seed is invalid, or there are options
+        :param options: those of `QuadSwarmEnv`, for the first episodes of all swarms; those of single swarms are in
+            "swarms", a mapping from a swarm's index to its options
+        :raises ValueError: if a seed or an option is invalid
         """
-        if options := checked_options(options):
-            raise ValueError(f"Unknown reset options {sorted(options)}: the vector environment has none.")
+        starts = self._checked_starts(options)
         if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim > 0):
             seeds = [checked_seed(value) for value in seed]
         else:
@@ -71,8 +78,27 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         for k, value in enumerate(seeds):
             if value is not None:
                 self._rngs[k] = gym.utils.seeding.np_random(value)[0]
-            self.task.reset(k, self._rngs[k])
+            if starts[k]:
+                self.task.place(k, "custom", rng=self._rngs[k], **starts[k])
+            else:
+                self.task.reset(k, self._rngs[k])
         return self.task.observe(), self._with_masks({"scenario": np.array(self.task.scenario)})
+
+    def _checked_starts(self, options: Any) -> list[dict[str, Any]]:
+        """Return the options of each swarm's start."""
+        options = checked_options(options)
+        own = options.pop("swarms", {})
+        if not isinstance(own, Mapping) or not all(map(self._is_swarm, own)):
+            raise ValueError(
+                f"reset option 'swarms'={shown(own)}: it must be a mapping from numbers of swarms, 0 to "
+                f"{self.num_envs - 1}, to their options."
+            )
+        common = checked_start(options, ("swarms",))
+        return [checked_start(own[k]) if k in own else common for k in range(self.num_envs)]
+
+    def _is_swarm(self, index: Any) -> bool:
+        whole = isinstance(index, (int, np.integer)) and not isinstance(index, bool)
+        return whole and bool(0 <= index < self.num_envs)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take one step in every swarm; see `QuadSwarmEnv.step`.
@@ -106,6 +132,7 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         velocities: Any = None,
         waypoints: Any = None,
         robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> np.ndarray:
         """Let robots of one swarm fly to other goals from now on, until its episode ends; see `QuadSwarmEnv.set_goals`.
 
@@ -116,9 +143,9 @@ class QuadSwarmVectorEnv(TaskAttributes, VectorEnv[np.ndarray, np.ndarray, np.nd
         """
         if not self._rngs:
             raise need_reset("set_goals")
-        if isinstance(swarm, bool) or not isinstance(swarm, (int, np.integer)) or not 0 <= swarm < self.num_envs:
+        if not self._is_swarm(swarm):
             raise ValueError(f"swarm={shown(swarm)}: it must be the number of a swarm, from 0 to {self.num_envs - 1}.")
-        self.task.set_goals(int(swarm), goals, velocities, waypoints, robots)
+        self.task.set_goals(int(swarm), goals, velocities, waypoints, robots, headings)
         return self.task.observe(np.arange(self.num_envs) == swarm)[0]
 
     def state_dict(self) -> dict[str, Any]:

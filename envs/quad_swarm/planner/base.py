@@ -10,10 +10,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from quad_swarm.errors import shown
-from quad_swarm.geometry import length
+from quad_swarm.geometry import length, wrapped
+from quad_swarm.planner.cost import PlanCost
+from quad_swarm.planner.model import ProblemModel
 from quad_swarm.planner.problem import PlannerConfig, Problems
 from quad_swarm.planner.right_of_way import keep_right
-from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, QuadrotorModel
+from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY, QuadrotorModel, VehicleModel
 
 
 class Solution(NamedTuple):
@@ -61,6 +63,7 @@ class PlanStatus(IntEnum):
 
 
 _TYPES = (np.dtype(float), np.dtype(float), np.dtype(bool), np.dtype(np.int64))  # of a solution's arrays
+SAME_HEADING = 1e-6  # rad by which headings may differ that are the same
 _LARGEST = 1e9  # state or input, beyond which a solver has diverged
 _SOLVED, _BRAKING = int(PlanStatus.SOLVED), int(PlanStatus.BRAKING)  # NumPy is slow with enumerations
 
@@ -93,13 +96,31 @@ class Plans(NamedTuple):
             iterations=np.zeros(count, dtype=np.int64),
         )
 
+    @classmethod
+    def steady(cls, x: np.ndarray, horizon: int, dt: float, late: np.ndarray | None = None) -> Plans:
+        """Return the plans of robots in flight before their first solve, made a step ago, which is to keep their
+        velocity, as others expect that know no plan.
+
+        :param x: states now, (B, 9)
+        :param horizon: number of stages N
+        :param dt: length of a stage (s)
+        :param late: when inputs take effect, as a fraction of a step, (B,); None if all do so at once
+        """
+        plans = cls.hover(x, horizon)
+        if np.count_nonzero(x[:, VELOCITY]):
+            times = dt * (np.arange(horizon + 1) - 1 + (np.zeros((len(x), 1)) if late is None else late[:, None]))
+            plans.x[..., POSITION] += times[..., None] * x[:, None, VELOCITY]
+        return plans
+
 
 class Planner:
     """Planner with warm-started solves and a fallback chain: solve, retry cold, continue the last plan, brake
-    (Sec. III-B).
+    (Sec. III-B). All levels plan with the same dynamics.
 
     The level is chosen independently for each robot, so a failure never affects another robot's plan.
 
+    :ivar rate: what computes the costs of plans after each call, see `PlanCost`; None for nothing
+    :ivar costs: these costs, (B,)
     :ivar checks: whether `plan` refuses invalid arrays; otherwise, problems whose numbers are not finite fail and
         brake, as in the steps of swarms, which never raise
 
@@ -110,17 +131,20 @@ class Planner:
         closest to; None for all
     """
 
-    def __init__(self, solver: Solver, model: QuadrotorModel, config: PlannerConfig, n_others: int | None = None):
+    def __init__(self, solver: Solver, model: VehicleModel, config: PlannerConfig, n_others: int | None = None):
         self.solver = solver
         self.model = model
         self.config = config
         self.n_others = n_others
         self.checks = True
+        self.rate: PlanCost | None = None
+        self.costs: np.ndarray | None = None
 
     def plan(self, problems: Problems, previous: Plans) -> Plans:
         """Solve a batch of B problems; solver failures never raise.
 
-        Robots may have any heading. Limits of roll and pitch hold along the heading.
+        Quadrotors may have any heading, and turn to that of their problem the short way. Limits of roll and pitch hold
+        along the heading.
 
         :param problems: the batch
         :param previous: plans of the same robots in the previous step
@@ -132,29 +156,34 @@ class Planner:
             problems, previous = self.checked(problems, previous)
         if (cruise := self.config.cruise_distance) is not None:
             problems = problems._replace(goal=nearer(problems.x[:, POSITION], problems.goal, cruise))
+        if problems.disturbance is not None and isinstance(self.model, QuadrotorModel):
+            problems = problems._replace(steady_input=self.model.params.steady_input(problems.disturbance))
         if problems.shape is None and self.config.downwash != 1:
             flat = np.ones((*problems.others.shape[:2], 3))
             flat[..., 2] = 1 / self.config.downwash
             problems = problems._replace(shape=flat)
-        if not np.count_nonzero(problems.x[:, 8]):
+        heading = problems.heading if self.config.max_yaw_rate else None
+        turns = np.count_nonzero(problems.x[:, 8]) or (heading is not None and np.count_nonzero(heading))
+        if isinstance(self.model, ProblemModel) or not turns:
             return self._plan(problems, previous)
-        # Within, roll and pitch are those about the world's axes, to which the problem has no yaw. Only robots with a
-        # yaw are turned, so that a plan does not depend on the batch it is in
-        rows = np.flatnonzero(problems.x[:, 8])
-        yaw, old = problems.x[rows, 8], previous.x[rows, :, 8]
+        # Within, roll and pitch are those about the world's axes, to which the problem has no yaw, and the yaw is that
+        # from the heading. Only robots with either are turned, so that a plan does not depend on the batch it is in
+        aims = np.zeros(len(problems.x)) if heading is None else heading
+        rows = np.flatnonzero((problems.x[:, 8] != 0) | (aims != 0))
+        yaw, old, aim = problems.x[rows, 8], previous.x[rows, :, 8], aims[rows]
         with np.errstate(invalid="ignore"):  # an infinite yaw fails like other states that are not finite
-            wrapped = np.remainder(yaw + np.pi, 2 * np.pi) - np.pi
+            left = wrapped(yaw - aim)
         start, before, u_before = problems.x.copy(), previous.x.copy(), previous.u.copy()
         start[rows], before[rows] = turned(start[rows], -yaw), turned(before[rows], -old)
-        start[rows, 8], before[rows, :, 8] = wrapped, old + (wrapped - yaw)[:, None]
+        start[rows, 8], before[rows, :, 8] = left, old + (left - yaw)[:, None]
         u_before[rows] = turned(u_before[rows], -old[:, :-1], 0)
         plans = self._plan(problems._replace(x=start), previous._replace(x=before, u=u_before))
-        planned = (
-            plans.x[rows, :-1, 8] if self.config.max_yaw_rate else np.repeat(wrapped[:, None], old.shape[1] - 1, 1)
-        )
+        planned = plans.x[rows, :-1, 8] if self.config.max_yaw_rate else np.repeat(left[:, None], old.shape[1] - 1, 1)
+        planned = planned + aim[:, None]
         u, limit = turned(plans.u[rows], planned, 0), self.config.max_tilt
         u[..., :2] = np.clip(u[..., :2], -limit, limit)
-        plans.u[rows], plans.x[rows] = u, self.model.rollout(problems.x[rows], u)
+        pushed = None if problems.disturbance is None else problems.disturbance[rows]
+        plans.u[rows], plans.x[rows] = u, self.model.rollout(problems.x[rows], u, pushed)
         return plans
 
     def checked(self, problems: Problems, previous: Plans) -> tuple[Problems, Plans]:
@@ -164,7 +193,7 @@ class Planner:
             if not isinstance(value, kind):
                 remedy = "; before the first solve, Plans.hover(x, horizon)" if kind is Plans else ""
                 raise ValueError(f"{name}={shown(value)}: pass {kind.__name__}{remedy}.")
-        count, *_ = (*_shape(problems.x), 0)
+        count = shape[0] if len(shape := _shape(problems.x)) == 2 else 1
         n_others = shape[1] if len(shape := _shape(problems.others)) == 4 else 0
         taken = n_others if kept is None else min(n_others, kept)
         if taken != (expected := getattr(getattr(self.solver, "problem", None), "n_others", taken)):
@@ -184,6 +213,7 @@ class Planner:
             shaped = getattr(getattr(self.solver, "problem", None), "shaped", True)
             if given is not None and name in ("shape", "size") and not shaped:
                 raise ValueError(f"{name}: this planner avoids spheres only; create it with obstacles or downwash.")
+        about |= self._checked_of_robots(problems, x)
         return Problems(x, goal, others, **about), Plans(
             # The last plan is a guess, so that numbers which are not finite only cost a retry
             _array("previous.x", previous.x, (count, stages + 1, N_STATES), finite=False),
@@ -192,6 +222,32 @@ class Planner:
             _array("previous.status", previous.status, (count,), np.dtype(np.int64)),
             _array("previous.iterations", previous.iterations, (count,), np.dtype(np.int64)),
         )
+
+    def _checked_of_robots(self, problems: Problems, x: np.ndarray) -> dict[str, np.ndarray]:
+        """Check the arrays of a call that some planners alone use, and return those that are given."""
+        count, stages = len(x), self.config.horizon
+        shapes = {"reference": (stages, 3), "reference_weight": (stages,), "disturbance": (3,), "heading": ()}
+        given = {
+            name: _array(name, array, (count, *shape))
+            for name, shape in shapes.items()
+            if (array := getattr(problems, name)) is not None
+        }
+        solved = getattr(self.solver, "problem", None)
+        if len(given.keys() & {"reference", "reference_weight"}) == 1 or (
+            "reference" in given and not getattr(solved, "committed", True)
+        ):
+            raise ValueError(
+                "reference: references need weights, and a planner with planner.commitment above 0, whose value only "
+                "swarms use."
+            )
+        if "reference" in given and (given["reference_weight"] < 0).any():
+            raise ValueError("reference_weight: weights must not be negative.")
+        if "disturbance" in given and not getattr(solved, "disturbed", True):
+            raise ValueError("disturbance: this planner knows none; set planner.disturbance_time.")
+        turns = np.abs(wrapped(given["heading"] - x[:, 8])).max(initial=0.0) if "heading" in given else 0.0
+        if turns > SAME_HEADING and not self.config.max_yaw_rate:
+            raise ValueError("heading: this planner holds the yaw of robots; create it with max_yaw_rate above 0.")
+        return given
 
     def _plan(self, problems: Problems, previous: Plans) -> Plans:
         """Do the same with roll and pitch about the world's axes, whatever the yaw."""
@@ -217,17 +273,22 @@ class Planner:
             lasts = age[failed] < self.config.horizon
             status[failed[lasts]] = PlanStatus.SHIFTED
             u[failed[lasts]] = u_guess[failed[lasts]]
-            u[failed[~lasts]] = self.braking_inputs(problems.x[failed[~lasts]])
-            x[failed] = self._rollout(problems.x[failed], u[failed])
+            hopeless = problems.part(failed[~lasts])
+            u[failed[~lasts]] = self.braking_inputs(hopeless.x, hopeless.disturbance)
+            pushed = None if problems.disturbance is None else problems.disturbance[failed]
+            x[failed] = self._rollout(problems.x[failed], u[failed], pushed)
+        if self.rate is not None:
+            self.costs = self.rate(problems, x, u)
         return Plans(x, u, age, status, iterations)
 
-    def _rollout(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _rollout(self, x: np.ndarray, u: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
         """Roll out states with roll and pitch about the world's axes, see `QuadrotorModel.rollout`."""
-        if not (np.count_nonzero(x[:, 8]) or np.count_nonzero(u[..., 3])):
-            return self.model.rollout(x, u)
+        turns = np.count_nonzero(x[:, 8]) or np.count_nonzero(u[..., 3])
+        if isinstance(self.model, ProblemModel) or not turns:
+            return self.model.rollout(x, u, disturbance)
         held, still = x.copy(), u.copy()
         held[:, 8] = still[..., 3] = 0.0
-        states = self.model.rollout(held, still)
+        states = self.model.rollout(held, still, disturbance)
         states[..., 8] = x[:, 8:]
         states[:, 1:, 8] += self.config.dt * u[..., 3].cumsum(axis=1)
         return states
@@ -261,21 +322,31 @@ class Planner:
         nearest = np.sort(np.argsort(gaps, axis=1, kind="stable")[:, :kept], axis=1)
         return problems.chosen(nearest)
 
-    def braking_inputs(self, x: np.ndarray) -> np.ndarray:
+    def braking_inputs(self, x: np.ndarray, disturbance: np.ndarray | None = None) -> np.ndarray:
         """Compute inputs that bring robots to hover from their states without a solver, (B, 9) -> (B, N, 4).
 
-        The commanded tilt, about the world's axes, opposes the velocity and saturates at its limit. The commanded climb
-        rate is zero.
+        The commanded tilt, about the world's axes, opposes the velocity and the disturbance and saturates at its limit.
+        The commanded climb rate only opposes the disturbance. Vehicles with dynamics of their own follow
+        `OptimalControlProblem.braking` instead.
+
+        :param x: states, (B, 9)
+        :param disturbance: see `Problems`
         """
+        if isinstance(self.model, ProblemModel):
+            return self.model.braking_inputs(x)
+        assert isinstance(self.model, QuadrotorModel)
         # Tilt a = v / (g * 0.5 s) stops the linearised robot in about half a second without overshoot
         gain = 1.0 / (self.model.params.gravity * 0.5)
         limit = self.config.max_tilt
         u = np.zeros((x.shape[0], self.config.horizon, N_INPUTS))
-        state = x
+        state, hold = x, np.zeros((x.shape[0], N_INPUTS))
+        if disturbance is not None:
+            hold = self.model.params.steady_input(disturbance)
+            u[..., 2] = np.clip(hold[:, None, 2], -self.config.descent_rate, self.config.max_climb_rate)
         for k in range(self.config.horizon):
-            u[:, k, 0] = np.clip(gain * state[:, 4], -limit, limit)
-            u[:, k, 1] = np.clip(-gain * state[:, 3], -limit, limit)
-            state = self._rollout(state, u[:, k : k + 1])[:, 1]
+            u[:, k, 0] = np.clip(gain * state[:, 4] + hold[:, 0], -limit, limit)
+            u[:, k, 1] = np.clip(-gain * state[:, 3] + hold[:, 1], -limit, limit)
+            state = self._rollout(state, u[:, k : k + 1], disturbance)[:, 1]
         return u
 
 

@@ -64,9 +64,17 @@ class FatropSolver:
         clearance = np.zeros(problems.others.shape[:3]) if problems.clearance is None else problems.clearance
         shape = np.ones((*problems.others.shape[:2], 3)) if problems.shape is None else problems.shape
         size = np.zeros(problems.others.shape[:2]) if problems.size is None else problems.size
+        reference, weight = problems.reference, problems.reference_weight
+        reference = np.zeros((count, horizon, 3)) if reference is None else reference
+        weight = np.zeros((count, horizon)) if weight is None else weight
+        disturbance, steady = problems.disturbance, problems.steady_input
+        disturbance = np.zeros((count, 3)) if disturbance is None else disturbance
+        steady = np.zeros((count, N_INPUTS)) if steady is None else steady
         for b in range(count):
             about_others = (problems.others[b].ravel(), clearance[b].ravel(), shape[b].ravel(), size[b])
-            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others])
+            kept_to = (reference[b].ravel(), weight[b]) if self.problem.committed else ()
+            pushed = (disturbance[b], steady[b, :nu]) if self.problem.disturbed else ()
+            parameters = np.concatenate([problems.x[b, :nx], problems.goal[b], *about_others, *kept_to, *pushed])
             variables[program.x_index] = x_guess[b, 1:, :nx] + _aside(problems, b, horizon)[:, :nx]
             variables[program.u_index] = u_guess[b, :, :nu]
             if not (_is_sane(parameters) and _is_sane(variables)):
@@ -139,7 +147,8 @@ def _is_sane(numbers: np.ndarray) -> bool:
 class Program(NamedTuple):
     """The problem as a nonlinear program.
 
-    :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance, shape, size), cost ``f`` and
+    :param nlp: variables ``x``, parameters ``p`` (state, goal, others, clearance, shape, size, and with
+        commitment reference and its weights, with disturbances these and the steady inputs), cost ``f`` and
         constraints ``g``
     :param bounds: bounds of variables and constraints
     :param structure: fatrop's description of the stages
@@ -163,14 +172,20 @@ def transcribe(problem: OptimalControlProblem) -> Program:
     others = ca.SX.sym("others", 3, horizon * n_others)  # column j * N + k - 1: robot j at stage k
     clearance = ca.SX.sym("clearance", horizon, n_others)
     shape, size = ca.SX.sym("shape", 3, n_others), ca.SX.sym("size", n_others)
+    reference, weight = ca.SX.sym("reference", 3, horizon), ca.SX.sym("weight", horizon)
+    kept_to = [ca.vec(reference), weight] if problem.committed else []
+    disturbance, steady = ca.SX.sym("disturbance", 3), ca.SX.sym("steady", nu)
+    pushed = [disturbance, steady] if problem.disturbed else []
+    moved = problem.drift(disturbance) if problem.disturbed else ca.SX.zeros(nx)
+    free = steady if problem.disturbed else ca.SX.zeros(nu)
     states = [x0] + [ca.SX.sym(f"x{k}", nx) for k in range(1, horizon + 1)]
     inputs = [ca.SX.sym(f"u{k}", nu) for k in range(horizon)]
     step = ca.Function("step", [states[1], inputs[0]], [problem.dynamics(states[1], inputs[0])])
 
     cost = problem.goal_cost(states[-1], x0, goal)
-    variables, lower, x_index, u_index = [], [], [], []
+    variables, lower, upper, x_index, u_index = [], [], [], [], []
     constraints, constraint_lower, equality, n_slacks = [], [], [], []
-    max_input = problem.max_input.full().ravel()
+    min_input, max_input = problem.min_input.full().ravel(), problem.max_input.full().ravel()
     farthest = config.separation * (_LARGEST_EXPONENT / config.repulsion_steepness + config.repulsion_buffer)
     offset = 0
     for k in range(horizon + 1):
@@ -179,6 +194,7 @@ def transcribe(problem: OptimalControlProblem) -> Program:
         if k > 0:
             variables.append(states[k])
             lower.append(np.full(nx, -np.inf))
+            upper.append(np.full(nx, np.inf))
             x_index.append(np.arange(offset, offset + nx))
             offset += nx
             around = others[:, [j * horizon + k - 1 for j in range(n_others)]]
@@ -189,36 +205,39 @@ def transcribe(problem: OptimalControlProblem) -> Program:
             # At large distances, the repulsion is zero long before its exponential overflows. The overflow would make
             # derivatives NaN, with which fatrop regularises its Hessian forever.
             cost += sum((problem.repulsion_cost(ca.fmin(d, farthest)) for d in distances), start=ca.SX(0))
+            if problem.committed:
+                cost += weight[k - 1] * ca.sumsqr(states[k][:3] - reference[:, k - 1])
             cost += config.violation_weight * (
                 ca.sumsqr(slack) + ca.sumsqr(ca.fmax(problem.box_violations(states[k]), 0))
             )
         if k < horizon:
-            cost += problem.input_cost(inputs[k])
+            cost += problem.input_cost(inputs[k] - free)
             variables.append(inputs[k])
-            lower.append(-max_input)
+            lower.append(min_input)
+            upper.append(max_input)
             u_index.append(np.arange(offset, offset + nu))
             offset += nu
-            constraints.append(states[k + 1] - step(states[k], inputs[k]))
+            constraints.append(states[k + 1] - step(states[k], inputs[k]) - moved)
             constraint_lower.append(np.zeros(nx))
             equality += [True] * nx
         variables.append(slack)
         lower.append(np.full(n_slacks[k], -np.inf))
+        upper.append(np.full(n_slacks[k], np.inf))
         offset += n_slacks[k]
         if k > 0:
             constraints += [d - config.separation - clearance[k - 1, j] + slack[j] for j, d in enumerate(distances)]
             constraint_lower.append(np.zeros(n_others))
             equality += [False] * n_others
-    bounds = np.concatenate(lower)
     return Program(
         nlp={
             "x": ca.vertcat(*variables),
             "f": cost,
             "g": ca.vertcat(*constraints),
-            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size),
+            "p": ca.vertcat(x0, goal, ca.vec(others), ca.vec(clearance), ca.vec(shape), size, *kept_to, *pushed),
         },
         bounds={
-            "lbx": bounds,
-            "ubx": -bounds,
+            "lbx": np.concatenate(lower),
+            "ubx": np.concatenate(upper),
             "lbg": np.concatenate(constraint_lower),
             "ubg": np.where(equality, 0.0, np.inf),
         },

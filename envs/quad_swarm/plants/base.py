@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.quadrotor import MixedModel, QuadrotorModel, QuadrotorParams
+from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams, VehicleModel
+from quad_swarm.registry import Registry
 
 MODEL = "model"
 
@@ -55,13 +55,19 @@ class Simulator:
         return str(self.adapter).partition(":")[0]
 
 
-SIMULATORS: dict[str, Simulator] = {
-    "crazyflow": Simulator(
-        "quad_swarm.plants.crazyflow:CrazyflowPlant",
-        ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
-    ),
-    "rotorpy": Simulator("quad_swarm.plants.rotorpy:RotorpyPlant", ("crazyflie", "crazyfliebrushless", "hummingbird")),
-}
+SIMULATORS: Registry[Simulator] = Registry(
+    "plant",
+    "quad_swarm.plants",
+    {
+        "crazyflow": Simulator(
+            "quad_swarm.plants.crazyflow:CrazyflowPlant",
+            ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350", "hb_x500"),
+        ),
+        "rotorpy": Simulator(
+            "quad_swarm.plants.rotorpy:RotorpyPlant", ("crazyflie", "crazyfliebrushless", "hummingbird")
+        ),
+    },
+)
 
 
 def simulated_vehicles() -> list[str]:
@@ -72,9 +78,10 @@ def simulated_vehicles() -> list[str]:
 def simulator_of(name: str) -> Simulator:
     """Return the entry of `SIMULATORS` for a name.
 
-    :raises ValueError: if it is no `Simulator`
+    :raises ValueError: if there is none, or it is no `Simulator`
+    :raises ImportError: if an installed package offers it, and it cannot be loaded
     """
-    if isinstance(known := SIMULATORS[name], Simulator):
+    if isinstance(known := SIMULATORS.find(name, (MODEL,)), Simulator):
         return known
     raise ValueError(
         f"SIMULATORS[{name!r}]={shown(known)}: it must be a quad_swarm.plants.Simulator, which names the adapter and "
@@ -112,7 +119,7 @@ class ModelPlant:
     :param model: the dynamics over a sub-step
     """
 
-    def __init__(self, model: QuadrotorModel | MixedModel):
+    def __init__(self, model: VehicleModel):
         self._model = model
 
     def place(self, swarm: int, state: np.ndarray) -> None:
@@ -138,8 +145,6 @@ def parse_plant(name: str) -> tuple[str, str]:
     simulator, _, vehicle = name.partition(":")
     if simulator == MODEL and not vehicle:
         return MODEL, ""
-    if simulator not in SIMULATORS:
-        raise unknown_name("plant", simulator, [MODEL, *SIMULATORS])
     known = simulator_of(simulator)
     if vehicle and vehicle not in known.vehicles:
         raise unknown_name(f"vehicle of {simulator}", vehicle, known.vehicles)
@@ -147,30 +152,23 @@ def parse_plant(name: str) -> tuple[str, str]:
 
 
 def make_plant(
-    name: str, params: QuadrotorParams | Sequence[QuadrotorParams], dt: float, n_swarms: int, n_robots: int
+    name: str, params: QuadrotorParams, dt: float, n_swarms: int, n_robots: int, model: VehicleModel | None = None
 ) -> Plant:
     """Create a plant.
 
     :param name: see `parse_plant`
-    :param params: parameters of our own model, of all robots or of each of the n; other simulators only use the drag,
-        for the force of the wind
+    :param params: parameters of our own model; other simulators only use the drag, for the force of the wind
     :param dt: length of a sub-step (s)
     :param n_swarms: number of swarms E
     :param n_robots: number of robots in a swarm
-    :raises ValueError: if the plant is unknown, another simulator is to fly unlike vehicles, or does not support
-        sub-steps of this length
+    :param model: our own model over a sub-step, by default that of quadrotors
+    :raises ValueError: if the plant is unknown, or the simulator does not support sub-steps of this length
     :raises ImportError: if the simulator is not installed
     :raises PlantError: if the simulator's process dies, or its adapter raises another error
     """
     simulator, vehicle = parse_plant(name)
-    kinds = tuple(dict.fromkeys([params] if isinstance(params, QuadrotorParams) else params))
-    if simulator == MODEL and len(kinds) > 1:
-        models = [QuadrotorModel(kind, dt) for kind in kinds]
-        return ModelPlant(MixedModel(models, [kinds.index(one) for one in params]))  # type: ignore[union-attr]
     if simulator == MODEL:
-        return ModelPlant(QuadrotorModel(kinds[0], dt))
-    if len(kinds) > 1:
-        raise ValueError(f"plant={name!r} flies vehicles that are all alike: only plant={MODEL!r} flies unlike ones.")
+        return ModelPlant(model or QuadrotorModel(params, dt))
     from quad_swarm.plants.remote import RemotePlant
 
-    return RemotePlant(simulator, vehicle, kinds[0], dt, n_swarms, n_robots)
+    return RemotePlant(simulator, vehicle, params, dt, n_swarms, n_robots)

@@ -94,7 +94,7 @@ class Loop:
         self.statistics = Statistics()
         self._wait = round(wait * _US)
         self._flying = False
-        self._next: tuple[Any, Any, Any] | None = None  # where to fly to from the next period on
+        self._next: tuple[Any, Any, Any, Any] | None = None  # where to fly to from the next period on
         self._forget()
 
     def warm_up(self) -> None:
@@ -108,7 +108,12 @@ class Loop:
             self.robot.plan()
 
     def start(
-        self, start: np.ndarray, goal: np.ndarray, first: int, obstacles: Sequence[Obstacle] | None = None
+        self,
+        start: np.ndarray,
+        goal: np.ndarray,
+        first: int,
+        obstacles: Sequence[Obstacle] | None = None,
+        heading: float = 0.0,
     ) -> None:
         """Begin a flight.
 
@@ -116,9 +121,10 @@ class Loop:
         :param goal: goal, (3,), world frame (m)
         :param first: start of the first period (us); the others' may differ by part of a period
         :param obstacles: the obstacles, where they are then; by default those that the world lists
+        :param heading: heading of the robot, which it keeps (rad)
         :raises ValueError: if there are more obstacles than the world has room for
         """
-        self.robot.reset(start, goal, self.late, now=first, obstacles=obstacles)
+        self.robot.reset(start, goal, self.late, now=first, obstacles=obstacles, initial_heading=heading)
         self.supervisor.reset()
         self.statistics = Statistics()
         self._forget()
@@ -126,13 +132,14 @@ class Loop:
         self._flying = True
         self._began = time.perf_counter(), time.process_time()
 
-    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None) -> None:
+    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None, heading: Any = None) -> None:
         """Fly to another goal from the next period on, see `Robot.fly_to`.
 
-        :raises ValueError: if something has another shape, or is not finite
+        :raises ValueError: if something has another shape, or is not finite, or the robot cannot turn
         """
         target_of(goal, velocity, waypoints)
-        self._next = goal, velocity, waypoints
+        self.robot.check_heading(heading)
+        self._next = goal, velocity, waypoints, heading
 
     def _forget(self) -> None:
         self._next = None

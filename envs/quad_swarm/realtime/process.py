@@ -184,7 +184,7 @@ def prepare(team: Team, link: SimulatedLink, vehicle: Vehicle) -> tuple[Loop, Wa
     loop.warm_up()
     if not set_priority(team.priority):
         print("no real-time priority: the system does not allow it", file=sys.stderr)
-    return loop, Watchdog(vehicle, team.limits)
+    return loop, Watchdog(vehicle, loop.supervisor.limits)
 
 
 def report_of(loop: Loop) -> Report:

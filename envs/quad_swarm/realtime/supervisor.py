@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Annotated
 
@@ -44,7 +44,8 @@ class SafetyLimits:
         None for that of a collision
     :param fence: how far it may leave the workspace to the sides and upwards, before it lands
     :param hung: time without a sign of life of the loop after which the watchdog hovers
-    :param landing: climb rate of a landing (m/s), negative
+    :param landing: climb rate of a landing (m/s), negative. Where the planner's limit of descents is lower, robots land
+        with that, and may take longer in proportion
     :param ground: height at which it has landed
     :param landing_time: longest duration of a landing
     :raises ValueError: if a value is out of range, or a state would be lost before it is stale
@@ -73,6 +74,7 @@ class SafetyLimits:
 class Supervisor:
     """The guards of one robot.
 
+    :ivar limits: the limits, with the climb rate of landings within the planner's limit
     :ivar mode: what the robot does; landing is final until `reset`
     :ivar sees: whether what is perceived can be planned with
     :ivar reasons: how often each guard stepped in
@@ -85,6 +87,9 @@ class Supervisor:
     """
 
     def __init__(self, config: SwarmConfig, limits: SafetyLimits, robot: int = 0):
+        fastest = config.kinds[config.kind_of[robot]].planner.descent_rate
+        if (slower := limits.landing / -fastest) > 1:
+            limits = replace(limits, landing=-fastest, landing_time=slower * limits.landing_time)
         self.limits = limits
         self._excess = 0.0 if config.excess is None else np.delete(config.excess[robot], robot)
         contact = 2 * config.radius - config.collision_tolerance

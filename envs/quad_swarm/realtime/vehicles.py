@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from quad_swarm.geometry import closest_approach, flattened, length
-from quad_swarm.plants import make_plant
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.link import Sensed, Traffic
 from quad_swarm.realtime.statistics import Statistics, total
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.obstacles import Obstacle, Obstacles
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, plant_of
 from quad_swarm.world.realisation import Realisation
 
 _US = 1_000_000
@@ -77,16 +76,21 @@ class Vehicles:
     :ivar held: which robots are held where they are until their first command, (n,) bool; `reset` holds nobody
 
     :param config: the world; its clock skew is not used, since commands take effect when they arrive
-    :raises ValueError: if a sub-step is no whole number of microseconds
+    :raises ValueError: if a sub-step is no whole number of microseconds, or the world's vehicles are no quadrotors
     """
 
     def __init__(self, config: SwarmConfig):
+        if not config.flies_quadrotors:
+            raise ValueError(
+                f"planner.problem={config.planner.problem!r}: vehicles in real time level and land as quadrotors do; "
+                "fly this world as a swarm, or give a quad_swarm.realtime.Loop a vehicle of your own."
+            )
         n, step = config.n_robots, config.planner.dt / config.substeps
         self.config, self.step_us = config, round(step * _US)
         if abs(self.step_us - step * _US) > 1e-6:
             raise ValueError(f"planner.dt / substeps = {step} s: in real time, it must be whole microseconds.")
         self._realisation = Realisation(config, 1)
-        self._plant = make_plant(config.plant, config.quadrotors, step, 1, n)
+        self._plant = plant_of(config, step, 1, n)
         self._others = other_indices(n)
         self.obstacles = Obstacles.of(config.obstacles, 1)
         self._state = np.zeros((1, n, N_STATES))

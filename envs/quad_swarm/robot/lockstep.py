@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.plants import make_plant
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.robot.robot import Plan, Robot
 from quad_swarm.world.beliefs import other_indices
 from quad_swarm.world.obstacles import Obstacle
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, plant_of
 from quad_swarm.world.realisation import Realisation
 from quad_swarm.world.route import Targets
 
@@ -35,7 +34,7 @@ class LockstepWorld:
         n = config.n_robots
         self.config, self.robots = config, list(robots)
         self.realisation = Realisation(config, 1)
-        self.plant = make_plant(config.plant, config.quadrotors, config.planner.dt / config.substeps, 1, n)
+        self.plant = plant_of(config, config.planner.dt / config.substeps, 1, n)
         self.state, self.now = np.zeros((1, n, N_STATES)), 0
         self._u = np.zeros((1, n, N_INPUTS))
         self._others = other_indices(n)
@@ -52,10 +51,14 @@ class LockstepWorld:
         obstacles: Sequence[Obstacle] | None = None,
         velocities: Any = None,
         waypoints: Any = None,
+        headings: Any = None,
+        initial_velocities: Any = None,
+        initial_headings: Any = None,
     ) -> None:
         """Begin an episode, see `Swarm.reset`."""
-        self.state[:], self._u[:], self.now = 0.0, 0.0, 0
-        self.state[0, :, POSITION] = starts
+        states = self.config.initial_states(np.asarray(starts), np.asarray(goals), initial_velocities, initial_headings)
+        moving, facing = states[:, VELOCITY], self.config.facing(states)
+        self.state[0], self._u[:], self.now = states, 0.0, 0
         self.plant.place(0, self.state[0])
         if self.config.is_random:
             self.realisation.reset(0, noise_seed)
@@ -65,13 +68,19 @@ class LockstepWorld:
         for k, robot in enumerate(self.robots):
             goal, velocity, passed = (one[k] for one in targets)
             delay, kept = float(late[k]), 1 + radio.delay
-            robot.reset(starts[k], goal, delay, kept=kept, obstacles=obstacles, velocity=velocity, waypoints=passed)
+            heading = None if headings is None else headings[k]
+            target: dict[str, Any] = {"velocity": velocity, "waypoints": passed, "heading": heading}
+            if self.config.flies_quadrotors:
+                target |= {"initial_velocity": moving[k], "initial_heading": facing[k]}
+            robot.reset(starts[k], goal, delay, kept=kept, obstacles=obstacles, **target)
         causal = radio.round_trip is not None
         self._flying = deque([] for _ in range(1 + (radio.round_trip or 0) + radio.jitter))
         most = 1 + radio.delay + (0 if causal else radio.jitter)
         self._plans = [
-            deque([Plan(-k * robot.period, robot.newest.positions) for k in range(most, 0, -1)], most)
-            for robot in self.robots
+            deque(
+                [Plan(-k * robot.period, robot.newest.positions - (k - 1) * stride) for k in range(most, 0, -1)], most
+            )
+            for robot, stride in zip(self.robots, self.config.planner.dt * moving, strict=True)
         ]
 
     def step(self) -> np.ndarray:

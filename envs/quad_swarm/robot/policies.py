@@ -21,7 +21,7 @@ __all__ = ["Actor", "Policy", "RulePolicy"]
 class RulePolicy:
     """A rule such as ``"cpa:1.0s:3&stale:4"`` or ``"event:0.1|push:0.2"``.
 
-    :param rule: the rule, see `quad_swarm.task.rules`; `push` becomes an announcement
+    :param rule: the rule, see `quad_swarm.task.rules`; `push` and `stage` become announcements
     :param seed: seed of rules that draw random numbers
     :raises ValueError: if the rule is unknown, or joins what two different robots know
     """

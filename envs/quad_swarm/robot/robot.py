@@ -16,6 +16,8 @@ from quad_swarm.native.pairs import advance
 from quad_swarm.planner import Plans, base
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 from quad_swarm.world.beliefs import Beliefs, resampled
+from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.kinds import bodies_of, make_planner_of
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.obstacles import Obstacle, Obstacles
@@ -69,6 +71,7 @@ class Robot:
     :ivar bodies: how large the robot and the others are
     :ivar hold: where it stays instead of flying to its goal, (1, 1, 3), world frame (m); None to fly
     :ivar late: time from the start of a period until its command takes effect (periods)
+    :ivar heading: heading that it turns to, (1, 1) (rad)
 
     :param config: the world as far as robots know it: team, vehicle, planner and memory
     :param index: number of the robot, from 0
@@ -97,6 +100,8 @@ class Robot:
             )
         self.bodies = bodies_of(config, index, self.others[None])
         self.obstacles = Obstacles.of(config.obstacles, 1)
+        self.commitment = Commitment.of(config.planner, 1, 1)
+        self.disturbance = DisturbanceEstimate.of(self.planner, 1, 1)
         self.period = round(1e6 * config.planner.dt)
         self.beliefs: Beliefs = make_beliefs(config, 1, 1)
         # What the others presumably believe about this robot, from what it sent
@@ -113,10 +118,13 @@ class Robot:
         obstacles: Sequence[Obstacle] | None = None,
         velocity: Any = None,
         waypoints: Any = None,
+        heading: Any = None,
+        initial_velocity: Any = None,
+        initial_heading: Any = None,
     ) -> None:
         """Begin to fly.
 
-        :param start: where the robot is commanded to hover, (3,), world frame (m)
+        :param start: where the robot is, commanded to hover unless it moves, (3,), world frame (m)
         :param goal: goal, (3,), world frame (m)
         :param late: time from the start of a period until its command takes effect (periods), less than 1
         :param kept: number of own plans that may still be sent, where the radio delays them by whole periods
@@ -124,42 +132,70 @@ class Robot:
         :param obstacles: the obstacles, where they are then; by default those that the world lists
         :param velocity: see `fly_to`
         :param waypoints: see `fly_to`
-        :raises ValueError: if there are more obstacles than the world has room for, or goals do not fit, see `fly_to`
+        :param heading: see `fly_to`, by default that at the start
+        :param initial_velocity: velocity of the robot, (3,), world frame (m/s), by default 0
+        :param initial_heading: heading of the robot (rad), by default 0
+        :raises ValueError: if there are more obstacles than the world has room for, goals do not fit, see `fly_to`, or
+            something has another shape, or is not finite
         """
+        initial_velocities = None if initial_velocity is None else [initial_velocity]
         obstacles = self.config.obstacles.listed if obstacles is None else obstacles
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(0, obstacles)
-        x = np.zeros((1, N_STATES))
-        x[:, POSITION] = start
+        initial_headings = None if initial_heading is None else [initial_heading]
+        x = self.config.initial_states(np.array([start]), np.array([goal]), initial_velocities, initial_headings)
+        moving, facing = x[:, VELOCITY], self.config.facing(x)
         self.late, self.now = late, now - self.period
         self.hold: np.ndarray | None = None
-        self.fly_to(goal, velocity, waypoints)
+        self._facing = facing
+        self.heading = facing[None].copy()
+        self.fly_to(goal, velocity, waypoints, heading)
         self._estimate, self._u = x[None], np.zeros((1, 1, N_INPUTS))
         self._pos = self._vel = np.zeros((1, 1, len(self.others), 3))
-        self._plans = Plans.hover(x, self.config.planner.horizon)
+        planner = self.config.planner
+        self._plans = Plans.steady(x, planner.horizon, planner.dt, np.array([late]))
         for beliefs in (self.beliefs, self.presumed):
             beliefs.forget(np.array([0]))
+        if self.commitment is not None:
+            self.commitment.forget(0)
+        if self.disturbance is not None:
+            self.disturbance.forget(0)
         self._sent: dict[int, Plan] = {}
         self._inbox: dict[int, Plan] = {}
-        self._own = [Plan(now - k * self.period, self.planned_positions()[0, 0]) for k in range(kept, 0, -1)]
+        newest, stride = self.planned_positions()[0, 0], planner.dt * moving
+        self._own = [Plan(now - k * self.period, newest - (k - 1) * stride) for k in range(kept, 0, -1)]
         self.source = np.zeros((1, 1, len(self.others)), dtype=np.int64)
 
-    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None) -> None:
+    def fly_to(self, goal: Any, velocity: Any = None, waypoints: Any = None, heading: Any = None) -> None:
         """Fly to another goal from now on. The former goal and waypoints are forgotten.
 
         :param goal: goal, (3,), world frame (m)
         :param velocity: velocity of the goal, (3,), world frame (m/s), by default 0
         :param waypoints: what the robot passes before, each as soon as it is within the goal radius of it, (any number,
             3), world frame (m), by default nothing
-        :raises ValueError: if something has another shape, or is not finite
+        :param heading: heading that the robot turns to, the short way, and keeps, from the x axis counter-clockwise
+            (rad), by default as before
+        :raises ValueError: if something has another shape, or is not finite, or the robot cannot turn, see
+            `check_heading`
         """
         targets = target_of(goal, velocity, waypoints)
+        self.check_heading(heading)
+        if heading is not None:
+            self.heading = np.full((1, 1), float(heading))
         self._goal = targets.goals[None]
         self._route: Route | None = None
         if targets.change:
             self._route = Route(self._goal)
             self._route.set(0, slice(None), targets)
             self._goal = self._route.current()
+
+    def check_heading(self, heading: Any) -> None:
+        """Check that the robot can turn to a heading (rad); None is one that it has.
+
+        :raises ValueError: if it is no finite angle, or not that at the start and the robot may not turn
+        """
+        if heading is not None:
+            self.config.check_headings("heading", [heading], self._facing, [self.index])
 
     @property
     def goal(self) -> np.ndarray:
@@ -218,6 +254,8 @@ class Robot:
         for _ in range(min(missed, self.config.planner.horizon)):  # by then, plans and beliefs have expired
             self._miss()
         self._estimate = np.array(state, float).reshape(1, 1, N_STATES)
+        if self.disturbance is not None:
+            self.disturbance.update(self._estimate)
         self._pos, self._vel = (np.array(a, float).reshape(1, 1, -1, 3) for a in (pos, vel))
         self.now = now
         if self._route is not None:
@@ -249,15 +287,26 @@ class Robot:
         :return: set-point: roll, pitch (rad), climb rate (m/s) and yaw rate (rad/s), (4,)
         """
         self.presumed.receive(*self._message(self._sent, *self._own_motion()))
+        if self.commitment is not None:
+            self.commitment.advance()
+            if self._sent:
+                *_, plans, ages = self._message(self._sent, *self._own_motion())
+                newest = ages.argmin()
+                self.commitment.sent(np.ones((1, 1), bool), plans[None, None, newest], ages[newest])
         believed, self.source = self.beliefs.update(*self._message(self._inbox, self._pos, self._vel))
         late = np.full((1, 1), self.late) if self.late else None
         goal_velocity = None
         if self._route is not None and self.hold is None:
             goal_velocity = self._route.current_velocity()
         arguments = (self._estimate, self.goal, believed, self.source, self._u, late, self.obstacles, goal_velocity)
-        problems = make_problems(self.config, self.planner.model, *arguments, self.bodies)
+        heading = self.heading if self.planner.config.max_yaw_rate else None
+        kept_to = self.commitment if self.hold is None else None
+        beside = (kept_to, self.disturbance, heading, self.bodies)
+        problems = make_problems(self.config, self.planner.model, *arguments, *beside)
         self._plans = self.planner.plan(problems, self._plans)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)
+        if self.disturbance is not None:
+            self.disturbance.expect(problems.x[None], self._u, late)
         self._pass_time()
         self._sent, self._inbox = {}, {}
         self._own = [*self._own[1:], Plan(self.now, self.planned_positions()[0, 0].copy())]
@@ -268,6 +317,10 @@ class Robot:
         self.now += self.period
         self.presumed.receive(*self._message({}, *self._own_motion()))
         self.beliefs.receive(*self._message({}, self._pos, self._vel))
+        if self.commitment is not None:
+            self.commitment.advance()
+        if self.disturbance is not None:
+            self.disturbance.miss()
         plans = self._plans
         self._plans = plans._replace(x=base.shift(plans.x), u=base.shift(plans.u), age=plans.age + 1)
         self._u = self._plans.u[:, 0].reshape(1, 1, N_INPUTS)

@@ -17,7 +17,8 @@ activates itself once as soon as it may. Besides the topics of `RosLink` and tho
 ====================== =================================== ==================================================
 name                   type                                content
 ====================== =================================== ==================================================
-``/NAME/goal_pose``    geometry_msgs/PoseStamped           where to fly, in the frame "map"; no heading
+``/NAME/goal_pose``    geometry_msgs/PoseStamped           where to fly, in the frame "map", and with
+                                                           ``planner.max_yaw_rate`` which heading to turn to
 ``/NAME/status``       diagnostic_msgs/DiagnosticArray     once a second: what the robot does, why, and counts
 ``/NAME/robot/land``   std_srvs/Trigger (a service)        begins to land, as ``deactivate`` does
 ====================== =================================== ==================================================
@@ -36,6 +37,7 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.errors import shown, unknown_name
+from quad_swarm.geometry import from_quaternion
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.attitude import AttitudeController, AttitudeGains
 from quad_swarm.realtime.link import Handler, monotonic
@@ -232,7 +234,8 @@ class RobotNode:
             raise ValueError(f"the robot would not fly: {', '.join(sorted(guards.why))}")
         if absent := self._link.absent():
             raise ValueError(f"{absent[0]} does not listen: configure all robots first")
-        loop.start(own, own if self._goal is None else self._goal, now + loop.robot.period)
+        goal, first = own if self._goal is None else self._goal, now + loop.robot.period
+        loop.start(own, goal, first, heading=float(sensed.state[8]))
         self._vehicle.engage()
         self._off, self._mode = 0, Mode.FLY
         self.flies = self._is_active = True
@@ -366,12 +369,16 @@ class RobotNode:
             self._log(f"goal refused: {error}")
 
     def _fly_to(self, message: Any) -> None:
-        loop, place = self.loop, message.pose.position
+        loop, place, turned = self.loop, message.pose.position, message.pose.orientation
         if message.header.frame_id != FRAME:
             raise ValueError(f"its frame is {shown(message.header.frame_id)}: give it in {FRAME!r}")
         if loop is None or not self.flies or loop.supervisor.shall_land or loop.supervisor.mode >= Mode.LAND:
             raise ValueError("the robot does not fly: activate it first")
-        loop.fly_to(reachable([place.x, place.y, place.z], loop.robot.config))
+        config, heading = loop.robot.config, None
+        quaternion = np.array([turned.x, turned.y, turned.z, turned.w])
+        if config.turning[loop.robot.index] and quaternion.any():  # who leaves it out asks for no heading
+            heading = from_quaternion(quaternion)[2]
+        loop.fly_to(reachable([place.x, place.y, place.z], config), heading=heading)
 
     def _take_wish(self, request: Any, response: Any) -> Any:
         response.success = self.land()

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.geometry import from_quaternion, to_frd, to_ned, to_quaternion
+from quad_swarm.geometry import from_quaternion, to_frd, to_ned, to_quaternion, wrapped
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.attitude import Attitude, AttitudeController
 from quad_swarm.realtime.link import Handler, Sensed
@@ -246,7 +246,7 @@ class LegacyCrazyswarmVehicle(OdometryVehicle):
         message.linear.x, message.linear.y = map(float, np.degrees([attitude.pitch, attitude.roll]))
         message.linear.z = float(min(attitude.thrust * _CRAZYFLIE_THRUST, _CRAZYFLIE_MOST))
         heading = self._states[self._link.index][1][8] if self._link.index in self._states else attitude.yaw
-        error = (attitude.yaw - heading + np.pi) % (2 * np.pi) - np.pi
+        error = wrapped(attitude.yaw - heading)
         message.angular.z = -float(np.degrees(2.0 * error + setpoint[3]))  # the firmware inverts it
         self._commands.publish(message)
 

@@ -30,3 +30,4 @@ class TaskOptions:
     world: Mapping[str, Any] | None = None
     solver: str = "auto"
     announcements: bool = False
+    plans_in_info: bool = False

@@ -109,6 +109,7 @@ class RequestTask:
     :param end_at_arrival: end episodes as soon as all robots are at their goals; the paper continues to the time limit
     :param end_at_collision: end episodes at collisions; otherwise they continue, which shows how deep collisions are
     :param announcements: whether robots may also send their plans without a request, see `act`
+    :param plans_in_info: whether `info` holds the robots' plans, for which the swarm computes their costs
     :raises ValueError: if ``near_miss_ahead`` of the reward exceeds the plans' horizon
     """
 
@@ -123,6 +124,7 @@ class RequestTask:
         end_at_arrival: bool = False,
         end_at_collision: bool = True,
         announcements: bool = False,
+        plans_in_info: bool = False,
     ):
         last = swarm.config.planner.horizon - 1
         if reward.near_miss_ahead > last:
@@ -142,6 +144,7 @@ class RequestTask:
         self.end_at_arrival = end_at_arrival
         self.end_at_collision = end_at_collision
         self.n_bits = 2 if announcements else 1
+        self.plans_in_info = plans_in_info
         self.scenario = [""] * swarm.n_swarms
         self.statistics = EpisodeStatistics(swarm.n_swarms, swarm.config)
         self.observation = observation or PaperObservation(swarm.config, scaled=False)
@@ -185,10 +188,14 @@ class RequestTask:
         obstacles: Sequence[Obstacle] | None = None,
         velocities: Any = None,
         waypoints: Any = None,
+        headings: Any = None,
+        initial_velocities: Any = None,
+        initial_headings: Any = None,
     ) -> None:
         """Start a given episode in one swarm; ``rng`` seeds its disturbances. See `Swarm.reset`."""
         noise_seed = int(rng.integers(2**63)) if self.swarm.config.is_random else 0
-        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked, velocities, waypoints)
+        changing = (velocities, waypoints, headings, initial_velocities, initial_headings)
+        self.swarm.reset(swarm, starts, goals, obstacles, noise_seed, checked, *changing)
         self.scenario[swarm] = name
         self.statistics.reset(swarm)
 
@@ -199,10 +206,11 @@ class RequestTask:
         velocities: Any = None,
         waypoints: Any = None,
         robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> None:
         """Let robots of one swarm fly to other goals from now on, see `Swarm.set_goals`. The episode counts as arrived
         only when all robots are at the goals that they have now."""
-        self.swarm.set_goals(swarm, goals, velocities, waypoints, robots)
+        self.swarm.set_goals(swarm, goals, velocities, waypoints, robots, headings)
         self.statistics.change_goals(swarm)
 
     def keep(self, swarms: np.ndarray) -> None:
@@ -338,10 +346,14 @@ class RequestTask:
     def info(self, outcome: Outcome) -> dict[str, Any]:
         """Return the `info` of a step: arrays with a leading axis of swarms, some in dicts. See `QuadSwarmEnv`."""
         report = outcome.report
-        more = {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
+        more: dict[str, Any] = (
+            {} if report.changed is None else {"neighbours": report.others, "pair_terminated": report.changed}
+        )
         if report.obstacles is not None:
             more["min_obstacle_distance"] = report.obstacles.distance.min(axis=(1, 2))
             more["min_obstacle_distance_continuous"] = report.obstacles.distance_continuous.min(axis=(1, 2))
+        if self.plans_in_info:
+            more["plan"] = self._plan(report)
         return more | {
             "scenario": np.array(self.scenario),
             "team_reward": outcome.reward,
@@ -356,6 +368,18 @@ class RequestTask:
             "belief_source": report.belief_source,
             "planner": {"status": report.plan_status, "iterations": report.iterations},
             "metrics": {f"reward/{name}": term for name, term in outcome.reward_terms.items()},
+        }
+
+    def _plan(self, report: StepReport) -> dict[str, np.ndarray]:
+        """Return what the robots planned in the last step: copies, since a reset writes into plans."""
+        swarm, (n_swarms, n) = self.swarm, self.swarm.state.shape[:2]
+        costs = swarm.planner.costs
+        assert costs is not None
+        return {
+            "states": swarm.plans.copy(),
+            "inputs": swarm.inputs.copy(),
+            "cost": costs.reshape(n_swarms, n),
+            "solve_seconds": np.full(n_swarms, report.solve_seconds),
         }
 
     def final_info(self) -> dict[str, Any]:
@@ -391,7 +415,7 @@ def task_of(options: TaskOptions, n_swarms: int = 1) -> RequestTask:
         warn(sentence)
     weights = replaced(RewardConfig(), options.reward or {}, "reward")
     return RequestTask(
-        Swarm(config, n_swarms, options.solver),
+        Swarm(config, n_swarms, options.solver, options.plans_in_info),
         sampler,
         weights,
         options.max_steps,
@@ -399,4 +423,5 @@ def task_of(options: TaskOptions, n_swarms: int = 1) -> RequestTask:
         options.continuous_collisions,
         options.end_at_arrival,
         announcements=options.announcements,
+        plans_in_info=options.plans_in_info,
     )

@@ -73,6 +73,27 @@ def _deviates(distance: float) -> Rule:
     return rule
 
 
+def stage(distance: float, drift: float) -> Rule:
+    """Event-triggered by the sender: a robot's plan is sent if at some stage it comes closer than ``distance`` (m) to
+    the predicted motion of the receiver, or what the receiver predicts of the sender does, and the two differ there by
+    more than ``drift`` (m)."""
+    tells = _differs_nearby(distance, drift)
+    return lambda view: view.of_the_other(tells(view))
+
+
+def _differs_nearby(distance: float, drift: float) -> Rule:
+    """Tell those who would meet the robot, or expect to, at a stage where they do not know its plan: `stage` for the
+    sender."""
+
+    def rule(view: View) -> np.ndarray:
+        mine, theirs = view.plan[:, :, None], view.expected()
+        believed = view.seen_by_others(range(view.horizon)).believed - view.own_pos[:, :, None, None]
+        near = np.minimum(length(mine - theirs), length(believed - theirs)) < distance
+        return (near & (length(mine - believed) > drift)).any(axis=-1)
+
+    return rule
+
+
 def stale(age: float) -> Rule:
     """Request if the newest received plan is at least ``age`` steps old or is no longer believed."""
     return lambda view: (view.age >= age) | ~view.prediction.remembers
@@ -108,6 +129,7 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
     "soon": (soon, ("TIME",)),
     "event": (event, ("EPS",)),
     "push": (push, ("EPS",)),
+    "stage": (stage, ("DIST", "EPS")),
     "stale": (stale, ("STEPS",)),
     "plan": (plan, ("DIST",)),
     "blocked": (blocked, ("DIST",)),
@@ -116,7 +138,7 @@ RULES: dict[str, tuple[Callable[..., Rule], tuple[str, ...]]] = {
 
 
 # Those of them by which the sender decides, as the sender sees it
-_SENDERS: dict[str, Callable[..., Rule]] = {"push": _deviates}
+_SENDERS: dict[str, Callable[..., Rule]] = {"push": _deviates, "stage": _differs_nearby}
 
 
 def parse_rule(text: str) -> Rule:
@@ -124,6 +146,8 @@ def parse_rule(text: str) -> Rule:
 
     :raises ValueError: if the rule is unknown, or arguments are missing, superfluous or not numbers
     """
+    if not isinstance(text, str):
+        raise ValueError(f"rule={shown(text)}: it must be the text of a rule, such as 'cpa:0.7:1.5'.")
     return _either([[_parse_one(part) for part in joined] for joined in _split(text)])
 
 
@@ -184,17 +208,20 @@ def _parse_one(text: str, instead: Mapping[str, Callable[..., Rule]] = MappingPr
     if any(scaled and not length for scaled, length in zip(relative, lengths, strict=True)):
         raise ValueError(f"Rule {text!r}: only lengths ({', '.join(_LENGTHS)}) can be in separations, as in 1.2s.")
     if not any(relative):
-        return _checked(text, factory(*numbers))
+        return checked_rule(text, factory(*numbers))
 
     @functools.cache  # rules may have a state
     def scaled(separation: float) -> Rule:
         return factory(*(n * separation if r else n for n, r in zip(numbers, relative, strict=True)))
 
-    return _checked(text, lambda view: scaled(view.separation)(view))
+    return checked_rule(text, lambda view: scaled(view.separation)(view))
 
 
-def _checked(text: str, rule: Rule) -> Rule:
+def checked_rule(text: str, rule: Rule) -> Rule:
     """Return a rule that refuses what are no requests.
+
+    :param text: name of the rule, for the error message
+    :param rule: the rule
 
     :raises ValueError: in the rule, if it returned something else than True or False for each of the others
     """

@@ -115,6 +115,8 @@ def farthest(config: SwarmConfig) -> float:
 def far_goals(config: SwarmConfig) -> tuple[float, str]:
     """Return the distance (m) from which on goals are approached at less than half of the possible speed, infinity with
     a cruise distance up to there, and the warning about it."""
+    if not config.flies_quadrotors:
+        return math.inf, ""
     planner, distance = config.planner, farthest(config)
     fastest = min(min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor))
     # Where robots aim beyond the end of the horizon, only their limits keep them from flying faster
@@ -134,32 +136,61 @@ def fast_goals(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
     :param config: the world
     :param velocities: velocities of goals, (n, 3) (m/s)
     """
-    speeds = np.array([_speeds(kind) for kind in config.kinds])[list(config.kind_of)]
-    beyond = np.abs(velocities) / speeds
+    yield from _too_fast(config, velocities, "velocities", "the goal moves", "which fall behind")
+
+
+def fast_starts(config: SwarmConfig, velocities: np.ndarray) -> Iterator[str]:
+    """Yield a sentence if robots start faster than they fly.
+
+    :param config: the world
+    :param velocities: velocities of robots, (n, 3) (m/s)
+    """
+    yield from _too_fast(config, velocities, "initial_velocities", "it starts", "which brake first")
+
+
+def _too_fast(config: SwarmConfig, velocities: np.ndarray, name: str, does: str, what: str) -> Iterator[str]:
+    if not config.flies_quadrotors:
+        return
+    of_kinds = np.array([_speeds(kind) for kind in config.kinds])[list(config.kind_of)]
+    fastest = of_kinds[:, :3]
+    fastest[:, 2] = np.where(velocities[:, 2] < 0, of_kinds[:, 3], of_kinds[:, 2])
+    beyond = np.abs(velocities) / fastest
     if beyond.max(initial=0.0) > 1:
         robot, axis = np.unravel_index(beyond.argmax(), beyond.shape)
         yield (
-            f"velocities[{robot}]={velocities[robot].tolist()}: the goal moves faster than the "
-            f"{speeds[robot, axis]:.2g} m/s of robots along {'xyz'[axis]}, which fall behind"
+            f"{name}[{robot}]={velocities[robot].tolist()}: {does} faster than the {fastest[robot, axis]:.2g} m/s of "
+            f"robots along {'xyz'[axis]}, {what}"
+        )
+
+
+def large_angles(name: str, headings: np.ndarray) -> Iterator[str]:
+    """Yield a sentence if headings are more than a turn, (k,) (rad), as degrees would be."""
+    if np.abs(headings).max(initial=0.0) > 2.01 * math.pi:
+        robot = int(np.abs(headings).argmax())
+        yield (
+            f"{name}[{robot}]={headings[robot]:g} is in rad and more than a turn: as degrees, it would be "
+            f"{math.radians(headings[robot]):.3g}"
         )
 
 
 def _speeds(config: SwarmConfig) -> list[float]:
-    """Return how fast robots fly along x, y and z (m/s)."""
-    planner = config.planner
-    fastest = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
-    return [*fastest, min(planner.max_vertical_speed, planner.max_climb_rate * config.quadrotor.climb_gain)]
+    """Return how fast robots fly along x and y, climb and descend (m/s)."""
+    planner, gain = config.planner, config.quadrotor.climb_gain
+    sideways = [min(planner.max_speed, axis.fastest) for axis in axes(planner, config.quadrotor)]
+    up = min(planner.max_vertical_speed, planner.max_climb_rate * gain)
+    return [*sideways, up, min(planner.descent_speed, planner.descent_rate * gain)]
 
 
 def standing_offset(config: SwarmConfig, wind: float | None = None) -> float:
-    """Return the distance to the goal (m) at which robots stand in a steady wind, which their planner does not know;
-    infinity if the wind blows them away.
+    """Return the distance to the goal (m) at which robots stand in a steady wind, 0 if they estimate it; infinity if
+    the wind blows them away.
 
     :param config: the world
     :param wind: speed of the wind (m/s), by default the world's
     """
     wind = config.noise.wind if wind is None else wind
-    return max(axis.offset(wind) for axis in axes(config.planner, config.quadrotor))
+    offset = max(axis.offset(wind) for axis in axes(config.planner, config.quadrotor))
+    return 0.0 if config.planner.disturbance_time is not None and math.isfinite(offset) else offset
 
 
 def arrival_radius(config: SwarmConfig) -> float:
@@ -172,9 +203,10 @@ def _unsteadiness(config: SwarmConfig) -> dict[str, float]:
     `flight` (docs/flight.md) and `paper`; what is added in each step adds up as a random walk."""
     noise, sensing = config.noise, config.sensing
     per_step = 1 / math.sqrt(config.planner.dt)
+    of_gusts = max(axis.offset(_LIGHT_AIR) for axis in axes(config.planner, config.quadrotor)) / _LIGHT_AIR
     return {
         "noise.wind": 1.1 * standing_offset(config),
-        "noise.gust": 1.1 * noise.gust * standing_offset(config, _LIGHT_AIR) / _LIGHT_AIR,
+        "noise.gust": 1.1 * noise.gust * of_gusts,
         "noise.vel": _SETTLING * noise.vel,
         "noise.attitude": 0.6 * per_step * noise.attitude,
         "sensing.vel": 0.6 * sensing.vel,
@@ -188,7 +220,11 @@ def _up(number: float) -> float:
 
 
 def doubts(config: SwarmConfig) -> Iterator[str]:
-    """Yield a sentence about everything that is doubtful about a world, with a field and what to do."""
+    """Yield a sentence about everything that is doubtful about a world, with a field and what to do. How vehicles with
+    dynamics from outside move is not known here."""
+    if not config.flies_quadrotors:
+        yield from _doubts_about_the_others(config)
+        return
     short = short_horizon(config)
     if short is None:
         yield from _doubts_about_arriving(config)
@@ -222,11 +258,12 @@ def _doubts_about_the_vehicle(config: SwarmConfig) -> Iterator[str]:
             f"planner.max_speed={planner.max_speed:g} is in m/s: with planner.max_tilt={planner.max_tilt:.3g} rad, the "
             f"vehicle reaches {fastest:.2g} m/s; use at most twice that, or tilt more"
         )
-    fall = vehicle.climb_gain * planner.max_climb_rate / vehicle.climb_time_constant
+    fall = vehicle.climb_gain * planner.descent_rate / vehicle.climb_time_constant
     if fall > vehicle.gravity:
         slower = vehicle.gravity * vehicle.climb_time_constant / vehicle.climb_gain
+        name = "max_climb_rate" if planner.max_descent_rate is None else "max_descent_rate"
         yield (
-            f"planner.max_climb_rate={planner.max_climb_rate:g}: with quadrotor.climb_time_constant="
+            f"planner.{name}={planner.descent_rate:g}: with quadrotor.climb_time_constant="
             f"{vehicle.climb_time_constant:g}, robots descend with {fall:.0f} m/s^2, faster than they would fall; at "
             f"most {slower:.2g} m/s is plausible"
         )
@@ -296,10 +333,11 @@ def _usual_flight(config: SwarmConfig) -> float:
 def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
     """Yield a sentence if robots cannot fly a usual distance, with detours, or climb two thirds of the room's height in
     time."""
+    if not config.flies_quadrotors:
+        return
     planner, space = config.planner, config.space
-    speeds = [_speeds(kind) for kind in config.kinds]
-    speed = max(min(min(one[:2]) for one in speeds), _TINIEST)
-    climb = max(min(one[2] for one in speeds), _TINIEST)
+    speeds = np.array([_speeds(kind) for kind in config.kinds])
+    speed, climb = (max(found.min(), _TINIEST) for found in (speeds[:, :2], speeds[:, 2:]))
     needed = max(
         1.5 * (_usual_flight(config) - config.goal_radius) / speed,
         (2 / 3 * (space.heights[1] - space.heights[0]) - config.goal_radius) / climb,
@@ -333,12 +371,7 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
                 f"{name}={error:g} is in metres and too much for radius={config.radius:g}: robots cannot keep clear of "
                 f"each other, or stay at a goal; use at most {0.5 * most:.1g}"
             )
-    stride = planner.dt * min(planner.max_speed, *(axis.fastest for axis in axes(planner, config.quadrotor)))
-    if not config.continuous_collisions and stride > 4 * config.radius:
-        yield (
-            f"radius={config.radius:g}: robots fly up to {stride:.2g} m in a step and through "
-            "each other between steps, where collisions are not counted; use continuous_collisions=true"
-        )
+    yield from _doubts_about_speed(config) if config.flies_quadrotors else ()
     if planner.right_of_way > planner.separation:
         yield (
             f"planner.right_of_way={planner.right_of_way:g} is in metres and exceeds planner.separation="
@@ -348,6 +381,16 @@ def _doubts_about_the_others(config: SwarmConfig) -> Iterator[str]:
         yield (
             f"memory={config.memory:g}: plans count as right that are off by more than the distance at which robots "
             f"touch, {2 * config.radius:g} m; use a few centimetres, as in the presets"
+        )
+
+
+def _doubts_about_speed(config: SwarmConfig) -> Iterator[str]:
+    planner = config.planner
+    stride = planner.dt * min(planner.max_speed, *(axis.fastest for axis in axes(planner, config.quadrotor)))
+    if not config.continuous_collisions and stride > 4 * config.radius:
+        yield (
+            f"radius={config.radius:g}: robots fly up to {stride:.2g} m in a step and through "
+            "each other between steps, where collisions are not counted; use continuous_collisions=true"
         )
     reach = config.neighbourhood.range
     if reach is not None and config.is_limited:

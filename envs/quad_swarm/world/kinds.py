@@ -23,7 +23,15 @@ if TYPE_CHECKING:
     from quad_swarm.world.presets import SwarmConfig
 
 # The fields of a planner that vehicles may have of their own
-LIMITS = ("max_tilt", "max_climb_rate", "max_yaw_rate", "max_speed", "max_vertical_speed")
+LIMITS = (
+    "max_tilt",
+    "max_climb_rate",
+    "max_descent_rate",
+    "max_yaw_rate",
+    "max_speed",
+    "max_vertical_speed",
+    "max_descent_speed",
+)
 
 
 @checked
@@ -35,9 +43,11 @@ class VehicleConfig:
     :param radius: radius of the sphere around the robot (m)
     :param max_tilt: limit of the commanded roll and pitch (rad)
     :param max_climb_rate: limit of the commanded climb rate (m/s)
+    :param max_descent_rate: limit of the commanded rate of descent (m/s)
     :param max_yaw_rate: limit of the commanded yaw rate (rad/s), see `PlannerConfig`
     :param max_speed: soft limit of the velocity along x and along y (m/s)
     :param max_vertical_speed: soft limit of the velocity along z (m/s)
+    :param max_descent_speed: soft limit of the velocity downwards (m/s)
     :raises ValueError: if a value is out of range
     """
 
@@ -45,9 +55,11 @@ class VehicleConfig:
     radius: PositiveLength | None = None
     max_tilt: float | None = None
     max_climb_rate: float | None = None
+    max_descent_rate: float | None = None
     max_yaw_rate: float | None = None
     max_speed: float | None = None
     max_vertical_speed: float | None = None
+    max_descent_speed: float | None = None
 
 
 def read_vehicles(vehicles: Any, quadrotor: QuadrotorParams) -> Any:
@@ -116,34 +128,37 @@ def bodies_of(config: SwarmConfig, robot: int | None = None, others: np.ndarray 
     )
 
 
-def make_planner_of(config: SwarmConfig, robot: int, solver: str = "auto") -> base.Planner:
+def make_planner_of(config: SwarmConfig, robot: int, solver: str = "auto", costs: bool = False) -> base.Planner:
     """Create the planner of one robot.
 
     :param config: the world
     :param robot: number of the robot
     :param solver: see `make_planner`
+    :param costs: see `make_planner`
     """
     kind, sizes = config.kinds[config.kind_of[robot]], bool((config.radii != config.radii[0]).any())
-    return make_planner(kind.planner, kind.quadrotor, config.n_others + 1, solver, config.obstacles.slots, sizes)
+    return make_planner(kind.planner, kind.quadrotor, config.n_others + 1, solver, config.obstacles.slots, costs, sizes)
 
 
-def make_planners(config: SwarmConfig, solver: str = "auto") -> list[base.Planner]:
+def make_planners(config: SwarmConfig, solver: str = "auto", costs: bool = False) -> list[base.Planner]:
     """Create the planners of a world: one for each robot, (n,), which robots of a kind share.
 
     :param config: the world
     :param solver: see `make_planner`
+    :param costs: see `make_planner`
     """
-    of_kinds = [make_planner_of(config, config.kind_of.index(kind), solver) for kind in range(len(config.kinds))]
+    of_kinds = [make_planner_of(config, config.kind_of.index(kind), solver, costs) for kind in range(len(config.kinds))]
     return [of_kinds[kind] for kind in config.kind_of]
 
 
-def make_team_planner(config: SwarmConfig, solver: str = "auto") -> base.Planner | MixedPlanner:
+def make_team_planner(config: SwarmConfig, solver: str = "auto", costs: bool = False) -> base.Planner | MixedPlanner:
     """Create the planner of whole teams.
 
     :param config: the world
     :param solver: see `make_planner`
+    :param costs: see `make_planner`
     """
-    planners = make_planners(config, solver)
+    planners = make_planners(config, solver, costs)
     if len(config.kinds) == 1:
         return planners[0]
     return MixedPlanner([planners[config.kind_of.index(kind)] for kind in range(len(config.kinds))], config.kind_of)

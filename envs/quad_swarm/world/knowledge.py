@@ -13,8 +13,10 @@ import numpy as np
 
 from quad_swarm.native.pairs import resample
 from quad_swarm.planner import Problems
-from quad_swarm.quadrotor import MixedModel, QuadrotorModel
+from quad_swarm.quadrotor import VehicleModel
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
+from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.kinds import Bodies, bodies_of
 from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.presets import SwarmConfig
@@ -118,7 +120,7 @@ def make_beliefs(config: SwarmConfig, n_swarms: int, n_robots: int) -> Beliefs:
 
 def make_problems(
     config: SwarmConfig,
-    model: QuadrotorModel | MixedModel,
+    model: VehicleModel,
     estimate: np.ndarray,
     goal: np.ndarray,
     believed: np.ndarray,
@@ -127,6 +129,9 @@ def make_problems(
     late: np.ndarray | None,
     obstacles: Obstacles | None,
     goal_velocity: np.ndarray | None = None,
+    commitment: Commitment | None = None,
+    disturbance: DisturbanceEstimate | None = None,
+    heading: np.ndarray | None = None,
     bodies: Bodies | None = None,
 ) -> Problems:
     """Return robots' planning problems, which start when their inputs take effect.
@@ -143,6 +148,9 @@ def make_problems(
     :param obstacles: obstacles, which follow the others among the bodies of a problem, None for none
     :param goal_velocity: velocities of the goals, (E, n, 3), world frame (m/s), None for goals that stand. Robots fly
         to where their goals will be at the end of the horizon, so that they do not fall behind
+    :param commitment: the plans that robots sent, None if their planner does not keep to them
+    :param disturbance: accelerations that robots estimate, None for none
+    :param heading: headings to turn to, (E, n) (rad), None for 0
     :param bodies: how large the robots and their others are, by default as all robots of the world perceive all others
     """
     bodies = bodies_of(config) if bodies is None else bodies
@@ -151,7 +159,8 @@ def make_problems(
         goal = goal + ahead * goal_velocity
     x = estimate
     if late is not None:
-        x = model.ahead(x, u, late * config.planner.dt)
+        pushed = None if disturbance is None else disturbance.acceleration
+        x = model.ahead(x, u, late * config.planner.dt, pushed)
         resample(believed, late)
     announced = None
     if config.planner.right_of_way:
@@ -162,6 +171,13 @@ def make_problems(
     if bodies.larger is not None:
         sizes = np.broadcast_to(bodies.larger, believed.shape[:3]).reshape(others.shape[:2])
         problems = problems._replace(size=sizes)
+    if disturbance is not None:
+        problems = problems._replace(disturbance=disturbance.acceleration.reshape(-1, 3).copy())
+    if commitment is not None:
+        reference, weight = commitment.reference(late)
+        problems = problems._replace(reference=reference, reference_weight=weight)
+    if heading is not None:
+        problems = problems._replace(heading=heading.reshape(-1).copy())
     return problems if obstacles is None else _among(obstacles, problems, config, late, bodies)
 
 

@@ -14,15 +14,26 @@ import numpy as np
 from pydantic import Field, PositiveInt
 
 from quad_swarm.errors import shown, unknown_name
-from quad_swarm.geometry import length
+from quad_swarm.geometry import length, wrapped
 from quad_swarm.planner import PlannerConfig
-from quad_swarm.planner.problem import check_vehicle
-from quad_swarm.plants.base import MODEL, parse_plant
-from quad_swarm.quadrotor import QuadrotorParams
-from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, checked, points, replaced
+from quad_swarm.planner.base import SAME_HEADING
+from quad_swarm.planner.model import model_of
+from quad_swarm.planner.problem import check_vehicle, make_problem, problem_class, start_states
+from quad_swarm.plants.base import MODEL, Plant, make_plant, parse_plant
+from quad_swarm.quadrotor import VELOCITY, MixedModel, QuadrotorParams, VehicleModel
+from quad_swarm.validation import LARGEST_LENGTH, Length, PositiveLength, angles, checked, points, replaced, vectors
 from quad_swarm.vehicles import load_vehicle
 from quad_swarm.world.disturbances import ProcessNoise, Radio, SensingError
-from quad_swarm.world.doubts import doubts, far_goals, farthest, fast_goals, short_horizon, warn
+from quad_swarm.world.doubts import (
+    doubts,
+    far_goals,
+    farthest,
+    fast_goals,
+    fast_starts,
+    large_angles,
+    short_horizon,
+    warn,
+)
 from quad_swarm.world.kinds import LIMITS, VehicleConfig, read_vehicles
 from quad_swarm.world.neighbours import Neighbourhood
 from quad_swarm.world.obstacles import Obstacle, ObstacleConfig, Surroundings, clearances, surroundings
@@ -62,8 +73,8 @@ class SwarmConfig:
     :param radio: transmission of plans
     :param neighbourhood: which others robots perceive and may request plans from, see `quad_swarm.world.neighbours`
     :param obstacles: obstacles
-    :param plant: simulated vehicle: "model" for the planner's model (with the disturbances), or for example
-        "crazyflow:cf21B_500" for a vehicle of that simulator, see `quad_swarm.plants`
+    :param plant: simulated vehicle: "model" for the planner's model, that of ``planner.problem`` (with the
+        disturbances), or for example "crazyflow:cf21B_500" for a vehicle of that simulator, see `quad_swarm.plants`
     :param mismatch: maximum relative deviation of each vehicle's parameters from the planner's model, drawn uniformly
         for each robot, parameter and episode
     :param clock_skew: latest time in a step, as a fraction of its length, at which a robot's new input takes effect,
@@ -208,6 +219,11 @@ class SwarmConfig:
         """Physical parameters of each robot, (n,)."""
         return tuple(self.kinds[kind].quadrotor for kind in self.kind_of)
 
+    @functools.cached_property
+    def turning(self) -> np.ndarray:
+        """Which robots may turn, (n,) bool."""
+        return self.per_robot(lambda kind: kind.planner.max_yaw_rate) > 0
+
     @property
     def least_separation(self) -> float:
         """Smallest distance that two robots of this team keep (m)."""
@@ -239,13 +255,33 @@ class SwarmConfig:
                 )
 
     def _check_vehicle(self) -> None:
+        planner, kind = self.planner, problem_class(self.planner)
+        if self.mismatch and (parse_plant(self.plant)[0] != MODEL or kind.has_own_dynamics()):
+            own = f"planner.problem={planner.problem!r} has no such parameters"
+            other = f"plant={self.plant!r} differs from the planner's model anyway"
+            raise ValueError(
+                f"mismatch={self.mismatch}: it only applies to the quadrotors of plant={MODEL!r}, since "
+                f"{own if kind.has_own_dynamics() else other}: set it to 0"
+            )
+        if kind.has_own_dynamics():
+            for name, value in (("substeps", self.substeps > 1), ("noise.wind or noise.gust", self._is_windy)):
+                if kind.is_discrete() and value and parse_plant(self.plant)[0] == MODEL:
+                    raise ValueError(
+                        f"{name}: {kind.__name__} says how its vehicles move in a whole step of still air only; write "
+                        "its `derivative` instead of `dynamics`"
+                    )
+        else:
+            self._check_quadrotor()
+        if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
+            raise ValueError(
+                f"clock_skew={self.clock_skew} is shorter than one of the substeps={self.substeps} of a step: raise "
+                "either of them"
+            )
+
+    def _check_quadrotor(self) -> None:
+        parse_plant(self.plant)
         planner, longest = self.planner, self.quadrotor.longest_step
         check_vehicle(planner, self.quadrotor, self.mismatch)
-        if parse_plant(self.plant)[0] != MODEL and self.mismatch:
-            raise ValueError(
-                f"mismatch={self.mismatch}: it only applies to plant={MODEL!r}, since plant={self.plant!r} differs "
-                "from the planner's model anyway: set it to 0"
-            )
         fastest = longest * (1 - self.mismatch)
         if planner.dt / self.substeps > fastest:
             raise ValueError(
@@ -260,11 +296,15 @@ class SwarmConfig:
                 f"planner.max_yaw_rate={planner.max_yaw_rate:g} is in rad/s: it must be at most half a turn per step, "
                 f"{math.floor(100 * math.pi / planner.dt) / 100}"
             )
-        if self.clock_skew and int(self.clock_skew * self.substeps) == 0:
-            raise ValueError(
-                f"clock_skew={self.clock_skew} is shorter than one of the substeps={self.substeps} of a step: raise "
-                "either of them"
-            )
+
+    @property
+    def _is_windy(self) -> bool:
+        return bool(self.noise.wind or self.noise.gust)
+
+    @property
+    def flies_quadrotors(self) -> bool:
+        """Whether the planner's model is that of quadrotors, instead of dynamics from outside."""
+        return not problem_class(self.planner).has_own_dynamics()
 
     @property
     def least_spacing(self) -> float:
@@ -344,6 +384,63 @@ class SwarmConfig:
         for sentence in fast_goals(self, targets.velocities):
             warn(sentence)
         return targets
+
+    def initial_states(
+        self, starts: np.ndarray, goals: np.ndarray, velocities: Any = None, headings: Any = None
+    ) -> np.ndarray:
+        """Check how k robots start, and return their states, (k, 9).
+
+        :param starts: starts, (k, 3), world frame (m)
+        :param goals: goals, (k, 3), world frame (m)
+        :param velocities: velocities, (k, 3), world frame (m/s); None for 0
+        :param headings: headings, (k,) (rad); None for 0
+        :raises ValueError: if they have other shapes, or are not finite, or are given to vehicles whose problem says
+            how they start
+        """
+        states, count = start_states(self.planner, self.quadrotor, starts, goals), len(starts)
+        for name, given in (("initial_velocities", velocities), ("initial_headings", headings)):
+            if given is not None and not self.flies_quadrotors:
+                raise ValueError(
+                    f"{name}: planner.problem={self.planner.problem!r} says how its vehicles start, by its method "
+                    "`start`: leave it out."
+                )
+        if velocities is not None:
+            states[:, VELOCITY] = vectors("initial_velocities", velocities, count)
+            for sentence in fast_starts(self, states[:, VELOCITY]):
+                warn(sentence)
+        if headings is not None:
+            states[:, 8] = angles("initial_headings", headings, count)
+            for sentence in large_angles("initial_headings", states[:, 8]):
+                warn(sentence)
+        return states
+
+    def facing(self, states: np.ndarray) -> np.ndarray:
+        """Return the headings of k robots with states (k, 9), (k,) (rad); 0 of other vehicles than quadrotors."""
+        return states[:, 8].copy() if self.flies_quadrotors else np.zeros(len(states))
+
+    def check_headings(self, name: str, values: Any, present: np.ndarray, robots: Any = slice(None)) -> np.ndarray:
+        """Check that k robots can turn to headings, and return these as an array.
+
+        :param name: name of the headings, for error messages
+        :param values: headings, (k,) (rad); None for those of now
+        :param present: headings of now, (k,) (rad)
+        :param robots: the robots, anything that indexes an array of all; by default all
+        :raises ValueError: if they have another shape, or are not finite, or robots would have to turn and may not
+        """
+        if values is None:
+            return present
+        found = angles(name, values, len(present))
+        turns = np.abs(wrapped(found - present)) > SAME_HEADING
+        held = turns & ~self.turning[robots]
+        if held.any():
+            robot = int(held.argmax())
+            raise ValueError(
+                f"{name}[{robot}]={found[robot]:g}: with planner.max_yaw_rate=0, robots keep their heading, here "
+                f"{present[robot]:g}; set planner.max_yaw_rate (rad/s)"
+            )
+        for sentence in large_angles(name, found):
+            warn(sentence)
+        return found
 
     def _check_inside(self, name: str, places: np.ndarray) -> None:
         beyond = self.outside(places)
@@ -485,7 +582,7 @@ def make_config(
     beyond twice the radius; the spacing of starts and goals keeps the preset's margin beyond the separation if robots
     would start closer than that; and the workspace grows with a room that exceeds it. With ``vehicles``, the largest
     robot counts. ``quadrotor``, also that of a vehicle, may be a name of `VEHICLES` or the path of a vehicle file. With
-    another ``plant`` than the model, ``mismatch`` defaults to 0.
+    another ``plant`` than the model, or dynamics of your own (``planner.problem``), ``mismatch`` defaults to 0.
 
     :param preset: a name of `PRESETS`, or a world
     :param world: fields of `SwarmConfig` to replace, nested ones as mappings
@@ -502,7 +599,7 @@ def make_config(
         given = changes.get("quadrotor", {})
         quadrotor = replaced(base.quadrotor, given, "quadrotor") if isinstance(given, Mapping) else given
         changes = {**changes, "vehicles": read_vehicles(changes["vehicles"], quadrotor)}
-    if changes.get("plant", MODEL) != MODEL:
+    if changes.get("plant", MODEL) != MODEL or _changes_dynamics(base, changes.get("planner")):
         changes = {"mismatch": 0.0, **changes}
     with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError):  # the check of the fields tells
         changes = _with_followers(base, changes)
@@ -519,6 +616,32 @@ def for_scenario(config: SwarmConfig, scenario: str | Mapping[str, float]) -> Sw
     if config.obstacles.most is not None or needed <= config.obstacles.slots:
         return config
     return replace(config, obstacles=replace(config.obstacles, most=needed))
+
+
+def _changes_dynamics(base: SwarmConfig, planner: Any) -> bool:
+    """Return whether the planner's problem is replaced by one with dynamics from outside."""
+    name = planner.get("problem") if isinstance(planner, Mapping) else getattr(planner, "problem", None)
+    if name is None or name == base.planner.problem or not isinstance(name, str):
+        return False
+    return problem_class(replace(base.planner, problem=name)).has_own_dynamics()
+
+
+def plant_of(config: SwarmConfig, dt: float, n_swarms: int, n_robots: int) -> Plant:
+    """Create the plant of a world.
+
+    :param config: the world
+    :param dt: length of a sub-step (s)
+    :param n_swarms: number of swarms E
+    :param n_robots: number of robots in a swarm
+    :raises ValueError: as `make_plant`
+    :raises ImportError: as `make_plant`
+    :raises PlantError: as `make_plant`
+    """
+    model: VehicleModel | None = None
+    if config.plant == MODEL and (len(config.kinds) > 1 or not config.flies_quadrotors):
+        models = [model_of(make_problem(kind.planner, kind.quadrotor, 0), dt) for kind in config.kinds]
+        model = models[0] if len(models) == 1 else MixedModel(models, config.kind_of)
+    return make_plant(config.plant, config.kinds[0].quadrotor, dt, n_swarms, n_robots, model)
 
 
 def _with_followers(base: SwarmConfig, changes: dict[str, Any]) -> dict[str, Any]:

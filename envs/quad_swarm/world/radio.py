@@ -47,6 +47,13 @@ class RadioChannel:
         self._available = [*map(advance, self._earlier), advance(plans)]
         self._earlier = self._available[1:]
 
+    @property
+    def newest(self) -> tuple[np.ndarray, int]:
+        """The newest plans that robots can send in this step, from the current step on, (E, n, N + 1, 3) (m), and
+        their age (steps)."""
+        age = 1 + self._delay
+        return self._available[-age], age
+
     def answers(
         self, arriving: np.ndarray, others: np.ndarray, lateness: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | int]:
@@ -58,8 +65,8 @@ class RadioChannel:
         :return: the plans, from the current step on, in the order of ``arriving``, (number of answers, N + 1, 3) (m),
             and their ages (steps), (number of answers,), or one number for all
         """
-        age = 1 + self._delay
-        received = answered(arriving, self._available[-age], others)
+        newest, age = self.newest
+        received = answered(arriving, newest, others)
         if lateness is None:
             return received, age
         late = lateness[arriving]
@@ -82,10 +89,19 @@ class RadioChannel:
     def forget(self, slots: np.ndarray) -> None:
         """Drop what is on its way to slots whose robot has changed, (E, n, n - 1) bool."""
 
-    def reset(self, swarm: int, plans: np.ndarray) -> None:
-        """Start one swarm with plans of robots at rest, (n, N + 1, 3) (m)."""
-        for earlier in self._earlier:
+    def reset(self, swarm: int, plans: np.ndarray, strides: np.ndarray | None = None) -> None:
+        """Start one swarm with plans of robots that keep their velocity.
+
+        :param swarm: index of the swarm
+        :param plans: planned positions of the last step, (n, N + 1, 3) (m)
+        :param strides: how far the robots fly in a step, (n, 3) (m); None for robots at rest
+        """
+        for steps, earlier in enumerate(reversed(self._earlier), start=1):
             earlier[swarm] = plans
+            if strides is not None:
+                earlier[swarm] -= steps * strides[:, None]
+                for _ in range(steps):
+                    earlier[swarm] = advance(earlier[swarm])
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
@@ -153,8 +169,8 @@ class CausalChannel(RadioChannel):
     def forget(self, slots: np.ndarray) -> None:
         self._ages[:, slots] = 0
 
-    def reset(self, swarm: int, plans: np.ndarray) -> None:
-        super().reset(swarm, plans)
+    def reset(self, swarm: int, plans: np.ndarray, strides: np.ndarray | None = None) -> None:
+        super().reset(swarm, plans, strides)
         self._ages[:, swarm] = 0
 
     def keep(self, swarms: np.ndarray) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from quad_swarm.errors import shown
 from quad_swarm.geometry import length
 from quad_swarm.states import like
-from quad_swarm.validation import points
+from quad_swarm.validation import points, vectors
 
 MOST_WAYPOINTS = 1000  # of a robot
 
@@ -46,14 +46,7 @@ class Targets(NamedTuple):
 
 
 def _velocities(values: Any, count: int) -> np.ndarray:
-    if values is None:
-        return np.zeros((count, 3))
-    try:
-        return points("velocities", values, count)
-    except ValueError:
-        raise ValueError(
-            f"velocities must be {count} finite vectors, shape ({count}, 3) (m/s), or None; got {shown(values)}."
-        ) from None
+    return np.zeros((count, 3)) if values is None else vectors("velocities", values, count)
 
 
 def _waypoints(values: Any, count: int) -> tuple[np.ndarray, ...]:

@@ -15,16 +15,17 @@ import numpy as np
 from quad_swarm.errors import shown
 from quad_swarm.native.steps import measure
 from quad_swarm.planner import MixedPlanner, Planner, Plans, Problems
-from quad_swarm.plants import make_plant
 from quad_swarm.plants.base import MODEL
 from quad_swarm.quadrotor import POSITION, VELOCITY
 from quad_swarm.validation import points
 from quad_swarm.world.beliefs import Beliefs, of_others, other_indices, resampled
+from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.kinds import Bodies, bodies_of, make_team_planner
 from quad_swarm.world.knowledge import SeenByOthers, make_beliefs, make_problems
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacle, Obstacles, Surroundings, surroundings
-from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.presets import SwarmConfig, plant_of
 from quad_swarm.world.radio import make_channel
 from quad_swarm.world.realisation import Realisation
 from quad_swarm.world.route import Route, Targets
@@ -112,6 +113,7 @@ class Swarm(SwarmState):
     :ivar state: true states, (E, n, 9)
     :ivar goal: where the robots fly to now, goals or waypoints before them, (E, n, 3), world frame (m)
     :ivar route: velocities of goals and waypoints, None where no goal changes
+    :ivar heading: headings that the robots turn to, (E, n) (rad), None where all of them are 0 or robots do not turn
     :ivar neighbours: which others each robot perceives
     :ivar disturbances: realisation of the disturbances
     :ivar beliefs: beliefs of each robot about the others
@@ -119,14 +121,15 @@ class Swarm(SwarmState):
     :param config: the world
     :param n_swarms: number of swarms E
     :param solver: see `make_planner`
+    :param costs: see `make_planner`
     """
 
-    def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto"):
+    def __init__(self, config: SwarmConfig, n_swarms: int = 1, solver: str = "auto", costs: bool = False):
         self.config = config
-        self.planner: Planner | MixedPlanner = make_team_planner(config, solver)
+        self.planner: Planner | MixedPlanner = make_team_planner(config, solver, costs)
         self.planner.checks = False
         n, horizon = config.n_robots, config.planner.horizon
-        self._plant = make_plant(config.plant, config.quadrotors, config.planner.dt / config.substeps, n_swarms, n)
+        self._plant = plant_of(config, config.planner.dt / config.substeps, n_swarms, n)
         state = np.zeros((n_swarms, n, 9))
         plans = Plans.hover(state.reshape(-1, 9), horizon)
         plans_of_robots = plans.x.reshape(n_swarms, n, horizon + 1, 9)
@@ -143,6 +146,8 @@ class Swarm(SwarmState):
             disturbances=Realisation(config, n_swarms),
             neighbours=Neighbours(n_swarms, n, config.neighbourhood),
             obstacles=Obstacles.of(config.obstacles, n_swarms),
+            commitment=Commitment.of(config.planner, n_swarms, n),
+            disturbance=DisturbanceEstimate.of(self.planner, n_swarms, n),
         )
         # Where others change, `bodies` follow
         self._bodies = bodies_of(config, others=self.neighbours.others)
@@ -271,9 +276,13 @@ class Swarm(SwarmState):
         checked: bool = False,
         velocities: Any = None,
         waypoints: Any = None,
+        headings: Any = None,
+        initial_velocities: Any = None,
+        initial_headings: Any = None,
     ) -> None:
-        """Place the robots of one swarm at rest. Robots pass their waypoints, each as soon as they are within the goal
-        radius of it, and then fly to their goals, which may move.
+        """Place the robots of one swarm, by default at rest, or in motion as `OptimalControlProblem.start` says. Robots
+        pass their waypoints, each as soon as they are within the goal radius of it, and then fly to their goals, which
+        may move.
 
         :param swarm: index of the swarm
         :param starts: starts, (n, 3), world frame (m)
@@ -283,8 +292,13 @@ class Swarm(SwarmState):
         :param checked: whether the starts and goals are known to fit the world, as those of a `ScenarioSampler` are
         :param velocities: velocities of the goals, (n, 3), world frame (m/s), by default 0
         :param waypoints: waypoints of each robot, n sequences (k, 3), world frame (m), by default none
+        :param headings: headings that robots turn to, the short way, and keep, from the x axis counter-clockwise, (n,)
+            (rad), by default those at the start
+        :param initial_velocities: velocities of the robots at the start, (n, 3), world frame (m/s), by default 0
+        :param initial_headings: headings of the robots at the start, (n,) (rad), by default 0
         :raises ValueError: if robots cannot fly from these starts to these goals, see `SwarmConfig.check_flight`, or
-            there are more obstacles than the world has room for
+            there are more obstacles than the world has room for, robots cannot turn to their headings, see
+            `SwarmConfig.check_headings`, or what they start with has another shape, or is not finite
         """
         n = self.config.n_robots
         obstacles = self.config.obstacles.listed if obstacles is None else tuple(obstacles)
@@ -292,21 +306,33 @@ class Swarm(SwarmState):
             starts, targets = points("starts", starts, n), Targets.of(goals, velocities, waypoints, n)
         else:
             starts, targets = self.config.check_flight(starts, goals, obstacles, velocities, waypoints)
-        self.state[swarm] = 0.0
-        self.state[swarm, :, POSITION] = starts
+        states = self.config.initial_states(starts, targets.goals, initial_velocities, initial_headings)
+        moving = states[:, VELOCITY]
+        headings = self.config.check_headings("headings", headings, self.config.facing(states))
+        self.state[swarm] = states
+        self._turn_to(swarm, slice(None), headings)
         self._fly_to(swarm, slice(None), targets)
         if self.obstacles is not None or obstacles:
             (self.obstacles or Obstacles(1, 0)).reset(swarm, obstacles)
         for beliefs in {self.beliefs, self.beliefs_seen_by_others}:
             beliefs.forget(np.array([swarm]))
-        hover = Plans.hover(self.state[swarm], self.config.planner.horizon)
-        for mine, fresh in zip(self._plans, hover, strict=True):
-            mine[swarm * n : (swarm + 1) * n] = fresh
-        self._radio.reset(swarm, self.plans[swarm, ..., POSITION])
+        if self.commitment is not None:
+            self.commitment.forget(swarm)
+        if self.disturbance is not None:
+            self.disturbance.forget(swarm)
         self._u[swarm] = 0.0
         self._plant.place(swarm, self.state[swarm])
         if self.config.is_random:
             self.disturbances.reset(swarm, noise_seed)
+        start, planner = self.disturbances.start, self.config.planner
+        late = None if start is None else start[swarm] / self.config.substeps
+        steady = Plans.steady(self.state[swarm], planner.horizon, planner.dt, late)
+        for mine, fresh in zip(self._plans, steady, strict=True):
+            mine[swarm * n : (swarm + 1) * n] = fresh
+        sent, moves = self.plans[swarm, ..., POSITION], bool(moving.any())
+        if moves and late is not None:
+            sent = resampled(sent, -late)
+        self._radio.reset(swarm, sent, planner.dt * moving if moves else None)
         if self.neighbours.limited:
             estimate = self._estimate()[swarm]
             self.neighbours.reset(swarm, estimate[:, POSITION], estimate[:, VELOCITY])
@@ -319,6 +345,7 @@ class Swarm(SwarmState):
         velocities: Any = None,
         waypoints: Any = None,
         robots: Sequence[int] | None = None,
+        headings: Any = None,
     ) -> None:
         """Let k robots of one swarm fly to other goals from now on. Their former goals and waypoints are forgotten.
 
@@ -329,7 +356,9 @@ class Swarm(SwarmState):
         :param waypoints: what each of the robots passes before, k sequences (any number, 3), world frame (m), by
             default nothing
         :param robots: indices of the robots, (k,), by default all
-        :raises ValueError: if there are no such robots, or goals do not fit, see `SwarmConfig.check_goals`
+        :param headings: headings that the robots turn to, (k,) (rad), by default as before
+        :raises ValueError: if there are no such robots, goals do not fit, see `SwarmConfig.check_goals`, or robots
+            cannot turn to their headings, see `SwarmConfig.check_headings`
         """
         n = self.config.n_robots
         which = _indices(robots, n)
@@ -340,6 +369,10 @@ class Swarm(SwarmState):
         for robot, one in zip(which, given.waypoints, strict=True):
             passed[robot] = one
         checked = self.config.check_goals(self.pos[swarm], places, self._surroundings(swarm), moving, passed)
+        if headings is not None:
+            self._turn_to(
+                swarm, which, self.config.check_headings("headings", headings, self.state[swarm, which, 8], which)
+            )
         self._fly_to(swarm, which, Targets(checked.goals[which], given.velocities, given.waypoints))
         self._pass_waypoints()
 
@@ -357,6 +390,15 @@ class Swarm(SwarmState):
             self.goal[swarm, robots] = targets.goals
         else:
             self.route.set(swarm, robots, targets)
+
+    def _turn_to(self, swarm: int, robots: Any, headings: np.ndarray) -> None:
+        if not self.config.turning.any() or (self.heading is None and not headings.any()):
+            return
+        if self.heading is None:
+            self.heading = np.zeros(self.state.shape[:2])
+        self.heading[swarm, robots] = headings
+        if not self.heading.any():
+            self.heading = None
 
     def _pass_waypoints(self) -> None:
         """Let robots pass the waypoints at which they believe to be. Where no goal changes any more, there is no
@@ -404,9 +446,14 @@ class Swarm(SwarmState):
             assumes that it arrives, however far the receiver is
         """
         believed, source = self._believe(requests, announced)
+        if self.disturbance is not None:
+            self.disturbance.update(self._estimate())
         started = time.perf_counter()
-        self._plans = self.planner.plan(self._problems(believed, source), self._plans)
+        problems = self._problems(believed, source)
+        self._plans = self.planner.plan(problems, self._plans)
         solve_seconds = time.perf_counter() - started
+        if self.disturbance is not None:
+            self.disturbance.expect(problems.x.reshape(self.state.shape), self.inputs, self._late)
         positions = self._fly()
         if self.route is not None:
             self.route.advance(self.config.planner.dt)
@@ -436,6 +483,11 @@ class Swarm(SwarmState):
         others = self.neighbours.others
         self._radio.send(self.planned_positions())
         carried = self.disturbances.carried(requests, self.pos, others)
+        if self.commitment is not None:
+            self.commitment.advance()
+            sent = carried if announced is None else carried | announced
+            who = np.asarray(self.neighbours.of_the_other(sent).any(axis=2))
+            self.commitment.sent(who, *self._radio.newest)
         if self._other_beliefs is not None:
             sent = carried if announced is None else carried | announced
             self._other_beliefs.receive(sent, *self._seen_by_all(), *self._radio.answers(sent, others))
@@ -445,11 +497,17 @@ class Swarm(SwarmState):
 
     def _problems(self, believed: np.ndarray, source: np.ndarray) -> Problems:
         """Return the robots' planning problems, which start when their inputs take effect."""
-        start = self.disturbances.start
-        late = None if start is None else start / self.config.substeps
+        late = self._late
         goal_velocity = None if self.route is None else self.route.current_velocity()
         arguments = (self._estimate(), self.goal, believed, source, self._u, late, self.obstacles, goal_velocity)
-        return make_problems(self.config, self.planner.model, *arguments, self.bodies)
+        beside = (self.commitment, self.disturbance, self.heading, self._bodies)
+        return make_problems(self.config, self.planner.model, *arguments, *beside)
+
+    @property
+    def _late(self) -> np.ndarray | None:
+        """When inputs take effect, as a fraction of a step, (E, n); None if all do so at once."""
+        start = self.disturbances.start
+        return None if start is None else start / self.config.substeps
 
     def _fly(self) -> np.ndarray:
         """Move the robots by a step. Returns positions before it and after S sub-steps, (S + 1, E, n, 3) (m)."""

@@ -11,7 +11,10 @@ import numpy as np
 
 from quad_swarm.planner import Plans, PlanStatus
 from quad_swarm.states import MOST_STEPS, like
+from quad_swarm.validation import LARGEST_ANGLE
 from quad_swarm.world.beliefs import Beliefs
+from quad_swarm.world.commitment import Commitment
+from quad_swarm.world.disturbance_estimate import DisturbanceEstimate
 from quad_swarm.world.neighbours import Neighbours
 from quad_swarm.world.obstacles import Obstacles
 from quad_swarm.world.radio import RadioChannel
@@ -46,7 +49,11 @@ class SwarmState:
     disturbances: Realisation
     neighbours: Neighbours
     obstacles: Obstacles | None
-    route: Route | None = None  # comes and goes in flight, and is not in states of before it existed
+    commitment: Commitment | None
+    disturbance: DisturbanceEstimate | None
+    # These come and go in flight, and are not in states of before they existed
+    route: Route | None = None
+    heading: np.ndarray | None = None
 
     def keep(self, swarms: np.ndarray) -> None:
         """Drop all but the given swarms (mask)."""
@@ -79,6 +86,9 @@ class SwarmState:
             if name == "route":
                 route = state.get(key)
                 self.route = None if route is None else Route.of_state(route, self.goal)
+            elif name == "heading":
+                heading, none = state.get(key), np.zeros(self.state.shape[:2])
+                self.heading = None if heading is None else like(none, heading, key, -LARGEST_ANGLE, LARGEST_ANGLE)
             elif isinstance(value, np.ndarray):
                 setattr(self, name, like(value, state[key], key))
             elif isinstance(value, Plans):

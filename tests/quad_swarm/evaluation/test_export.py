@@ -53,7 +53,7 @@ def test_programs_answer_as_the_model_without_what_critics_see(tmp_path):
     predictor, observation, n_bits = fitted(model, MODEL, config)
     swarm, rng = Swarm(config), np.random.default_rng(0)
     _, starts, goals, _ = ScenarioSampler("symmetric_swap", 3, config.space, config).sample(rng)
-    swarm.reset(0, starts, goals, 1)
+    swarm.reset(0, starts, goals, noise_seed=1)
     asked = 0
     for _ in range(20):
         bits = predictor.predict(observation(swarm), deterministic=True)[0].reshape(3, 2, n_bits) > 0

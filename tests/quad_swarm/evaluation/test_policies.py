@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch as th
 
+from quad_swarm.evaluation.evaluation import evaluate
 from quad_swarm.evaluation.flight import Condition, begin, first_episode, fly, run_episodes
-from quad_swarm.evaluation.policies import load_model, make_policy, short_name, trained_in
+from quad_swarm.evaluation.policies import load_model, make_policy, name_of, short_name, trained_in
 from quad_swarm.figures.replay import replay_page
 from quad_swarm.task.request_task import requests_of
 from quad_swarm.world.presets import make_config
@@ -213,7 +214,7 @@ def test_answers_that_are_no_bits_are_refused(answer, message):
 
 @pytest.mark.parametrize("policy", [None, 3, object(), foreign.Asker, ["none"]])
 def test_what_is_no_policy_is_refused(policy):
-    with pytest.raises(ValueError, match=r"it must be a rule, the path of a model's zip, or an object with predict"):
+    with pytest.raises(ValueError, match=r"it must be a rule, the path of a model's zip, an object with predict"):
         Condition(policy, "random", make_config("paper"))
 
 
@@ -238,3 +239,54 @@ def test_rules_say_who_sends_where_distance_limits_the_radio():
     make_policy("stale:4&push:0.1", anywhere, "")
     with pytest.raises(ValueError, match="joins what the receiver and the sender know"):
         make_policy("stale:4&push:0.1", near, "")
+
+
+def near(view):
+    return np.linalg.norm(view.pos, axis=-1) < 1.5
+
+
+def test_a_function_of_a_view_is_a_rule():
+    world = make_config("paper")
+    rows = {
+        policy: run_episodes(Condition(policy, "random", world), [first_episode(0)])
+        for policy in (near, "distance:1.5")
+    }
+    for mine, theirs in zip(*rows.values(), strict=True):
+        assert {k: v for k, v in mine.items() if k != "solve_seconds"} == {
+            k: v for k, v in theirs.items() if k != "solve_seconds"
+        }
+    flights = [fly(Condition("none", "random", world), 0, model=near), fly(Condition(near, "random", world), 0)]
+    assert np.array_equal(flights[0].requests, flights[1].requests)
+    assert name_of(near) == "near"
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        (lambda: True, r"<lambda>: the rule failed \(TypeError"),
+        (lambda view: None, "Rule '<lambda>' returned None: it must return True or False"),
+        (lambda view: view.pos, "Rule '<lambda>' returned .*shape \\(1, 4, 3\\)"),
+    ],
+)
+def test_functions_that_are_no_rules_are_refused_in_one_sentence(rule, message):
+    with pytest.raises(ValueError, match=message) as error:
+        fly(Condition(rule, "random", make_config("paper")), 0)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda world: Condition("none", 3, world), "scenario=3: it must be the name"),
+        (lambda world: Condition("none", "random", "paper"), "config='paper': it must be a world"),
+        (lambda world: evaluate(Condition("none", "random", world), 2), "conditions=.* must be a list of conditions"),
+        (lambda world: evaluate(["none"], 2), "'none' is no condition: write quad_swarm.evaluation.Condition"),
+        (lambda world: evaluate([Condition("none", "random", world)], 2.5), "episodes=2.5: it must be a whole number"),
+        (lambda world: fly("none", 0), "'none' is no condition"),
+        (lambda world: fly(Condition("none", "random", world), 0, model=3), "none: 3 is no policy"),
+        (lambda world: fly(Condition("none", "random", world), 0, other_rule=near), "rule=.*: it must be the text"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused_in_one_sentence(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(make_config("paper"))

@@ -273,6 +273,31 @@ def test_reset_takes_waypoints_and_goals_that_move():
     assert not info["at_goal"].any()
 
 
+def test_reset_and_new_goals_take_headings():
+    env = gymnasium.make("QuadSwarm-v0", n_robots=2, planner={"max_yaw_rate": 1.5}).unwrapped
+    env.reset(seed=0, options={"starts": STARTS, "goals": GOALS, "headings": [1.0, -1.0]})
+    for _ in range(30):
+        env.step(np.zeros(2, np.int8))
+    np.testing.assert_allclose(env.task.swarm.state[0, :, 8], [1, -1], atol=0.1)
+    env.set_goals(STARTS[:1], robots=[0], headings=[3.0])
+    assert env.task.swarm.heading.tolist() == [[3, -1]]
+    env.reset(seed=0)
+    assert env.task.swarm.heading is None
+    still = QuadSwarmEnv(n_robots=2)
+    with pytest.raises(ValueError, match=r"headings\[0\]=1: with planner\.max_yaw_rate=0"):
+        still.reset(options={"starts": STARTS, "goals": GOALS, "headings": [1.0, -1.0]})
+
+
+def test_reset_takes_velocities_and_headings_of_the_robots():
+    env = gymnasium.make("QuadSwarm-v0", n_robots=2).unwrapped
+    motion = {"initial_velocities": [[1, 0, 0], [0, 0.5, 0]], "initial_headings": [0.5, -2]}
+    observation, _ = env.reset(seed=0, options={"starts": STARTS, "goals": GOALS, **motion})
+    np.testing.assert_allclose(observation[:, :3], motion["initial_velocities"])
+    np.testing.assert_array_equal(env.task.swarm.state[0, :, 8], motion["initial_headings"])
+    observation, _ = env.reset(seed=0, options={"starts": STARTS, "goals": GOALS})
+    assert not observation[:, :3].any()
+
+
 def test_an_episode_whose_goals_change_arrives_again():
     env = gymnasium.make("QuadSwarm-v0", n_robots=2, max_steps=90).unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded, match="set_goals"):
@@ -303,3 +328,44 @@ def test_points_beyond_any_number_are_refused_in_one_line():
 def test_a_level_that_is_none_is_refused(level):
     with pytest.raises(ValueError, match=r"Level .* does not exist"):
         QuadSwarmEnv(scenario="curriculum").set_curriculum_level(level)
+
+
+def test_plans_are_in_the_info_on_request():
+    """And nothing else changes."""
+    world = {"preset": "flight", "scenario": "random", "max_steps": 6}
+    plain, told = (gymnasium.make("QuadSwarm-v0", plans_in_info=on, **world).unwrapped for on in (False, True))
+    kind = {"vectorization_mode": "vector_entry_point", "plans_in_info": True}
+    batch = gymnasium.make_vec("QuadSwarm-v0", num_envs=2, **kind, **world).unwrapped
+    parallel = quad_swarm.parallel_env(plans_in_info=True, **world)
+    for env in (plain, told, batch, parallel):
+        env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for step in range(6):
+        action = rng.integers(0, 2, plain.action_space.shape)
+        expected, *_, without = plain.step(action)
+        observation, *_, info = told.step(action)
+        *_, infos = batch.step(np.stack([action, action]))
+        *_, of_agents = parallel.step(dict(zip(parallel.possible_agents, action.reshape(8, 7), strict=True)))
+        assert np.array_equal(observation, expected)
+        assert info.keys() - without.keys() == {"plan"}
+        plan, swarm = info["plan"], told.task.swarm
+        shapes = {"states": (8, 21, 9), "inputs": (8, 4), "cost": (8,), "solve_seconds": ()}
+        assert {name: np.shape(value) for name, value in plan.items()} == shapes
+        assert np.array_equal(plan["states"], swarm.plans[0])
+        assert np.array_equal(plan["inputs"], swarm.inputs[0])
+        assert (plan["cost"] > 0).all()
+        assert plan["solve_seconds"] > 0
+        for name in ("states", "inputs", "cost"):  # in the last step, too, after which the batch begins anew
+            assert np.array_equal(infos["plan"][name][0], plan[name]), (step, name)
+            assert np.array_equal(of_agents["robot_3"]["plan"][name], plan[name])
+    assert pickle.loads(pickle.dumps(told)).step(action)[-1]["plan"]["cost"].shape == (8,)
+
+
+def test_a_pickled_environment_reaches_the_end_of_its_episode():
+    env = gymnasium.make("QuadSwarm-v0", scenario="random", max_steps=30).unwrapped
+    env.reset(seed=0)
+    copied = pickle.loads(pickle.dumps(env))
+    for _ in range(30):
+        *_, over, truncated, info = copied.step(np.ones(12, np.int8))
+    assert over or truncated
+    assert "swarm/arrival_rate" in info["metrics"]

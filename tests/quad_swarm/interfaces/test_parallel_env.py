@@ -108,10 +108,11 @@ def test_actions_that_are_no_mapping_are_refused(actions):
 
 def test_goals_change_as_in_the_team_environment():
     starts, goals = [[0, -2, 1.5], [0, 2, 1.5]], [[3, -2, 1.5], [3, 2, 1.5]]
-    env = quad_swarm.parallel_env(n_robots=2)
+    env = quad_swarm.parallel_env(n_robots=2, planner={"max_yaw_rate": 1.5})
     options = {"starts": starts, "goals": goals, "waypoints": [[[1, -3, 1]], []], "unknown": 1}
     observations, _ = env.reset(seed=0, options=options)
     np.testing.assert_allclose(observations["robot_0"][3:6], [1, -1, -0.5])
-    observations = env.set_goals([[-3, 2, 1.5]], robots=[1])
+    observations = env.set_goals([[-3, 2, 1.5]], robots=[1], headings=[2])
+    assert env.task.swarm.heading.tolist() == [[0, 2]]
     np.testing.assert_allclose(observations["robot_0"][3:6], [1, -1, -0.5])
     np.testing.assert_allclose(observations["robot_1"][3:6], [-3, 0, 0])

@@ -114,6 +114,44 @@ def test_goals_of_a_swarm_change_until_its_episode_ends():
     for swarm in (2, -1, True, "a"):
         with pytest.raises(ValueError, match=r"swarm=.*from 0 to 1"):
             env.set_goals(swarm, GOALS)
+    with pytest.raises(ValueError, match=r"headings\[1\]=2: with planner\.max_yaw_rate=0"):
+        env.set_goals(1, GOALS, headings=[0, 2])
+
+
+def test_swarms_start_as_asked_all_alike_or_single_ones():
+    env = gymnasium.make_vec("QuadSwarm-v0", num_envs=3, n_robots=2, scenario="random").unwrapped
+    starts = np.array([[0.0, -2, 1.5], [0, 2, 1.5]])
+    options = {"starts": starts, "goals": GOALS, "initial_velocities": [[1, 0, 0], [0, 0, 0]]}
+    single = QuadSwarmEnv(n_robots=2)
+    expected, _ = single.reset(seed=4, options=options)
+    observations, infos = env.reset(seed=3, options=options)
+    for observation in observations:
+        np.testing.assert_array_equal(observation, expected)
+    assert infos["scenario"].tolist() == ["custom"] * 3
+    drawn, _ = env.reset(seed=3)
+    observations, infos = env.reset(seed=3, options={"swarms": {1: options}})
+    assert infos["scenario"].tolist() == ["random", "custom", "random"]
+    np.testing.assert_array_equal(observations[1], expected)
+    np.testing.assert_array_equal(observations[[0, 2]], drawn[[0, 2]])
+    observations, _ = env.reset(seed=3, options={**options, "swarms": {2: {}}})
+    np.testing.assert_array_equal(observations, [expected, expected, drawn[2]])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"starts": 0}, "reset options name only 'starts'; pass both"),
+        ({"swarm": {}}, r"Unknown reset option 'swarm'.*Did you mean 'swarms'"),
+        ({"swarms": {2: {}}}, r"'swarms'=\{2: \{\}\}: it must be a mapping from numbers of swarms, 0 to 1"),
+        ({"swarms": {True: {}}}, "'swarms'=.* mapping from numbers"),
+        ({"swarms": [{}]}, "'swarms'=.* mapping from numbers"),
+        ({"swarms": {1: {"goals": 0}}}, "reset options name only 'goals'; pass both"),
+        ({"swarms": {1: 3}}, "options=3"),
+    ],
+)
+def test_starts_that_do_not_fit_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        quad_swarm.QuadSwarmVectorEnv(2).reset(options=options)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +162,6 @@ def test_goals_of_a_swarm_change_until_its_episode_ends():
         (lambda: quad_swarm.QuadSwarmVectorEnv(2, render_mode="human"), "cannot render"),
         (lambda: quad_swarm.QuadSwarmVectorEnv(2).render(), r"render\(\): the vector environment cannot render"),
         (lambda: quad_swarm.QuadSwarmVectorEnv(2).reset(seed=[1]), "1 seeds for 2 swarms"),
-        (lambda: quad_swarm.QuadSwarmVectorEnv(2).reset(options={"starts": 0}), "reset options"),
     ],
 )
 def test_refuses_senseless_arguments(call, message):

@@ -275,9 +275,13 @@ def test_folders_of_killed_builds_are_removed(cache, stub_compiler):
     assert young.exists(), "another process may be at work in it"
 
 
-def run_harness(folder: Path, main: str, *flags: str) -> str:
-    """Compile a program around the sources and run it."""
-    model = generate_model(OptimalControlProblem(CONFIG, QUADROTOR, 2))
+def run_harness(folder: Path, main: str, *flags: str, config: PlannerConfig = CONFIG, shaped: bool = False) -> str:
+    """Compile a program around the sources and run it.
+
+    :param config: the planner
+    :param shaped: whether bodies have shapes and sizes
+    """
+    model = generate_model(OptimalControlProblem(config, QUADROTOR, 2, shaped))
     (folder / "model.hpp").write_text(model)
     (folder / "main.cpp").write_text(main)
     command = [*build_module.compiler(), *build_module._FLAGS, build_module._native_flag(), "-DREAL=float", *flags]
@@ -301,15 +305,18 @@ int main() {
   long solved = 0;
   for (int count : {0, 1, 2, 3, 5, 8, 9, 16, 17, 33, 50}) {
     std::vector<double> x(count * 9), goal(count * 3), others(count * N_OTHERS * N * 3), guess(count * N * 4);
-    std::vector<double> clearance(count * N_OTHERS * N);
-    for (auto* array : {&x, &goal, &others, &guess, &clearance})
+    std::vector<double> clearance(count * N_OTHERS * N), shape(count * N_OTHERS * 3), size(count * N_OTHERS);
+    std::vector<double> reference(count * N * 3), weight(count * N, 2.0), push(count * 3), steady(count * 4);
+    for (auto* array : {&x, &goal, &others, &guess, &clearance, &shape, &size, &reference, &push, &steady})
       for (double& value : *array) value = normal(random);
     for (int k = 0; k < count; k += 4) x[k * 9] = bad[k / 4 % 3];
     std::vector<double> x_plan(count * (N + 1) * 9), u_plan(count * N * 4);
     std::vector<std::uint8_t> success(count);
     std::vector<std::int64_t> iterations(count);
-    quad_swarm_rti(count, x.data(), goal.data(), others.data(), count % 2 ? clearance.data() : nullptr, guess.data(),
-                   x_plan.data(), u_plan.data(), success.data(), iterations.data(), 2, 6, 50, 1e-4);
+    const auto some = [count](const std::vector<double>& array) { return count % 2 ? array.data() : nullptr; };
+    quad_swarm_rti(count, x.data(), goal.data(), others.data(), some(clearance), some(shape), some(size),
+                   some(reference), some(weight), some(push), some(steady), guess.data(), x_plan.data(), u_plan.data(),
+                   success.data(), iterations.data(), 2, 6, 50, 1e-4);
     for (auto s : success) solved += s;
   }
   std::printf("%ld", solved);
@@ -318,8 +325,11 @@ int main() {
 
 
 @pytest.mark.slow
-def test_sanitizers_find_nothing(tmp_path):
-    solved = run_harness(tmp_path, SANITIZED, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+@pytest.mark.parametrize("everything", [False, True])
+def test_sanitizers_find_nothing(everything, tmp_path):
+    flags = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    config = PlannerConfig(commitment=1.0, disturbance_time=1.0) if everything else CONFIG
+    solved = run_harness(tmp_path, SANITIZED, *flags, config=config, shaped=everything)
     assert int(solved) > 70  # of 144 problems a quarter are absurd
 
 

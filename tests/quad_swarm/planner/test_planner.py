@@ -106,3 +106,18 @@ def test_changes_of_a_problem_that_is_no_subclass_are_obeyed_too():
     call = Problems(state, np.array([[2.0, 0, 0]]), others), np.repeat(state[:, None], 11, axis=1), np.zeros((1, 10, 4))
     thrifty = foreign.Thrifty(config, QUADROTOR, 1)
     assert np.array_equal(RtiSolver(problem).solve(*call).u, RtiSolver(thrifty).solve(*call).u)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"config": "paper"}, "config='paper': pass PlannerConfig"),
+        ({"quadrotor": "bebop2"}, "quadrotor='bebop2': pass QuadrotorParams"),
+        ({"n_robots": 0}, "n_robots=0: it must be a whole number, at least 1"),
+        ({"n_robots": 2.5}, "n_robots=2.5: it must be a whole number"),
+        ({"n_obstacles": -1}, "n_obstacles=-1: it must be a whole number, at least 0"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused_in_one_sentence(change, message):
+    with pytest.raises(ValueError, match=message):
+        make_planner(**{"config": PlannerConfig(), "quadrotor": QUADROTOR, "n_robots": 2} | change)

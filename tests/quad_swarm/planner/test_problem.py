@@ -3,6 +3,7 @@
 import math
 
 import casadi as ca
+import foreign
 import numpy as np
 import pytest
 from planning import QUADROTOR
@@ -45,6 +46,19 @@ def test_inputs_cost_by_their_limits():
     at_limits = number(PROBLEM.input_cost, PROBLEM.max_input.full().ravel())
     assert at_limits == pytest.approx(3 * CONFIG.input_weight)
     assert number(PROBLEM.input_cost, [0.0, 0.0, 0.5]) == pytest.approx(CONFIG.input_weight * 0.25)
+
+
+@pytest.mark.parametrize(("rate", "larger"), [(0.5, 1.0), (2.0, 2.0)])
+def test_climbs_and_descents_cost_by_the_larger_of_their_limits(rate, larger):
+    problem = OptimalControlProblem(PlannerConfig(max_descent_rate=rate), QUADROTOR, 1)
+    assert problem.min_input.full().ravel().tolist() == [-CONFIG.max_tilt, -CONFIG.max_tilt, -rate]
+    for climb in (-0.4, 0.4):
+        cost = CONFIG.input_weight * (0.4 / larger) ** 2
+        assert number(problem.input_cost, [0.0, 0.0, climb]) == pytest.approx(cost)
+
+
+def test_another_limit_of_a_user_s_problem_holds_in_both_directions():
+    assert foreign.Gentle(CONFIG, QUADROTOR, 1).min_input.full().ravel()[0] == pytest.approx(-0.1 * CONFIG.max_tilt)
 
 
 @pytest.mark.parametrize(
@@ -101,6 +115,8 @@ def test_what_leaves_the_box_is_a_violation_by_so_much(column, value, violation)
         ({"horizon": 1}, "horizon=1: it must be greater than or equal to 2"),
         ({"dt": 0.0}, r"dt=0\.0"),
         ({"max_tilt": 1.6}, r"max_tilt=1\.6: it must be less than 1\.57"),
+        ({"max_descent_rate": 0.0}, r"max_descent_rate=0\.0: it must be greater than or equal to 0\.000001"),
+        ({"max_descent_speed": -1.0}, r"max_descent_speed=-1\.0: it must be greater than 0"),
         ({"input_weight": float("nan")}, "input_weight=nan: it must be a finite number"),
         ({"separation": -1.0}, r"separation=-1\.0"),
         ({"workspace_low": (5.0, -4.8, 0.48)}, "Empty workspace"),

@@ -43,7 +43,7 @@ def test_our_own_model_is_the_model():
 
 def test_vehicles_of_others_cannot_be_varied():
     assert make_config("flight", plant="crazyflow").mismatch == 0
-    with pytest.raises(ValueError, match=r"mismatch=0\.1: it only applies to plant='model'"):
+    with pytest.raises(ValueError, match=r"mismatch=0\.1: it only applies to the quadrotors of plant='model'"):
         make_config("flight", plant="crazyflow", mismatch=0.1)
 
 
@@ -55,24 +55,6 @@ def test_a_simulator_names_its_adapter_and_vehicles(monkeypatch):
     assert {"gazebo:iris", "gazebo:typhoon"} < set(simulated_vehicles())
     with pytest.raises(ValueError, match="Did you mean 'iris'"):
         parse_plant("gazebo:irs")
-
-
-def test_the_model_flies_each_robot_with_its_own_parameters():
-    rng, kinds = np.random.default_rng(0), [QuadrotorParams(), QuadrotorParams(drag_x=1.0, gravity=9.0)]
-    x, u, air = rng.normal(size=(3, 3, 9)) / 4, rng.normal(size=(3, 3, 4)) / 4, rng.normal(size=(3, 3, 2))
-    factors = rng.uniform(0.9, 1.1, (3, 3, 8))
-    plant = make_plant("model", [kinds[0], kinds[1], kinds[0]], 0.02, 3, 3)
-    for varied in (None, factors):
-        flown = plant.step(x, u, air, varied)
-        for robot, kind in enumerate((0, 1, 0)):
-            some = None if varied is None else varied[:, robot]
-            alone = QuadrotorModel(kinds[kind], 0.02).step(x[:, robot], u[:, robot], air[:, robot], some)
-            assert np.array_equal(flown[:, robot], alone)
-
-
-def test_simulators_refuse_unlike_vehicles():
-    with pytest.raises(ValueError, match="plant='rotorpy' flies vehicles that are all alike: only plant='model'"):
-        make_plant("rotorpy", [QuadrotorParams(), QuadrotorParams(drag_x=1.0)], 0.02, 1, 2)
 
 
 @pytest.mark.parametrize(

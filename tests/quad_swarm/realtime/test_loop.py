@@ -217,6 +217,8 @@ def test_another_goal_counts_from_the_next_period_on():
     loop.fly_to([2.0, 0, 1.5])
     with pytest.raises(ValueError, match="goals"):
         loop.fly_to([np.nan, 0, 1.5])
+    with pytest.raises(ValueError, match=r"heading\[0\]=1: with planner\.max_yaw_rate=0"):
+        loop.fly_to([2.0, 0, 1.5], heading=1.0)
     periods(loop, 1)
     np.testing.assert_array_equal(loop.robot.goal[0, 0], [2.0, 0, 1.5])
 

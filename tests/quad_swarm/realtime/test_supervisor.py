@@ -78,6 +78,15 @@ def test_landing_is_final_and_ends_on_the_ground():
     assert modes(supervisor, [sensed]) == [Mode.FLY]
 
 
+def test_a_landing_obeys_the_planner_s_limit_and_may_take_longer():
+    slow = make_config(CONFIG, planner={"max_descent_rate": 0.1})
+    supervisor = Supervisor(slow, SafetyLimits(landing_time=1.0))
+    assert supervisor.setpoint(Mode.LAND).tolist() == [0, 0, -0.1, 0]
+    assert supervisor.limits.landing_time == pytest.approx(5.0)
+    fast = make_config(CONFIG, planner={"max_descent_rate": 2.0})
+    assert Supervisor(fast, SafetyLimits()).limits == SafetyLimits()
+
+
 def test_a_landing_without_a_state_ends_some_time():
     supervisor = Supervisor(CONFIG, SafetyLimits(landing_time=1.0))
     last = sensed(0)

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import foreign
 import numpy as np
 import pytest
 
+from quad_swarm.planner import PROBLEMS
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.realtime.vehicles import Vehicles
 from quad_swarm.world.obstacles import Obstacle, ObstacleConfig
@@ -134,3 +136,10 @@ def test_it_flies_as_the_swarm_does():
 def test_steps_of_no_whole_microseconds_are_refused():
     with pytest.raises(ValueError, match="whole microseconds"):
         Vehicles(make_config("flight", {"substeps": 7}))
+
+
+def test_vehicles_that_are_no_quadrotors_are_refused(monkeypatch):
+    """They would level and land as quadrotors do."""
+    monkeypatch.setitem(PROBLEMS, "boat", foreign.Boat)
+    with pytest.raises(ValueError, match="vehicles in real time level and land as quadrotors do"):
+        Vehicles(make_config("flight", planner={"problem": "boat"}))

@@ -2,6 +2,7 @@
 
 import functools
 
+import foreign
 import numpy as np
 import pytest
 import torch as th
@@ -9,12 +10,14 @@ import torch as th
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import Condition, begin, first_episode
 from quad_swarm.evaluation.policies import fitted, load_model
+from quad_swarm.planner import PROBLEMS
 from quad_swarm.robot import Plan, Robot, RulePolicy
 from quad_swarm.robot.lockstep import LockstepWorld
 from quad_swarm.task.request_task import requests_of
 from quad_swarm.world.kinds import make_planners
 from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
+from quad_swarm.world.swarm import Swarm
 from sb3_maddpg.hub.pretrained import pretrained_folder
 
 MODEL = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -103,6 +106,51 @@ def test_unlike_robots_fly_as_the_swarm(preset, scenario, rule):
     assert not list(differences(config, [RulePolicy(rule) for _ in range(4)], rule, scenario))
 
 
+@pytest.mark.parametrize("rule", ["full", "stage:1.0:0.2"])
+def test_unlike_robots_that_estimate_and_keep_to_what_they_told_fly_as_the_swarm(rule):
+    planner = {"commitment": 3.0, "disturbance_time": 1.0, "max_descent_rate": 0.5}
+    config = make_config("flight", {"vehicles": UNLIKE, "planner": planner}, n_robots=4)
+    assert not list(differences(config, [RulePolicy(rule) for _ in range(4)], rule, "symmetric_swap"))
+
+
+@pytest.mark.parametrize("rule", ["full", "stage:1.0:0.2", "cpa:1.2s:3&stale:4|stage:1.0:0.2"])
+@pytest.mark.parametrize("radio", [{}, {"delay": 0, "round_trip": 1}])
+def test_robots_keep_to_what_they_told_as_the_swarm_does(radio, rule):
+    planner = {"commitment": 3.0, "disturbance_time": 1.0}
+    config = make_config("flight", {"planner": planner, "radio": radio}, n_robots=3)
+    assert not list(differences(config, [RulePolicy(rule) for _ in range(3)], rule, "symmetric_swap"))
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        {},
+        {"radio": {"delay": 3, "jitter": 2}},
+        {"radio": {"delay": 0, "round_trip": 1}},
+        {"clock_skew": 0.0},
+        {"vehicles": [{}, {"max_speed": 2}]},
+    ],
+)
+def test_robots_that_start_in_flight_and_turn_fly_as_the_swarm(world):
+    config = make_config("flight", world, n_robots=2, planner={"max_yaw_rate": 1.0})
+    swarm = Swarm(config)
+    planners = getattr(swarm.planner, "planners", [swarm.planner] * 2)
+    robots = [Robot(config, k, RulePolicy("full"), planners[k]) for k in range(2)]
+    flown, starts = LockstepWorld(config, robots), np.array([[0.0, -2, 1.5], [0, 2, 1.5]])
+    motion = {"initial_velocities": [[1, 0.3, 0.2], [-1, 0, -0.3]], "initial_headings": [0.5, -3]}
+    goals = starts + np.array([2, 0, 0])
+    swarm.reset(0, starts, goals, noise_seed=7, headings=[2, 0], **motion)
+    flown.reset(starts, goals, 7, headings=[2, 0], **motion)
+    for _ in range(40):
+        flown.step()
+        swarm.step(np.ones((1, 2, 1), bool))
+        assert np.array_equal(flown.state, swarm.state)
+        believed = np.concatenate([robot.beliefs._remembered for robot in robots], axis=1)
+        assert np.array_equal(believed, swarm.beliefs._remembered)
+    assert (np.abs(swarm.state[0, :, 8]) > [1.2, 0]).all()
+    assert abs(swarm.state[0, 1, 8]) < 1.8
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 @pytest.mark.parametrize("n", [2, 4, 8])
@@ -129,6 +177,9 @@ CHANGED = {
     "no memory": {"memory": 0.0},
     "few neighbours planned with": {"planner": {"max_neighbours": 2}},
     "yaw": {"planner": {"max_yaw_rate": 1.0}},
+    "a disturbance estimated": {"planner": {"disturbance_time": 1.0, "max_yaw_rate": 1.0}},
+    "commitment": {"planner": {"commitment": 3.0}},
+    "commitment in a network": {"planner": {"commitment": 3.0}, "radio": {"delay": 0, "round_trip": 1}},
     "no sensing errors": {"sensing": {"pos": 0.0, "vel": 0.0, "attitude": 0.0, "others_pos": 0.0, "others_vel": 0.0}},
 }
 
@@ -238,3 +289,13 @@ def test_a_robot_refuses_the_planner_of_another_kind():
     config = make_config("flight", {"vehicles": UNLIKE}, n_robots=3)
     with pytest.raises(ValueError, match="it is not that of robot 1"):
         Robot(config, 1, RulePolicy("full"), planners_of(config)[0])
+
+
+@pytest.mark.parametrize("preset", ["paper", "flight"])
+@pytest.mark.parametrize("kind", [foreign.Boat, foreign.Drifter])
+def test_vehicles_from_outside_fly_alike(kind, preset, monkeypatch):
+    monkeypatch.setitem(PROBLEMS, "boat", kind)
+    config = make_config(preset, n_robots=3, planner={"problem": "boat"})
+    policies = [RulePolicy("full")] * 3
+    assert not list(differences(config, policies, "full", "random", steps=20))
+    planners_of.cache_clear()

@@ -1,6 +1,7 @@
 """The node of a robot: its parameters, its life, its goals."""
 
 import json
+import math
 import re
 import runpy
 import subprocess
@@ -21,6 +22,7 @@ from quad_swarm.ros import plant_node
 from quad_swarm.ros.messages import msgs
 from quad_swarm.ros.node import make_node, quality
 from quad_swarm.ros.robot_node import PARAMETERS, RobotNode
+from quad_swarm.world.presets import make_config
 
 ROOT = Path(__file__).parents[3]
 GOOD = {"policy": "full", "names": ["robot_0", "robot_1"], "index": 0}
@@ -174,6 +176,20 @@ def test_a_robot_begins_to_fly_in_the_air_if_it_sees_everybody(make, transitions
         np.testing.assert_allclose(goal_of(robot), [0, 0, 1.5])
     robot._take_goal(goal(1, 0.5, 1.2), None)
     np.testing.assert_allclose(goal_of(robot), [1, 0.5, 1.2])
+    turned = goal(1, 0.5, 1.2)
+    turned.pose.orientation.z, turned.pose.orientation.w = math.sin(0.5), math.cos(0.5)
+    robot._take_goal(turned, None)
+    assert robot.loop._next[3] is None, "it may not turn"
+    config = make_config(robot.loop.robot.config, planner={"max_yaw_rate": 1.0})
+    robot.loop.robot.config = config
+    robot._take_goal(turned, None)
+    assert robot.loop._next[3] == pytest.approx(1.0)
+    turned.pose.orientation.w = 5.0
+    robot._take_goal(turned, None)
+    assert "is no rotation" in capfd.readouterr().err
+    turned.pose.orientation.z = turned.pose.orientation.w = 0.0
+    robot._take_goal(turned, None)
+    assert robot.loop._next[3] is None, "no heading is asked for"
 
     assert node.trigger_deactivate() == transitions.SUCCESS
     assert robot.loop.supervisor.shall_land

@@ -130,6 +130,21 @@ def test_push_sends_what_has_left_what_the_others_were_told():
     assert not parse_rule("push:9")(View(swarm)).any()
 
 
+def test_stage_sends_what_has_left_what_was_told_to_those_nearby():
+    swarm = Swarm(make_config("paper", n_robots=3), 1)
+    starts = np.array([[-2.0, 0, 1], [0.6, 1.2, 1], [4.0, -4, 1]])
+    swarm.reset(0, starts, np.array([[2.0, 0, 1], [0.6, 1.2, 1], [4.0, -4, 1]]))
+    asked, rule = np.zeros((1, 3, 2), bool), parse_rule("stage:1.5:0.1")
+    for _ in range(8):
+        swarm.step(asked)
+    # Robot 0 passes robot 1, whose prediction of it is off; robot 2 is far away
+    assert rule(View(swarm))[0].tolist() == [[False, False], [True, False], [False, False]]
+    assert not parse_rule("stage:1.5:9")(View(swarm)).any()
+    asked[0, 1, 0] = True
+    swarm.step(asked)
+    assert not rule(View(swarm)).any(), "it knows the plan now"
+
+
 def test_lengths_may_be_given_in_separations():
     swarm = Swarm(make_config("paper", n_robots=2, radius=0.1), 1)
     assert View(swarm).separation == pytest.approx(0.2)

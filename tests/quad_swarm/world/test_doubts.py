@@ -115,6 +115,8 @@ def test_a_cruise_distance_that_is_too_far_is_no_remedy():
         ("paper", {"planner": {"dt": 0.02}}, r"planner\.horizon=10 .* 0\.2 s ahead.* use planner\.horizon=36"),
         ("paper", {"quadrotor": {"roll_time_constant": 2}}, r"quadrotor\.roll_time_constant=2 s.*planner\.horizon=60"),
         ("paper", {"planner": {"max_climb_rate": 100}}, r"max_climb_rate=100: .* faster than they would fall"),
+        ("paper", {"planner": {"max_descent_rate": 9}}, r"max_descent_rate=9: .* faster than they would fall"),
+        ("paper", {"planner": {"max_descent_speed": 0.026}}, r"max_steps=100: .* vertically"),
         ("paper", {"planner": {"max_yaw_rate": 30}}, r"max_yaw_rate=30 is in rad/s.*0\.524"),
         ("paper", {"planner": {"max_speed": 40}}, r"max_speed=40 is in m/s: .* reaches 7\.1 m/s"),
         ("paper", {"planner": {"max_speed": 0.01}}, r"max_steps=100: episodes of 10 s are too short"),

@@ -5,13 +5,15 @@ import json
 import pickle
 from pathlib import Path
 
+import foreign
 import numpy as np
 import pytest
 
 from quad_swarm import QuadSwarmEnv, QuadSwarmParallelEnv
-from quad_swarm.planner import PlannerConfig
+from quad_swarm.planner import PROBLEMS, PlannerConfig
+from quad_swarm.quadrotor import QuadrotorModel, QuadrotorParams
 from quad_swarm.world.doubts import DoubtfulWorld
-from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config
+from quad_swarm.world.presets import PRESET_VERSION, PRESETS, SwarmConfig, make_config, plant_of
 from quad_swarm.world.swarm import Swarm
 
 FROZEN = json.loads(Path(__file__).with_name(f"presets_v{PRESET_VERSION}.json").read_text())
@@ -269,3 +271,69 @@ def test_a_state_outside_is_no_reset():
     other = QuadSwarmEnv(n_robots=2)
     other.load_state_dict(env.state_dict())
     assert other.task.swarm.state[0, 0, 0] == 7.0
+
+
+@pytest.fixture
+def fleet(monkeypatch):
+    """Vehicles from outside."""
+    for name, kind in {"boat": foreign.Boat, "stepper": foreign.Stepper, "thrifty": foreign.Thrifty}.items():
+        monkeypatch.setitem(PROBLEMS, name, kind)
+
+
+@pytest.mark.parametrize("planner", [{"problem": "boat"}, PlannerConfig(problem="boat")])
+def test_vehicles_from_outside_are_not_judged_as_quadrotors(planner, fleet, recwarn):
+    config = make_config("flight", planner=planner, quadrotor={"roll_time_constant": 5.0}, max_steps=3)
+    assert (config.mismatch, config.flies_quadrotors) == (0.0, False)
+    assert not [one for one in recwarn if issubclass(one.category, DoubtfulWorld)]
+    costs = make_config("flight", planner={"problem": "thrifty"})
+    assert (costs.mismatch, costs.flies_quadrotors) == (0.1, True)
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        ({"planner": {"problem": "bote"}}, "Unknown problem 'bote'; known: .*Did you mean 'boat'"),
+        ({"planner": {"problem": "boat"}, "mismatch": 0.1}, "mismatch=0.1: .*'boat' has no such parameters"),
+        ({"planner": {"problem": "stepper"}, "substeps": 5}, "substeps: Stepper says how its vehicles move in a whole"),
+        ({"planner": {"problem": "stepper"}, "noise": {"wind": 1}}, "noise.wind or noise.gust: Stepper .*`derivative`"),
+        ({"planner": {"problem": 3}}, "planner.problem=3"),
+    ],
+)
+def test_worlds_that_a_vehicle_from_outside_cannot_fly_in_are_refused(world, message, fleet):
+    with pytest.raises(ValueError, match=message):
+        make_config("paper", world)
+
+
+def test_the_planner_s_model_is_what_flies(fleet):
+    state, u = np.zeros((1, 2, 9)), np.ones((1, 2, 4))
+    plant = plant_of(make_config("paper", planner={"problem": "boat"}), 0.02, 1, 2)
+    after = plant.step(state, u, np.zeros((1, 2, 2)), None)
+    np.testing.assert_allclose(after[..., 3:5], (1 - np.exp(-0.4 * 0.02)) / 0.4, rtol=1e-6)
+    assert not after[..., 5:].any()
+
+
+def test_the_model_flies_each_robot_with_its_own_parameters():
+    kinds = [QuadrotorParams(), QuadrotorParams(drag_x=1.0, gravity=9.0)]
+    config = make_config("paper", {"vehicles": [{}, {"quadrotor": kinds[1]}]}, n_robots=3)
+    rng = np.random.default_rng(0)
+    x, u, air = rng.normal(size=(3, 3, 9)) / 4, rng.normal(size=(3, 3, 4)) / 4, rng.normal(size=(3, 3, 2))
+    factors = rng.uniform(0.9, 1.1, (3, 3, 8))
+    plant = plant_of(config, 0.02, 3, 3)
+    for varied in (None, factors):
+        flown = plant.step(x, u, air, varied)
+        for robot, kind in enumerate((0, 1, 0)):
+            some = None if varied is None else varied[:, robot]
+            alone = QuadrotorModel(kinds[kind], 0.02).step(x[:, robot], u[:, robot], air[:, robot], some)
+            assert np.array_equal(flown[:, robot], alone)
+
+
+def test_vehicles_from_outside_may_differ_in_their_limits(fleet):
+    config = make_config("paper", {"planner": {"problem": "boat"}, "vehicles": [{}, {"max_tilt": 0.1}]})
+    swarm = Swarm(config)
+    starts = np.array([[0.0, -3, 1.5], [0, 3, 1.5], [3, 0, 1.5], [-3, 0, 1.5]])
+    swarm.reset(0, starts, starts * [-1, -1, 1])
+    for _ in range(20):
+        swarm.step(np.zeros((1, 4, 3), bool))
+    assert np.isfinite(swarm.state).all()
+    assert (np.abs(swarm.state[0, :, :3] - starts).max(axis=1) > 0.1).all()
+    assert not swarm.state[..., 5:].any()

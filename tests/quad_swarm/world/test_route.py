@@ -209,26 +209,27 @@ def test_doubtful_goals_are_warned_of():
 
 
 def test_robots_of_their_own_fly_to_other_goals_as_the_swarm_does():
-    config = make_config("flight", n_robots=2)
+    config = make_config("flight", n_robots=2, planner={"max_yaw_rate": 1.0})
     swarm = Swarm(config)
     starts = STARTS * [1, 0.7, 1]
     robots = [Robot(config, k, RulePolicy("full")) for k in range(2)]
     world = LockstepWorld(config, robots)
-    swarm.reset(0, starts, starts + ASIDE / 2, noise_seed=7)
-    world.reset(starts, starts + ASIDE / 2, 7)
+    swarm.reset(0, starts, starts + ASIDE / 2, noise_seed=7, headings=[2.0, 0])
+    world.reset(starts, starts + ASIDE / 2, 7, headings=[2.0, 0])
     goal, velocity, waypoints = [-1.0, 2, 1.5], [0.2, 0, 0], [[0.0, 2.5, 1], [-2, 2, 1]]
     for step in range(90):
         if step == 10:
-            swarm.set_goals(0, [goal], [velocity], [waypoints], robots=[1])
-            robots[1].fly_to(goal, velocity, waypoints)
+            swarm.set_goals(0, [goal], [velocity], [waypoints], robots=[1], headings=[-3.0])
+            robots[1].fly_to(goal, velocity, waypoints, -3.0)
         world.step()
         fly(swarm, 1)
         np.testing.assert_array_equal(world.state, swarm.state)
     for k, robot in enumerate(robots):
         np.testing.assert_array_equal(robot.goal[0, 0], swarm.goal[0, k])
     assert swarm.route.at_last.all()
-    for arguments in (([1, 2],), (goal, [np.nan, 0, 0]), (goal, None, [[1, 2]])):
-        with pytest.raises(ValueError, match=r"goals|velocities|waypoints"):
+    np.testing.assert_allclose(swarm.state[0, :, 8], [2.0, -3.0], atol=0.3)
+    for arguments in (([1, 2],), (goal, [np.nan, 0, 0]), (goal, None, [[1, 2]]), (goal, None, None, np.inf)):
+        with pytest.raises(ValueError, match=r"goals|velocities|waypoints|heading"):
             robots[1].fly_to(*arguments)
 
 

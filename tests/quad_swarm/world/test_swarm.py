@@ -9,6 +9,7 @@ from quad_swarm.native.pairs import advance
 from quad_swarm.planner import SOLVERS, PlanStatus
 from quad_swarm.task.view import View
 from quad_swarm.world.beliefs import Beliefs, BeliefSource
+from quad_swarm.world.doubts import DoubtfulWorld
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import SCENARIOS, ScenarioSampler
 from quad_swarm.world.swarm import Swarm
@@ -46,6 +47,163 @@ def test_a_swarm_flies_the_same_alone_and_in_company():
         alone = make_swarm(3)
         alone.keep(np.arange(3) == k)
         assert np.array_equal(fly(alone, 30)[:, 0], positions[:, k])
+
+
+STARTS, ENDS = np.array([[0.0, -2, 1.5], [0, 2, 1.5]]), np.array([[2.0, -2, 1.5], [2, 2, 1.5]])
+
+
+def turning(n_swarms: int = 1, **world) -> Swarm:
+    return Swarm(make_config("paper", {"planner": {"max_yaw_rate": 1.5}, **world}, n_robots=2), n_swarms)
+
+
+def test_robots_turn_to_their_headings_on_the_way_and_keep_them():
+    swarm = turning()
+    swarm.reset(0, STARTS, ENDS, headings=np.radians([90, 350]))
+    fly(swarm, 50)
+    np.testing.assert_allclose(np.degrees(swarm.state[0, :, 8]), [90, -10], atol=1)
+    assert np.linalg.norm(swarm.pos - swarm.goal, axis=-1).max() < 0.1
+    swarm.set_goals(0, STARTS[:1], robots=[0], headings=[np.radians(-170)])
+    swarm.set_goals(0, STARTS[1:], robots=[1])
+    fly(swarm, 50)
+    np.testing.assert_allclose(np.degrees(swarm.state[0, :, 8]), [190, -10], atol=1)
+    assert np.linalg.norm(swarm.pos - STARTS, axis=-1).max() < 0.1
+
+
+def test_headings_of_zero_are_none_and_cost_nothing():
+    plain, written = turning(), turning()
+    plain.reset(0, STARTS, ENDS)
+    written.reset(0, STARTS, ENDS, headings=[0, 0])
+    assert plain.heading is written.heading is None
+    np.testing.assert_array_equal(fly(plain, 20), fly(written, 20))
+    written.set_goals(0, STARTS, headings=[0, 1])
+    assert written.heading.tolist() == [[0, 1]]
+    written.reset(0, STARTS, ENDS)
+    assert written.heading is None, "the headings of the last episode"
+
+
+def test_swarms_have_headings_of_their_own_and_states_and_copies_hold_them():
+    swarm = turning(2)
+    swarm.reset(0, STARTS, ENDS)
+    swarm.reset(1, STARTS, ENDS, headings=[1.0, -2.0])
+    fly(swarm, 4)
+    state, fork, alone, other = swarm.state_dict(), swarm.fork(), swarm.part(np.array([False, True])), turning(2)
+    other.load_state_dict(state)
+    for one in (swarm, fork, other, alone):
+        fly(one, 20)
+        np.testing.assert_array_equal(one.state, swarm.state[-one.n_swarms :])
+    assert (swarm.state[0, :, 8] == 0).all()
+    assert (swarm.state[1, :, 8] * [1, -1] > 0.5).all()
+    other.load_state_dict({key: value for key, value in state.items() if key != "heading"})
+    assert other.heading is None, "states of before there were headings"
+    with pytest.raises(ValueError, match="heading"):
+        other.load_state_dict({**state, "heading": np.zeros(3)})
+
+
+@pytest.mark.parametrize(
+    ("headings", "message"),
+    [
+        ([0.0], r"headings must be 2 finite angles, shape \(2,\) \(rad\), up to 10000; got \[0\.0\]"),
+        ([0.0, np.nan], r"headings must be 2 finite angles"),
+        ("north", r"headings must be 2 finite angles.*'north'"),
+        ([0.0, 1e9], r"headings must be 2 finite angles"),
+    ],
+)
+def test_headings_that_do_not_fit_are_refused_and_change_nothing(headings, message):
+    swarm = turning()
+    swarm.reset(0, STARTS, ENDS, headings=[1, 2])
+    for call in (
+        lambda: swarm.reset(0, STARTS, ENDS, headings=headings),
+        lambda: swarm.set_goals(0, STARTS, headings=headings),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    assert swarm.heading.tolist() == [[1, 2]]
+    np.testing.assert_array_equal(swarm.goal[0], ENDS)
+
+
+def test_robots_that_may_not_turn_keep_their_heading():
+    swarm = Swarm(make_config("paper", n_robots=2))
+    swarm.reset(0, STARTS, ENDS, headings=[0, 2 * np.pi])
+    with pytest.raises(ValueError, match=r"^headings\[1\]=1: with planner\.max_yaw_rate=0, robots keep .* here 0; set"):
+        swarm.reset(0, STARTS, ENDS, headings=[0, 1])
+    with pytest.raises(ValueError, match=r"^headings\[0\]=-1: with planner\.max_yaw_rate=0"):
+        swarm.set_goals(0, STARTS[:1], robots=[0], headings=[-1])
+    assert swarm.heading is None
+
+
+def test_headings_in_degrees_are_warned_of():
+    with pytest.warns(DoubtfulWorld, match=r"headings\[1\]=90 is in rad and more than a turn: .* it would be 1\.57"):
+        turning().reset(0, STARTS, ENDS, headings=[0, 90])
+
+
+MOVING = np.array([[1.0, 0, 0.2], [0, -0.5, -0.3]])
+
+
+def test_robots_may_start_in_flight_with_headings():
+    swarm = turning()
+    swarm.reset(0, STARTS, ENDS, initial_velocities=MOVING, initial_headings=[0.5, -2])
+    np.testing.assert_array_equal(swarm.vel[0], MOVING)
+    fly(swarm, 1)
+    np.testing.assert_allclose(swarm.pos[0], STARTS + 0.1 * MOVING, atol=0.04)
+    fly(swarm, 60)
+    assert np.linalg.norm(swarm.pos - swarm.goal, axis=-1).max() < 0.1
+    np.testing.assert_allclose(swarm.state[0, :, 8], [0.5, -2], atol=1e-3)
+    swarm.reset(0, STARTS, ENDS, headings=[1, 1], initial_headings=[0.5, -2])
+    fly(swarm, 50)
+    np.testing.assert_allclose(swarm.state[0, :, 8], [1, 1], atol=0.1)
+    swarm.reset(0, STARTS, ENDS)
+    assert not swarm.state[0, :, 3:].any()
+    assert swarm.heading is None
+
+
+def test_robots_that_may_not_turn_keep_the_heading_that_they_start_with():
+    swarm = Swarm(make_config("paper", n_robots=2))
+    swarm.reset(0, STARTS, ENDS, initial_headings=[1.0, 0], headings=[1.0, 2 * np.pi])
+    fly(swarm, 40)
+    np.testing.assert_allclose(swarm.state[0, :, 8], [1, 0], atol=1e-12)
+    assert np.linalg.norm(swarm.pos - swarm.goal, axis=-1).max() < 0.1
+    with pytest.raises(ValueError, match=r"headings\[0\]=0: with planner\.max_yaw_rate=0, .* here 1; set"):
+        swarm.set_goals(0, STARTS, headings=[0, 0])
+
+
+@pytest.mark.parametrize("radio", [{}, {"delay": 2, "jitter": 1}, {"delay": 0, "round_trip": 1}])
+def test_first_plans_asked_for_are_to_keep_the_velocity(radio):
+    swarm = Swarm(make_config("flight", {"radio": {"loss": 0.0, **radio}}, n_robots=2))
+    swarm.reset(0, STARTS, ENDS, initial_velocities=MOVING, noise_seed=3)
+    times = 0.05 * np.arange(1, 21)[:, None]
+    believed, source = swarm._believe(all_ask(swarm))
+    if "round_trip" in radio:  # nothing has arrived yet
+        assert (source == BeliefSource.CONSTANT_VELOCITY).all()
+        return
+    assert (source == BeliefSource.REQUESTED).all()
+    for robot in range(2):
+        expected = STARTS[1 - robot] + times * MOVING[1 - robot]
+        np.testing.assert_allclose(believed[0, robot, 0], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"initial_velocities": [1, 0, 0]}, r"initial_velocities must be 2 finite vectors, shape \(2, 3\) \(m/s\)"),
+        ({"initial_velocities": [[0, 0, np.inf]] * 2}, "initial_velocities must be 2 finite vectors"),
+        ({"initial_headings": 1.0}, "initial_headings must be 2 finite angles"),
+        ({"initial_headings": [0, np.nan]}, "initial_headings must be 2 finite angles"),
+    ],
+)
+def test_what_robots_cannot_start_with_is_refused(arguments, message):
+    swarm = turning()
+    swarm.reset(0, STARTS, ENDS)
+    with pytest.raises(ValueError, match=message):
+        swarm.reset(0, ENDS, STARTS, **arguments)
+    np.testing.assert_array_equal(swarm.pos[0], STARTS)
+
+
+def test_starts_beyond_the_limits_are_warned_of():
+    message = r"initial_velocities\[1\]=\[0\.0, 5\.0, 0\.0\]: it starts faster than the 4 m/s .* along y, which brake"
+    with pytest.warns(DoubtfulWorld, match=message):
+        turning().reset(0, STARTS, ENDS, initial_velocities=[[0, 0, 0], [0, 5, 0]])
+    with pytest.warns(DoubtfulWorld, match=r"initial_headings\[0\]=-45 is in rad"):
+        turning().reset(0, STARTS, ENDS, initial_headings=[-45, 0])
 
 
 def test_first_plan_asked_for_is_to_stay():

@@ -8,7 +8,7 @@ from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import Swarm
 
 KEYS = ["state", "goal", "input", "plans", "earlier", "beliefs", "presumed_beliefs", "chance"]
-KEYS += ["neighbours", "obstacles", "route"]
+KEYS += ["neighbours", "obstacles", "commitment", "disturbance", "route", "heading"]
 AMONG = {"obstacles": {"number": (1, 2), "speed": (0.5, 1.0)}}
 LIMITED = {"neighbourhood": {"max_others": 2}}
 

@@ -7,6 +7,7 @@ zeros of the dynamics are never computed. The handwritten C++ source contains no
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 
 import casadi as ca
 import numpy as np
@@ -48,7 +49,10 @@ def generate_model(problem: OptimalControlProblem) -> str:
     lines += [f"constexpr int {name} = {value};" for name, value in constants.items()]
     lines += [
         f"constexpr bool SHAPED = {str(problem.shaped).lower()};",
+        f"constexpr bool COMMITTED = {str(problem.committed).lower()};",
+        f"constexpr bool DISTURBED = {str(problem.disturbed).lower()};",
         f"constexpr double VIOLATION_WEIGHT = {problem.config.violation_weight!r};",
+        _array("double", "MIN_INPUT", problem.min_input.full().ravel()),
         _array("double", "MAX_INPUT", problem.max_input.full().ravel()),
         _array("int", "BOUNDED_STATE", state),
         _array("double", "STATE_LOW", low),
@@ -59,6 +63,7 @@ def generate_model(problem: OptimalControlProblem) -> str:
     functions = [
         _emit("dynamics", {"x": x, "u": u}, {"x_next": x_next}),
         _emit("linearise", {"x": x, "u": u}, {"x_next": x_next, "a": a_values, "b": b_values}),
+        _emit("drift", {"disturbance": (push := ca.SX.sym("disturbance", 3))}, {"moved": problem.drift(push)}),
         *_costs(problem),
         *_riccati(problem, (a, a_symbols), (b, b_symbols)),
     ]
@@ -77,10 +82,12 @@ def formulas(problem: OptimalControlProblem) -> tuple[object, ...]:
         problem.repulsion_residual(distance),
         problem.repulsion_cost(distance),
         problem.box_violations(x),
+        problem.drift(goal),
     ]
     function = ca.Function("formulas", [x, u, x0, goal, others, distance], outputs)
-    sizes = problem.n_others, problem.shaped, *problem.max_input.full().ravel()
-    return problem.config, sizes, function.serialize()
+    limits = (*problem.min_input.full().ravel(), *problem.max_input.full().ravel())
+    sizes = problem.n_others, problem.shaped, problem.committed, problem.disturbed
+    return problem.config, sizes, limits, function.serialize()
 
 
 def _check_form(problem: OptimalControlProblem) -> None:
@@ -132,7 +139,10 @@ def _costs(problem: OptimalControlProblem) -> list[str]:
     residual = problem.repulsion_residual(distance)
     slope = ca.jacobian(residual, distance)
     # With nobody, the kernel does not call the function
-    some = problem if problem.n_others else OptimalControlProblem(problem.config, problem.quadrotor, 1, problem.shaped)
+    some = problem
+    if not problem.n_others:
+        some = copy(problem)
+        some.n_others = 1
     columns = [other, *(ca.SX.sym(f"other{j}", 3) for j in range(1, some.n_others))]
     about_other = {"x": x, "other": other}
     if problem.shaped:

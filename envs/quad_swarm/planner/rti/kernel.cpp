@@ -32,6 +32,10 @@ struct Batch {
   const double* clearance;  // (count, N_OTHERS, N), or null
   const double* shape;    // (count, N_OTHERS, 3), or null
   const double* size;     // (count, N_OTHERS), or null
+  const double* reference;         // (count, N, 3), or null
+  const double* reference_weight;  // (count, N), or null
+  const double* disturbance;       // (count, 3), or null
+  const double* steady_input;      // (count, 4), or null
   double* x_plan;         // (count, N + 1, 9)
   double* u_plan;         // (count, N, 4)
   std::uint8_t* success;  // (count,)
@@ -44,7 +48,7 @@ constexpr double START_SLACK = 0.05;  // least t at the start, where the guess i
 constexpr double RESIDUAL_TOLERANCE = 2e-3;  // of the linear conditions, over their residual at the start
 constexpr double COST_IN_TOLERANCE = 0.01;    // violations of metres cost thousands; see tolerance in Options
 constexpr double STEP_TO_BOUNDARY = 0.99;
-constexpr double STILL_MOVING = 0.3;  // change of an input over its limit in the last quadratic program
+constexpr double STILL_MOVING = 0.3;  // change of an input over half of its range in the last quadratic program
 
 // One inequality h + g z >= -s in the step z. A hard one has no violation s; a soft one pays rho s^2 / 2 for it, which
 // makes s = lambda / rho and lets it be eliminated.
@@ -121,6 +125,7 @@ struct Stage {
   V clearance[N_OTHERS];     // distance to keep in addition to the separation
   V direction[N_OTHERS][3];  // from each other robot to this one
   V repulsion_gradient[N_OTHERS], repulsion_curvature[N_OTHERS];
+  V reference[COMMITTED ? 3 : 0], reference_weight[COMMITTED ? 1 : 0];  // twice the weight
   V bound_sign[N_BOUNDS];
   Inequality<V, false> input_low[NU], input_high[NU];
   Inequality<V, true> bound[N_BOUNDS], separation[N_OTHERS];
@@ -157,6 +162,7 @@ class LaneGroup {
   V x0_[NX], goal_[3];
   V shape_[SHAPED ? N_OTHERS : 0][3], size_[SHAPED ? N_OTHERS : 0];
   V goal_gradient_[NX], goal_hessian_[N_SYMMETRIC];
+  V moved_[DISTURBED ? NX : 0], steady_input_[DISTURBED ? NU : 0];
   Mask iterations_, converged_, moving_;
 
   void load(const Batch& batch, const double* u_guess, const std::int64_t* problems, int count) {
@@ -174,6 +180,8 @@ class LaneGroup {
       }
     }
     if constexpr (SHAPED) load_shapes(batch, problems, count);
+    if constexpr (COMMITTED) load_references(batch, problems, count);
+    if constexpr (DISTURBED) load_disturbances(batch, problems, count);
     for (int k = 0; k < N; k++) {
       limit_inputs(stages_[k].u);
       for (int j = 0; j < N_OTHERS; j++) {
@@ -197,11 +205,38 @@ class LaneGroup {
     }
   }
 
+  void load_references(const Batch& batch, const std::int64_t* problems, int count) {
+    const bool given = batch.reference && batch.reference_weight;
+    for (int k = 0; k < N; k++) {
+      Stage<V>& s = stages_[k];
+      s.reference[0] = s.reference[1] = s.reference[2] = s.reference_weight[0] = V{};
+      for (int q = 0; given && q < W; q++) {
+        const std::int64_t row = problems[q < count ? q : count - 1] * N + k;
+        for (int i = 0; i < 3; i++) s.reference[i][q] = static_cast<T>(batch.reference[row * 3 + i]);
+        s.reference_weight[0][q] = static_cast<T>(2 * batch.reference_weight[row]);
+      }
+    }
+  }
+
+  void load_disturbances(const Batch& batch, const std::int64_t* problems, int count) {
+    V disturbance[3] = {};
+    for (int i = 0; i < NU; i++) steady_input_[i] = V{};
+    for (int q = 0; q < W; q++) {
+      const std::int64_t problem = problems[q < count ? q : count - 1];
+      if (batch.disturbance)
+        for (int i = 0; i < 3; i++) disturbance[i][q] = static_cast<T>(batch.disturbance[problem * 3 + i]);
+      if (batch.steady_input)
+        for (int i = 0; i < NU; i++)
+          steady_input_[i][q] = static_cast<T>(batch.steady_input[problem * INPUT_STRIDE + i]);
+    }
+    ::drift<V>(disturbance, moved_);
+  }
+
   static void limit_inputs(V* u) {
     for (int i = 0; i < NU; i++) {
-      const V limit = splat<V>(MAX_INPUT[i]);
-      u[i] = select<V>(u[i] > limit, limit, u[i]);  // written so that NaN stays NaN
-      u[i] = select<V>(u[i] < -limit, -limit, u[i]);
+      const V low = splat<V>(MIN_INPUT[i]), high = splat<V>(MAX_INPUT[i]);
+      u[i] = select<V>(u[i] > high, high, u[i]);  // written so that NaN stays NaN
+      u[i] = select<V>(u[i] < low, low, u[i]);
     }
   }
 
@@ -211,11 +246,17 @@ class LaneGroup {
     for (int k = 0; k < N; k++) {
       Stage<V>& s = stages_[k];
       ::linearise<V>(x, s.u, s.x, s.a, s.b);
-      ::input_gradient<V>(s.u, s.input_gradient);
+      if constexpr (DISTURBED) {
+        V beyond[NU];
+        for (int i = 0; i < NX; i++) s.x[i] += moved_[i];
+        for (int i = 0; i < NU; i++) beyond[i] = s.u[i] - steady_input_[i];
+        ::input_gradient<V>(beyond, s.input_gradient);
+      } else {
+        ::input_gradient<V>(s.u, s.input_gradient);
+      }
       for (int i = 0; i < NU; i++) {
-        const V limit = splat<V>(MAX_INPUT[i]);
-        s.input_low[i].start(limit + s.u[i]);
-        s.input_high[i].start(limit - s.u[i]);
+        s.input_low[i].start(s.u[i] - splat<V>(MIN_INPUT[i]));
+        s.input_high[i].start(splat<V>(MAX_INPUT[i]) - s.u[i]);
         s.du[i] = V{};
       }
       x = s.x;
@@ -291,6 +332,8 @@ class LaneGroup {
           for (int l = 0; l <= i; l++)
             p[packed(i, l)] = multiply_add(weight * s.direction[j][i], s.direction[j][l], p[packed(i, l)]);
       }
+      if constexpr (COMMITTED)
+        for (int i = 0; i < 3; i++) p[packed(i, i)] += s.reference_weight[0];
       V weight[NU];
       for (int i = 0; i < NU; i++) {
         s.input_low[i].eliminate();
@@ -332,6 +375,9 @@ class LaneGroup {
       const V force = s.separation[j].force() - s.repulsion_gradient[j];
       for (int i = 0; i < 3; i++) costate[i] = negative_multiply_add(s.direction[j][i], force, costate[i]);
     }
+    if constexpr (COMMITTED)
+      for (int i = 0; i < 3; i++)
+        costate[i] = multiply_add(s.reference_weight[0], s.x[i] - s.reference[i], costate[i]);
     V gradient[NU];
     for (int i = 0; i < NU; i++)
       gradient[i] = s.input_gradient[i] - s.input_low[i].force() + s.input_high[i].force();
@@ -393,7 +439,7 @@ class LaneGroup {
     moving_ = Mask{};
     for (int k = 0; k < N; k++) {
       for (int i = 0; i < NU; i++) {
-        const V du = stages_[k].du[i], limit = splat<V>(STILL_MOVING * MAX_INPUT[i]);
+        const V du = stages_[k].du[i], limit = splat<V>(STILL_MOVING * (MAX_INPUT[i] - MIN_INPUT[i]) / 2);
         stages_[k].u[i] += du;
         moving_ |= (du > limit) | (du < -limit);
       }
@@ -409,7 +455,7 @@ class LaneGroup {
         for (int i = 0; i < INPUT_STRIDE; i++) {
           double value = i < NU ? static_cast<double>(stages_[k].u[i][q]) : 0.0;
           if (i < NU && value > MAX_INPUT[i]) value = MAX_INPUT[i];  // the limit itself rounds in single precision
-          if (i < NU && value < -MAX_INPUT[i]) value = -MAX_INPUT[i];
+          if (i < NU && value < MIN_INPUT[i]) value = MIN_INPUT[i];
           u[k * INPUT_STRIDE + i] = value;
         }
       batch.success[problem] = converged_[q] != 0;
@@ -423,18 +469,21 @@ class LaneGroup {
 template <int W>
 void roll_out(const Batch& batch, std::int64_t first, int count) {
   using V = typename LaneTypes<double, W>::Real;
-  V x[NX] = {}, u[NU] = {}, x_next[NX];
+  V x[NX] = {}, u[NU] = {}, x_next[NX], disturbance[3] = {}, moved[NX] = {};
   for (int q = 0; q < count; q++) {
     const double* from = batch.x + (first + q) * STATE_STRIDE;
     double* to = batch.x_plan + (first + q) * (N + 1) * STATE_STRIDE;
     for (int i = 0; i < STATE_STRIDE; i++) to[i] = from[i];
     for (int i = 0; i < NX; i++) x[i][q] = from[i];
+    if (DISTURBED && batch.disturbance)
+      for (int i = 0; i < 3; i++) disturbance[i][q] = batch.disturbance[(first + q) * 3 + i];
   }
+  if constexpr (DISTURBED) ::drift<V>(disturbance, moved);
   for (int k = 0; k < N; k++) {
     for (int q = 0; q < count; q++)
       for (int i = 0; i < NU; i++) u[i][q] = batch.u_plan[((first + q) * N + k) * INPUT_STRIDE + i];
     ::dynamics<V>(x, u, x_next);
-    for (int i = 0; i < NX; i++) x[i] = x_next[i];
+    for (int i = 0; i < NX; i++) x[i] = DISTURBED ? x_next[i] + moved[i] : x_next[i];
     for (int q = 0; q < count; q++) {
       double* to = batch.x_plan + ((first + q) * (N + 1) + k + 1) * STATE_STRIDE;
       for (int i = 0; i < STATE_STRIDE; i++) to[i] = i < NX ? x[i][q] : 0.0;
@@ -474,10 +523,13 @@ void solve_all(const Batch& batch, const double* u_guess, const std::vector<std:
 
 extern "C" __attribute__((visibility("default"))) void quad_swarm_rti(
     std::int64_t count, const double* x, const double* goal, const double* others, const double* clearance,
-    const double* shape, const double* size, const double* u_guess, double* x_plan, double* u_plan, std::uint8_t* success, std::int64_t* iterations,
+    const double* shape, const double* size, const double* reference, const double* reference_weight,
+    const double* disturbance, const double* steady_input, const double* u_guess, double* x_plan, double* u_plan,
+    std::uint8_t* success, std::int64_t* iterations,
     std::int64_t sqp_iterations, std::int64_t extra_iterations, std::int64_t max_iterations, double tolerance) {
   std::vector<std::uint8_t> moving(count);
-  const Batch batch{x, goal, others, clearance, shape, size, x_plan, u_plan, success, iterations, moving.data()};
+  const Batch batch{x,           goal,         others, clearance, shape,   size,       reference,    reference_weight,
+                    disturbance, steady_input, x_plan, u_plan,    success, iterations, moving.data()};
   const Options options{max_iterations, tolerance};
   std::fill(iterations, iterations + count, 0);
   std::vector<std::int64_t> problems(count);

@@ -30,6 +30,10 @@ SIGNATURE = Signature(
     clearance="B m N f8 optional",
     shape="B m 3 f8 optional",
     size="B m f8 optional",
+    reference="B N 3 f8 optional",
+    reference_weight="B N f8 optional",
+    disturbance="B 3 f8 optional",
+    steady_input=f"B {N_INPUTS} f8 optional",
     u_guess=f"B N {N_INPUTS} f8",
     x_plan=f"B N+1 {N_STATES} f8 out",
     u_plan=f"B N {N_INPUTS} f8 out",
@@ -106,17 +110,14 @@ class RtiSolver:
 
         :raises ValueError: if an array has another shape than the problem's
         """
-        clearance, shape, size = (
-            None if array is None else np.asarray(array, float)
-            for array in (problems.clearance, problems.shape, problems.size)
-        )
+        names = ("clearance", "shape", "size", "reference", "reference_weight", "disturbance", "steady_input")
+        arrays = {name: getattr(problems, name) for name in names}
+        given = {name: None if array is None else np.asarray(array, float) for name, array in arrays.items()}
         return self._compiled()(
             x=np.asarray(problems.x, float),
             goal=np.asarray(problems.goal, float),
             others=np.asarray(problems.others, float),
-            clearance=clearance,
-            shape=shape,
-            size=size,
+            **given,
             u_guess=np.asarray(u_guess, float),
             sqp_iterations=self.sqp_iterations,
             extra_iterations=self.extra_iterations,

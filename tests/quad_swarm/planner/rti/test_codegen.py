@@ -1,5 +1,6 @@
 """The generated C++, read as arithmetic: what it computes is what the optimal control problem says."""
 
+import dataclasses
 import math
 import re
 
@@ -73,6 +74,19 @@ def test_constants_are_the_problem_s(problem):
     assert constants["STATE_LOW"].tolist() == [*CONFIG.workspace_low, -4.0, -4.0, -1.5]
     assert constants["STATE_HIGH"].tolist() == [*CONFIG.workspace_high, 4.0, 4.0, 1.5]
     assert constants["VIOLATION_WEIGHT"] == 1e4
+    limits = [CONFIG.max_tilt, CONFIG.max_tilt, 1.0, 1.0][: problem.nu]
+    assert constants["MAX_INPUT"].tolist() == limits
+    assert (-constants["MIN_INPUT"]).tolist() == limits
+
+
+def test_descents_may_have_limits_of_their_own():
+    config = dataclasses.replace(CONFIG, max_descent_rate=0.4, max_descent_speed=0.3)
+    constants = Generated(OptimalControlProblem(config, QUADROTOR, 2)).constants
+    assert (constants["MIN_INPUT"][2], constants["MAX_INPUT"][2]) == (-0.4, 1.0)
+    assert (constants["STATE_LOW"][5], constants["STATE_HIGH"][5]) == (-0.3, 1.5)
+    alike = dataclasses.replace(CONFIG, max_descent_rate=1.0, max_descent_speed=1.5)
+    texts = [generate_model(OptimalControlProblem(one, QUADROTOR, 2)) for one in (CONFIG, alike)]
+    assert texts[0] == texts[1]
 
 
 def test_every_number_of_the_problem_changes_the_text():

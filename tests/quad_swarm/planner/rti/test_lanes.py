@@ -64,7 +64,7 @@ def test_absurd_problems_stay_in_their_lanes(bad):
 @given(seed=st.integers(0, 2**32), scale=st.floats(0.01, 20), n_others=st.sampled_from([1, 3]), yaw=st.booleans())
 @settings(max_examples=60, deadline=None)
 def test_plans_obey_dynamics_and_limits_whatever_is_asked(seed, scale, n_others, yaw):
-    config = PlannerConfig(horizon=5, max_yaw_rate=math.pi / 2 if yaw else 0.0)
+    config = PlannerConfig(horizon=5, max_yaw_rate=math.pi / 2 if yaw else 0.0, max_descent_rate=0.6 if yaw else None)
     solver = RtiSolver(OptimalControlProblem(config, QUADROTOR, n_others))
     call = scattered(config, 7, n_others, seed, scale)
     plan = solver.solve(*call)
@@ -72,6 +72,7 @@ def test_plans_obey_dynamics_and_limits_whatever_is_asked(seed, scale, n_others,
     assert plan.success[reachable].all()
     assert np.isfinite(plan.x[reachable]).all()
     assert (np.abs(plan.u) <= [config.max_tilt, config.max_tilt, config.max_climb_rate, config.max_yaw_rate]).all()
+    assert (plan.u[..., 2] >= -config.descent_rate).all()
     held, tilting = call[0].x.copy(), plan.u.copy()  # about the world's axes
     held[:, 8] = tilting[..., 3] = 0.0
     rolled = QuadrotorModel(QUADROTOR, config.dt).rollout(held, tilting)
