@@ -1,7 +1,8 @@
 """Fly random worlds within and at the limits of their fields.
 
-``python -m studies.random_worlds [--count 1000] [--steps 20] [--seed 0] [--json F]``. Each world has 2 to 64 robots,
-and each of its fields may have any valid value. A world is either refused with one line when it is created, or flies:
+``python -m studies.random_worlds [--count 1000] [--steps 20] [--seed 0] [--jobs 1] [--json F]``. Each world has 2 to 64
+robots, and each of its fields may have any valid value; some flights begin in motion, and some robots turn. A world is
+either refused with one line when it is created, or flies:
 resets never fail, steps neither raise nor return anything that is not finite, the reported separations and collisions
 are those of the states, and a swarm flies in a batch as it does alone, to the last bit. Actions are random. JSON: one
 row with the numbers of flown and refused worlds, and one for each failure.
@@ -10,6 +11,7 @@ row with the numbers of flown and refused worlds, and one for each failure.
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 import traceback
 import warnings
@@ -23,6 +25,7 @@ from tqdm import tqdm
 
 from quad_swarm import PRESETS, SCENARIOS, QuadSwarmEnv, QuadSwarmVectorEnv
 from quad_swarm.evaluation.rows import write_rows
+from quad_swarm.jobs import Pool
 from quad_swarm.quadrotor import POSITION
 from quad_swarm.vehicles import VEHICLES
 from quad_swarm.world.scenarios import DoesNotFit
@@ -73,7 +76,9 @@ _FIELDS: dict[str, dict[str, Any]] = {
         "max_vertical_speed": _real(1e-3, 1e3), "workspace_low": _corner(-50, -1), "workspace_high": _corner(1, 50),
         "goal_weight": _real(0, 1e4), "input_weight": _real(1e-4, 1e4), "repulsion_weight": _real(0, 1e3),
         "right_of_way": _real(0, 2), "violation_weight": _real(1e-2, 1e6), "max_neighbours": _whole(1, 8),
-        "max_obstacles": _whole(1, 12), "downwash": _real(1, 20),
+        "max_obstacles": _whole(1, 12), "downwash": _real(1, 20), "max_descent_rate": _real(1e-6, 1e4),
+        "max_descent_speed": _real(1e-3, 1e3), "cruise_distance": _real(1e-2, 1e3), "commitment": _real(0, 1e4),
+        "commitment_fade": _real(0, 100), "disturbance_time": _real(1e-3, 1e4),
     },
     "space": {
         "half_width": _real(0.1, 1e4), "heights": _range(-1e4, 1e4), "spacing": _real(0, 5),
@@ -100,7 +105,7 @@ _FIELDS: dict[str, dict[str, Any]] = {
     "radio": {
         "loss": _real(0, 1), "delay": _whole(0, 30), "jitter": _whole(0, 10), "bursts": _real(0, 0.99),
         "burst_length": _real(1, 100), "outage": _real(0, 1), "range": _real(0.1, 100),
-        "half_distance": _real(0.1, 100), "path_loss_exponent": _real(1, 10),
+        "half_distance": _real(0.1, 100), "path_loss_exponent": _real(1, 10), "round_trip": _whole(0, 10),
     },
     "neighbourhood": {"max_others": _whole(1, 16), "range": _real(0.1, 100), "look_ahead": _real(0, 5)},
     "quadrotor": {
@@ -120,7 +125,8 @@ _VEHICLE: dict[str, Any] = {
         rng, _FIELDS["quadrotor"], 0.3
     ),
     "radius": _real(1e-2, 1), "max_tilt": _real(0.05, 1), "max_climb_rate": _real(0.1, 10), "max_speed": _real(0.1, 20),
-    "max_yaw_rate": _real(0, 10), "max_vertical_speed": _real(0.1, 10),
+    "max_yaw_rate": _real(0, 10), "max_vertical_speed": _real(0.1, 10), "max_descent_rate": _real(0.1, 10),
+    "max_descent_speed": _real(0.1, 10),
 }  # fmt: skip
 
 
@@ -148,6 +154,25 @@ def draw_world(seed: int, number: int) -> dict[str, Any]:
         "announcements": bool(rng.random() < 0.2),
         "world": {**world, **_some(rng, _PLAIN, float(rng.choice([0.0, 0.1, 0.3])))},
     }
+
+
+def draw_motion(rng: Rng, swarm: Any) -> dict[str, Any]:
+    """Return options of a reset, for two thirds of the flights: the flight that a swarm begins, in motion."""
+    config, n = swarm.config, swarm.config.n_robots
+    names = [name for name in ("initial_velocities", "initial_headings", "headings") if rng.random() < 0.3]
+    if not names or not config.flies_quadrotors:
+        return {}
+    fastest = config.per_robot(lambda kind: min(kind.planner.max_speed, 50.0))
+    options: dict[str, Any] = {"starts": swarm.pos[0].copy(), "goals": swarm.final_goal[0].copy()}
+    drawn = {
+        "initial_velocities": rng.uniform(-1, 1, (n, 3)) * fastest[:, None],
+        "initial_headings": rng.uniform(-7, 7, n),
+        "headings": rng.uniform(-7, 7, n),
+    }
+    options |= {name: drawn[name] for name in names}
+    if "headings" in names:  # robots that may not turn keep theirs
+        options["headings"] = np.where(config.turning, drawn["headings"], options.get("initial_headings", np.zeros(n)))
+    return options
 
 
 def _not_finite(where: str, value: Any) -> list[str]:
@@ -227,8 +252,9 @@ def fly(arguments: Mapping[str, Any], seed: int, steps: int = 20, resets: int = 
         for k in range(resets):
             alone.reset(seed=seed + 1000 + k)
         which = n_swarms - 1
-        seen, _ = batch.reset(seed=seed)
-        own, _ = alone.reset(seed=seed + which)
+        motion = draw_motion(rng, alone.task.swarm)
+        seen, _ = batch.reset(seed=seed, options={"swarms": {which: motion}})
+        own, _ = alone.reset(seed=seed + which, options=motion)
         wrong += _not_finite("observation", seen)
         for _ in range(steps):
             actions = rng.integers(0, 2, batch.action_space.shape)
@@ -277,22 +303,31 @@ def attempt(arguments: Mapping[str, Any], seed: int, steps: int = 20) -> tuple[s
     return ("wrong", wrong) if wrong else ("flown", [])
 
 
+def _numbered(number: int, seed: int, steps: int) -> tuple[dict[str, Any], str, list[str]]:
+    """Draw and fly a world, see `attempt`."""
+    arguments = draw_world(seed, number)
+    return arguments, *attempt(arguments, number, steps)
+
+
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     tally, wrong = Counter[str](), []
-    for k in tqdm(range(args.count), disable=not sys.stderr.isatty()):
-        arguments = draw_world(args.seed, k)
-        outcome, told = attempt(arguments, k, args.steps)
-        tally[outcome] += 1
-        if outcome == "wrong":
-            wrong.append({"world": k, "arguments": arguments, "errors": told})
-            print(f"world {k}: {arguments}\n  {told[0]}")
+    with Pool(args.jobs) as pool:
+        results = pool.map(functools.partial(_numbered, seed=args.seed, steps=args.steps), range(args.count))
+        for k, (arguments, outcome, told) in enumerate(
+            tqdm(results, total=args.count, disable=not sys.stderr.isatty())
+        ):
+            tally[outcome] += 1
+            if outcome == "wrong":
+                wrong.append({"world": k, "arguments": arguments, "errors": told})
+                print(f"world {k}: {arguments}\n  {told[0]}")
     print(f"{args.count} worlds: {tally['flown']} flown, {tally['refused']} refused, {len(wrong)} failures")
     if args.json:
         write_rows(args.json, [{"seed": args.seed, "steps": args.steps, **tally}, *wrong])
