@@ -124,6 +124,7 @@ def _page(about: dict[str, Any], config: SwarmConfig, dt: float, flights: Iterab
         "dt": dt,
         "plan_stride": _PLAN_STRIDE,
         "radius": config.radius,
+        **({} if config.excess is None else {"radii": config.radii.tolist()}),
         "goal_radius": config.goal_radius,
         "collision_distance": 2 * config.radius,
         **({"downwash": config.planner.downwash} if config.planner.downwash != 1 else {}),

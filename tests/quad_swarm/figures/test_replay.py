@@ -555,7 +555,7 @@ def test_recorded_flights_are_replayed(tmp_path, monkeypatch, capsys):
         assert "--policy" in capsys.readouterr().err
 
 
-def test_the_page_holds_obstacles_and_ellipsoids(tmp_path):
+def test_the_page_holds_obstacles_ellipsoids_and_radii(tmp_path):
     page = tmp_path / "replay.html"
     arguments = ["--preset", "flight", "--policy", "none", "--n-robots", "4", "--max-steps", "40", "--out", str(page)]
     assert main([*arguments, "--scenario", "crossing_traffic", "--world", "planner.downwash=2"]) == 0
@@ -579,6 +579,9 @@ def test_the_page_holds_obstacles_and_ellipsoids(tmp_path):
     plain = data_of(page.read_text())
     assert "downwash" not in plain
     assert set(data["flights"][0]) - set(plain["flights"][0]) == {"obstacles", "hitting", "obstacle_distance"}
+    assert "radii" not in plain
+    assert main([*arguments, "--scenario", "random", "--world", "vehicles=[{radius: 0.2}, {radius: 0.5}]"]) == 0
+    assert data_of(page.read_text())["radii"] == [0.2, 0.5, 0.2, 0.5]
 
 
 @pytest.mark.slow

@@ -5,6 +5,8 @@ export const flights = data.flights;
 export const nRobots = flights[0].goals.length;
 export const nPairs = nRobots * (nRobots - 1);
 export const contact = data.collision_distance;
+export const radii = data.radii ?? Array(nRobots).fill(data.radius); // m
+export const largest = Math.max(...radii);
 export const downwash = data.downwash ?? 1; // height over width of the ellipsoids that count as contact
 export let last = 0;
 
@@ -105,8 +107,8 @@ export function toSurface(p, obstacle, t) {
   return Math.hypot(p[0] - q[0], p[1] - q[1], dz) - obstacle.radius;
 }
 
-// m, where vertical parts count less with downwash
-export const apart = (p, q) => Math.hypot(p[0] - q[0], p[1] - q[1], (p[2] - q[2]) / downwash);
+// m, where vertical parts count less with downwash, and surfaces count as if all robots had the world's radius
+export const apart = (p, q, i, j) => Math.hypot(p[0] - q[0], p[1] - q[1], (p[2] - q[2]) / downwash) - (radii[i] + radii[j] - 2 * data.radius);
 
 export function attitude(flight, i, t) {
   const [k, next, s] = ends(t, flight.attitudes.length);

@@ -1,7 +1,7 @@
 // What belongs to each flight on the page: its view with counters, and its timeline and plots.
 
 import {
-  askedUntil, contact, counted, data, downwash, flights, fullName, grouped, hasArrived, hasCollided, metres, nPairs, nRobots, percent, possibleUntil, seconds, separationAt,
+  askedUntil, contact, counted, data, downwash, flights, fullName, grouped, hasArrived, hasCollided, largest, metres, nPairs, nRobots, percent, possibleUntil, radii, seconds, separationAt,
 } from "./data.js";
 import {drawRequests, drawSeparation, stepUnder, timeScale, top} from "./plots.js";
 import {drawTimeline, wordsAt} from "./timeline.js";
@@ -98,16 +98,18 @@ function set(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-const obstacles = flights.flatMap(flight => flight.obstacles);
+const alike = radii.every(radius => radius === data.radius), obstacles = flights.flatMap(flight => flight.obstacles);
 
 export const legend = [
   ["arc", "request: from the robot that asks to the one it asks; a light runs there and returns with the plan"],
   ...(flights.some(flight => flight.announces) ? [["arc announced", "announced plan, sent unasked: from the robot whose plan it is; a light runs there"]] : []),
   ["tube", `plan for the next ${seconds((flights[0].plans[0][0].length - 1) * data.plan_stride)}`],
   ["goal", "goal of the robot of this colour"],
-  ["bubble", `safety bubble, radius ${data.radius} m${downwash === 1 ? "" : `, ${downwash} times as high as wide`}: two that touch are a collision`],
-  ...(obstacles.length ? [["body", `obstacle${obstacles.some(one => one.moves) ? ", some fly straight on" : ""}: a robot closer than ${data.radius} m collides`]] : []),
-  ["bubble close", `closer than ${(1.1 * contact).toFixed(2)} m to another${obstacles.length ? `, or ${(data.radius + 0.1 * contact).toFixed(2)} m to an obstacle` : ""}`],
+  ["bubble", `safety bubble, radius ${alike ? data.radius : `${Math.min(...radii)} to ${largest}`} m${downwash === 1 ? "" : `, ${downwash} times as high as wide`}: two that touch are a collision`],
+  ...(obstacles.length ? [["body", `obstacle${obstacles.some(one => one.moves) ? ", some fly straight on" : ""}: a robot ${alike ? `closer than ${data.radius} m` : "whose bubble it touches"} collides`]] : []),
+  ["bubble close", alike
+    ? `closer than ${(1.1 * contact).toFixed(2)} m to another${obstacles.length ? `, or ${(data.radius + 0.1 * contact).toFixed(2)} m to an obstacle` : ""}`
+    : `bubble closer than ${(0.1 * contact).toFixed(2)} m to another${obstacles.length ? " or to an obstacle" : ""}`],
   ["bubble alarm", "collision"],
 ];
 
@@ -116,4 +118,5 @@ export const about = `${nRobots} quadrotors fly from where they start to the rin
   `${flights.length > 1 ? "All policies fly the same episode, synchronised. " : ""}A request is one robot asking another in one step.` +
   (flights.some(flight => flight.announces) ? " A plan is sent in answer to a request, or announced without one." : "") +
   (obstacles.length ? " All know the obstacles: where they are, how large, and how fast." : "") +
+  (alike ? "" : ` Distances between robots count from surface to surface, plus ${contact.toFixed(2)} m.`) +
   (downwash === 1 ? "" : ` They keep out of the air that others blow down: vertical parts of distances count 1 / ${downwash}.`);

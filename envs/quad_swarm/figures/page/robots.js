@@ -6,12 +6,12 @@ import {
   TorusGeometry,
 } from "three";
 import {mergeGeometries} from "three/addons/utils/BufferGeometryUtils.js";
-import {apart, attitude, colour, contact, data, downwash, nRobots, plan, position, touchingAt, toSurface} from "./data.js";
+import {apart, attitude, colour, contact, data, downwash, nRobots, plan, position, radii, touchingAt, toSurface} from "./data.js";
 import {Obstacles} from "./obstacles.js";
 import {Requests} from "./requests.js";
 import {Tubes} from "./tubes.js";
 
-export const LABEL_HEIGHT = data.radius + 0.12; // m above its robot
+export const labelHeight = i => radii[i] + 0.12; // m above its robot
 export const ALARM = "#e00000", WARNING = "#ffa000";
 const TRAIL = 2.5, TRAIL_POINTS = 32; // s behind a robot
 const SPIN = 41; // rad/s of a propeller as it is drawn: real ones would only flicker
@@ -95,6 +95,7 @@ export function inkOn(hex) {
 class Robot {
   constructor(i) {
     this.colour = new Color(colour(i));
+    this.height = labelHeight(i);
     this.group = new Group();
     this.body = new Group();
     const tinted = new MeshStandardMaterial({color: this.colour, vertexColors: true, roughness: 0.45, metalness: 0.1});
@@ -115,6 +116,7 @@ class Robot {
       ...bubbleShader, transparent: true, depthWrite: false,
       uniforms: {tint: {value: new Color()}, core: {value: 0}, rim: {value: 0}},
     }));
+    for (const part of [this.body, this.bubble]) part.scale.setScalar(radii[i] / data.radius);
     this.bubble.renderOrder = 2;
     this.label = new Sprite(new SpriteMaterial({
       map: textTexture(String(i), {colour: inkOn(colour(i)), background: colour(i)}), depthTest: false, sizeAttenuation: false, transparent: true,
@@ -144,7 +146,7 @@ class Robot {
     tint.value.set(state === "collision" ? ALARM : state === "close" ? WARNING : this.colour);
     core.value = state === "collision" ? 0.4 : state === "close" ? 0.1 : 0.05;
     rim.value = state === "collision" ? 0.95 : state === "close" ? 0.9 : dark ? 0.5 : 0.45;
-    this.label.position.z = LABEL_HEIGHT;
+    this.label.position.z = this.height;
     this.label.scale.set(labelSize, labelSize, 1);
   }
 }
@@ -173,8 +175,8 @@ export class Swarm {
     this.obstacles.update(now, dark);
     this.robots.forEach((robot, i) => {
       const p = positions[i];
-      const close = positions.some((q, j) => j !== i && apart(p, q) < 1.1 * contact)
-        || flight.obstacles.some(obstacle => toSurface(p, obstacle, now) - data.radius < 0.1 * contact);
+      const close = positions.some((q, j) => j !== i && apart(p, q, i, j) < 1.1 * contact)
+        || flight.obstacles.some(obstacle => toSurface(p, obstacle, now) - radii[i] < 0.1 * contact);
       const state = touching?.has(i) ? "collision" : close ? "close" : "free";
       robot.update(p, attitude(flight, i, now), spin, state, dark, labelSize);
       const ahead = plan(flight, i, now);

@@ -3,9 +3,9 @@
 import {
   AmbientLight, Color, DirectionalLight, HemisphereLight, PCFShadowMap, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
 } from "three";
-import {data, flights, position} from "./data.js";
+import {data, flights, largest, position} from "./data.js";
 import {Ground} from "./ground.js";
-import {LABEL_HEIGHT, Swarm} from "./robots.js";
+import {labelHeight, Swarm} from "./robots.js";
 import {isDark} from "./theme.js";
 
 const FOV = 32;
@@ -16,7 +16,7 @@ const PALETTES = {
 
 // What must be in the picture: starts, goals and paths. A robot that strays far after a collision may leave it.
 const ends = flights[0].positions[0].concat(flights[0].goals);
-const near = [0, 1, 2].map(k => [Math.min(...ends.map(p => p[k])) - 2 * data.radius, Math.max(...ends.map(p => p[k])) + 2 * data.radius]);
+const near = [0, 1, 2].map(k => [Math.min(...ends.map(p => p[k])) - 2 * largest, Math.max(...ends.map(p => p[k])) + 2 * largest]);
 const visited = flights.flatMap(flight => flight.positions.filter((_, k) => k % 3 === 0).flat().concat(flight.goals))
   .map(p => p.map((x, k) => k < 2 ? Math.min(Math.max(x, near[k][0]), near[k][1]) : x));
 // Of obstacles that stand, what is among the robots or beside them
@@ -28,8 +28,8 @@ for (const {moves, radius, positions: [[x, y]]} of flights.flatMap(flight => fli
 }
 visited.push(...feet);
 const bounds = {
-  low: [0, 1, 2].map(k => Math.min(...visited.map(p => p[k])) - data.radius),
-  high: [0, 1, 2].map(k => Math.max(...visited.map(p => p[k])) + data.radius),
+  low: [0, 1, 2].map(k => Math.min(...visited.map(p => p[k])) - largest),
+  high: [0, 1, 2].map(k => Math.max(...visited.map(p => p[k])) + largest),
 };
 const middle = new Vector3(...bounds.low.map((low, k) => (low + bounds.high[k]) / 2));
 
@@ -59,7 +59,7 @@ export function framed(preset, aspect, head) {
   for (let pass = 0; pass < 12; pass++) {
     let [west, east, south, north] = [Infinity, -Infinity, Infinity, -Infinity];
     for (const p of points) {
-      const depth = Math.max(distance - p.dot(away), 0.5), x = p.dot(right) - x0, y = p.dot(above) - y0, r = data.radius;
+      const depth = Math.max(distance - p.dot(away), 0.5), x = p.dot(right) - x0, y = p.dot(above) - y0, r = largest;
       west = Math.min(west, (x - r) / depth / wide); east = Math.max(east, (x + r) / depth / wide);
       south = Math.min(south, (y - r) / depth / tall); north = Math.max(north, (y + r) / depth / tall);
     }
@@ -152,7 +152,7 @@ export class Views {
     let best = null, nearest = 28;
     this.scenes[view].swarm.positions.forEach((p, i) => {
       // Its body, or its number
-      for (const above of [0, LABEL_HEIGHT]) {
+      for (const above of [0, labelHeight(i)]) {
         const at = new Vector3(p[0], p[1], p[2] + above).project(camera);
         const away = Math.hypot((at.x + 1) / 2 * rect.width - x, (1 - at.y) / 2 * rect.height - y);
         if (at.z < 1 && away < nearest) [best, nearest] = [i, away];
