@@ -337,7 +337,7 @@ def too_short(config: SwarmConfig, max_steps: int) -> Iterator[str]:
         return
     planner, space = config.planner, config.space
     speeds = np.array([_speeds(kind) for kind in config.kinds])
-    speed, climb = (max(found.min(), _TINIEST) for found in (speeds[:, :2], speeds[:, 2:]))
+    speed, climb = (max(float(found.min()), _TINIEST) for found in (speeds[:, :2], speeds[:, 2:]))
     needed = max(
         1.5 * (_usual_flight(config) - config.goal_radius) / speed,
         (2 / 3 * (space.heights[1] - space.heights[0]) - config.goal_radius) / climb,
