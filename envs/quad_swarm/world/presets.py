@@ -560,6 +560,13 @@ PRESETS: dict[str, SwarmConfig] = {
         space=_SMALL_ROOM,
     ),
     "flight": _FLIGHT,
+    # Version 2 of `flight`: answers take the time that they need, and count when they come; robots hold against wind and
+    # payloads, and keep to the plans that they sent. See docs/flight.md for what each of these is worth.
+    "flight-v2": replace(
+        _FLIGHT,
+        planner=replace(_FLIGHT.planner, disturbance_time=1.0, commitment=1.0),
+        radio=Radio(loss=0.1, round_trip=0, jitter=1),
+    ),
     # The same team without motion capture and in more wind: errors two to four times as large, interrupted links, and
     # robots that stop answering.
     "flight-hard": replace(

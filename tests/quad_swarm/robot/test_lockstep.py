@@ -80,6 +80,8 @@ def differences(config, policies, rule, scenario, model=None, steps=60, episode=
         ("paper", 4, "random"),
         ("flight-hard", 3, "symmetric_swap"),
         ("flight", 3, "crossing_traffic"),
+        ("flight-v2", 3, "symmetric_swap"),
+        ("flight-v2", 3, "forest"),
         ("flight-hard", 4, "tour"),
         ("flight", 3, "moving_goals"),
     ],
@@ -154,7 +156,7 @@ def test_robots_that_start_in_flight_and_turn_fly_as_the_swarm(world):
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS)
 @pytest.mark.parametrize("n", [2, 4, 8])
-@pytest.mark.parametrize("preset", ["paper", "flight", "flight-hard"])
+@pytest.mark.parametrize("preset", ["paper", "flight", "flight-v2", "flight-hard"])
 def test_robots_with_rules_fly_as_the_swarm_anywhere(preset, n, scenario):
     config = make_config(preset, n_robots=n)
     for rule in RULES:
@@ -193,7 +195,7 @@ def test_robots_fly_as_the_swarm_in_changed_worlds(world):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["paper", "flight", "flight-hard"])
+@pytest.mark.parametrize("preset", ["paper", "flight", "flight-v2", "flight-hard"])
 @pytest.mark.parametrize("n", [2, 4, 8])
 def test_robots_with_a_learned_policy_fly_as_the_swarm(preset, n, tmp_path):
     pytest.importorskip("onnxruntime")
