@@ -14,6 +14,7 @@ from quad_swarm.planner.base import Planner, Plans, PlanStatus, Solution, Solver
 from quad_swarm.planner.cost import PlanCost
 from quad_swarm.planner.fatrop import FatropSolver
 from quad_swarm.planner.model import ProblemModel, model_of, same_dynamics
+from quad_swarm.planner.orca import OrcaSolver, ReciprocalVelocities
 from quad_swarm.planner.problem import PROBLEMS, OptimalControlProblem, PlannerConfig, Problems, make_problem
 from quad_swarm.planner.rti import RtiSolver
 from quad_swarm.quadrotor import QuadrotorParams
@@ -21,8 +22,9 @@ from quad_swarm.registry import Registry
 
 # Name -> what creates the solver of a problem: its class, or a function
 SOLVERS: Registry[Callable[[OptimalControlProblem], Solver]] = Registry(
-    "solver", "quad_swarm.solvers", {"rti": RtiSolver, "fatrop": FatropSolver}
+    "solver", "quad_swarm.solvers", {"rti": RtiSolver, "fatrop": FatropSolver, "orca": OrcaSolver}
 )
+PROBLEMS |= {"orca": ReciprocalVelocities}
 
 
 def make_planner(
@@ -64,7 +66,10 @@ def make_planner(
 
 
 def _make_solver(problem: OptimalControlProblem, name: str) -> Solver:
-    chosen = "rti" if name == "auto" else name
+    only = problem.solver
+    if only is not None and name not in ("auto", only):
+        raise ValueError(f"solver={name!r}: planner.problem={problem.config.problem!r} is for solver={only!r} only.")
+    chosen = only or "rti" if name == "auto" else name
     solver = SOLVERS.find(chosen)(problem)
     has_solve = callable(getattr(solver, "solve", None)) and not isinstance(solver, type)
     if not has_solve or not isinstance(getattr(solver, "name", None), str):
@@ -101,6 +106,7 @@ __all__ = [
     "BuildError",
     "FatropSolver",
     "OptimalControlProblem",
+    "OrcaSolver",
     "PlanCost",
     "PlanStatus",
     "Planner",
