@@ -17,6 +17,7 @@ from quad_swarm.planner.model import ProblemModel, model_of, same_dynamics
 from quad_swarm.planner.orca import OrcaSolver, ReciprocalVelocities
 from quad_swarm.planner.problem import PROBLEMS, OptimalControlProblem, PlannerConfig, Problems, make_problem
 from quad_swarm.planner.rti import RtiSolver
+from quad_swarm.planner.voronoi import VoronoiCells
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.registry import Registry
 
@@ -24,7 +25,7 @@ from quad_swarm.registry import Registry
 SOLVERS: Registry[Callable[[OptimalControlProblem], Solver]] = Registry(
     "solver", "quad_swarm.solvers", {"rti": RtiSolver, "fatrop": FatropSolver, "orca": OrcaSolver}
 )
-PROBLEMS |= {"orca": ReciprocalVelocities}
+PROBLEMS |= {"orca": ReciprocalVelocities, "voronoi": VoronoiCells}
 
 
 def make_planner(
@@ -62,6 +63,8 @@ def make_planner(
     limit = None if n_bodies == n_robots - 1 + n_obstacles else n_bodies
     planner = Planner(_make_solver(problem, solver), model_of(problem), config, limit)
     planner.rate = PlanCost(problem) if costs else None
+    if type(problem).prepare is not OptimalControlProblem.prepare:
+        planner.prepare = problem.prepare
     return planner
 
 

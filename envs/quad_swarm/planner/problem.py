@@ -295,6 +295,11 @@ class OptimalControlProblem:
         Inputs beyond their limits are clipped."""
         return ca.SX.zeros(self.nu)
 
+    def prepare(self, problems: Problems) -> Problems:
+        """Return what solvers and costs see of problems with as many bodies as this one considers: the problems
+        themselves, unless a subclass restates where the bodies or the goals are. `right_of_way` is then its matter."""
+        return problems
+
     def start(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return the states in which vehicles begin to fly, (n, 9): at rest. Vehicles that cannot rest begin in motion.
 
