@@ -120,6 +120,7 @@ __all__ = [
     "RtiSolver",
     "Solution",
     "Solver",
+    "VoronoiCells",
     "make_planner",
     "make_problem",
     "model_of",

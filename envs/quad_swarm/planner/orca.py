@@ -24,7 +24,7 @@ from quad_swarm.planner.projection import project
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
 
 _SMALL = 1e-9  # length of vectors without a direction (m or m/s)
-_HARD = 1e4  # weight of the largest violation of half-spaces, squared, over a squared change of velocity
+_HARD = 1e6  # weight of the largest violation of half-spaces, squared, over a squared change of velocity
 _TURNING = 2.0  # rate at which robots turn to their heading (1/s)
 
 
@@ -90,8 +90,7 @@ class OrcaSolver:
         """See `Solver.solve`. Neither guess is used."""
         velocity, iterations = self.velocities(problems)
         x, u = self._track(problems, velocity)
-        success = np.isfinite(x).all(axis=(1, 2)) & np.isfinite(u).all(axis=(1, 2))
-        return Solution(x, u, success, iterations)
+        return Solution(x, u, np.isfinite(velocity).all(axis=1), iterations)
 
     def velocities(self, problems: Problems) -> tuple[np.ndarray, np.ndarray]:
         """Choose velocities, (B, 3), world frame (m/s). Returns them with the number of iterations of each, (B,)."""
@@ -158,12 +157,12 @@ class OrcaSolver:
                 self._rollout = RowFunction(function)
             except BuildError:
                 self._rollout = function
-        if isinstance(self._rollout, RowFunction):
-            flat = self._rollout(count, arguments)
-        else:
+        if isinstance(self._rollout, ca.Function):
             zeros = [np.zeros((count, self._rollout.numel_in(k))) for k in range(4)]
             given = [zero if one is None else one for zero, one in zip(zeros, arguments, strict=True)]
             flat = self._rollout(*(one.T for one in given)).full().T
+        else:
+            flat = self._rollout(count, arguments)
         flown = flat.reshape(count, stages, problem.nx + problem.nu)
         x, u = np.zeros((count, stages + 1, N_STATES)), np.zeros((count, stages, N_INPUTS))
         x[:, 0] = problems.x
