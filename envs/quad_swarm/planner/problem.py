@@ -61,7 +61,8 @@ class PlannerConfig:
         others and obstacles together that its last plan comes closest to
     :param downwash: height over width of the ellipsoid around another robot that robots keep out of, because of the air
         that rotors blow down (-); 1 for spheres
-    :param problem: a name of `PROBLEMS`: the dynamics that are planned, and flown with ``plant="model"``, and the cost
+    :param problem: a name of `PROBLEMS`: the dynamics that are planned, and flown with ``plant="model"``, and the cost;
+        "orca" and "voronoi" avoid others in ways that need no messages
     :param cruise_distance: distance (m) beyond which a goal counts as if it were this far away, in its direction, so
         that robots fly to goals at any distance at the same speed; None for goals as they are, see
         `quad_swarm.planner.Planner`

@@ -23,7 +23,8 @@ def project(points: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tup
     :param points: B points, (B, d)
     :param normals: normals of K half-spaces of each, about as long as 1, (B, K, d)
     :param offsets: the half-spaces are ``normals @ x >= offsets``, (B, K)
-    :return: the nearest points, (B, d), NaN where a number of the problem is not finite, and the number of iterations of each, (B,) int
+    :return: the nearest points, (B, d), NaN where a number of the problem is not finite, and the number of iterations
+        of each, (B,) int
     """
     count, n_spaces, dimension = normals.shape
     nearest, iterations = points.copy(), np.zeros(count, dtype=np.int64)

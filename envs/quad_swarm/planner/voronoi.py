@@ -32,12 +32,13 @@ class VoronoiCells(OptimalControlProblem):
     weight of other violations.
 
     Robots that are where their cell ends in the direction of their goal would wait there for each other forever. They
-    make a detour to the right (the paper's Sec. IV-D): as long as they are there, their goal seems to be there.
+    make a detour to the right, as in the paper: as long as they are there, their goal seems to be to their right.
 
     :cvar buffer: what is added to half of the separation (m), for vehicles that cannot stop at once
     :cvar rest: weight of the squared velocity at the end of the horizon (s^2/m^2), so that plans end in their cell
         because they stop there
-    :cvar detours: whether robots make detours
+    :cvar detour: how far to the right the goals of robots that are stuck seem to be (m); 0 for no detours
+    :cvar stuck: distance to the point of the cell that is nearest to the goal, within which robots are stuck (m)
     """
 
     buffer: ClassVar[float] = 0.05
@@ -76,8 +77,7 @@ class VoronoiCells(OptimalControlProblem):
         # Two robots in one place are apart along an axis, whatever others do
         normals = np.where((distance > _SMALL)[..., None], between, [1.0, 0.0, 0.0])
         normals /= np.maximum(length(normals), _SMALL)[..., None]
-        # The plane of a robot is where it would be if the robot were a separation away from half of the distance, less
-        # half of that
+        # Solvers keep points a separation away from a plane, while cells end half a separation before the middle
         shift = np.where(robots, (distance - config.separation) / 2 + self.buffer, self.buffer)
         normals *= factors
         squared = np.maximum(dot(normals, normals), _SMALL**2)
@@ -89,7 +89,8 @@ class VoronoiCells(OptimalControlProblem):
     def _detoured(self, cells: Problems) -> Problems:
         """Return the problems with the goals of robots that are stuck to their right."""
         config, position, goal = self.config, cells.x[:, POSITION], cells.goal
-        assert cells.shape is not None and cells.size is not None
+        assert cells.shape is not None
+        assert cells.size is not None
         kept = config.separation + cells.size
         if cells.clearance is not None:
             kept = kept + cells.clearance[..., 0]
