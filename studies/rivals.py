@@ -3,7 +3,7 @@
 ``python -m studies.rivals [--json F]`` flies 100 episodes of eight robots in each of two presets and three scenarios.
 ``python -m studies.rivals --choose orca voronoi [--json F]`` flies the grids from which the parameters of both were
 chosen, on another set of episodes: most episodes in which all arrive without a collision before the preset's time
-limit, and of those that are equal the shortest time to arrival. The four best points then fly four times as many.
+limit, and of those that are equal the shortest time to arrival.
 
 Whoever has not arrived after `LIMIT` seconds without a collision is deadlocked. JSON: one row per preset, scenario and
 swarm with what `quad_swarm.evaluation.summarise` returns, ``in_time`` (arrived before the preset's time limit) and
@@ -50,7 +50,6 @@ GRIDS: dict[str, list[dict[str, tuple[float, ...]]]] = {
         {"detour": (0.0, 1.0, 2.0), "stuck": (0.3, 0.6)},
     ],
 }
-FINALISTS = 4
 FIRST = {"orca": {"speed": 3.0, "settling": 0.6}, "voronoi": {}}  # what a first grid holds fixed
 
 
@@ -78,23 +77,19 @@ def fly(
 
 
 def choose(kind: str, episodes: int) -> Iterator[dict[str, Any]]:
-    """Fly the grids of a kind, each around the best point of those before, and the best points of all again in four
-    times as many episodes. Yields a row for each point."""
+    """Fly the grids of a kind, each around the best point of those before. Yields a row for each point."""
     best: dict[str, Any] = dict(FIRST[kind])
-    flown: list[dict[str, Any]] = []
     for grid in GRIDS[kind]:
         rows = []
         for values in itertools.product(*grid.values()):
             point = best | dict(zip(grid, values, strict=True))
             rows.append(_fly_point(kind, point, episodes))
             yield rows[-1]
-        best = max(rows, key=_merit)["parameters"]
-        flown += rows
-    for row in sorted(flown, key=_merit, reverse=True)[:FINALISTS]:
-        yield _fly_point(kind, row["parameters"], 4 * episodes)
+        best = max(rows, key=merit)["parameters"]
 
 
-def _merit(row: dict[str, Any]) -> tuple[float, float]:
+def merit(row: dict[str, Any]) -> tuple[float, float]:
+    """Return what is compared of two points: the larger one is better."""
     return row["in_time"], -row["seconds"]
 
 
@@ -126,9 +121,10 @@ def _fly_point(kind: str, parameters: dict[str, Any], episodes: int) -> dict[str
     }
 
 
-def measure(episodes: int) -> Iterator[dict[str, Any]]:
-    """Fly all swarms. Yields a row for each preset, scenario and swarm."""
-    for name, (policy, problem, seconds) in SWARMS.items():
+def measure(swarms: list[str], episodes: int) -> Iterator[dict[str, Any]]:
+    """Fly some of `SWARMS`. Yields a row for each preset, scenario and swarm."""
+    for name in swarms:
+        policy, problem, seconds = SWARMS[name]
         for condition, rows in fly(policy, problem, seconds, episodes, MEASURED, LIMIT).items():
             config = condition.config
             preset = next(one for one in WORLDS if PRESETS[one].planner.dt == config.planner.dt)
@@ -165,6 +161,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--choose", nargs="+", choices=GRIDS, default=[], help="fly the grids of these instead")
+    parser.add_argument("--swarm", nargs="+", choices=SWARMS, default=list(SWARMS), help="fly these only")
     parser.add_argument("--episodes", type=int, help="per preset and scenario (default 100, of the grids 24)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows")
     args = parser.parse_args()
@@ -178,7 +175,7 @@ def main() -> None:
             )
             rows.append(row)
     if not args.choose:
-        rows = list(measure(args.episodes or 100))
+        rows = list(measure(args.swarm, args.episodes or 100))
         print(table(rows))
     if args.json is not None:
         write_rows(args.json, rows)

@@ -44,7 +44,7 @@ class OrcaSolver:
     If the half-spaces leave no velocity in it, the largest violation is made as small as possible.
 
     Vehicles do not have their new velocity at once, as the paper's do. Therefore bodies are larger by ``margin``, and
-    robots slow down before their goal so that they can stop there.
+    robots slow down before their goal so that they can stop there. The defaults are those of `studies.rivals`.
 
     :param problem: the problem, whose cost is not used
     :param horizon: time for which robots avoid others, the paper's tau (s)
@@ -61,11 +61,11 @@ class OrcaSolver:
     def __init__(
         self,
         problem: OptimalControlProblem,
-        horizon: float = 2.0,
-        margin: float = 0.1,
-        speed: float = 2.0,
-        settling: float = 0.6,
-        bandwidth: float = 4.0,
+        horizon: float = 1.0,
+        margin: float = 0.15,
+        speed: float = 4.0,
+        settling: float = 0.4,
+        bandwidth: float = 8.0,
     ):
         numbers = {"horizon": horizon, "speed": speed, "settling": settling, "bandwidth": bandwidth}
         for name, value in numbers.items():

@@ -3,9 +3,8 @@
 Every robot's plan stays in its own cell: the points that are nearer to it than to any other robot, less a buffer. The
 cells of two robots that have the same positions in mind do not overlap, so nobody needs to know where others fly.
 Source: Zhou, Wang, Bandyopadhyay and Schwager, "Fast, on-line collision avoidance for dynamic vehicles using buffered
-Voronoi cells", IEEE Robotics and Automation Letters, 2017; among obstacles as in Zhu and Alonso-Mora, "B-UAVC: buffered
-uncertainty-aware Voronoi cells for probabilistic multi-robot collision avoidance", International Symposium on
-Multi-Robot and Multi-Agent Systems, 2019.
+Voronoi cells", IEEE Robotics and Automation Letters, 2017; among obstacles as in Zhu, Brito and Alonso-Mora, "Decentralized
+probabilistic multi-robot collision avoidance using buffered uncertainty-aware Voronoi cells", Autonomous Robots, 2022.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ class VoronoiCells(OptimalControlProblem):
     :cvar stuck: distance to the point of the cell that is nearest to the goal, within which robots are stuck (m)
     """
 
-    buffer: ClassVar[float] = 0.05
-    rest: ClassVar[float] = 0.2
-    detour: ClassVar[float] = 1.0
-    stuck: ClassVar[float] = 0.1
+    buffer: ClassVar[float] = 0.0
+    rest: ClassVar[float] = 0.05
+    detour: ClassVar[float] = 2.0
+    stuck: ClassVar[float] = 0.6
 
     def __init__(self, config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int, shaped: bool = False):
         super().__init__(config, quadrotor, n_others, True)  # a half-space has a shape: its normal
