@@ -46,8 +46,7 @@ GRIDS: dict[str, list[dict[str, tuple[float, ...]]]] = {
         {"speed": (2.0, 3.0, 4.0), "settling": (0.4, 0.6)},
     ],
     "voronoi": [
-        {"seconds": (0.6, 0.7, 0.8), "buffer": (0.0, 0.05), "rest": (0.0, 0.05), "detour": (2.0,), "stuck": (0.6,)},
-        {"detour": (0.0, 1.0, 2.0), "stuck": (0.3, 0.6)},
+        {"seconds": (0.6, 0.7), "buffer": (0.0, 0.05), "rest": (0.0, 0.05), "detour": (2.0,), "stuck": (0.6,)},
     ],
 }
 FIRST = {"orca": {"speed": 3.0, "settling": 0.6}, "voronoi": {}}  # what a first grid holds fixed
@@ -117,7 +116,7 @@ def _fly_point(kind: str, parameters: dict[str, Any], episodes: int) -> dict[str
         "episodes": sum(map(len, flown.values())),
         "in_time": len(times),
         "collisions": int(sum(row["collided"] for rows in flown.values() for row in rows)),
-        "seconds": float(np.mean(times)) if times else float("inf"),
+        "seconds": round(float(np.mean(times)), 2) if times else float("inf"),
     }
 
 

@@ -3,8 +3,9 @@
 Every robot's plan stays in its own cell: the points that are nearer to it than to any other robot, less a buffer. The
 cells of two robots that have the same positions in mind do not overlap, so nobody needs to know where others fly.
 Source: Zhou, Wang, Bandyopadhyay and Schwager, "Fast, on-line collision avoidance for dynamic vehicles using buffered
-Voronoi cells", IEEE Robotics and Automation Letters, 2017; among obstacles as in Zhu, Brito and Alonso-Mora, "Decentralized
-probabilistic multi-robot collision avoidance using buffered uncertainty-aware Voronoi cells", Autonomous Robots, 2022.
+Voronoi cells", IEEE Robotics and Automation Letters, 2017; among obstacles as in Zhu, Brito and Alonso-Mora,
+"Decentralized probabilistic multi-robot collision avoidance using buffered uncertainty-aware Voronoi cells", Autonomous
+Robots, 2022.
 """
 
 from __future__ import annotations
