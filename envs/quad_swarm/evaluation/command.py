@@ -24,7 +24,7 @@ from quad_swarm.evaluation.rows import STDOUT, aligned, check_writable, write_cs
 from quad_swarm.jobs import ENGINES
 from quad_swarm.jobs.journal import default_folder
 from quad_swarm.parsing import Parser
-from quad_swarm.planner import SOLVERS, BuildError
+from quad_swarm.planner import PROBLEMS, SOLVERS, BuildError
 from quad_swarm.plants.base import MODEL, PlantError, simulated_vehicles
 from quad_swarm.task.rules import RULES
 from quad_swarm.validation import read_assignments
@@ -184,7 +184,7 @@ def add_policy_arguments(parser: argparse.ArgumentParser, required: bool = True)
         action="extend",
         default=[],
         metavar="NAME=VALUE",
-        help=f"fields of the preset, e.g. noise.wind=1: {names}",
+        help=f"fields of the preset, e.g. noise.wind=1 or planner.problem=NAME ({', '.join(PROBLEMS)}): {names}",
     )
     simulated = ", ".join(simulated_vehicles())
     parser.add_argument("--plant", help=f"simulated vehicle: {MODEL} (default), or one of a simulator ({simulated})")

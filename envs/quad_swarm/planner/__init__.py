@@ -15,15 +15,18 @@ from quad_swarm.planner.cost import PlanCost
 from quad_swarm.planner.fatrop import FatropSolver
 from quad_swarm.planner.mixed import MixedPlanner
 from quad_swarm.planner.model import ProblemModel, model_of, same_dynamics
+from quad_swarm.planner.orca import OrcaSolver, ReciprocalVelocities
 from quad_swarm.planner.problem import PROBLEMS, OptimalControlProblem, PlannerConfig, Problems, make_problem
 from quad_swarm.planner.rti import RtiSolver
+from quad_swarm.planner.voronoi import VoronoiCells
 from quad_swarm.quadrotor import QuadrotorParams
 from quad_swarm.registry import Registry
 
 # Name -> what creates the solver of a problem: its class, or a function
 SOLVERS: Registry[Callable[[OptimalControlProblem], Solver]] = Registry(
-    "solver", "quad_swarm.solvers", {"rti": RtiSolver, "fatrop": FatropSolver}
+    "solver", "quad_swarm.solvers", {"rti": RtiSolver, "fatrop": FatropSolver, "orca": OrcaSolver}
 )
+PROBLEMS |= {"orca": ReciprocalVelocities, "voronoi": VoronoiCells}
 
 
 def make_planner(
@@ -63,11 +66,16 @@ def make_planner(
     limit = None if n_bodies == n_robots - 1 + n_obstacles else n_bodies
     planner = Planner(_make_solver(problem, solver), model_of(problem), config, limit)
     planner.rate = PlanCost(problem) if costs else None
+    if type(problem).prepare is not OptimalControlProblem.prepare:
+        planner.prepare = problem.prepare
     return planner
 
 
 def _make_solver(problem: OptimalControlProblem, name: str) -> Solver:
-    chosen = "rti" if name == "auto" else name
+    only = problem.solver
+    if only is not None and name not in ("auto", only):
+        raise ValueError(f"solver={name!r}: planner.problem={problem.config.problem!r} is for solver={only!r} only.")
+    chosen = only or "rti" if name == "auto" else name
     solver = SOLVERS.find(chosen)(problem)
     has_solve = callable(getattr(solver, "solve", None)) and not isinstance(solver, type)
     if not has_solve or not isinstance(getattr(solver, "name", None), str):
@@ -105,6 +113,7 @@ __all__ = [
     "FatropSolver",
     "MixedPlanner",
     "OptimalControlProblem",
+    "OrcaSolver",
     "PlanCost",
     "PlanStatus",
     "Planner",
@@ -115,6 +124,7 @@ __all__ = [
     "RtiSolver",
     "Solution",
     "Solver",
+    "VoronoiCells",
     "make_planner",
     "make_problem",
     "model_of",

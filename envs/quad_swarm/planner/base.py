@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
 
@@ -121,6 +122,7 @@ class Planner:
 
     :ivar rate: what computes the costs of plans after each call, see `PlanCost`; None for nothing
     :ivar costs: these costs, (B,)
+    :ivar prepare: what restates problems before they are solved, see `OptimalControlProblem.prepare`; None for nothing
     :ivar checks: whether `plan` refuses invalid arrays; otherwise, problems whose numbers are not finite fail and
         brake, as in the steps of swarms, which never raise
 
@@ -138,6 +140,7 @@ class Planner:
         self.n_others = n_others
         self.checks = True
         self.rate: PlanCost | None = None
+        self.prepare: Callable[[Problems], Problems] | None = None
         self.costs: np.ndarray | None = None
 
     def plan(self, problems: Problems, previous: Plans) -> Plans:
@@ -253,7 +256,9 @@ class Planner:
         """Do the same with roll and pitch about the world's axes, whatever the yaw."""
         x_guess, u_guess = shift(previous.x), shift(previous.u)
         problems = self._nearest_others(problems, x_guess)
-        if self.config.right_of_way:
+        if self.prepare is not None:
+            problems = self.prepare(problems)
+        elif self.config.right_of_way:
             problems = keep_right(problems, self.config.right_of_way, self.config.dt)
         x, u, success, iterations = self._solve(problems, x_guess, u_guess)
         age = np.zeros(len(success), dtype=np.int64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -61,7 +61,8 @@ class PlannerConfig:
         others and obstacles together that its last plan comes closest to
     :param downwash: height over width of the ellipsoid around another robot that robots keep out of, because of the air
         that rotors blow down (-); 1 for spheres
-    :param problem: a name of `PROBLEMS`: the dynamics that are planned, and flown with ``plant="model"``, and the cost
+    :param problem: a name of `PROBLEMS`: the dynamics that are planned, and flown with ``plant="model"``, and the cost;
+        "orca" and "voronoi" avoid others in ways that need no messages
     :param cruise_distance: distance (m) beyond which a goal counts as if it were this far away, in its direction, so
         that robots fly to goals at any distance at the same speed; None for goals as they are, see
         `quad_swarm.planner.Planner`
@@ -183,6 +184,24 @@ class Problems(NamedTuple):
         """Return some of the problems, selected by anything that indexes an array."""
         return Problems._make(None if array is None else array[which] for array in self)
 
+    def present(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the bodies are believed to be at stage 0, (B, m, 3), and their velocities, (B, m, 3), those
+        between the first two stages."""
+        first = self.others[:, :, 0]
+        moved = self.others[:, :, 1] - first
+        return first - moved, moved / dt
+
+    def robots(self, downwash: float) -> np.ndarray:
+        """Return which bodies are robots, which avoid others, too: those of a robot's shape and size, (B, m) bool. What
+        is added to the size of obstacles makes theirs another one, unless their radius happens to be such.
+
+        :param downwash: that of the planner
+        """
+        found = np.ones(self.others.shape[:2], dtype=bool)
+        if self.shape is not None:
+            found &= (self.shape == [1.0, 1.0, 1.0 / downwash]).all(axis=-1)
+        return found if self.size is None else found & (self.size == 0)
+
     def chosen(self, bodies: np.ndarray) -> Problems:
         """Return the problems with some of the bodies only, whose indices are (B, k)."""
         rows, about = np.arange(len(bodies))[:, None], ("others", "clearance", "announced", "shape", "size")
@@ -200,6 +219,7 @@ class OptimalControlProblem:
     and the next three the velocity, world frame (m, m/s), since robots perceive these of each other. Inputs are limited
     to plus or minus ``max_input``.
 
+    :cvar solver: name of the only solver that the problem is for; None for all
     :ivar nx: number of states that the problem has, at most 9; the others are 0
     :ivar nu: number of inputs that the problem has, at most 4; the others are 0
     :ivar max_input: limits of the inputs, (nu,)
@@ -210,6 +230,8 @@ class OptimalControlProblem:
     :param shaped: whether they may have shapes and sizes, see `Problems`; otherwise, all are spheres of a robot's size
     :raises ValueError: if the planner does not fit the vehicle, see `check_vehicle`
     """
+
+    solver: ClassVar[str | None] = None
 
     def __init__(self, config: PlannerConfig, quadrotor: QuadrotorParams, n_others: int, shaped: bool = False):
         if not self.has_own_dynamics():
@@ -273,6 +295,11 @@ class OptimalControlProblem:
         longer than a horizon, as a function of its state: 0. Quadrotors brake to hover, see `Planner.braking_inputs`.
         Inputs beyond their limits are clipped."""
         return ca.SX.zeros(self.nu)
+
+    def prepare(self, problems: Problems) -> Problems:
+        """Return what solvers and costs see of problems with as many bodies as this one considers: the problems
+        themselves, unless a subclass restates where the bodies or the goals are. `right_of_way` is then its matter."""
+        return problems
 
     def start(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return the states in which vehicles begin to fly, (n, 9): at rest. Vehicles that cannot rest begin in motion.

@@ -170,7 +170,9 @@ def test_what_is_no_problem_is_refused(entry, monkeypatch):
 
 @pytest.mark.parametrize("name", ["quadrotr", "", "boats"])
 def test_unknown_problems_are_refused(name):
-    with pytest.raises(ValueError, match=r"Unknown problem .*; known: boat, drifter, quadrotor, stepper, thrifty"):
+    with pytest.raises(
+        ValueError, match=r"Unknown problem .*; known: boat, drifter, orca, quadrotor, stepper, thrifty, voronoi"
+    ):
         make_planner(config(name), QUADROTOR, 2)
 
 

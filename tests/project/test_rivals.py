@@ -1,0 +1,47 @@
+"""The study of swarms that send no messages: what docs/planner.md says about it."""
+
+import json
+from pathlib import Path
+
+from quad_swarm.planner import PROBLEMS, SOLVERS, OrcaSolver, PlannerConfig, VoronoiCells, make_problem
+from quad_swarm.quadrotor import QuadrotorParams
+from studies import rivals
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "studies" / "data"
+
+
+def recorded(name: str) -> list[dict]:
+    return json.loads((DATA / name).read_text())
+
+
+def test_the_page_has_the_recorded_table():
+    page = (ROOT / "docs" / "planner.md").read_text()
+    rows = recorded("rivals.json")
+    assert len(rows) == 24
+    for row in rows:
+        interval = f"{100 * row['collision_low']:.1f} to {100 * row['collision_high']:.1f} %"
+        cells = [row["scenario"], row["swarm"], f"{row['collisions']} ({interval})", row["in_time"], row["deadlocks"]]
+        seconds = "-" if row["steps_to_arrival"] is None else f"{row['steps_to_arrival'] * row['dt']:.1f}"
+        line = " | ".join(map(str, [*cells, seconds]))
+        assert f"| `{row['preset']}` | {line} |" in page
+
+
+def test_defaults_are_the_points_that_won():
+    rows = recorded("rivals_choice.json")
+    orca, cells = (max((row for row in rows if row["kind"] == kind), key=rivals.merit) for kind in rivals.GRIDS)
+    solver = OrcaSolver(make_problem(PlannerConfig(), QuadrotorParams(), 1))
+    assert {name: getattr(solver, name) for name in orca["parameters"]} == orca["parameters"]
+    values = dict(cells["parameters"])
+    assert values.pop("seconds") == rivals.SWARMS["Voronoi cells"][2]
+    assert {name: getattr(VoronoiCells, name) for name in values} == values
+
+
+def test_points_of_a_grid_fly_with_their_parameters_alone(monkeypatch):
+    monkeypatch.setattr(rivals, "WORLDS", ("paper",))
+    monkeypatch.setattr(rivals, "SCENARIOS", ("symmetric_swap",))
+    monkeypatch.setattr(rivals, "N_ROBOTS", 3)
+    slow, fast = (rivals._fly_point("orca", {"speed": speed}, 2) for speed in (1.0, 3.0))
+    assert slow["seconds"] > fast["seconds"]
+    assert (fast["episodes"], fast["in_time"], fast["collisions"]) == (2, 2, 0)
+    assert (SOLVERS["orca"], PROBLEMS["voronoi"]) == (OrcaSolver, VoronoiCells)
