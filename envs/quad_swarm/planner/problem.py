@@ -193,7 +193,8 @@ class Problems(NamedTuple):
 
     def robots(self, downwash: float) -> np.ndarray:
         """Return which bodies are robots, which avoid others, too: those of a robot's shape and size, (B, m) bool. What
-        is added to the size of obstacles makes theirs another one, unless their radius happens to be such.
+        is added to the size of obstacles makes theirs another one, unless their radius happens to be such. In teams of
+        unlike radii, robots of another size count as obstacles, so that both do all of what it takes.
 
         :param downwash: that of the planner
         """

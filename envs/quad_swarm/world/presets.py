@@ -560,8 +560,8 @@ PRESETS: dict[str, SwarmConfig] = {
         space=_SMALL_ROOM,
     ),
     "flight": _FLIGHT,
-    # Version 2 of `flight`: answers take the time that they need, and count when they come; robots hold against wind and
-    # payloads, and keep to the plans that they sent. See docs/flight.md for what each of these is worth.
+    # Version 2 of `flight`: answers count when they come, and robots hold against wind and payloads and keep to the
+    # plans that they sent. See docs/flight.md for what each of these is worth.
     "flight-v2": replace(
         _FLIGHT,
         planner=replace(_FLIGHT.planner, disturbance_time=1.0, commitment=1.0),
