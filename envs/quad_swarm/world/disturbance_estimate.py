@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from quad_swarm.planner import MixedPlanner, Planner
+from quad_swarm.planner import MixedPlanner, base
 from quad_swarm.quadrotor import VELOCITY, QuadrotorModel, VehicleModel
 from quad_swarm.states import like
 
@@ -28,7 +28,7 @@ class DisturbanceEstimate:
     :param n_swarms: number of swarms E
     """
 
-    def __init__(self, planners: Sequence[Planner], kind_of: Sequence[int], model: VehicleModel, n_swarms: int):
+    def __init__(self, planners: Sequence[base.Planner], kind_of: Sequence[int], model: VehicleModel, n_swarms: int):
         config = planners[0].config
         assert config.disturbance_time is not None
         self._model, self._dt = model, config.dt
@@ -38,14 +38,14 @@ class DisturbanceEstimate:
         self._expected = np.full(self.acceleration.shape, np.nan)  # velocities now
 
     @classmethod
-    def of(cls, planner: Planner | MixedPlanner, n_swarms: int, n_robots: int) -> DisturbanceEstimate | None:
+    def of(cls, planner: base.Planner | MixedPlanner, n_swarms: int, n_robots: int) -> DisturbanceEstimate | None:
         """Return the estimates at first, which are 0; None if robots estimate nothing.
 
         :param planner: the planner of the n robots
         :param n_swarms: number of swarms E
         :param n_robots: number of robots
         """
-        planners: tuple[Planner, ...]
+        planners: tuple[base.Planner, ...]
         if isinstance(planner, MixedPlanner):
             planners, kind_of = planner.planners, planner.kind_of
         else:
@@ -113,7 +113,7 @@ class DisturbanceEstimate:
         return other
 
 
-def _largest(planner: Planner) -> np.ndarray:
+def _largest(planner: base.Planner) -> np.ndarray:
     """Return the accelerations against which nine tenths of tilt and climb rate hold robots, (3,) (m/s^2)."""
     assert isinstance(planner.model, QuadrotorModel)  # problems of other vehicles refuse to estimate any
     config, params = planner.config, planner.model.params
