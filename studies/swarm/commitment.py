@@ -36,7 +36,8 @@ def world(n_robots: int, commitment: float, fade: float, estimate: float | None,
     return make_config("flight", changes, n_robots=n_robots, space=WIDER if n_robots > 12 else None)
 
 
-def _time(text: str) -> float | None:
+def time_constant(text: str) -> float | None:
+    """Read a time constant (s) or "none"."""
     return None if text == "none" else float(text)
 
 
@@ -45,7 +46,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--commitment", nargs="+", type=float, default=[0.0, 3.0])
     parser.add_argument("--fade", nargs="+", type=float, default=[2.0])
-    parser.add_argument("--estimate", nargs="+", type=_time, default=[None, 1.0], help="time constants (s), or none")
+    parser.add_argument(
+        "--estimate", nargs="+", type=time_constant, default=[None, 1.0], help="time constants (s), or none"
+    )
     parser.add_argument("--round-trip", nargs="+", type=int, default=[0])
     parser.add_argument("--rule", nargs="+", default=RULES)
     parser.add_argument("--n-robots", nargs="+", type=int, default=[8])

@@ -14,7 +14,8 @@ from quad_swarm.quadrotor import POSITION
 from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
-from studies.swarm import delay_check, fly, report, tune_flight
+from studies import wind
+from studies.swarm import commitment, delay_check, fly, report, tune_flight, version2
 from studies.swarm.experiment import Experiment
 from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TESTS, NAMES, TEST, VALIDATION, WORLDS
 
@@ -27,7 +28,7 @@ CALM = {
 
 
 def test_sets_of_episodes_are_apart():
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS}) == 7
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, version2.SEALED}) == 8
 
 
 @pytest.mark.parametrize("family", tune_flight.families(16))
@@ -325,3 +326,36 @@ def test_the_sealed_flights_take_what_was_tuned_and_do_not_repeat_what_was_flown
     fly.main(words)
     fly.main([*words, "--again"])
     assert ran == [0, 3]
+
+
+@pytest.mark.slow
+def test_the_scan_of_commitments_flies_what_it_says(tmp_path, monkeypatch, capsys):
+    words = ["--rule", "full", "stage:0.9:0.3", "--commitment", "0", "3", "--estimate", "1", "--fade", "2", "1"]
+    monkeypatch.setattr("sys.argv", ["commitment", *words, "--episodes", "2", "--json", str(tmp_path / "rows.json")])
+    commitment.main()
+    rows = read_rows(tmp_path / "rows.json")
+    points = [(row["commitment"], row["fade"], row["rule"]) for row in rows]
+    rules = ["full", "stage:0.9:0.3"]
+    assert points == [(*point, rule) for point in ((0, 2), (3, 2), (3, 1)) for rule in rules]  # no fade of nothing
+    assert [row["request_share"] for row in rows[::2]] == [1.0] * 3
+    assert all(0 < row["request_share"] < 0.2 for row in rows[1::2])
+    times = [row["steps_to_arrival"] for row in rows[::2]]
+    assert times[0] < times[1] < times[2]
+    assert capsys.readouterr().out.count("full") == 3
+
+
+@pytest.mark.slow
+def test_the_sealed_test_of_version_2_flies_its_parts(tmp_path, monkeypatch, capsys):
+    words = ["--part", "none", "teams", "--episodes", "1", "--json", str(tmp_path / "rows.json")]
+    monkeypatch.setattr("sys.argv", ["version2", *words])
+    version2.main()
+    rows = read_rows(tmp_path / "rows.json")
+    expected = [(8, "none"), (8, "none"), (4, "full"), (4, "stage:1.0:0.2"), (12, "full"), (12, "stage:1.0:0.2")]
+    assert [(row["n_robots"], row["policy"]) for row in rows] == expected
+    assert [row["request_share"] for row in rows[:2]] == [0, 0]
+    assert "symmetric_swap" in capsys.readouterr().out
+
+
+def test_wind_moves_robots_beside_their_goals_unless_they_estimate_it():
+    assert wind.distance("paper", 4.0, None) > 0.3
+    assert wind.distance("paper", 4.0, 1.0) < 0.01
