@@ -182,6 +182,8 @@ CHANGED = {
     "a disturbance estimated": {"planner": {"disturbance_time": 1.0, "max_yaw_rate": 1.0}},
     "commitment": {"planner": {"commitment": 3.0}},
     "commitment in a network": {"planner": {"commitment": 3.0}, "radio": {"delay": 0, "round_trip": 1}},
+    "ORCA": {"planner": {"problem": "orca"}},
+    "Voronoi cells": {"planner": {"problem": "voronoi", "horizon": 14}},
     "no sensing errors": {"sensing": {"pos": 0.0, "vel": 0.0, "attitude": 0.0, "others_pos": 0.0, "others_vel": 0.0}},
 }
 
