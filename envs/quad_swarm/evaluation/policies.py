@@ -165,7 +165,7 @@ def make_policy(policy: Any, config: SwarmConfig, algo: str) -> tuple[RequestPol
 def _by_rule(asks: Rule, tells: Rule | None = None) -> RequestPolicy:
     def decide(task: RequestTask, rngs: list[np.random.Generator]) -> np.ndarray:
         view = View(task.swarm, rngs)
-        return np.stack([asks(view)] if tells is None else [asks(view), tells(view)], axis=-1)
+        return asks(view)[..., None] if tells is None else np.stack([asks(view), tells(view)], axis=-1)
 
     return decide
 

@@ -532,9 +532,8 @@ class Swarm(SwarmState):
         # Of all pairs, including those that do not perceive each other
         radius, downwash = self.config.goal_radius, self.config.planner.downwash
         measured = measure(positions, self.final_goal, contact, radius, others, downwash, self.config.excess)
-        collision, collision_continuous = (
-            one < contact for one in (measured.min_separation, measured.min_separation_continuous)
-        )
+        collision = measured.min_separation < contact
+        collision_continuous = measured.min_separation_continuous < contact
         obstacles = self._report_obstacles(positions)
         if obstacles is not None:
             collision = collision | obstacles.colliding.any(axis=(1, 2))

@@ -45,6 +45,8 @@ SIGNATURE = Signature(
     tolerance="real",
     result=Solution,
 )
+# What the function takes of problems
+_GIVEN = tuple(name for name in SIGNATURE.parameters if name in Problems._fields)
 
 
 class RtiSolver:
@@ -110,13 +112,10 @@ class RtiSolver:
 
         :raises ValueError: if an array has another shape than the problem's
         """
-        names = ("clearance", "shape", "size", "reference", "reference_weight", "disturbance", "steady_input")
-        arrays = {name: getattr(problems, name) for name in names}
-        given = {name: None if array is None else np.asarray(array, float) for name, array in arrays.items()}
+        given = {
+            name: None if (array := getattr(problems, name)) is None else np.asarray(array, float) for name in _GIVEN
+        }
         return self._compiled()(
-            x=np.asarray(problems.x, float),
-            goal=np.asarray(problems.goal, float),
-            others=np.asarray(problems.others, float),
             **given,
             u_guess=np.asarray(u_guess, float),
             sqp_iterations=self.sqp_iterations,
