@@ -333,7 +333,7 @@ def write(path: Path, recording: Recording) -> None:
 def read(path: Path) -> Recording:
     """Read a recording, of this package or a laboratory's own.
 
-    :raises ValueError: if the file is no recording
+    :raises ValueError: if the file cannot be read, or is no recording
     :raises ImportError: if the extra ``record`` is not installed, which ``.mcap`` needs
     """
     check_suffix(path)
@@ -344,6 +344,8 @@ def read(path: Path) -> Recording:
         readers[".mcap"] = mcap_files.read
     try:
         return readers[path.suffix](path)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({error.strerror}).") from None
     except (ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile, EOFError, RecursionError) as error:
         raise ValueError(f"{path} is no recording of a flight: {shown(str(error))}.") from None
 
@@ -455,16 +457,21 @@ def _write_csv(path: Path, recording: Recording) -> None:
 
 def _read_csv(path: Path) -> Recording:
     with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = list(csv.DictReader(file))
+        rows: list[dict[str, Any]] = list(csv.DictReader(file))
     needed = ("time", "robot", *_STATE[:3])
     if not rows or not set(needed) <= rows[0].keys():
         missing = [name for name in needed if not rows or name not in rows[0]]
         raise ValueError(f"it needs the columns time, robot, x, y and z, and has no {', '.join(missing)}")
     times = sorted({float(row["time"]) for row in rows})
-    robots = sorted({int(row["robot"]) for row in rows})
+    for line, row in enumerate(rows, start=2):
+        number = float(row["robot"])
+        if not number.is_integer():
+            raise ValueError(f"line {line}: robot={row['robot']} is no whole number")
+        row["robot"] = int(number)
+    robots = sorted({row["robot"] for row in rows})
     if robots != list(range(len(robots))) or len(rows) != len(times) * len(robots):
         raise ValueError("it needs one row for each time and each robot, whose numbers count from 0")
-    rows.sort(key=lambda row: (float(row["time"]), int(row["robot"])))
+    rows.sort(key=lambda row: (float(row["time"]), row["robot"]))
     shape, time, guessed = (len(times), len(robots)), np.array(times), set()
 
     def column(name: str) -> np.ndarray:

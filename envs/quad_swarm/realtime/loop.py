@@ -300,13 +300,7 @@ class Loop:
         try:
             sensed = self.vehicle.sense()
             if sensed is not None:
-                m = len(self.robot.others)
-                arrays = tuple(np.asarray(one, float) for one in sensed[1:])
-                if tuple(one.shape for one in arrays) != ((9,), (m, 3), (m, 3)):
-                    raise ValueError(f"shapes {tuple(one.shape for one in arrays)}")
-                if not all(np.isfinite(one).all() for one in arrays):
-                    raise ValueError("a state is not finite")
-                self._sensed = Sensed(int(sensed.stamp), *arrays)
+                self._sensed = Sensed(int(sensed.stamp), *self.robot.perceived(*sensed[1:]))
         except Exception as error:
             self._note("sensing", error)
         return self._sensed

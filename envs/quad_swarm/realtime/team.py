@@ -66,7 +66,7 @@ class Team:
             # Robots know neither the plant nor how far vehicles are from their model
             known: dict[str, Any] = {"plant": self.config.plant, "mismatch": self.config.mismatch}
             if dataclasses.replace(exported, **known) != self.config:
-                raise ValueError(f"{self.policy} was exported for another world: export it for this one")
+                raise ValueError(f"{self.policy} was exported for another world: {_difference(exported, self.config)}")
         else:
             RulePolicy(self.policy)
 
@@ -103,3 +103,17 @@ def load(path: str | os.PathLike[str]) -> Team:
         return Team(**content)
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} describes no team: {shown(str(error))}.") from None
+
+
+def _difference(exported: Any, config: Any, path: str = "") -> str:
+    """Say in which field two worlds differ first, and what to do."""
+    for one in dataclasses.fields(config):
+        old, new = getattr(exported, one.name), getattr(config, one.name)
+        if old == new or one.name in ("plant", "mismatch"):
+            continue
+        if dataclasses.is_dataclass(new) and type(old) is type(new):
+            return _difference(old, new, f"{path}{one.name}.")
+        name = f"{path}{one.name}"
+        option = f"--n-robots {new}" if name == "n_robots" else f"--world {name}={new}"
+        return f"for {name}={old}, and this one has {new}; write it for this one with `sb3-maddpg export ... {option}`"
+    raise AssertionError("the worlds are equal")

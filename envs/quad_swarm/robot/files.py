@@ -138,7 +138,8 @@ def _content(path: Path) -> dict[str, Any]:
             raise ValueError(f"{path} is larger than {_MOST_BYTES} bytes, so it describes no robot.")
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}): write it with `sb3-maddpg export`.") from None
+        remedy = "give the folder" if path.parent.is_file() else "write it with `sb3-maddpg export`"
+        raise ValueError(f"{path} cannot be read ({error.strerror}): {remedy}.") from None
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
         raise ValueError(f"{path} is no JSON: write it with `sb3-maddpg export`.") from None
     if not isinstance(content, dict):

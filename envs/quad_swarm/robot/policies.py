@@ -58,9 +58,10 @@ class Actor:
         expected = config.n_others * n_bits
         try:
             width: Any = self._run(self.observed).size
-        except Exception as error:  # ONNX Runtime has its own classes of errors
+        except Exception:  # ONNX Runtime has its own classes of errors
             raise ValueError(
-                f"{path}: the policy does not read the {self.observation.size} columns of {seen!r} ({shown(error)})."
+                f"{path}: the policy does not read the {self.observation.size} columns of {seen!r} of "
+                f"{config.n_robots} robots: export it for this world."
             ) from None
         if width != expected:
             raise ValueError(f"{path}: the policy answers with {width} bits, not {expected}.")

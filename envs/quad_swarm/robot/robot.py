@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from quad_swarm.errors import shown
 from quad_swarm.native.pairs import advance
 from quad_swarm.planner import Plans, base
 from quad_swarm.quadrotor import N_INPUTS, N_STATES, POSITION, VELOCITY
@@ -239,24 +240,60 @@ class Robot:
         """The plan of the last period, which answers and announcements contain."""
         return self._own[-1]
 
+    def perceived(self, state: Any, pos: Any, vel: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Check what a robot perceives, and return it as arrays. Whether places lie in the room is not checked.
+
+        :param state: estimate of the own state, (9,): position and velocity, world frame (m, m/s), roll, pitch and yaw
+            (rad); of other vehicles than quadrotors, the last three are what their problem says
+        :param pos: positions of the others in ascending order, see `others`, (n - 1, 3), world frame (m)
+        :param vel: velocities of the others, (n - 1, 3), world frame (m/s)
+        :raises ValueError: if something has another shape, or is not finite, or angles are none of a quadrotor that
+            flies: roll and pitch beyond a right angle, or a yaw beyond two turns
+        """
+        m, found = len(self.others), []
+        for name, value, shape, what in (
+            ("state", state, (N_STATES,), "x, y, z, vx, vy, vz, roll, pitch, yaw"),
+            ("pos", pos, (m, 3), f"the others, in the order of robot.others, without robot {self.index} itself"),
+            ("vel", vel, (m, 3), f"the others, in the order of robot.others, without robot {self.index} itself"),
+        ):
+            array = np.asarray(value, float)
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}; it must be {shape}: {what}.")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name}={array.tolist()}: what a robot perceives must be finite.")
+            found.append(array)
+        roll, pitch, yaw = found[0][6:]
+        if self.config.flies_quadrotors and (max(abs(roll), abs(pitch)) > np.pi / 2 or abs(yaw) > 4 * np.pi):
+            raise ValueError(
+                f"state: roll {roll:g}, pitch {pitch:g} and yaw {yaw:g} are in rad, and no attitude of a robot that "
+                "flies; give roll and pitch within a right angle, and yaw within a turn."
+            )
+        return found[0], found[1], found[2]
+
     def decide(self, now: int, state: np.ndarray, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
         """Begin a period: perceive, and decide whom to ask and whom to tell. Periods that have been missed are made up
         for: plans and beliefs advance as if nothing had arrived.
 
         :param now: start of the period (us), a whole number of periods after the last one
-        :param state: estimate of the own state, (9,)
-        :param pos: positions of the others in ascending order, (n - 1, 3), world frame (m)
-        :param vel: velocities of the others, (n - 1, 3), world frame (m/s)
+        :param state: see `perceived`
+        :param pos: see `perceived`
+        :param vel: see `perceived`
         :return: whether to ask each of the others for its plan and, in a second column, whether to send it the own one,
             (n - 1, 1 or 2) bool
+        :raises ValueError: as `perceived`, or if the period is not later than the last one
         """
+        state, pos, vel = self.perceived(state, pos, vel)
+        if isinstance(now, bool) or not isinstance(now, (int, np.integer)) or now <= self.now:
+            raise ValueError(
+                f"now={shown(now)}: give whole microseconds, later than {self.now}, when the last period began."
+            )
         missed = (now - self.now) // self.period - 1
         for _ in range(min(missed, self.config.planner.horizon)):  # by then, plans and beliefs have expired
             self._miss()
-        self._estimate = np.array(state, float).reshape(1, 1, N_STATES)
+        self._estimate = state.reshape(1, 1, N_STATES).copy()
         if self.disturbance is not None:
             self.disturbance.update(self._estimate)
-        self._pos, self._vel = (np.array(a, float).reshape(1, 1, -1, 3) for a in (pos, vel))
+        self._pos, self._vel = (a.reshape(1, 1, -1, 3).copy() for a in (pos, vel))
         self.now = now
         if self._route is not None:
             self._route.take(self._estimate[..., POSITION], self.config.goal_radius)

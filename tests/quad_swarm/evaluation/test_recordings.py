@@ -193,3 +193,15 @@ def test_a_flight_among_obstacles_is_a_flight_again(preset):
     # Between steps, a recording is straight
     np.testing.assert_allclose(again.min_obstacle_distance, flown.min_obstacle_distance, atol=0.02)
     assert again.obstacles_at(60)[0].position == pytest.approx(tuple(flown.obstacle_pos[60, 0]))
+
+
+def test_numbers_of_robots_may_be_written_as_floats(tmp_path):
+    path = tmp_path / "lab.csv"
+    lines = ["time,robot,x,y,z", *(f"{t / 10},{k:.6f},{k},{t / 20},1" for t in range(4) for k in range(2))]
+    path.write_text("\n".join(lines))
+    assert read(path).n_robots == 2
+    path.write_text("\n".join([*lines, "0.4,0.5,0,0,1"]))
+    with pytest.raises(ValueError, match=r"line 10: robot=0\.5 is no whole number"):
+        read(path)
+    with pytest.raises(ValueError, match=r"nothere.npz cannot be read \(No such file"):
+        read(tmp_path / "nothere.npz")

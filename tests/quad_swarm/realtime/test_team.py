@@ -7,7 +7,7 @@ import pytest
 
 from quad_swarm.realtime import Conditions, SafetyLimits
 from quad_swarm.realtime.team import Team, load
-from quad_swarm.robot import RulePolicy
+from quad_swarm.robot import RulePolicy, files
 from quad_swarm.world.presets import make_config
 
 CONFIG = make_config("flight", n_robots=3)
@@ -71,5 +71,13 @@ def test_a_model_flies_in_the_world_that_it_was_exported_for(tmp_path):
     assert team.is_learned
     assert team.robot(1).policy.n_bits == 2
     Team(dataclasses.replace(CONFIG, plant="crazyflow:cf21B_500", mismatch=0.0), str(tmp_path))
-    with pytest.raises(ValueError, match="another world"):
+    told = "another world: for goal_radius=0.3, and this one has 0.4; .*export ... --world goal_radius=0.4"
+    with pytest.raises(ValueError, match=told):
         Team(dataclasses.replace(CONFIG, goal_radius=0.4), str(tmp_path))
+    planner = dataclasses.replace(CONFIG.planner, max_speed=1.0)
+    with pytest.raises(ValueError, match=r"for planner\.max_speed=4\.0, and this one has 1\.0"):
+        Team(dataclasses.replace(CONFIG, planner=planner), str(tmp_path))
+    with pytest.raises(ValueError, match=r"for n_robots=3, .*export \.\.\. --n-robots 7"):
+        Team(dataclasses.replace(CONFIG, n_robots=7), str(tmp_path))
+    with pytest.raises(ValueError, match="give the folder"):
+        files.load(tmp_path / "robot.json")

@@ -145,3 +145,43 @@ def test_limited_neighbourhoods_are_refused():
     config = make_config("paper", {"neighbourhood": {"max_others": 1}}, n_robots=3)
     with pytest.raises(ValueError, match="perceives all others"):
         Robot(config, 0, RulePolicy("none"))
+
+
+ATTITUDE_IN_DEGREES = np.array([0, 0, 1, 0, 0, 0, 0, 0, 90.0])
+
+
+@pytest.mark.parametrize(
+    ("state", "pos", "vel", "message"),
+    [
+        (np.zeros(6), OTHERS, STILL, r"state has shape \(6,\); it must be \(9,\): x, y, z, vx, vy, vz, roll"),
+        (
+            np.zeros(9),
+            np.zeros((3, 3)),
+            STILL,
+            r"pos has shape \(3, 3\); it must be \(2, 3\): the others, .*robot 0",
+        ),
+        (np.zeros(9), OTHERS, STILL[:1], r"vel has shape \(1, 3\)"),
+        (np.full(9, np.nan), OTHERS, STILL, "what a robot perceives must be finite"),
+        (np.zeros(9), OTHERS * np.inf, STILL, "pos=.*what a robot perceives must be finite"),
+        (ATTITUDE_IN_DEGREES, OTHERS, STILL, "roll 0, pitch 0 and yaw 90 are in rad"),
+        (np.array([0, 0, 1, 0, 0, 0, 20.0, 0, 0]), OTHERS, STILL, "roll 20, pitch 0 and yaw 0 are in rad"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_what_no_robot_perceives_is_refused_and_changes_nothing(state, pos, vel, message):
+    robot = Robot(CONFIG, 0, RulePolicy("none"), PLANNER)
+    robot.reset(np.array([0.0, 0, 1]), GOAL, now=0)
+    with pytest.raises(ValueError, match=message):
+        robot.decide(0, state, pos, vel)
+    assert robot.now == -PERIOD
+    robot.decide(0, state_at([0.0, 0, 1]), OTHERS, STILL)
+    assert robot.plan().shape == (4,)
+
+
+@pytest.mark.parametrize("now", [0, -5, 0.25, True])
+def test_periods_go_forward(now):
+    robot = Robot(CONFIG, 0, RulePolicy("none"), PLANNER)
+    robot.reset(np.array([0.0, 0, 1]), GOAL, now=0)
+    robot.decide(0, state_at([0.0, 0, 1]), OTHERS, STILL)
+    with pytest.raises(ValueError, match=f"now={now}: give whole microseconds, later than 0"):
+        robot.decide(now, state_at([0.0, 0, 1]), OTHERS, STILL)
