@@ -172,5 +172,5 @@ def test_one_source_is_named(words, capsys):
 def test_the_file_is_checked_before_the_logs_are_read(tmp_path):
     with pytest.raises(ValueError, match=r"--out .* cannot be written"):
         main(["--log", "missing.csv", "--out", str(tmp_path)])
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ValueError, match=r"missing\.csv cannot be read \(No such file"):
         main(["--log", str(tmp_path / "missing.csv")])
