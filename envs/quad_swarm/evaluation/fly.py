@@ -35,6 +35,7 @@ from quad_swarm.realtime.team import Team
 from quad_swarm.realtime.udp_world import UdpWorld
 from quad_swarm.realtime.vehicles import Flight
 from quad_swarm.realtime.virtual import VirtualFlight
+from quad_swarm.robot import files
 from quad_swarm.ros.world import RosWorld
 from quad_swarm.validation import read_assignments
 from quad_swarm.world.kinds import make_planners
@@ -240,7 +241,11 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     parser = Parser("sb3-maddpg fly", description=__doc__)
     parser.add_argument(
-        "--policy", nargs="+", required=True, metavar="POLICY", help="rules and models, as for `sb3-maddpg evaluate`"
+        "--policy",
+        nargs="+",
+        required=True,
+        metavar="POLICY",
+        help="rules and models, as for `sb3-maddpg evaluate`, and folders that `sb3-maddpg export` wrote",
     )
     parser.add_argument("--n-robots", type=int, help="number of robots (default: the preset's)")
     parser.add_argument("--preset", help=f"{', '.join(PRESETS)} (default: that of the models, otherwise flight)")
@@ -278,7 +283,9 @@ def _main(args: argparse.Namespace) -> None:
         raise ValueError(f"--episodes {args.episodes}: fly at least one.")
     if args.json is not None:
         check_writable(args.json, "--json")
-    models = {one: trained_in(load_model(one, args.algo)) for one in args.policy if is_model(one)}
+    exported = {one for one in args.policy if (Path(one) / files.DESCRIPTION).is_file()}
+    named = [one for one in args.policy if is_model(one) and one not in exported]
+    models = {one: trained_in(load_model(one, args.algo)) for one in named}
     preset = args.preset or (preset_of(models) if models else "flight")
     config = make_config(preset, read_assignments("--world", args.world), n_robots=args.n_robots, plant=args.plant)
     config = for_scenario(config, args.scenario)

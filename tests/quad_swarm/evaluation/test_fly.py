@@ -104,3 +104,18 @@ def test_wrong_words_are_one_line(words, told, capsys):
     assert error.startswith("error: ")
     assert told in error
     assert len(error.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_folders_of_exported_robots_are_flown_by_their_path(tmp_path, capsys):
+    pytest.importorskip("onnxruntime")
+    from quad_swarm.evaluation.export import export
+    from sb3_maddpg.hub.pretrained import pretrained_folder
+
+    folder = tmp_path / "robots"
+    export(str(pretrained_folder("quad-swarm-flight") / "model.zip"), make_config("flight", n_robots=2), folder)
+    words = ["--policy", str(folder), "--link", "virtual", "--most", "1"]
+    assert main([*words, "--n-robots", "2"]) == 0
+    assert "robots" in capsys.readouterr().out
+    assert main([*words, "--n-robots", "3"]) == 1
+    assert "was exported for another world: for n_robots=2, and this one has 3" in capsys.readouterr().err
