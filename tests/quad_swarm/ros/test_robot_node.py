@@ -364,7 +364,7 @@ with Operator(["robot_0", "robot_1"]) as operator:
         operator.start_robot(name, policy="full", limits=LIMITS, goal=goal, index=-1, autostart=True)
     operator.start_world(starts=starts)
     there = lambda: operator.position and all(
-        np.linalg.norm(operator.position.get(name, np.inf) - goal) < 0.2 for name, goal in goals.items()
+        np.linalg.norm(np.subtract(operator.position.get(name, np.inf), goal)) < 0.2 for name, goal in goals.items()
     )
     operator.wait(there)
     assert operator.trigger("/robot_0/robot/land")
