@@ -155,6 +155,75 @@ def from_trajectory(message: Any) -> tuple[str, Plan, int]:
     return message.joint_names[0], Plan(from_time(message.header.stamp), positions), period
 
 
+class SerialisedPlans:
+    """Plans of one robot as the bytes of `to_trajectory`. Messages of as many points at the same intervals differ in a
+    time and in numbers at the same places only, which are written and read without the message's objects.
+
+    :param sender: name of the robot
+    :param count: number of points
+    :param period: time between them (us)
+    """
+
+    def __init__(self, sender: str, count: int, period: int):
+        from rclpy.serialization import serialize_message
+
+        message = to_trajectory(Plan(0, np.zeros((count, 3))), period, sender)
+        stamp, numbers = np.array([0x1234567, 0x2345678], np.int32), np.arange(6.0 * count).reshape(count, 6) + 0.123
+        message.header.stamp = msgs().Time(sec=int(stamp[0]), nanosec=int(stamp[1]))
+        for point, (x, y, z, vx, vy, vz) in zip(message.points, numbers.tolist(), strict=True):
+            point.transforms[0].translation = msgs().Vector3(x=x, y=y, z=z)
+            point.velocities[0].linear = msgs().Vector3(x=vx, y=vy, z=vz)
+        data = serialize_message(message)
+        self._period = period
+        self._stamp = self._places(data, stamp)
+        self._numbers = self._places(data, numbers).reshape(count, 6, 8)
+        gaps = self._gaps(data, sender, self._numbers[:, 0, 0], self._numbers[:, 3, 0])
+        self._bytes = np.frombuffer(data, np.uint8).copy()
+        self._bytes[gaps] = 0
+        fixed = np.ones(len(data), dtype=bool)
+        fixed[self._stamp] = fixed[self._numbers] = fixed[gaps] = False
+        self._fixed = np.flatnonzero(fixed)
+
+    @staticmethod
+    def _places(data: bytes, values: np.ndarray) -> np.ndarray:
+        """Return where the bytes of values are, each of which occurs once."""
+        starts = [data.index(value.tobytes()) for value in values.reshape(-1)]
+        assert all(data.count(value.tobytes()) == 1 for value in values.reshape(-1))
+        return np.array(starts)[:, None] + np.arange(values.itemsize)
+
+    @staticmethod
+    def _gaps(data: bytes, sender: str, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+        """Return where bytes only align what follows, which serialisation leaves as the memory was.
+
+        :param positions: where the position of each point begins, after the number of its transforms, (N + 1,)
+        :param velocities: where its velocity begins, after seven numbers and the number of its twists, (N + 1,)
+        """
+        counts = np.frombuffer(data, "<u4", 2, positions[0] - 12)
+        first = counts.tolist() == [len(positions), 1]
+        later = positions[1:] - velocities[:-1] > 64
+        ends = [*positions[: int(first)], *positions[1:][later], *velocities[velocities - positions > 60]]
+        name = data.index(sender.encode() + b"\0") + len(sender.encode()) + 1
+        return np.array([*range(name, name + -name % 4), *(end - k for end in ends for k in (1, 2, 3, 4))], dtype=int)
+
+    def write(self, plan: Plan) -> bytes:
+        """Return the bytes of a plan's message."""
+        data = self._bytes.copy()
+        data[self._stamp] = np.array([plan.stamp // _S, plan.stamp % _S * 1000], np.int32)[:, None].view(np.uint8)
+        velocities = np.gradient(plan.positions, self._period / _S, axis=0)
+        data[self._numbers] = np.concatenate([plan.positions, velocities], axis=1)[..., None].view(np.uint8)
+        return data.tobytes()
+
+    def read(self, data: bytes) -> Plan | None:
+        """Return the plan of a message's bytes, None if it is not one of these."""
+        if len(data) != len(self._bytes):
+            return None
+        found = np.frombuffer(data, np.uint8)
+        if not np.array_equal(found[self._fixed], self._bytes[self._fixed]):
+            return None
+        sec, nanosec = found[self._stamp].view(np.int32)[:, 0].tolist()
+        return Plan(sec * _S + nanosec // 1000, found[self._numbers[:, :3]].view(float)[..., 0])
+
+
 def to_command(setpoint: np.ndarray, stamp: int) -> Any:
     """Return a set-point as ``geometry_msgs/TwistStamped``: angular x and y are roll and pitch (rad), linear z is the
     climb rate (m/s), and angular z the yaw rate (rad/s).

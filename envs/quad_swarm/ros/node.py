@@ -206,19 +206,20 @@ class Mailbox:
         self._executor = make_executor(node.context)
         self._executor.add_node(node)
 
-    def subscribe(self, kind: type, topic: str, profile: Any, take: Take) -> None:
+    def subscribe(self, kind: type, topic: str, profile: Any, take: Take, raw: bool = False) -> None:
         """Receive a topic.
 
         :param kind: class of its messages
         :param topic: its name
         :param profile: its quality of service
         :param take: what to do with a message, given the handler of `wait`, too
+        :param raw: whether to take its bytes
         """
 
         def hand_over(message: Any) -> None:
             take(message, self._handler)
 
-        self._node.create_subscription(kind, topic, hand_over, profile)
+        self._node.create_subscription(kind, topic, hand_over, profile, raw=raw)
 
     def wait(self, until: int, handler: Handler, done: Callable[[], bool] = lambda: False) -> None:
         """See `quad_swarm.realtime.Link`."""

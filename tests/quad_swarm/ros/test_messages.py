@@ -76,6 +76,34 @@ def test_what_is_no_plan_is_refused(damage):
         messages.from_trajectory(message)
 
 
+@pytest.mark.parametrize(("sender", "count"), [("robot_3", 21), ("a", 2), ("cf231", 11)])
+def test_serialised_plans_are_those_of_messages(sender, count):
+    pytest.importorskip("rclpy")
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    serialised, rng = messages.SerialisedPlans(sender, count, 50_000), np.random.default_rng(0)
+    for stamp in (0, 1_790_000_000_123_456):
+        plan = Plan(stamp, rng.normal(size=(count, 3)))
+        data = serialised.write(plan)
+        message = messages.to_trajectory(plan, 50_000, sender)
+        theirs, kind = serialize_message(message), messages.msgs().MultiDOFJointTrajectory
+        assert len(data) == len(theirs)
+        assert deserialize_message(data, kind) == message
+        name, again, period = messages.from_trajectory(message)
+        for found in (again, serialised.read(data), serialised.read(theirs)):
+            assert found.stamp == stamp
+            np.testing.assert_array_equal(found.positions, plan.positions)
+        assert (name, period) == (sender, 50_000)
+    # Whatever else differs is left to the message
+    others = [messages.to_trajectory(plan, *about) for about in ((50_000, sender[:-1] + "x"), (40_000, sender))]
+    others.append(messages.to_trajectory(plan._replace(positions=np.zeros((count + 1, 3))), 50_000, sender))
+    turned = messages.to_trajectory(plan, 50_000, sender)
+    turned.points[1].transforms[0].rotation.z = 1.0
+    for other in (*others, turned):
+        assert serialised.read(serialize_message(other)) is None
+    assert serialised.read(b"") is None
+
+
 def test_commands_and_back():
     pytest.importorskip("rclpy")
     setpoint = np.array([0.1, -0.2, 0.3, 0.4])
