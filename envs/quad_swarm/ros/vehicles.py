@@ -72,23 +72,20 @@ class TeamVehicle:
         self._node, self._link, self._name = node, link, names[link.index]
         self.controller = controller or AttitudeController()
         self._states: dict[int, tuple[int, np.ndarray]] = {}
+        self._arrived: dict[int, Any] = {}  # the newest messages, which are not read before somebody asks
+        self._kind, self._convert = kind, convert
         self._others = [number for number in range(len(names)) if number != link.index]
         self._commanded = link.now()
         for number, name in enumerate(names):
 
             def take(message: Any, handler: Handler, number: int = number) -> None:
-                try:
-                    stamp, state = convert(message, number)
-                except ValueError:
-                    link.traffic.refused += 1
-                    return
-                self._see(number, stamp, state)
+                self._arrive(number, message)
 
-            mailbox.subscribe(kind, f"/{name}/{topic}", quality(1), take)
+            mailbox.subscribe(kind, f"/{name}/{topic}", quality(1), take, raw=True)
 
     def sense(self) -> Sensed | None:
         """See `quad_swarm.realtime.Vehicle`. The others are moved to the time of the robot's own state."""
-        states = self._states
+        states = self._seen()
         if len(states) < len(self._others) + 1:
             return None
         stamp, own = states[self._link.index]
@@ -111,6 +108,26 @@ class TeamVehicle:
         """See `quad_swarm.realtime.Vehicle`. Here, whoever stands behind the topics stops the motors of what lies on
         the ground."""
 
+    def _arrive(self, number: int, message: Any) -> None:
+        """Keep the newest message about a robot."""
+        self._arrived[number] = message
+
+    def _seen(self) -> dict[int, tuple[int, np.ndarray]]:
+        """Read what has arrived. Returns the newest states by robot."""
+        while self._arrived:
+            number, message = self._arrived.popitem()
+            try:
+                if isinstance(message, bytes):
+                    from rclpy.serialization import deserialize_message
+
+                    message = deserialize_message(message, self._kind)
+                stamp, state = self._convert(message, number)
+            except Exception:  # whatever a foreign message, or the middleware, raises
+                self._link.traffic.refused += 1
+                continue
+            self._see(number, stamp, state)
+        return self._states
+
     def _see(self, number: int, stamp: int, state: np.ndarray) -> None:
         """Keep the newest state of a robot, with the time on this robot's clock."""
         stamp = self._link.own(stamp) + self._link.clock_error
@@ -120,7 +137,7 @@ class TeamVehicle:
     def _attitude(self, setpoint: np.ndarray) -> Attitude:
         """Return attitude and thrust. Before a state has been perceived, the robot is taken to be level and at rest."""
         now = self._link.now()
-        state = self._states.get(self._link.index, (0, np.zeros(N_STATES)))[1]
+        state = self._seen().get(self._link.index, (0, np.zeros(N_STATES)))[1]
         attitude = self.controller(state, setpoint, (now - self._commanded) / _S)
         self._commanded = now
         return attitude
@@ -219,7 +236,7 @@ class CrazyswarmVehicle(OdometryVehicle):
         self._commands.publish(message)
 
     def _place(self) -> np.ndarray | None:
-        own = self._states.get(self._link.index)
+        own = self._seen().get(self._link.index)
         return self._held if self._held is not None else None if own is None else own[1][POSITION]
 
 
@@ -245,7 +262,8 @@ class LegacyCrazyswarmVehicle(OdometryVehicle):
         message = msgs().Twist()
         message.linear.x, message.linear.y = map(float, np.degrees([attitude.pitch, attitude.roll]))
         message.linear.z = float(min(attitude.thrust * _CRAZYFLIE_THRUST, _CRAZYFLIE_MOST))
-        heading = self._states[self._link.index][1][8] if self._link.index in self._states else attitude.yaw
+        own = self._seen().get(self._link.index)
+        heading = attitude.yaw if own is None else own[1][8]
         error = wrapped(attitude.yaw - heading)
         message.angular.z = -float(np.degrees(2.0 * error + setpoint[3]))  # the firmware inverts it
         self._commands.publish(message)

@@ -56,10 +56,11 @@ class RosVehicle(OdometryVehicle):
     def begin(self, words: dict[str, Any]) -> None:
         """See `SimulatedVehicle`."""
         self._states.clear()
+        self._arrived.clear()
 
-    def _see(self, number: int, stamp: int, state: np.ndarray) -> None:
+    def _arrive(self, number: int, message: Any) -> None:
         self.heard = self._link.now()
-        super()._see(number, stamp, state)
+        super()._arrive(number, message)
 
     def _hear(self, message: Any, handler: Handler) -> None:
         self.heard = self._link.now()
