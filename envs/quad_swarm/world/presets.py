@@ -214,11 +214,6 @@ class SwarmConfig:
         excess.setflags(write=False)
         return excess
 
-    @property
-    def quadrotors(self) -> tuple[QuadrotorParams, ...]:
-        """Physical parameters of each robot, (n,)."""
-        return tuple(self.kinds[kind].quadrotor for kind in self.kind_of)
-
     @functools.cached_property
     def turning(self) -> np.ndarray:
         """Which robots may turn, (n,) bool."""

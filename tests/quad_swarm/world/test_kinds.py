@@ -55,8 +55,8 @@ def test_entries_repeat_and_leave_the_rest_as_in_the_world():
     assert config.kind_of == (0, 1, 2, 0, 1)
     assert config.radii.tolist() == [0.2, 0.3, 0.5, 0.2, 0.3]
     assert [kind.radius for kind in config.kinds] == [0.2, 0.3, 0.5]
-    assert config.quadrotors[0] == VEHICLES["crazyflie21"]
-    assert config.quadrotors[1].drag_x == 0.1
+    assert config.kinds[config.kind_of[0]].quadrotor == VEHICLES["crazyflie21"]
+    assert config.kinds[config.kind_of[1]].quadrotor.drag_x == 0.1
     assert config.excess[0, 2] == pytest.approx(0.1)
     assert config.excess[2, 2] == 0
 
@@ -74,9 +74,13 @@ def test_parameters_of_a_vehicle_replace_some_of_the_world(tmp_path):
     vehicles = [{"quadrotor": {"drag_y": 0.2}}, {"quadrotor": str(path)}, {"quadrotor": Path(path)}, {}]
     config = make_config("paper", {"vehicles": vehicles}, quadrotor="x500")
     x500 = VEHICLES["x500"]
-    assert config.quadrotors[0] == dataclasses.replace(x500, drag_y=0.2)
-    assert config.quadrotors[1] == config.quadrotors[2] == QuadrotorParams(drag_x=0.7)
-    assert config.quadrotors[3] == x500
+    assert config.kinds[config.kind_of[0]].quadrotor == dataclasses.replace(x500, drag_y=0.2)
+    assert (
+        config.kinds[config.kind_of[1]].quadrotor
+        == config.kinds[config.kind_of[2]].quadrotor
+        == QuadrotorParams(drag_x=0.7)
+    )
+    assert config.kinds[config.kind_of[3]].quadrotor == x500
 
 
 def test_command_lines_and_files_give_vehicles():
