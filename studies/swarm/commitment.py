@@ -21,8 +21,8 @@ from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
 from quad_swarm.evaluation.rows import write_rows
 from quad_swarm.world.presets import SwarmConfig, make_config
 from quad_swarm.world.scenarios import SCENARIOS
+from studies.swarm import protocol
 from studies.swarm.experiment import condition
-from studies.swarm.protocol import WIDER
 
 BEST_RULE = "cpa:1.0s:3&soon:0.5|cpa:1.0s:3&stale:4"
 KEPT = ("episodes", "collisions", "collision_low", "collision_high", "request_share", "arrived", "steps_to_arrival")
@@ -33,7 +33,7 @@ def world(n_robots: int, commitment: float, fade: float, estimate: float | None,
     """Return `flight` with a causal radio, a commitment and an estimate of disturbances."""
     planner = {"commitment": commitment, "commitment_fade": fade, "disturbance_time": estimate}
     changes: dict[str, Any] = {"planner": planner, "radio": {"delay": 0, "round_trip": round_trip}}
-    return make_config("flight", changes, n_robots=n_robots, space=WIDER if n_robots > 12 else None)
+    return make_config(protocol.world("flight", n_robots), changes)
 
 
 def time_constant(text: str) -> float | None:
