@@ -5,8 +5,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import pairwise
 from typing import Any
 
@@ -39,17 +39,36 @@ def interruptible() -> None:
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C raise ``KeyboardInterrupt`` only after the block. In other threads it raises nothing anyway."""
+def uninterrupted() -> Iterator[Callable[[], AbstractContextManager[None]]]:
+    """
+    Let Ctrl-C raise ``KeyboardInterrupt`` only after the block, and within it where ``with`` what it yields allows it:
+    there at once, also for a Ctrl-C that came before. In other threads it raises nothing anyway.
+    """
     handler = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(handler):
-        yield
+        yield nullcontext
         return
     interrupts: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, frame: interrupts.append(number))
-    try:
-        yield
-    finally:
+
+    def hold(number: int, frame: Any) -> None:
+        interrupts.append(number)
+
+    def release() -> None:
         signal.signal(signal.SIGINT, handler)
         if interrupts:
+            interrupts.clear()
             signal.raise_signal(signal.SIGINT)
+
+    @contextmanager
+    def allowed() -> Iterator[None]:
+        try:
+            release()
+            yield
+        finally:
+            signal.signal(signal.SIGINT, hold)
+
+    signal.signal(signal.SIGINT, hold)
+    try:
+        yield allowed
+    finally:
+        release()

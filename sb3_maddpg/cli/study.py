@@ -7,7 +7,7 @@ import contextlib
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,7 @@ from sb3_maddpg.cli.search import (
 from sb3_maddpg.cli.tuning import SPACES, Searched, convert_params
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
 from sb3_maddpg.files.model_files import trusted
+from sb3_maddpg.starting import uninterrupted
 from sb3_maddpg.utils import arguments_of, atomic_write, remedy_of, shown, suggest, told
 
 # Trials that count towards the maximum. Those that run do too: otherwise each worker could start one too many.
@@ -98,6 +99,7 @@ class Search:
         # Otherwise workers with the same --seed and continued searches would repeat trials
         self.draws_anew = self.kept is None or self.kept.is_file()
         self.study: optuna.Study | None = None
+        self._interruptible: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
 
     def run(self) -> None:
         """
@@ -158,8 +160,11 @@ class Search:
             if _count(study, _COUNTED) >= self.most:
                 return
             limits = {"callbacks": [MaxTrialsCallback(self.most, states=_COUNTED)]}
+        # An interrupt within Optuna itself raises another error there; threads of several jobs have none
+        held = uninterrupted() if self.args.n_jobs == 1 else contextlib.nullcontext(contextlib.nullcontext)
         # Without collecting garbage, environments and models of finished trials stay in memory
-        study.optimize(self._objective, n_jobs=self.args.n_jobs, gc_after_trial=True, **limits)
+        with held as self._interruptible:
+            study.optimize(self._objective, n_jobs=self.args.n_jobs, gc_after_trial=True, **limits)
 
     def _sampler(self) -> optuna.samplers.BaseSampler:
         sampler: optuna.samplers.BaseSampler
@@ -190,7 +195,8 @@ class Search:
     def _objective(self, trial: optuna.Trial) -> float:
         """:return: mean return of the last evaluation"""
         try:
-            return self._value(trial)
+            with self._interruptible():
+                return self._value(trial)
         except KeyboardInterrupt:
             optuna.logging.set_verbosity(optuna.logging.ERROR)  # a warning would show the traceback
             raise

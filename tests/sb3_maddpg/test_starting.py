@@ -72,3 +72,24 @@ def trap(folder: Path, code: str) -> None:
 
 def environment(folder: Path) -> dict[str, str]:
     return {"PYTHONPATH": str(folder / "path"), "PATH": "/usr/bin:/bin", "HOME": str(folder)}
+
+
+def test_parts_of_it_may_be_cut_short():
+    done = []
+
+    def work():
+        with uninterrupted() as allowed:
+            signal.raise_signal(signal.SIGINT)
+            done.append("all")
+            with allowed():
+                done.append("an earlier interrupt raises first")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done == ["all"]
+    with uninterrupted() as allowed:
+        with pytest.raises(KeyboardInterrupt), allowed():
+            signal.raise_signal(signal.SIGINT)
+        done.append("then it is finished again")
+    assert len(done) == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import yaml
 from optuna.storages.journal import JournalFileBackend
+from optuna.study import _optimize as optuna_loop
 from optuna.trial import TrialState
 from processes import children, descendants
 
@@ -88,6 +89,25 @@ def test_an_interrupt_leaves_a_whole_journal(function, tmp_path, monkeypatch):
     assert [one.name for one in tmp_path.iterdir()] == ["s.log"], "no lock is left"
     assert optuna.load_study(storage=open_storage(str(path)), study_name="s").user_attrs == {"note": 1}
     assert study.user_attrs == {"note": 1}
+
+
+@pytest.mark.parametrize("function", ["_tell_with_warning", "_run_trial"])
+def test_an_interrupt_within_optuna_is_kept_until_the_next_trial(function, tmp_path, monkeypatch, capsys):
+    """Between two trials, and while one is finished: there, Optuna itself would raise another error."""
+    monkeypatch.chdir(tmp_path)
+    Path("recipe.yml").write_text(yaml.safe_dump({"OwnBit-v0": RECIPE}))
+    before = getattr(optuna_loop, function)
+
+    def interrupted(*args, **kwargs):
+        monkeypatch.setattr(optuna_loop, function, before)
+        signal.raise_signal(signal.SIGINT)
+        return before(*args, **kwargs)
+
+    monkeypatch.setattr(optuna_loop, function, interrupted)
+    assert main([*COMMAND[3:], "--n-trials", "4"]) == 130
+    assert "The search was interrupted; repeat the command to continue." in capsys.readouterr().out
+    completed = 1 if function == "_tell_with_warning" else 0
+    assert sorted(states()) == [TrialState.COMPLETE] * completed + [TrialState.FAIL]
 
 
 @pytest.mark.slow
