@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from quad_swarm.realtime.link import Sensed, Traffic, monotonic, of_day
-from quad_swarm.realtime.process import Hears, Report, Sample
+from quad_swarm.realtime.process import Hears, Report, Sample, without_priority
 from quad_swarm.realtime.statistics import Statistics
 from quad_swarm.realtime.team import Team
 from quad_swarm.realtime.udp_world import UdpWorld
@@ -59,7 +59,7 @@ class Pace:
             self.pauses += 1
 
 
-class RobotEndedError(RuntimeError):
+class RobotEndedError(ChildProcessError):
     """Raised if the process of a robot ended, or did not start."""
 
 
@@ -253,7 +253,7 @@ class Arena:
         self.team.write(path)
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         for k in range(self.team.config.n_robots):
-            with contextlib.ExitStack() as stack:
+            with contextlib.ExitStack() as stack, without_priority():
                 output = None if log is None else stack.enter_context((log / f"robot_{k}.log").open("wb"))
                 command = self._exchange.process(path, k)
                 self._processes.append(subprocess.Popen(command, env=environment, stdout=output, stderr=output))
@@ -261,6 +261,7 @@ class Arena:
         while len(self._ready) < len(self._processes):
             self._exchange.receive(monotonic() + _US // 10, self)
             self._ended()
+            self.part(())  # who hears nothing for long takes the world to have ended
             if time.monotonic() > ends:
                 missing = [k for k in range(len(self._processes)) if k not in self._ready]
                 raise RobotEndedError(f"The robots {missing} were not ready within {_READY:g} s.")

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Mapping
+import struct
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +21,10 @@ from quad_swarm.robot import Plan
 
 FRAME = "map"
 _S = 1_000_000  # us
+# Where the numbers of serialised odometry are: its frames alone, which come before, have lengths of their own
+_STAMP = struct.Struct("<iI")  # after the four bytes that tell the encoding
+_POSE = struct.Struct(f"<7d{36 * 8}x3d{(3 + 36) * 8}x")  # pose, its covariance, twist and its covariance, at the end
+_LITTLE_ENDIAN = (b"\x00\x01", b"\x00\x07")  # XCDR versions 1 and 2
 
 
 @functools.cache
@@ -90,29 +95,65 @@ def to_odometry(state: np.ndarray, stamp: int, child: str) -> Any:
     message = msgs().Odometry()
     message.header.frame_id, message.child_frame_id = FRAME, child
     message.header.stamp = to_time(stamp)
-    pose, twist = message.pose.pose, message.twist.twist
-    pose.position.x, pose.position.y, pose.position.z = map(float, state[POSITION])
-    q = to_quaternion(state[6:9])
-    pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = map(float, q)
-    twist.linear.x, twist.linear.y, twist.linear.z = map(float, rotation(state[6:9]).T @ state[VELOCITY])
+    pose, linear = message.pose.pose, message.twist.twist.linear
+    x, y, z, *q, vx, vy, vz = _seen_from_body(state)
+    pose.position.x, pose.position.y, pose.position.z = x, y, z
+    pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = q
+    linear.x, linear.y, linear.z = vx, vy, vz
     return message
 
 
 def from_odometry(message: Any, world_twist: bool = False) -> tuple[int, np.ndarray]:
     """Return stamp (us) and state, (9,), of ``nav_msgs/Odometry``.
 
-    :param message: the message
+    :param message: the message, or its bytes
     :param world_twist: whether its twist is in the frame of the world instead of that of the body
     :raises ValueError: if the orientation is no rotation
     """
-    pose, linear = message.pose.pose, message.twist.twist.linear
+    if isinstance(message, bytes):
+        if len(message) > _POSE.size + 20 and message[:2] in _LITTLE_ENDIAN:
+            sec, nanosec = _STAMP.unpack_from(message, 4)
+            numbers = _POSE.unpack_from(message, len(message) - _POSE.size)
+            return sec * _S + nanosec // 1000, _state_of(numbers[:7], numbers[7:], world_twist)
+        from rclpy.serialization import deserialize_message
+
+        message = deserialize_message(message, msgs().Odometry)
+    place, q, linear = message.pose.pose.position, message.pose.pose.orientation, message.twist.twist.linear
+    numbers = (place.x, place.y, place.z, q.x, q.y, q.z, q.w)
+    return from_time(message.header.stamp), _state_of(numbers, (linear.x, linear.y, linear.z), world_twist)
+
+
+def _seen_from_body(state: np.ndarray) -> list[float]:
+    """Return position (m), quaternion x, y, z, w, and velocity along the axes of the body (m/s) of a state, (9,)."""
+    velocity = rotation(state[6:9]).T @ state[VELOCITY]
+    return [*state[POSITION].tolist(), *to_quaternion(state[6:9]).tolist(), *velocity.tolist()]
+
+
+def _state_of(pose: Sequence[float], velocity: Sequence[float], world_twist: bool) -> np.ndarray:
+    """Return the state, (9,), of position (m) and quaternion x, y, z, w, and of a velocity (m/s)."""
     state = np.empty(N_STATES)
-    state[POSITION] = pose.position.x, pose.position.y, pose.position.z
-    q = pose.orientation
-    state[6:9] = from_quaternion(np.array([q.x, q.y, q.z, q.w]))
-    velocity = np.array([linear.x, linear.y, linear.z])
-    state[VELOCITY] = velocity if world_twist else rotation(state[6:9]) @ velocity
-    return from_time(message.header.stamp), state
+    state[POSITION], state[6:9] = pose[:3], from_quaternion(np.array(pose[3:]))
+    state[VELOCITY] = velocity if world_twist else rotation(state[6:9]) @ np.array(velocity)
+    return state
+
+
+class SerialisedOdometry:
+    """States of one robot as the bytes of `to_odometry`, without the message's objects.
+
+    :param child: name of the body's frame
+    """
+
+    def __init__(self, child: str):
+        from rclpy.serialization import serialize_message
+
+        self._bytes = serialize_message(to_odometry(np.zeros(N_STATES), 0, child))
+
+    def write(self, state: np.ndarray, stamp: int) -> bytes:
+        """Return the bytes of a state's message, see `to_odometry`."""
+        data = bytearray(self._bytes)
+        _STAMP.pack_into(data, 4, stamp // _S, stamp % _S * 1000)
+        _POSE.pack_into(data, len(data) - _POSE.size, *_seen_from_body(state))
+        return bytes(data)
 
 
 def to_trajectory(plan: Plan, period: int, sender: str) -> Any:

@@ -158,12 +158,6 @@ def standing(config: SwarmConfig) -> None:
             )
 
 
-def entities(node: Any) -> list[tuple[Callable[[Any], Any], Any]]:
-    """Return what a node publishes, receives and offers, each with what destroys it."""
-    kinds = ("publisher", "subscription", "service")
-    return [(getattr(node, f"destroy_{kind}"), one) for kind in kinds for one in getattr(node, f"{kind}s")]
-
-
 def make_executor(context: Any) -> Any:
     """Return an executor for nodes of a context. The default one asks all subscriptions at each message: plans take
     about 15 times as long with it."""
@@ -203,6 +197,7 @@ class Mailbox:
     def __init__(self, node: Any):
         self._node = node
         self._handler: Any = None
+        self._silent: Any = None  # a node without an executor, which would be woken by each message
         self._executor = make_executor(node.context)
         self._executor.add_node(node)
 
@@ -221,6 +216,32 @@ class Mailbox:
 
         self._node.create_subscription(kind, topic, hand_over, profile, raw=raw)
 
+    def newest(self, kind: type, topic: str, raw: bool = False) -> Callable[[], Any]:
+        """Receive a topic of which only the newest message counts. Nothing happens when messages come.
+
+        :param kind: class of its messages
+        :param topic: its name
+        :param raw: whether to take its bytes
+        :return: takes the newest message, None if none has come since
+        """
+        if self._silent is None:
+            name = f"{self._node.get_name()}_senses"
+            self._silent = make_node(name, self._node.get_namespace(), self._node.context)
+        subscription = self._silent.create_subscription(kind, topic, lambda message: None, quality(1))
+
+        def take() -> Any:
+            with subscription.handle:
+                taken = subscription.handle.take_message(kind, raw)
+            return None if taken is None else taken[0]
+
+        return take
+
+    def entities(self) -> list[tuple[Callable[[Any], Any], Any]]:
+        """Return what the node publishes, receives and offers, each with what destroys it."""
+        kinds, nodes = ("publisher", "subscription", "service"), [self._node, *filter(None, [self._silent])]
+        every = ((kind, node, one) for node in nodes for kind in kinds for one in getattr(node, f"{kind}s"))
+        return [(getattr(node, f"destroy_{kind}"), one) for kind, node, one in every]
+
     def wait(self, until: int, handler: Handler, done: Callable[[], bool] = lambda: False) -> None:
         """See `quad_swarm.realtime.Link`."""
         self._handler = handler
@@ -233,5 +254,6 @@ class Mailbox:
     def close(self) -> None:
         """Stop receiving, and end the node."""
         self._executor.shutdown()
-        self._node.destroy_node()
+        for node in filter(None, [self._silent, self._node]):
+            node.destroy_node()
         self._node.context.try_shutdown()

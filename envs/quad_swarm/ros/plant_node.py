@@ -4,7 +4,7 @@ try the robots' nodes without any hardware.
 ====================== ===================================== ===============================================
 topic                  type                                  content
 ====================== ===================================== ===============================================
-``/NAME/odom``         nav_msgs/Odometry                     a robot's state, each sub-step
+``/NAME/odom``         nav_msgs/Odometry                     a robot's state, 50 times a second
 ``/NAME/cmd``          geometry_msgs/TwistStamped            its set-point
 ``/world/status``      diagnostic_msgs/DiagnosticArray       once a second: collisions, who flies
 ``/world/reset``       std_srvs/Trigger (a service)          puts everybody back to their starts

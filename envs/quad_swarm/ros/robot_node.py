@@ -52,7 +52,6 @@ from quad_swarm.ros.node import (
     Nobody,
     checked_names,
     declare,
-    entities,
     leave,
     make_context,
     numbers,
@@ -204,11 +203,11 @@ class RobotNode:
         """
         if self.flies:
             raise ValueError("the robot has not landed yet: wait until its status says so")
-        before = {id(one) for _, one in entities(self.node)}
+        before = {id(one) for _, one in self._mailbox.entities()}
         try:
             self._configure(values_of(self.node, PARAMETERS))
         finally:
-            self._own += [(destroy, one) for destroy, one in entities(self.node) if id(one) not in before]
+            self._own += [(destroy, one) for destroy, one in self._mailbox.entities() if id(one) not in before]
             if self.loop is None:
                 self._release()
 

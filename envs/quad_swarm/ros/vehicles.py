@@ -29,7 +29,7 @@ import numpy as np
 from quad_swarm.geometry import from_quaternion, to_frd, to_ned, to_quaternion, wrapped
 from quad_swarm.quadrotor import N_STATES, POSITION, VELOCITY
 from quad_swarm.realtime.attitude import Attitude, AttitudeController
-from quad_swarm.realtime.link import Handler, Sensed
+from quad_swarm.realtime.link import Sensed
 from quad_swarm.robot import Plan
 from quad_swarm.ros.link import RosLink
 from quad_swarm.ros.messages import FRAME, from_odometry, msgs, rotation, to_command, to_time
@@ -72,16 +72,11 @@ class TeamVehicle:
         self._node, self._link, self._name = node, link, names[link.index]
         self.controller = controller or AttitudeController()
         self._states: dict[int, tuple[int, np.ndarray]] = {}
-        self._arrived: dict[int, Any] = {}  # the newest messages, which are not read before somebody asks
-        self._kind, self._convert = kind, convert
+        self._convert = convert
         self._others = [number for number in range(len(names)) if number != link.index]
         self._commanded = link.now()
-        for number, name in enumerate(names):
-
-            def take(message: Any, handler: Handler, number: int = number) -> None:
-                self._arrive(number, message)
-
-            mailbox.subscribe(kind, f"/{name}/{topic}", quality(1), take, raw=True)
+        raw = kind is msgs().Odometry
+        self._topics = [mailbox.newest(kind, f"/{name}/{topic}", raw) for name in names]
 
     def sense(self) -> Sensed | None:
         """See `quad_swarm.realtime.Vehicle`. The others are moved to the time of the robot's own state."""
@@ -108,24 +103,15 @@ class TeamVehicle:
         """See `quad_swarm.realtime.Vehicle`. Here, whoever stands behind the topics stops the motors of what lies on
         the ground."""
 
-    def _arrive(self, number: int, message: Any) -> None:
-        """Keep the newest message about a robot."""
-        self._arrived[number] = message
-
     def _seen(self) -> dict[int, tuple[int, np.ndarray]]:
-        """Read what has arrived. Returns the newest states by robot."""
-        while self._arrived:
-            number, message = self._arrived.popitem()
+        """Take what has arrived. Returns the newest states by robot."""
+        for number, newest in enumerate(self._topics):
             try:
-                if isinstance(message, bytes):
-                    from rclpy.serialization import deserialize_message
-
-                    message = deserialize_message(message, self._kind)
-                stamp, state = self._convert(message, number)
+                message = newest()
+                if message is not None:
+                    self._see(number, *self._convert(message, number))
             except Exception:  # whatever a foreign message, or the middleware, raises
                 self._link.traffic.refused += 1
-                continue
-            self._see(number, stamp, state)
         return self._states
 
     def _see(self, number: int, stamp: int, state: np.ndarray) -> None:

@@ -45,6 +45,31 @@ def test_odometry_and_back():
     assert np.hypot(linear.x, linear.y) != pytest.approx(np.hypot(2.0, 0.5), abs=1e-3), "the twist is the body's"
 
 
+@pytest.mark.parametrize("frames", [("map", "robot_1/base_link"), ("", ""), ("world", "b"), ("a frame", "odd")])
+def test_serialised_odometry_is_that_of_the_middleware(frames):
+    pytest.importorskip("rclpy")
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    rng, kind = np.random.default_rng(0), messages.msgs().Odometry
+    serialised = messages.SerialisedOdometry(frames[1])
+    for stamp in (0, 1_790_000_000_123_456):
+        state = rng.uniform(-1, 1, 9)
+        message = messages.to_odometry(state, stamp, frames[1])
+        assert deserialize_message(serialised.write(state, stamp), kind) == message
+        message.header.frame_id = frames[0]
+        message.pose.covariance[:] = message.twist.covariance[:] = rng.normal(size=36)
+        message.twist.twist.angular.x = 7.0
+        for world in (False, True):
+            found, expected = (messages.from_odometry(one, world) for one in (serialize_message(message), message))
+            assert found[0] == expected[0] == stamp
+            np.testing.assert_array_equal(found[1], expected[1])
+    message.pose.pose.orientation.w = np.nan
+    with pytest.raises(ValueError, match="no rotation"):
+        messages.from_odometry(serialize_message(message))
+    with pytest.raises(Exception, match=r"(?i)deserialize"):
+        messages.from_odometry(b"\0\1" + bytes(20))
+
+
 def test_trajectories_and_back():
     pytest.importorskip("rclpy")
     positions = np.arange(21)[:, None] ** 2 * np.array([0.01, 0.0, -0.002])

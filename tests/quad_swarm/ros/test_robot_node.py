@@ -52,8 +52,8 @@ def goal_of(robot):
 
 
 def topics(robot):
-    services = (one.srv_name for one in robot.node.services)
-    return {*services, *(one.topic_name for one in (*robot.node.publishers, *robot.node.subscriptions))}
+    names = ("srv_name", "topic_name")
+    return {getattr(one, name) for _, one in robot._mailbox.entities() for name in names if hasattr(one, name)}
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ class Node:
     """Keeps what is published, and receives what is handed to it. It is its own mailbox."""
 
     def __init__(self):
-        self.published, self.takes = {}, {}
+        self.published, self.newer = {}, {}
 
     def create_publisher(self, kind, topic, profile):
         published = self.published.setdefault(topic, [])
@@ -129,13 +129,14 @@ class Node:
 
         return SimpleNamespace(publish=publish)
 
-    def subscribe(self, kind, topic, profile, take, raw=False):
-        self.takes[topic] = kind, take
+    def newest(self, kind, topic, raw=False):
+        self.newer[topic] = kind, []
+        return lambda: self.newer[topic][1].pop() if self.newer[topic][1] else None
 
     def receive(self, topic, message):
-        kind, take = self.takes[topic]
+        kind, waiting = self.newer[topic]
         assert type(message) is kind
-        take(message, None)
+        waiting[:] = [message]
 
 
 def make(kind, *args, **options):
