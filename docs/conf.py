@@ -11,6 +11,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx-mathjax-offline",
+    "sphinxarg.ext",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
@@ -24,6 +25,7 @@ html_static_path = ["_static"]
 html_css_files = ["tables.css"]
 html_js_files = ["keyboard.js"]
 
+smartquotes_action = "qe"  # no dashes: options begin with two hyphens
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
 

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+import runpy
 from pathlib import Path
 
 import gymnasium
@@ -15,6 +16,7 @@ import sb3_maddpg.team.toys  # noqa: F401
 from quad_swarm.evaluation.rows import read_rows
 from quad_swarm.task.rules import RULES
 from sb3_maddpg import MADDPG, MATD3, MADDPGPolicy, PairPolicy
+from sb3_maddpg.cli.main import COMMANDS
 from sb3_maddpg.common.estimators import ESTIMATORS
 
 ROOT = Path(__file__).parents[2]
@@ -46,6 +48,16 @@ def examples(page: str) -> list[tuple[int, str]]:
     text = text_of(page)
     blocks = [block for block in FENCED.finditer(text) if block[1] == "python"]
     return [(text[: block.start(2)].count("\n"), block[2]) for block in blocks]
+
+
+def test_the_reference_of_the_command_line_has_all_commands():
+    parsers = re.findall(r"^:func: (.*)$", text_of("docs/cli.md"), re.MULTILINE)
+    assert sorted(parsers) == sorted(COMMANDS)
+    for name, command in COMMANDS.items():
+        assert f"| [`{name}`](#{name}) | {command.help} |" in text_of("docs/cli.md")
+    functions = runpy.run_path(str(ROOT / "docs/commands.py"))
+    for name in COMMANDS:
+        assert functions[name]().prog == f"sb3-maddpg {name}"
 
 
 @pytest.fixture

@@ -260,7 +260,8 @@ def run(command: Callable[[argparse.Namespace], None], args: argparse.Namespace)
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> Parser:
+    """Return the parser of the command."""
     parser = Parser(
         "sb3-maddpg evaluate",
         description="Fly the same held-out episodes with several policies and compare them. Without options, this "
@@ -338,7 +339,7 @@ def workers(args: argparse.Namespace) -> Executor:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    args = _parser().parse_args(argv)
+    args = make_parser().parse_args(argv)
     return run(_judge if args.flight else _compare, args)
 
 

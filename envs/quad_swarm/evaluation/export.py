@@ -60,8 +60,8 @@ def export(model: str, config: SwarmConfig, folder: Path, algo: str = "sb3_maddp
     return files.load(folder)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return the exit status."""
+def make_parser() -> Parser:
+    """Return the parser of the command."""
     parser = Parser("sb3-maddpg export", description=__doc__)
     parser.add_argument(
         "model", metavar="MODEL", help="a model's zip, MODEL.zip@THRESHOLD, latest:LOGDIR or pretrained:NAME"
@@ -80,7 +80,12 @@ def main(argv: list[str] | None = None) -> int:
         help="class that loads models (default %(default)s)",
     )
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    args = make_parser().parse_args(argv)
     for name in args.gym_packages or ():  # `sb3-maddpg` has imported them before
         importlib.import_module(name)
     if not is_model(args.model):

@@ -237,8 +237,8 @@ def _virtual(team: Team) -> VirtualFlight:
     return VirtualFlight(config, policies, team.conditions, None, team.limits, *times, team.checked, planners)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return the exit status."""
+def make_parser() -> Parser:
+    """Return the parser of the command."""
     parser = Parser("sb3-maddpg fly", description=__doc__)
     parser.add_argument(
         "--policy",
@@ -275,7 +275,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--gym-packages", nargs="+", action="extend", metavar="MODULE", help="modules to import first")
     parser.add_argument("--algo", default="sb3_maddpg:MADDPG", metavar="MODULE:CLASS", help="class that loads models")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    return run(_main, parser.parse_args(argv))
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    return run(_main, make_parser().parse_args(argv))
 
 
 def _main(args: argparse.Namespace) -> None:

@@ -62,8 +62,8 @@ def _log(path: Path, recording: Recording) -> Log:
     return Log(recording.time, recording.state, recording.setpoint)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line and return the exit status."""
+def make_parser() -> Parser:
+    """Return the parser of the command."""
     parser = Parser("sb3-maddpg identify", description=__doc__)
     group = parser.add_mutually_exclusive_group(required=True)
     group.add_argument("--plant", help=f"a simulator's vehicle: one of {', '.join(simulated_vehicles())}")
@@ -85,7 +85,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, metavar="FILE", help="vehicle file to write, YAML; - is the standard output"
     )
-    args = parser.parse_args(argv)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    args = make_parser().parse_args(argv)
     for name in args.gym_packages or ():  # `sb3-maddpg` has imported them before
         importlib.import_module(name)
     piped = args.out == Path("-")

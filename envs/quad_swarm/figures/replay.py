@@ -253,8 +253,8 @@ def _touching(
     return np.argwhere(apart < limit)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit status."""
+def make_parser() -> Parser:
+    """Return the parser of the command."""
     parser = Parser(
         "sb3-maddpg replay",
         description="Fly a held-out episode with several policies and write a web page that replays it.",
@@ -267,7 +267,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, default=Path("replay.html"), help="file of the page, or - (default %(default)s)"
     )
-    return run(_write, parser.parse_args(argv))
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    return run(_write, make_parser().parse_args(argv))
 
 
 def _write(args: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from quad_swarm.realtime import Conditions, Mode
 from quad_swarm.realtime.arena import Arena, Pace, RobotEndedError
 from quad_swarm.realtime.link import monotonic, of_day
 from quad_swarm.realtime.team import Team
+from quad_swarm.realtime.udp_world import UdpWorld
 from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import for_scenario, make_config
 from quad_swarm.world.scenarios import ScenarioSampler
@@ -102,6 +103,21 @@ def test_a_process_that_does_not_start_is_told(tmp_path, monkeypatch):
     with pytest.raises(RobotEndedError, match=r"robot \d ended with exit status 1"):
         Arena(Team(CONFIG, "none"), log=tmp_path)
     assert "describes no team" in (tmp_path / "robot_0.log").read_text()
+
+
+class LateWorld(UdpWorld):
+    """One robot takes longer to start than the others would wait for any word of the world."""
+
+    def process(self, team, robot):
+        command = super().process(team, robot)
+        return ["sh", "-c", 'sleep 18; exec "$@"', "sh", *command] if robot == 1 else command
+
+
+@pytest.mark.slow
+def test_robots_wait_for_those_that_start_late():
+    config = make_config("flight", n_robots=2)
+    with Arena(Team(config, "none"), LateWorld()) as arena:
+        assert arena.fly(*places(config), most=1.0).total.counts["periods"] > 20
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from quad_swarm.realtime.process import set_priority
 from quad_swarm.realtime.team import Team
 from quad_swarm.world.presets import make_config
@@ -26,6 +28,27 @@ def test_a_robot_that_the_team_does_not_have(tmp_path):
 
 def test_no_priority_is_no_request():
     assert set_priority(0)
+
+
+def test_a_priority_is_that_of_all_threads_but_not_of_processes_that_start():
+    code = """
+import os, subprocess, sys, threading
+from quad_swarm.realtime.process import set_priority, without_priority
+ends = threading.Event()
+threading.Thread(target=ends.wait).start()
+if set_priority(1):
+    print({os.sched_getscheduler(int(one)) == os.SCHED_FIFO for one in os.listdir("/proc/self/task")})
+    child = [sys.executable, "-c", "import os; print(os.sched_getscheduler(0) == os.SCHED_FIFO)"]
+    with without_priority():
+        print(subprocess.run(child, capture_output=True, text=True).stdout.strip())
+    print(os.sched_getscheduler(0) == os.SCHED_FIFO)
+ends.set()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    if not done.stdout:
+        pytest.skip("the system allows no real-time priority")
+    assert done.stdout == "{True}\nFalse\nTrue\n"
 
 
 def test_a_process_imports_what_a_vehicle_has():
