@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 
 from quad_swarm.realtime.process import run
@@ -22,12 +23,13 @@ def main() -> int:
     def make(team: Team) -> tuple[RosLink, RosVehicle]:
         names = names_of(team.config.n_robots)
         node = make_node("robot", names[args.index])
-        mailbox = Mailbox(node)
+        mailbox = stack.enter_context(contextlib.closing(Mailbox(node)))
         link = RosLink(node, mailbox, args.index, names)
         vehicle = RosVehicle(node, mailbox, link, names)
         return link, vehicle
 
-    return run(args.team, make)
+    with contextlib.ExitStack() as stack:  # otherwise the middleware leaves its shared memory behind
+        return run(args.team, make)
 
 
 if __name__ == "__main__":
