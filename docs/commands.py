@@ -5,24 +5,18 @@ from collections.abc import Callable
 from functools import partial
 
 from sb3_maddpg.cli.main import COMMANDS, build_parser
+from sb3_maddpg.cli.offered import GROUPS
 from sb3_maddpg.cli.parser import Parser
-
-MODULES = {
-    "evaluate": "quad_swarm.evaluation.command",
-    "replay": "quad_swarm.figures.replay",
-    "identify": "quad_swarm.evaluation.identification",
-    "export": "quad_swarm.evaluation.export",
-    "fly": "quad_swarm.evaluation.fly",
-}
+from sb3_maddpg.offers import offer_named
 
 
 def parser_of(command: str) -> Parser:
     """
     :param command: name of a command
-    :return: its parser; that of the package that provides it, if it parses its own words
+    :return: its parser; that of the swarm, if packages provide it
     """
-    if command in MODULES:
-        return importlib.import_module(MODULES[command]).make_parser()
+    if command in GROUPS:
+        return importlib.import_module(offer_named(GROUPS[command], "QuadSwarm-v0").module).make_parser()
     return build_parser()[1][command]
 
 

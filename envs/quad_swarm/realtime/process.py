@@ -204,7 +204,8 @@ def set_priority(priority: int) -> bool:
         return True
     try:
         for thread in _threads():
-            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+            with contextlib.suppress(ProcessLookupError):  # it has ended
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError):
         return False
     return True
@@ -222,12 +223,12 @@ def _threads() -> list[int]:
 def without_priority() -> Iterator[None]:
     """Start processes in the block that do not inherit the real-time priority of this one. While robots import and
     compile, which takes seconds, those with a priority would let nobody else run."""
-    try:
-        policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    except AttributeError:  # not on Linux
+    policy = os.sched_getscheduler(0) if hasattr(os, "sched_getscheduler") else None
+    if policy is None or policy not in (os.SCHED_FIFO, os.SCHED_RR):
         yield
         return
+    parameters = os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     try:
         yield
     finally:
