@@ -26,13 +26,15 @@ from quad_swarm.evaluation import Condition
 from quad_swarm.evaluation.evaluation import Rows, fly_all, summarise
 from quad_swarm.evaluation.rows import aligned, write_rows
 from quad_swarm.planner import PROBLEMS, SOLVERS, OrcaSolver, VoronoiCells
-from quad_swarm.world.presets import PRESETS, make_config
+from quad_swarm.world.presets import PRESETS, SwarmConfig, make_config
+from studies.swarm import protocol
 
 CHOOSING, MEASURED = 93, 94  # sets of held-out episodes
 N_ROBOTS = 8
 SCENARIOS = ("symmetric_swap", "asymmetric_swap", "random")
 WORLDS = ("paper", "flight")
 LIMIT = 30.0  # s
+Cells = list[tuple[SwarmConfig, str]]  # worlds and scenarios
 # Swarm -> policy, planner's problem, horizon (s) or None for the preset's
 SWARMS: dict[str, tuple[str, str, float | None]] = {
     "planner, no messages": ("none", "quadrotor", None),
@@ -48,14 +50,24 @@ GRIDS: dict[str, list[dict[str, tuple[float, ...]]]] = {
     "voronoi": [
         {"seconds": (0.6, 0.7), "buffer": (0.0, 0.05), "rest": (0.0, 0.05), "detour": (2.0,), "stuck": (0.6,)},
     ],
+    "crowds": [
+        {"horizon": (0.6, 1.0, 1.5), "margin": (0.05, 0.15, 0.25, 0.35)},
+        {"speed": (2.0, 3.0, 4.0), "settling": (0.4, 0.6)},
+    ],
 }
-FIRST = {"orca": {"speed": 3.0, "settling": 0.6}, "voronoi": {}}  # what a first grid holds fixed
+# What a first grid holds fixed
+FIRST: dict[str, dict[str, Any]] = {
+    "orca": {"speed": 3.0, "settling": 0.6},
+    "voronoi": {},
+    "crowds": {"speed": 4.0, "settling": 0.4},
+}
+CROWDS = (("symmetric_swap", 16), ("forest", 8), ("doorway", 8))
 
 
 def fly(
-    policy: str, problem: str, seconds: float | None, episodes: int, seed: int, limit: float | None
+    policy: str, problem: str, seconds: float | None, episodes: int, seed: int, limit: float | None, cells: Cells
 ) -> dict[Condition, Rows]:
-    """Fly all presets and scenarios.
+    """Fly worlds.
 
     :param policy: the policy
     :param problem: the planner's problem
@@ -63,16 +75,27 @@ def fly(
     :param episodes: episodes of each
     :param seed: set of held-out episodes
     :param limit: time limit (s), None for the preset's
+    :param cells: worlds and scenarios
     """
     conditions = []
-    for preset, scenario in itertools.product(WORLDS, SCENARIOS):
-        dt = PRESETS[preset].planner.dt
-        planner: dict[str, Any] = {"problem": problem}
+    for config, scenario in cells:
+        dt, planner = config.planner.dt, dict[str, Any](problem=problem)
         if seconds is not None:
             planner["horizon"] = round(seconds / dt)
-        config = make_config(preset, n_robots=N_ROBOTS, planner=planner)
-        conditions.append(Condition(policy, scenario, config, None if limit is None else round(limit / dt)))
+        world = make_config(config, planner=planner)
+        conditions.append(Condition(policy, scenario, world, None if limit is None else round(limit / dt)))
     return fly_all(conditions, episodes, seed)
+
+
+def free_rooms() -> Cells:
+    """Return both presets with eight robots, in all scenarios."""
+    worlds = [make_config(preset, n_robots=N_ROBOTS) for preset in WORLDS]
+    return [(world, scenario) for world in worlds for scenario in SCENARIOS]
+
+
+def crowds() -> Cells:
+    """Return the cells of `CROWDS`."""
+    return [(protocol.world("flight-v2", n), scenario) for scenario, n in CROWDS]
 
 
 def choose(kind: str, episodes: int) -> Iterator[dict[str, Any]]:
@@ -96,12 +119,13 @@ def _fly_point(kind: str, parameters: dict[str, Any], episodes: int) -> dict[str
     values = dict(parameters)
     seconds = values.pop("seconds", None)
     try:
-        if kind == "orca":
+        if kind != "voronoi":
             SOLVERS["orca"] = functools.partial(OrcaSolver, **values)
-            flown = fly("none", "orca", None, episodes, CHOOSING, None)
+            cells = free_rooms() if kind == "orca" else crowds()
+            flown = fly("none", "orca", None, episodes, CHOOSING, None, cells)
         else:
             PROBLEMS["voronoi"] = type("Varied", (VoronoiCells,), values)
-            flown = fly("none", "voronoi", seconds, episodes, CHOOSING, None)
+            flown = fly("none", "voronoi", seconds, episodes, CHOOSING, None, free_rooms())
     finally:
         SOLVERS["orca"], PROBLEMS["voronoi"] = OrcaSolver, VoronoiCells
     times = [
@@ -124,7 +148,7 @@ def measure(swarms: list[str], episodes: int) -> Iterator[dict[str, Any]]:
     """Fly some of `SWARMS`. Yields a row for each preset, scenario and swarm."""
     for name in swarms:
         policy, problem, seconds = SWARMS[name]
-        for condition, rows in fly(policy, problem, seconds, episodes, MEASURED, LIMIT).items():
+        for condition, rows in fly(policy, problem, seconds, episodes, MEASURED, LIMIT, free_rooms()).items():
             config = condition.config
             preset = next(one for one in WORLDS if PRESETS[one].planner.dt == config.planner.dt)
             arrived = [row for row in rows if row["arrived"]]

@@ -15,17 +15,14 @@ from typing import Any
 import numpy as np
 
 from quad_swarm.evaluation.evaluation import Rows
-from quad_swarm.evaluation.flight import fly_steps
 from quad_swarm.geometry import length
 from quad_swarm.native.pairs import advance
 from quad_swarm.planner import Planner, Plans, Problems, make_planner
 from quad_swarm.quadrotor import N_INPUTS, POSITION, QuadrotorModel
-from quad_swarm.task.request_task import RequestTask, RewardConfig
 from quad_swarm.world.beliefs import BeliefSource, resampled
 from quad_swarm.world.presets import SwarmConfig
-from quad_swarm.world.scenarios import ScenarioSampler
 from quad_swarm.world.swarm import StepReport, Swarm
-from studies.swarm.experiment import LINGER
+from studies.swarm.experiment import fly_swarm
 
 COMMITTED, CANDIDATE = 0, 1
 _CHUNK = 100  # episodes per batch
@@ -38,12 +35,14 @@ class DelayCheckedSwarm(Swarm):
     :param n_swarms: number of swarms E
     :param clearance: minimum distance between a candidate and the plans that others announced (m)
     :param solver: see `make_planner`
-    :raises ValueError: if there is jitter
+    :raises ValueError: if there is jitter, or robots would keep to plans that they sent
     """
 
     def __init__(self, config: SwarmConfig, n_swarms: int, clearance: float, solver: str = "rti"):
         if config.radio.jitter:
             raise ValueError(f"radio.jitter={config.radio.jitter}: the check assumes a constant delay, set it to 0.")
+        if config.planner.commitment:
+            raise ValueError(f"planner.commitment={config.planner.commitment:g}: set it to 0.")
         super().__init__(config, n_swarms, solver)
         n, horizon = config.n_robots, config.planner.horizon
         # Each of the others counts twice, with its committed and its candidate plan
@@ -108,6 +107,10 @@ class DelayCheckedSwarm(Swarm):
             field[..., :-1, :] = field[..., 1:, :].copy()
         self._inputs[..., -1, :] = 0.0
         known = self._receive(requests)
+        pushed = None
+        if self.disturbance is not None:
+            self.disturbance.update(self.estimate())
+            pushed = self.disturbance.acceleration
 
         waiting = self._pending > 0
         dropped = waiting & self._comes_near(known)
@@ -121,7 +124,7 @@ class DelayCheckedSwarm(Swarm):
         self._sent = [*self._sent[1:], self._announced()]
         x, start = self.estimate(), self.disturbances.start
         if start is not None:
-            x = self.planner.model.ahead(x, self._u, start / self.config.substeps * self.config.planner.dt)
+            x = self.planner.model.ahead(x, self._u, start / self.config.substeps * self.config.planner.dt, pushed)
         inputs = self._inputs[:, :, COMMITTED].copy()
         inputs[:, :, 0] += (self._x[:, :, COMMITTED, 0] - x) @ self._feedback.T
         planner = self.config.planner
@@ -137,6 +140,8 @@ class DelayCheckedSwarm(Swarm):
             none,
             none,
         )
+        if self.disturbance is not None:
+            self.disturbance.expect(x, self.inputs, self._late)
         source = np.full(requests.shape, BeliefSource.REQUESTED)
         return self._report(self._fly(), source, 0.0)
 
@@ -151,12 +156,14 @@ class DelayCheckedSwarm(Swarm):
         x = self._x[who, COMMITTED]
         others = known[who][..., wait + 1 : wait + 1 + horizon, :].reshape(len(x), -1, horizon, 3)
         problems = Problems(x[:, wait], self.goal[who], others, announced=np.ones(others.shape[:2], dtype=bool))
+        if self.disturbance is not None:
+            problems = problems._replace(disturbance=self.disturbance.acceleration[who])
         last = slice(wait - 1, wait + horizon)
         none = np.zeros(len(x), dtype=np.int64)
         inputs = self._inputs[who, COMMITTED]
         plans = self.planner.plan(problems, Plans(x[:, last], inputs[:, last][:, :horizon], none, none, none))
-        tail = self.planner.braking_inputs(plans.x[:, -1])
-        rest = self.planner.model.rollout(plans.x[:, -1], tail)
+        tail = self.planner.braking_inputs(plans.x[:, -1], problems.disturbance)
+        rest = self.planner.model.rollout(plans.x[:, -1], tail, problems.disturbance)
         self._x[who, CANDIDATE] = np.concatenate([x[:, :wait], plans.x, rest[:, 1:]], axis=1)
         self._inputs[who, CANDIDATE] = np.concatenate([inputs[:, :wait], plans.u, tail], axis=1)
         refused = who & self._comes_near(known)
@@ -186,18 +193,8 @@ def fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequence
     :param episodes: seeds
     """
     chunks = [episodes[k : k + _CHUNK] for k in range(0, len(episodes), _CHUNK)]
-    return [row for chunk in chunks for row in _fly(config, scenario, clearance, chunk)]
-
-
-def _fly(config: SwarmConfig, scenario: str, clearance: float, episodes: Sequence[int]) -> Rows:
-    swarm = DelayCheckedSwarm(config, len(episodes), clearance)
-    sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
-    task = RequestTask(swarm, sampler, RewardConfig(), end_at_collision=False)
-    rngs = [np.random.default_rng(seed) for seed in episodes]
-    for k, rng in enumerate(rngs):
-        task.reset(k, rng)
-    everybody = np.ones((1, config.n_robots, config.n_robots - 1, 1), dtype=bool)
-    rows: dict[int, dict[str, Any]] = {}
-    for step in fly_steps(lambda task, _: everybody.repeat(task.swarm.n_swarms, 0), task, rngs, LINGER):
-        rows |= {int(step.episodes[k]): task.statistics.row(int(k)) for k in np.flatnonzero(step.over)}
-    return [rows[k] for k in range(len(episodes))]
+    return [
+        row
+        for chunk in chunks
+        for row in fly_swarm(DelayCheckedSwarm(config, len(chunk), clearance), scenario, "full", chunk)
+    ]

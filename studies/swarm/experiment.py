@@ -17,14 +17,19 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 from tqdm import tqdm
 
 from quad_swarm.evaluation.command import add_worker_arguments
 from quad_swarm.evaluation.evaluation import Rows, fly_all, summarise
-from quad_swarm.evaluation.flight import Condition
+from quad_swarm.evaluation.flight import Condition, fly_steps
+from quad_swarm.evaluation.policies import make_policy
 from quad_swarm.evaluation.rows import read_rows, write_rows
 from quad_swarm.jobs.journal import default_folder
+from quad_swarm.task.request_task import RequestTask, RewardConfig
 from quad_swarm.world.presets import SwarmConfig
+from quad_swarm.world.scenarios import ScenarioSampler
+from quad_swarm.world.swarm import Swarm
 
 Item = TypeVar("Item")
 Row = dict[str, Any]
@@ -41,6 +46,26 @@ def condition(policy: str, scenario: str, config: SwarmConfig, algo: str = "sb3_
 def fly_kept(conditions: Sequence[Condition], episodes: int, seed: int, skip: int = 0) -> dict[Condition, Rows]:
     """Call `fly_all` with a journal, so that a killed run continues from its finished pieces."""
     return fly_all(conditions, episodes, seed, skip=skip, journal=default_folder())
+
+
+def fly_swarm(swarm: Swarm, scenario: str, policy: str, episodes: Sequence[int]) -> Rows:
+    """Fly a swarm that is not the world's own, as experiments with another planning step have.
+
+    :param swarm: as many swarms as episodes
+    :param scenario: name of the scenario
+    :param policy: a rule or a model's zip
+    :param episodes: seeds, see `first_episode`
+    """
+    config = swarm.config
+    decide, observation = make_policy(policy, config, "sb3_maddpg:MADDPG")
+    sampler = ScenarioSampler(scenario, config.n_robots, config.space, config)
+    task = RequestTask(swarm, sampler, RewardConfig(), None, observation, end_at_collision=False)
+    for k, seed in enumerate(episodes):
+        task.reset(k, np.random.default_rng(seed))
+    rows: dict[int, dict[str, Any]] = {}
+    for step in fly_steps(decide, task, [np.random.default_rng([seed, 1]) for seed in episodes], LINGER):
+        rows |= {int(step.episodes[k]): task.statistics.row(int(k)) for k in np.flatnonzero(step.over)}
+    return [rows[k] for k in range(len(episodes))]
 
 
 class Job(NamedTuple):

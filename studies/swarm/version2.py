@@ -1,8 +1,10 @@
-"""Fly the sealed test of `flight-v2`: full communication, none, rules and a model of version 1.
+"""Fly the sealed tests of `flight-v2`: full communication, none, rules, a model of version 1, and rivals.
 
-``python -m studies.swarm.version2 [--part full ...] [--episodes ...] [--jobs 2] [--json F]`` flies set 700, on which
-nothing was chosen, in parts: ``obstacles``, ``full`` (all scenarios with eight robots), ``sixteen``, ``rules``,
-``teams`` (four and twelve) and ``none``. JSON: one row per policy, scenario and number of robots with the keys of
+``python -m studies.swarm.version2 [--part full ...] [--episodes ...] [--jobs 2] [--json F]`` flies sets on which
+nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios with eight robots), ``sixteen``, ``rules``,
+``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and ``crazyflie``
+(the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and ``crowd`` (full
+communication of sixteen) in all scenarios. JSON: one row per policy, scenario and number of robots with the keys of
 `summarise`; written after each part, so that a run that is ended keeps what it has.
 """
 
@@ -10,27 +12,50 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from quad_swarm.evaluation.evaluation import fly_all, make_pool, summarise
+from quad_swarm.evaluation.evaluation import Rows, fly_all, make_pool, summarise
+from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.rows import aligned, write_rows
+from quad_swarm.plants.base import MODEL
+from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import MOST_OBSTACLES, without_obstacles
+from sb3_maddpg.hub.pretrained import pretrained_folder
+from studies.swarm import delay_check
 from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import condition
+from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import world
 
-SEALED = 700
+SEALED, LATER = 700, 701
 SWAPS = ("asymmetric_swap", "symmetric_swap")
+# Version 1's model, at its threshold and at the safe one
+LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
+MODELS = (LEARNED, f"{LEARNED}@0.05")
+EVERYWHERE = (*without_obstacles(), *MOST_OBSTACLES)
+# What the delay check assumes of the world: a longest delay, and robots that keep to what passed it anyway
+CHECKED: dict[str, Any] = {"radio": {"jitter": 0}, "planner": {"commitment": 0.0}}
 
 
 class Part(NamedTuple):
-    """Policies that fly scenarios with some number of robots."""
+    """Policies that fly scenarios with some number of robots.
+
+    :param policies: the policies; `DELAY_CHECK` is no rule but `studies.swarm.delay_check`
+    :param scenarios: names of the scenarios
+    :param n_robots: numbers of robots
+    :param episodes: number of episodes of each
+    :param set: index of the set of episodes
+    :param plant: what flies
+    """
 
     policies: tuple[str, ...]
     scenarios: tuple[str, ...]
     n_robots: tuple[int, ...]
     episodes: int
+    set: int = SEALED
+    plant: str = MODEL
 
 
 PARTS = {
@@ -40,6 +65,17 @@ PARTS = {
     "rules": Part((BEST_RULE, "stage:0.9:0.3", "stage:1.0:0.2"), SWAPS, (8,), 2000),
     "teams": Part(("full", "stage:1.0:0.2"), ("symmetric_swap",), (4, 12), 2000),
     "none": Part(("none",), SWAPS, (8,), 1000),
+    "learned": Part(MODELS, SWAPS, (8,), 2000, LATER),
+    "hummingbird": Part(
+        ("full", BEST_RULE, *MODELS, "none"), ("symmetric_swap",), (8,), 1000, LATER, "rotorpy:hummingbird"
+    ),
+    "crazyflie": Part(
+        ("full", BEST_RULE, *MODELS, "none"), ("symmetric_swap",), (8,), 1000, LATER, "crazyflow:cf21B_500"
+    ),
+    "delay_check": Part((DELAY_CHECK,), SWAPS, (8,), 1000, LATER),
+    "four": Part(("full",), EVERYWHERE, (4,), 2000, LATER),
+    "twelve": Part(("full",), EVERYWHERE, (12,), 2000, LATER),
+    "crowd": Part(("full",), EVERYWHERE, (16,), 2000, LATER),
 }
 
 
@@ -48,11 +84,27 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
 
     :param episodes: number of episodes, None for the part's
     """
+    count = episodes or part.episodes
     for n in part.n_robots:
-        config = world("flight-v2", n)
-        conditions = [condition(policy, name, config) for name in part.scenarios for policy in part.policies]
-        for one, rows in fly_all(conditions, episodes or part.episodes, SEALED, executor=executor).items():
-            yield {"policy": one.policy, "scenario": one.scenario, "n_robots": n, **summarise(rows, config)}
+        config = make_config(world("flight-v2", n), plant=part.plant)
+        for scenario in part.scenarios:
+            flown: dict[str, Rows] = {}
+            conditions = [condition(policy, scenario, config) for policy in part.policies if policy != DELAY_CHECK]
+            if conditions:
+                found = fly_all(conditions, count, part.set, executor=executor)
+                flown |= {one.policy: rows for one, rows in found.items()}
+            if DELAY_CHECK in part.policies:
+                first, checked = first_episode(part.set), make_config(config, CHECKED)
+                pieces = [range(first + k, first + min(k + 100, count)) for k in range(0, count, 100)]
+                fly_piece = partial(delay_check.fly, checked, scenario, CLEARANCE)
+                flown[DELAY_CHECK] = [row for rows in executor.map(fly_piece, pieces) for row in rows]
+            for policy, rows in flown.items():
+                keys = {"policy": _name(policy), "scenario": scenario, "n_robots": n, "plant": part.plant}
+                yield keys | {"set": part.set} | summarise(rows, config)
+
+
+def _name(policy: str) -> str:
+    return policy.replace(LEARNED, "pretrained:quad-swarm-flight")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
