@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Callable
 from functools import partial
 
+from sb3_maddpg.cli import returns
 from sb3_maddpg.cli.main import COMMANDS, build_parser
 from sb3_maddpg.cli.offered import GROUPS
 from sb3_maddpg.cli.parser import Parser
@@ -22,4 +23,5 @@ def parser_of(command: str) -> Parser:
 
 # Functions by name, which is what the directive `argparse` takes
 FUNCTIONS: dict[str, Callable[[], Parser]] = {name: partial(parser_of, name) for name in COMMANDS}
+FUNCTIONS["evaluate_elsewhere"] = returns.make_parser
 globals().update(FUNCTIONS)

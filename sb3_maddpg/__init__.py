@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sb3_maddpg.relational.policy import PairPolicy
     from sb3_maddpg.team.pettingzoo import TeamEnv
     from sb3_maddpg.vec_env.normalize import SafeVecNormalize
+    from sb3_maddpg.vec_env.wrap import make_vec_env
 
     __version__: str
 
@@ -45,6 +46,7 @@ _MODULES = {
     "TeamReplayBuffer": "common.buffers",
     "allow_in_files": "files.registry",
     "check_team_env": "common.env_checker",
+    "make_vec_env": "vec_env.wrap",
     "pretrained": "hub.pretrained",
     "untrusted": "files.trust",
 }
@@ -67,6 +69,7 @@ __all__ = [
     "TeamReplayBuffer",
     "allow_in_files",
     "check_team_env",
+    "make_vec_env",
     "pretrained",
     "untrusted",
 ]

@@ -53,7 +53,7 @@ class Ours:
         self.model.train(gradient_steps=1, batch_size=common.BATCH_SIZE)
 
     def act(self, observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {agent: self.policies[agent].predict(observation) for agent, observation in observations.items()}
+        return {agent: self.policies[agent].predict(observation)[0] for agent, observation in observations.items()}
 
     def network(self, agent: str) -> nn.Module:
         return self.policies[agent]

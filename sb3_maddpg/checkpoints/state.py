@@ -32,6 +32,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_maddpg.checkpoints.fingerprints import fingerprint
 from sb3_maddpg.common.buffers import TeamReplayBuffer
 from sb3_maddpg.common.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
+from sb3_maddpg.common.evaluation import TeamEvalCallback
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError, NoStateError
 from sb3_maddpg.files.typed_json import encode
@@ -73,6 +74,7 @@ KEPT: dict[type[BaseCallback], tuple[str, ...]] = {
     StopTrainingOnNoModelImprovement: ("last_best_mean_reward", "no_improvement_evals"),
     StopTrainingOnRewardThreshold: (),
 }
+KEPT[TeamEvalCallback] = (*KEPT[EvalCallback], "best_value", "agent_results", "agent_lengths")
 _CALLS, _TOLD = "n_calls", "state_dict"
 
 

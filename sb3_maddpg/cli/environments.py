@@ -23,11 +23,11 @@ from stable_baselines3.common.vec_env import (
     is_vecenv_wrapped,
 )
 
-from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.options import modules_beside
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv
 from sb3_maddpg.cli.recipe import wrapper_of
 from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
+from sb3_maddpg.team import pettingzoo_ids
 from sb3_maddpg.utils import did_you_mean, shown, suggest, told
 from sb3_maddpg.vec_env.gymnasium import GymnasiumVecEnv
 from sb3_maddpg.vec_env.normalize import SafeVecNormalize

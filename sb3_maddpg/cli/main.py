@@ -97,7 +97,7 @@ COMMANDS: dict[str, Command] = {
         quiet=True,
     ),
     "evaluate": Command(
-        "compare policies over the same episodes, or judge recorded flights",
+        "compare policies over the same episodes, in any environment, or judge recorded flights",
         "offered:run",
         None,
         f"  {PROG} evaluate --env ENV --policy latest:logs",

@@ -1,4 +1,7 @@
-"""``sb3-maddpg evaluate``, ``replay``, ``identify``, ``export``, ``fly``: what packages provide for environments."""
+"""
+``sb3-maddpg evaluate``, ``replay``, ``identify``, ``export``, ``fly``: what packages provide for environments. Without
+such a command, ``evaluate`` measures returns, see ``returns``.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,7 @@ from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.files.model_files import refuse_pickled, trusted
 from sb3_maddpg.hub.pretrained import pretrained_models
 from sb3_maddpg.offers import broken, load_offer, offer_named, offers
+from sb3_maddpg.team.pettingzoo_ids import register
 from sb3_maddpg.utils import shown, suggest, told
 
 GROUPS = {
@@ -43,20 +47,24 @@ def run(args: argparse.Namespace, words: list[str], example: str, user_errors: t
     names = sorted({one.name for one in offers(group)})
     words = ["--help" if word == "--help-all" else word for word in words]
     helps = not {"-h", "--help"}.isdisjoint(words)
-    if helps:
+    if helps and (args.env is None or offer_named(group, args.env) is not None):
         _print_help(group, example, names)
     if args.env is None and (len(names) != 1 and not (helps and names)):
         choice = f"choose one of {', '.join(names)}" if names else f"no installed package has {group}"
         raise InvalidArgumentError(f"--env is missing: {choice}.")
     env_id = args.env or names[0]
     offer = offer_named(group, env_id)
+    near = get_close_matches(env_id, names, n=1)
+    if offer is None and args.command == "evaluate" and (not near or register(env_id)):
+        from sb3_maddpg.cli import returns
+
+        return returns.run(args, words)
     if offer is None:
-        if get_close_matches(env_id, names, n=1):
+        if near:
             raise InvalidArgumentError(suggest("environment", env_id, names))
         raise InvalidArgumentError(
             f"This command is for {', '.join(names)}, not for {shown(env_id)}: no installed package "
-            f"provides {group} for it. `sb3-maddpg enjoy` and `record` run models in any environment, and "
-            "evaluate_policy of Stable-Baselines3 measures their returns."
+            f"provides {group} for it. `sb3-maddpg evaluate`, `enjoy` and `record` run models in any environment."
         )
     main = load_offer(offer)
     words = [model_path(word, args.algo, env_id) for word in words]

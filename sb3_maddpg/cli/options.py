@@ -132,6 +132,13 @@ def training_options(parser: Parser) -> None:
     add("-P", "--progress", action="store_true", help="show a progress bar")
     add("--eval-freq", type=_ONE_OR_DEFAULT, default=25_000, metavar="N", help="evaluate every N steps; -1: never")
     add("--eval-episodes", type=_ONE, default=5, metavar="N", help="episodes of an evaluation (default %(default)s)")
+    add(
+        "--best-by",
+        default="mean_reward",
+        metavar="WHAT",
+        help="what makes best_model.zip the best in an evaluation: the team's mean_reward (default), success_rate, or "
+        "the name of an agent for its return",
+    )
     add("--resume", nargs="?", const="", metavar="RUN", help="resume a run (default: the newest)")
     add("-i", "--trained-agent", default="", metavar="MODEL", help="continue the training of a model's zip file")
     rare("--eval-env-kwargs", **_PAIRS, help="arguments of the evaluation environment, merged over --env-kwargs")

@@ -29,13 +29,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.algorithms import algorithm
 from sb3_maddpg.cli.literals import BoundedLoader, parse_literal
 from sb3_maddpg.cli.options import MOST_COPIES, files_beside
 from sb3_maddpg.cli.overview import packaged_recipes
 from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError
 from sb3_maddpg.team import pettingzoo as parallel
+from sb3_maddpg.team import pettingzoo_ids
 from sb3_maddpg.utils import arguments_of, did_you_mean, shown, suggest, told
 from sb3_maddpg.validation import Arguments, NormalizationArguments, validated_as
 

@@ -11,7 +11,6 @@ from typing import Any
 import gymnasium
 
 from sb3_maddpg.checkpoints.commit import newest
-from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.cli.algorithms import ALGORITHMS
 from sb3_maddpg.cli.experiment import given_recipe
 from sb3_maddpg.cli.options import PROG, general_options, import_packages, training_options
@@ -21,6 +20,7 @@ from sb3_maddpg.cli.runs import CHECKPOINTS
 from sb3_maddpg.cli.safety import check_links, check_names, check_paths, is_inside, may_import, read_settings
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError, UntrustedFileError
 from sb3_maddpg.files.model_files import trusted
+from sb3_maddpg.team import pettingzoo_ids
 from sb3_maddpg.utils import shown
 
 # Options of a run that hold when it is resumed. All others concern its beginning, or are in its recipe.

@@ -8,16 +8,20 @@ import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 
 from sb3_maddpg.checkpoints.commit import locked, newest
 from sb3_maddpg.cli.processes import SECONDS_TO_END, run_all, without_processes
 from sb3_maddpg.cli.resuming import parsed
-from sb3_maddpg.cli.runs import CHECKPOINTS
+from sb3_maddpg.cli.runs import CHECKPOINTS, name_of
 from sb3_maddpg.cli.safety import as_yaml, read_settings
+from sb3_maddpg.cli.terminal import aligned
+from sb3_maddpg.common.evaluation import mean_interval
 from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.utils import shown
 
@@ -74,7 +78,46 @@ def train_seeds(args: argparse.Namespace, words: list[str], seeds: list[int], jo
     folder = Path(args.log_folder)
     folder.mkdir(parents=True, exist_ok=True)
     words = without_processes(words)
-    return run_all([_Training(seed, words, folder) for seed in seeds], jobs, args.engine, args.address)
+    trainings = [_Training(seed, words, folder) for seed in seeds]
+    status = run_all(trainings, jobs, args.engine, args.address)
+    if curves := {one.seed: curve for one in trainings if (curve := one.curve()) is not None}:
+        print(summary(curves))
+        if find_spec("matplotlib") is not None:
+            from sb3_maddpg.cli.plots import draw_seeds
+
+            path = folder / f"{args.algo}-{name_of(args.env)}-seeds.png"
+            named = {f"seed {seed}": (curve.steps, curve.returns) for seed, curve in curves.items()}
+            print(f"figure: {draw_seeds(named, args.env, path)}")
+    return status
+
+
+class Curve(NamedTuple):
+    """The evaluations during a training."""
+
+    run: Path
+    """Folder of the run"""
+    steps: np.ndarray
+    """Numbers of steps after which the model was evaluated, (evaluations,)"""
+    returns: np.ndarray
+    """Mean return of each evaluation, (evaluations,)"""
+
+
+def summary(curves: Mapping[int, Curve]) -> str:
+    """
+    :param curves: the evaluations of each seed
+    :return: a table of the last and the best evaluations, with means over the seeds and their 95 % intervals
+    """
+    lines = [["seed", "last", "best", "after steps", "folder"]]
+    for seed, (run, steps, returns) in curves.items():
+        best = int(returns.argmax())
+        lines.append([str(seed), f"{returns[-1]:.3f}", f"{returns[best]:.3f}", str(int(steps[best])), str(run)])
+    if len(curves) > 1:
+        figures = []
+        for values in ([curve.returns[-1] for curve in curves.values()], [max(one.returns) for one in curves.values()]):
+            mean, low, high = mean_interval(values)
+            figures.append(f"{mean:.3f} [{low:.3f}, {high:.3f}]")
+        lines.append(["mean", *figures, "", f"95 % intervals of {len(curves)} seeds"])
+    return f"Returns in the evaluations during training:\n{aligned(lines)}"
 
 
 @dataclass(frozen=True)
@@ -107,6 +150,16 @@ class _Training:
             if not (run / CHECKPOINTS).exists() and any(run.glob("*.zip")):
                 return [], f"finished before, {run}"
         return ["train", *words], "starts"
+
+    def curve(self) -> Curve | None:
+        """:return: the evaluations of this training, None if there are none"""
+        run = self._run_of(parsed([*self.words, "--seed", str(self.seed)]))
+        path = None if run is None else run / "evaluations.npz"
+        if run is None or path is None or not path.is_file():
+            return None
+        with np.load(path, allow_pickle=False) as file:
+            steps, results = file["timesteps"], file["results"]
+        return Curve(run, steps, results.mean(axis=1)) if len(steps) else None
 
     def _run_of(self, args: argparse.Namespace) -> Path | None:
         """:return: the newest run that these options started, if there is one"""

@@ -152,13 +152,30 @@ def _prepare(
     normalization = unwrap_vec_normalize(env)
     if normalization is not None and getattr(args, "norm_reward", False):
         normalization.norm_reward = True
-    return _load(cls, path, args, shares, env, settings), env, (run, f"{title}-{args.algo}-{name}")
+    return (
+        load_model(cls, path, shares, env, settings, args.seed, args.device),
+        env,
+        (run, f"{title}-{args.algo}-{name}"),
+    )
 
 
-def _load(
-    cls: Any, path: Path, args: argparse.Namespace, shares: bool, env: VecEnv, settings: Mapping[str, Any]
+def load_model(
+    cls: Any, path: Path, shares: bool, env: VecEnv, settings: Mapping[str, Any], seed: int, device: str
 ) -> Any:
-    kwargs: dict[str, Any] = {"seed": args.seed}
+    """
+    Load a model that acts, but is not trained on.
+
+    :param cls: the algorithm
+    :param path: the model's file
+    :param shares: whether all agents share its policy, see ``shares_parameters``
+    :param env: the environment in which it acts
+    :param settings: settings of its run, see ``run_settings``
+    :param seed: seed of its random numbers
+    :param device: PyTorch's device
+    :return: the model, or what acts with it for the whole team
+    :raises ValueError: if the file is damaged, or is not trusted and may run code
+    """
+    kwargs: dict[str, Any] = {"seed": seed}
     if issubclass(cls, OffPolicyAlgorithm) and not issubclass(cls, TeamAlgorithm):
         kwargs |= {"buffer_size": 1, "optimize_memory_usage": False}  # nothing is stored
         if "HerReplayBuffer" in str(settings.get("replay_buffer_class", "")):
@@ -168,7 +185,7 @@ def _load(
     with warnings.catch_warnings():
         if settings.get("normalize"):  # as this environment does
             warnings.filterwarnings("ignore", ".* was trained with VecNormalize")
-        model = cls.load(path, custom_objects=_UNUSED, device=args.device, **kwargs)
+        model = cls.load(path, custom_objects=_UNUSED, device=device, **kwargs)
     return SharedPolicy(model) if shares else model
 
 

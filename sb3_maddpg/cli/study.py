@@ -38,6 +38,7 @@ from sb3_maddpg.cli.search import (
     search,
     tell_best,
 )
+from sb3_maddpg.cli.terminal import aligned, tell
 from sb3_maddpg.cli.tuning import SPACES, Searched, convert_params
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
 from sb3_maddpg.files.model_files import trusted
@@ -47,6 +48,7 @@ from sb3_maddpg.utils import arguments_of, atomic_write, remedy_of, shown, sugge
 # Trials that count towards the maximum. Those that run do too: otherwise each worker could start one too many.
 _COUNTED = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED)
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+MOST_SHOWN = 4  # trials in the table of the best ones
 # What the trials of a search without a storage depend on
 _SETTINGS = (
     *("algo", "n_timesteps", "n_trials", "max_total_trials", "n_startup_trials", "n_evaluations", "eval_episodes"),
@@ -110,6 +112,7 @@ class Search:
         best = best_recipe(self.folder, self.experiment.name)
         check_writable(best)
         verbosity, interrupted = optuna.logging.get_verbosity(), False
+        optuna.logging.set_verbosity(optuna.logging.WARNING)  # `_tell` is shorter
         try:
             with self._told_disk():
                 self.study = self._open()
@@ -156,15 +159,31 @@ class Search:
 
     def _optimize(self, study: optuna.Study) -> None:
         limits: dict[str, Any] = {"n_trials": self.args.n_trials}
+        callbacks: list[Callable[[optuna.Study, optuna.trial.FrozenTrial], None]] = [self._tell]
         if self.most is not None:
             if _count(study, _COUNTED) >= self.most:
                 return
-            limits = {"callbacks": [MaxTrialsCallback(self.most, states=_COUNTED)]}
+            limits = {}
+            callbacks.append(MaxTrialsCallback(self.most, states=_COUNTED))
         # An interrupt within Optuna itself raises another error there; threads of several jobs have none
         held = uninterrupted() if self.args.n_jobs == 1 else contextlib.nullcontext(contextlib.nullcontext)
         # Without collecting garbage, environments and models of finished trials stay in memory
         with held as self._interruptible:
-            study.optimize(self._objective, n_jobs=self.args.n_jobs, gc_after_trial=True, **limits)
+            study.optimize(self._objective, n_jobs=self.args.n_jobs, gc_after_trial=True, callbacks=callbacks, **limits)
+
+    def _tell(self, study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
+        """Print a line about a finished trial."""
+        finished, most = _count(study, _FINISHED), self.most or self.args.n_trials
+        seconds = f", {trial.duration.total_seconds():.0f} s" if trial.duration is not None else ""
+        outcome = "failed"
+        if trial.state == TrialState.PRUNED:
+            outcome = "pruned"
+        elif trial.value is not None:
+            best = study.best_trial
+            outcome = f"{trial.value:.4g}" + (
+                ", the best so far" if best.number == trial.number else f" (best {best.value:.4g}, trial {best.number})"
+            )
+        tell(f"trial {trial.number}, {finished} of {most}: {outcome}{seconds}")
 
     def _sampler(self) -> optuna.samplers.BaseSampler:
         sampler: optuna.samplers.BaseSampler
@@ -265,8 +284,13 @@ class Search:
     def _report(self, study: optuna.Study) -> None:
         best = study.best_trial
         print(f"Best of {len(study.trials)} trials: number {best.number} with a mean return of {best.value:.6g}")
-        for key, value in best.params.items():
-            print(f"    {key}: {value}")
+        done = sorted(study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]), key=_value_of, reverse=True)
+        shown_trials = done[:MOST_SHOWN]
+        lines = [["", *(f"trial {one.number}" for one in shown_trials)]]
+        lines.append(["mean return", *(f"{one.value:.4g}" for one in shown_trials)])
+        for key in best.params:
+            lines.append([key, *(_short(one.params.get(key, "")) for one in shown_trials)])
+        print(aligned(lines))
         name = f"report_{self.experiment.name}_{self.args.n_trials}-trials-{self.experiment.n_timesteps}"
         path = self.folder / f"{name}-{self.args.sampler}-{self.args.pruner}_{int(time.time())}.csv"
         study.trials_dataframe().to_csv(path)
@@ -302,6 +326,15 @@ class _TrialEvaluation(EvalCallback):
             self.trial.report(self.last_mean_reward, self.evaluations)
             self.is_pruned = self.trial.should_prune()
         return not self.is_pruned
+
+
+def _value_of(trial: optuna.trial.FrozenTrial) -> float:
+    assert trial.value is not None
+    return trial.value
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def trial_of(args: argparse.Namespace) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import stat
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -101,3 +101,14 @@ def tell(text: str) -> None:
     """
     with _telling:
         print(text, flush=True)
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> str:
+    """
+    :param lines: cells of a table's lines
+    :return: the table as text: the first column begins at the left, the others end at the right
+    """
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines
+    )

@@ -11,6 +11,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from pprint import pprint
 from typing import Any, cast
@@ -44,6 +45,7 @@ from sb3_maddpg.cli.runs import CHECKPOINTS, claim_folder, latest_number
 from sb3_maddpg.cli.safety import write_settings
 from sb3_maddpg.cli.seeds import parse_seeds, train_seeds
 from sb3_maddpg.common.callbacks import DashboardCallback, check_drawn, check_layout
+from sb3_maddpg.common.evaluation import MEAN_REWARD, TeamEvalCallback
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
 from sb3_maddpg.errors import InvalidArgumentError
 from sb3_maddpg.files.model_files import not_ours, refuse_pickled, trusted
@@ -207,7 +209,11 @@ class Training:
             env = experiment.environments.make(
                 args.n_eval_envs, experiment.eval_env_kwargs, evaluates=True, statistics=self._statistics()
             )
-            evaluation = EvalCallback(
+            team = issubclass(experiment.algorithm, TeamAlgorithm)
+            if args.best_by != MEAN_REWARD and not team:
+                raise InvalidArgumentError(f"--best-by is for teams' algorithms, not for --algo {args.algo}.")
+            kind: Any = partial(TeamEvalCallback, best_by=args.best_by) if team else EvalCallback
+            evaluation = kind(
                 env,
                 callback_on_new_best=_SaveStatistics(self.settings / STATISTICS),
                 best_model_save_path=str(self.folder),

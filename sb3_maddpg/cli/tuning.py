@@ -83,7 +83,10 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     if "one_minus_gamma" in params:
         params["gamma"] = 1 - params.pop("one_minus_gamma")
     if "first_noise" in params:
-        params["exploration_noise"] = [params.pop("first_noise"), params.pop("last_noise")]
+        first = params.pop("first_noise")
+        # Earlier studies sampled the last noise on its own
+        last = params.pop("last_noise") if "last_noise" in params else first * params.pop("noise_left")
+        params["exploration_noise"] = [first, last]
     policy_kwargs: dict[str, Any] = {
         key: json.loads(params.pop(key)) for key in ("share_actor", "share_critic") if key in params
     }
@@ -102,7 +105,7 @@ def _suggest(trial: optuna.Trial, searched: Searched) -> TeamActions:
     trial.suggest_float("policy_regularization", 1e-5, 1e-2, log=True)
     if actions.has_continuous and "action_noise" not in searched.hyperparams:
         trial.suggest_float("first_noise", 0.1, 1.0, log=True)
-        trial.suggest_float("last_noise", 0.01, 0.3, log=True)
+        trial.suggest_float("noise_left", 0.03, 1.0, log=True)
     if actions.discrete:
         estimator = trial.suggest_categorical("estimator", list(ESTIMATORS))
         if estimator not in WITHOUT_TEMPERATURE:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -16,8 +17,9 @@ from torch import nn
 from sb3_maddpg.common.actions import ActionKind, Categorical, Continuous, make_kinds
 from sb3_maddpg.common.networks import single_precision
 from sb3_maddpg.errors import DivergedError, InvalidArgumentError
+from sb3_maddpg.team.agents import flat_observation
 from sb3_maddpg.team.spaces import AgentActionSpace, into_box
-from sb3_maddpg.utils import as_numbers, atomic_write, shown
+from sb3_maddpg.utils import atomic_write, shown
 
 _TORCHSCRIPT = (".pt", ".pth", ".ts", ".torchscript")
 
@@ -36,6 +38,7 @@ class AgentPolicy(nn.Module):
     :param mask: columns of the observation that hold the action mask, see ``TeamObservation``; empty without one
     :param statistics: mean and standard deviation of observations, (obs_dim,), and the limit of normalised ones, None
         for observations that are not normalised
+    :param observation_space: the agent's observation space before it was flattened, by default a flat one
     """
 
     columns: th.Tensor
@@ -59,8 +62,10 @@ class AgentPolicy(nn.Module):
         threshold: float,
         mask: Sequence[int] = (),
         statistics: tuple[np.ndarray, np.ndarray, float] | None = None,
+        observation_space: spaces.Space | None = None,
     ):
         super().__init__()
+        self.observation_space = observation_space or spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
         self.n_hidden = 0
         self.limit = None if statistics is None else statistics[2]
         if statistics is not None:
@@ -113,11 +118,13 @@ class AgentPolicy(nn.Module):
         places[list(columns)] = np.arange(len(columns))
         policy.register_buffer("places", th.tensor(places))
         policy.obs_dim = len(columns)
+        policy.observation_space = spaces.Box(-np.inf, np.inf, (policy.obs_dim,), np.float32)
         return policy
 
-    def forward(self, obs: th.Tensor) -> th.Tensor:
+    def forward(self, obs: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
         :param obs: observations, (batch, obs_dim)
+        :param deterministic: whether to choose the most probable actions instead of sampling
         :return: actions in the environment's units, in the data type of the agent's action space and within its bounds:
             batch first and then the space's shape, but (batch, 1) for ``Discrete``
         """
@@ -128,7 +135,7 @@ class AgentPolicy(nn.Module):
         logits = self.network(obs)[:, self.columns].unsqueeze(1)
         if self.has_mask:
             logits = self.kind.mask(logits, (obs[:, self.mask] > 0).unsqueeze(1))
-        actions = self.kind.act(logits, deterministic=True).squeeze(1)
+        actions = self.kind.act(logits, deterministic=deterministic).squeeze(1)
         if isinstance(self.kind, Continuous):
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
             actions = (actions.round() if self.whole else actions).clamp(self.low, self.high)
@@ -141,49 +148,35 @@ class AgentPolicy(nn.Module):
         return actions if self.flat else actions.reshape(-1, *self.shape)
 
     @single_precision()
-    def predict(self, observation: np.ndarray) -> np.ndarray:
+    def predict(
+        self, observation: Any, state: None = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, None]:
         """
-        Choose the action for an observation.
+        Choose the action for an observation, with the arguments of Stable-Baselines3's ``predict``.
 
-        :param observation: an array, such as an image, or a flat observation, (obs_dim,), or a batch of flat ones,
-            (batch, obs_dim), flattened as by Gymnasium's ``flatten``
+        :param observation: an observation of the agent's own observation space, such as a dict, a category or an
+            image; or flattened as by Gymnasium's ``flatten``, (obs_dim,), or a batch of flat ones, (batch, obs_dim)
+        :param state: unused
+        :param episode_start: unused
+        :param deterministic: whether to choose the most probable action instead of sampling
         :return: an action of the agent's action space, or a batch of them: batch first and then the space's shape, but
-            (batch, 1) for ``Discrete``
-        :raises ValueError: if the observation has another length or holds NaN or infinity
+            (batch, 1) for ``Discrete``; and None for the state
+        :raises ValueError: if the observation does not fit its space or holds NaN or infinity
         """
-        flatten = (
-            f"Flatten an observation as TeamEnv does: gymnasium.spaces.flatten(env.observation_space({self.name!r}), "
-            "observation)."
-        )
-        if isinstance(observation, Mapping) and self.name in observation:
-            raise InvalidArgumentError(
-                f"These are observations of several agents: pass observations[{self.name!r}] alone."
-            )
-        try:
-            obs = th.as_tensor(as_numbers(observation))
-        except ValueError:
-            raise InvalidArgumentError(
-                f"The observation of {self.name} is not an array of numbers: {shown(observation)}. {flatten}"
-            ) from None
-        if obs.numel() == self.obs_dim and obs.shape[-1:] != (self.obs_dim,):
-            obs = obs.flatten()
-        if obs.shape[-1:] != (self.obs_dim,) or obs.dim() > 2:
-            raise InvalidArgumentError(
-                f"An observation of {self.name} has shape ({self.obs_dim},), not {tuple(obs.shape)}. {flatten}"
-            )
+        obs = th.as_tensor(flat_observation(self.name, self.observation_space, self.obs_dim, observation))
         if not obs.isfinite().all():
             raise InvalidArgumentError(
                 f"The observation of {self.name} holds NaN or infinity: clip or replace such values."
             )
         with th.no_grad():
-            actions = self(obs.reshape(-1, self.obs_dim)).numpy()
+            actions = self(obs.reshape(-1, self.obs_dim), deterministic).numpy()
         space = self.action_space
         if isinstance(space, spaces.Box):
             actions = into_box(space, actions)
         actions = actions.astype(space.dtype, copy=False)
         if obs.dim() == 2:
-            return actions
-        return actions[0, 0] if isinstance(space, spaces.Discrete) else actions[0].reshape(space.shape)
+            return actions, None
+        return (actions[0, 0] if isinstance(space, spaces.Discrete) else actions[0].reshape(space.shape)), None
 
     @single_precision()
     def export(self, path: str | os.PathLike[str]) -> None:

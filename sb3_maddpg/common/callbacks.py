@@ -31,12 +31,19 @@ def widen_tables(logger: Logger, keys: Iterable[str]) -> None:
             output.max_length = max(output.max_length, width)
 
 
-def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
+# Metrics that SB3 logs of the team as means of its last episodes
+_OF_EPISODES = ("rollout/ep_rew_", "rollout/ep_len_")
+
+
+def record_metrics(
+    logger: Logger, infos: list[dict[str, Any]], last: Callable[[str, float], None] | None = None
+) -> None:
     """
     Log the numbers in ``info["metrics"]``, as means over the steps until the next dump of the log.
 
     :param logger: the algorithm's logger
     :param infos: infos of one step, one per environment, see ``TeamInfo``
+    :param last: takes name and value of the agents' returns and lengths instead, None to log them as the others
     :raises ValueError: if a metric is not a finite number
     """
     for info in infos:
@@ -55,7 +62,10 @@ def record_metrics(logger: Logger, infos: list[dict[str, Any]]) -> None:
                 raise InvalidEnvironmentError(
                     f"info['metrics'][{name!r}] is {shown(value)}: a metric must be a finite number."
                 )
-            logger.record_mean(name, number)
+            if last is not None and str(name).startswith(_OF_EPISODES):
+                last(name, number)
+            else:
+                logger.record_mean(name, number)
 
 
 def check_success(infos: list[dict[str, Any]]) -> None:

@@ -725,11 +725,9 @@ class MADDPGPolicy(BasePolicy):
         network = deepcopy(self.actor.single(index)).requires_grad_(False).cpu()
         columns, space = self.actions.columns_of(index), team.action_spaces[index]
         mask = team.masks[index] if team.masks else ()
-        own = None
-        if statistics is not None:
-            mean, var = (part[index, : team.obs_dims[index]] for part in (statistics.mean, statistics.var))
-            own = (mean, np.sqrt(var + statistics.epsilon), statistics.clip)
-        arguments = (columns, space, team.obs_dims[index], self.threshold, mask, own)
+        own = None if statistics is None else statistics.of_agent(index, team.obs_dims[index])
+        seen = getattr(self.observation_space, "agent_spaces", None)
+        arguments = (columns, space, team.obs_dims[index], self.threshold, mask, own, seen and seen[index])
         return AgentPolicy(team.names[index], network, *arguments)
 
     def not_finite(self, parameters: Mapping[str, th.Tensor]) -> str | None:
@@ -767,8 +765,9 @@ class MADDPGPolicy(BasePolicy):
         alone = "For one agent alone: model.agent_policy(NAME).predict(its observation)."
         if isinstance(observation, Mapping):
             raise InvalidArgumentError(
-                f"observation={shown(observation)} is a dict, but a team observes an array of shape "
-                f"{self.observation_space.shape}, as sb3_maddpg.TeamEnv(env) returns it. {alone}"
+                f"observation={shown(observation)} is a dict, but a team's policy observes an array of shape "
+                f"{self.observation_space.shape}, as sb3_maddpg.TeamEnv(env) returns it; model.predict takes the dict "
+                f"of a PettingZoo environment. {alone}"
             )
         try:
             numbers = as_numbers(observation)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import gymnasium
@@ -45,7 +46,8 @@ from sb3_maddpg.errors import (
 from sb3_maddpg.files.model_files import FILE_FORMAT
 from sb3_maddpg.files.saving import Lean, SavesSafely
 from sb3_maddpg.files.typed_json import encode
-from sb3_maddpg.team.pettingzoo import find_module
+from sb3_maddpg.team.agents import agent_actions, flat_observation
+from sb3_maddpg.team.pettingzoo_ids import register
 from sb3_maddpg.team.spaces import ACTION_SPACES, MixedActions, into_box, plain_joint_space
 from sb3_maddpg.utils import describe_env, remove_empty_log_folder, shown, suggest
 from sb3_maddpg.validation import Arguments, LearnArguments, RunArguments, TeamArguments, validated
@@ -134,6 +136,8 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
                     f"replay_buffer_kwargs[{name!r}] is an argument of the algorithm: pass {name} to it instead."
                 )
         with _explained_id(env):
+            if isinstance(env, str):
+                register(env)
             super().__init__(
                 policy,
                 env,
@@ -171,6 +175,8 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
         self._left_as: str | None = None  # how learn() left the environment, see fingerprint()
         self.normalized_observations = False  # whether VecNormalize normalises the observations of the networks
         self.observation_statistics: dict[str, Any] | None = None  # of a loaded file, see ObservationStatistics
+        # The last returns and lengths of agents, by the names under which their means are logged
+        self.agent_windows: dict[str, deque[float]] = {}
         self.lean: Lean | None = None
         self.algorithm = type(self).__name__
         self.file_format = FILE_FORMAT
@@ -511,6 +517,13 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
         :raises ValueError: if there is no such agent, its parameters are not finite, or the statistics of observations
             are unknown
         """
+        return self.policy.agent_policy(agent, self.statistics_of_agents())
+
+    def statistics_of_agents(self) -> ObservationStatistics | None:
+        """
+        :return: how the observations of agents are normalised that act without the training's environment
+        :raises ValueError: if this is unknown
+        """
         statistics = self._present_statistics() if self.normalized_observations else None
         if self.normalized_observations and self.num_timesteps and statistics is None:
             raise InvalidEnvironmentError(
@@ -518,7 +531,57 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
                 "the statistics: load it with env=SafeVecNormalize.load(RUN/ENV/vecnormalize.pkl, env), or with "
                 "normalized_observations=False if you normalise observations yourself."
             )
-        return self.policy.agent_policy(agent, statistics)
+        return statistics
+
+    def agent_policies(self) -> dict[str, AgentPolicy]:
+        """
+        Extract the policies of all agents, see ``agent_policy``.
+
+        :return: the policies by the agents' names
+        """
+        return {name: self.agent_policy(name) for name in self.policy.team.names}
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, Any]:
+        """
+        Choose the team's actions, see Stable-Baselines3's ``predict``.
+
+        :param observation: observation of the team, as a team environment returns it, or a batch of them; or the dict
+            of a PettingZoo environment, in which agents that have ended may be missing
+        :param state: unused
+        :param episode_start: unused
+        :param deterministic: whether to act without exploration
+        :return: the joint action, or for a dict the actions of its agents, each of the agent's action space, which a
+            PettingZoo environment takes; and None for the state
+        :raises ValueError: if the observation does not fit, an agent is unknown, or a dict needs statistics of
+            ``VecNormalize`` that are unknown, see ``agent_policy``
+        """
+        if not isinstance(observation, Mapping):
+            return super().predict(observation, state, episode_start, deterministic)
+        team = self.policy.team
+        rows = {agent: team.index(agent) for agent in observation}
+        matrix, statistics = np.zeros(self.observation_space.shape or (), np.float32), self.statistics_of_agents()
+        seen = getattr(self.observation_space, "agent_spaces", None)
+        for agent, row in rows.items():
+            name, length = team.names[row], team.obs_dims[row]
+            space = spaces.Box(-np.inf, np.inf, (length,)) if seen is None else seen[row]
+            obs = flat_observation(name, space, length, observation[agent])
+            if obs.ndim > 1:
+                raise InvalidArgumentError(
+                    f"The observation of {name} is a batch of {len(obs)}: pass one of each agent."
+                )
+            if statistics is not None:
+                mean, std, limit = statistics.of_agent(row, length)
+                obs = ((obs - mean) / std).clip(-limit, limit)
+            matrix[row, :length] = obs
+        joint, _ = super().predict(matrix, deterministic=deterministic)
+        places = agent_actions(team.action_spaces)
+        return {agent: places[row].of(joint) for agent, row in rows.items()}, None
 
     def set_threshold(self, threshold: float) -> None:
         """
@@ -590,6 +653,8 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         self._seeds_of_reset = self._seeds_of_env()
+        if not self.ep_info_buffer:
+            self.agent_windows = {}
         self._check_evaluation(callback)
         return total_timesteps, callback
 
@@ -654,11 +719,22 @@ class TeamAlgorithm(SavesSafely, SavesReplayBuffer):
             check_returned(self.n_envs, infos, dones=dones)
         check_success(infos)
         super()._update_info_buffer(infos, dones)
-        record_metrics(self.logger, infos)
+        record_metrics(self.logger, infos, self._keep_last)
         if dones is not None and np.count_nonzero(dones):  # a wrapper may have ended an episode, unknown to its TeamEnv
             assert self.env is not None
             begun = [self.env.unwrapped.reset_infos[k] for k in np.flatnonzero(dones)]
-            record_metrics(self.logger, [{"metrics": info["last_metrics"]} for info in begun if "last_metrics" in info])
+            ended = [{"metrics": info["last_metrics"]} for info in begun if "last_metrics" in info]
+            record_metrics(self.logger, ended, self._keep_last)
+
+    def _keep_last(self, name: str, value: float) -> None:
+        """Keep a return or length of an agent for as many episodes as SB3 keeps the team's."""
+        self.agent_windows.setdefault(name, deque(maxlen=self._stats_window_size)).append(value)
+
+    def dump_logs(self) -> None:
+        """Write the log, see SB3."""
+        for name, values in self.agent_windows.items():
+            self.logger.record(name, sum(values) / len(values))
+        super().dump_logs()
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         self._seeds_of_reset = None
@@ -757,13 +833,9 @@ def _explained_id(env: Any) -> Iterator[None]:
     try:
         yield
     except gymnasium.error.UnregisteredEnv as error:
-        name, what = str(env).removesuffix("/parallel_env").replace("/", "."), "the environment"
-        with suppress(ValueError):
-            if all(map(str.isidentifier, name.split("."))) and hasattr(find_module(name), "parallel_env"):
-                what = f"{name}.parallel_env()"
         raise InvalidEnvironmentError(
-            f"env={env!r} is no id that Gymnasium knows ({error}): pass {what} itself, or import the package that "
-            "registers the id first."
+            f"env={env!r} is no id that Gymnasium knows ({error}), nor PACKAGE/MODULE of a PettingZoo environment: "
+            "pass the environment itself, or import the package that registers the id first."
         ) from error
 
 

@@ -22,7 +22,7 @@ _MOST_BYTES = 2**24  # of a file beside the model, also when it is read
 # Keys of a recipe that are no arguments of an algorithm
 _RECIPE = {"algo", "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps"}
 _RECIPE |= {"noise_std", "noise_type", "normalize", "policy", "vec_env_wrapper", "vec_env", "eval_env_kwargs"}
-_CURVES = {"timesteps", "results", "ep_lengths", "successes"}
+_CURVES = {"timesteps", "results", "ep_lengths", "successes", "agent_names", "agent_results", "agent_lengths"}
 
 
 def write_model_folder(

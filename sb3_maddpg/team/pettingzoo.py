@@ -10,19 +10,20 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatdim, flatten, flatten_space
+from gymnasium.spaces.utils import flatdim, flatten_space
 from pettingzoo import AECEnv, ParallelEnv
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_maddpg.errors import InvalidEnvironmentError
-from sb3_maddpg.team.spaces import TeamObservation, check_action_space, heads_of, into_box, joint_action_space
-from sb3_maddpg.utils import as_flag, as_number, as_numbers, as_seed, not_finite_at, shown, told
+from sb3_maddpg.team.agents import agent_actions, fits, flat
+from sb3_maddpg.team.spaces import TeamObservation, check_action_space, heads_of, joint_action_space
+from sb3_maddpg.utils import as_flag, as_number, as_seed, not_finite_at, shown, told
 
 ENTRY_POINT = f"{__name__}:make"
 MASK = "action_mask"
@@ -33,19 +34,6 @@ _BLACK_DEATH = (
     "agents are both terminated and truncated in the same step). Remove this wrapper: TeamEnv handles agents that end "
     "before the others."
 )
-
-
-class _Action(NamedTuple):
-    """The place of an agent's action in the joint action, and how to convert it."""
-
-    begin: int
-    end: int
-    space: spaces.Space
-    clips: bool
-    """Whether to clip again, because the space's precision is not that of the joint action"""
-    start: Any
-    scalar: Any
-    """The type of a number of the space"""
 
 
 class TeamEnv(gymnasium.Env):
@@ -139,6 +127,7 @@ class TeamEnv(gymnasium.Env):
             },
             _state_space(env) if state else None,
             {name: _mask_columns(s) for name, s in zip(self.agent_names, self._observation_spaces, strict=True)},
+            self._observation_spaces,
         )
         self.action_space = joint_action_space(action_spaces)
         self._state_space: Any = env.state_space if state else None
@@ -187,20 +176,18 @@ class TeamEnv(gymnasium.Env):
         return self.observation_space, self.action_space
 
     def _lay_out(self, action_spaces: Sequence[Any]) -> None:
-        ends = np.cumsum([len(heads_of(space)) for space in action_spaces]).tolist()
-        self._actions = []
+        self._actions = agent_actions(action_spaces)
+        length = self._actions[-1].end
         # Continuous actions are clipped to the first two bounds, all actions must lie within the last two
-        self._low = np.full(ends[-1], -np.inf, np.float32)
-        self._high = np.full(ends[-1], np.inf, np.float32)
-        self._least = np.full(ends[-1], np.finfo(np.float32).min)
+        self._low = np.full(length, -np.inf, np.float32)
+        self._high = np.full(length, np.inf, np.float32)
+        self._least = np.full(length, np.finfo(np.float32).min)
         self._most = -self._least
-        for space, begin, end in zip(action_spaces, [0, *ends], ends, strict=False):
+        for begin, end, space, *_ in self._actions:
             if isinstance(space, spaces.Box):
                 self._low[begin:end], self._high[begin:end] = space.low.ravel(), space.high.ravel()
             else:
                 self._least[begin:end], self._most[begin:end] = 0, np.array(heads_of(space)) - 1
-            clips = isinstance(space, spaces.Box) and space.dtype != np.float32
-            self._actions.append(_Action(begin, end, space, clips, _start_of(space), space.dtype.type))
         self._clip = any(isinstance(space, spaces.Box) for space in action_spaces)
         whole = np.concatenate([np.full(len(heads_of(one)), not isinstance(one, spaces.Box)) for one in action_spaces])
         self._whole = whole if whole.any() else None  # bits and categories
@@ -423,24 +410,7 @@ class TeamEnv(gymnasium.Env):
             self._refuse_action(values)
         if self._clip:
             values = np.minimum(np.maximum(values, self._low), self._high, dtype=np.float32)
-        actions = {}
-        for row in self._live:
-            begin, end, space, clips, start, scalar = self._actions[row]
-            part: Any
-            if isinstance(space, spaces.Discrete):
-                part = values[begin]
-                if start or type(part) is not scalar:
-                    part = scalar(int(part) + start)
-            elif isinstance(space, spaces.Box):
-                part = values[begin:end].reshape(space.shape)
-                if clips:
-                    part = into_box(space, part)
-            else:
-                part = values[begin:end].astype(space.dtype).reshape(space.shape)
-                if start is not None:
-                    part += start
-            actions[self._agents[row]] = part
-        return actions
+        return {self._agents[row]: self._actions[row].of(values) for row in self._live}
 
     def _inside(self, values: np.ndarray) -> np.ndarray:
         """:return: which numbers are finite and, unless they will be clipped, in their space, (length,)"""
@@ -475,12 +445,12 @@ class TeamEnv(gymnasium.Env):
                 matrix[row, :length] = observation.ravel()
                 continue
             try:
-                fits = _fits(space, observation)
-                if fits:
-                    matrix[row, :length] = _flat(space, observation)
+                fitting = fits(space, observation)
+                if fitting:
+                    matrix[row, :length] = flat(space, observation)
             except (TypeError, ValueError, LookupError, OverflowError):
-                fits = False
-            if not fits:
+                fitting = False
+            if not fitting:
                 shape = getattr(observation, "shape", None)
                 what = f"is {shown(observation)}" if shape in (None, space.shape) else f"has shape {shape}"
                 raise InvalidEnvironmentError(
@@ -549,7 +519,7 @@ class TeamEnv(gymnasium.Env):
 
     def _state(self, size: int) -> np.ndarray:
         try:
-            state = _flat(self._state_space, self.parallel_env.state())
+            state = flat(self._state_space, self.parallel_env.state())
         except NotImplementedError as error:
             raise InvalidEnvironmentError(
                 f"{self.parallel_env} has a state_space but no state(): set state=False."
@@ -734,12 +704,6 @@ class TurnBased(ParallelEnv):
         self.env.close()
 
 
-def _start_of(space: spaces.Space) -> Any:
-    """:return: the first category of each sub-action, None for other actions"""
-    start = getattr(space, "start", None)
-    return int(start) if isinstance(space, spaces.Discrete) else start  # type: ignore[arg-type]
-
-
 def _names_of_returns(names: Sequence[str]) -> list[str]:
     """:return: the names under which agents' returns are logged, other than that of the team's, ep_rew_mean"""
     renamed = "agent_mean"
@@ -752,46 +716,6 @@ def _agent_infos(infos: Mapping[Any, Any]) -> dict[str, Any]:
     if not any(infos.values()):
         return {}
     return {"agent_infos": {str(agent): info for agent, info in infos.items() if info}}
-
-
-def _fits(space: spaces.Space, value: Any) -> bool:
-    """
-    Check whether a value has the structure, shapes and categories of a space. Unlike ``contains``, this accepts any
-    data type.
-    """
-    if isinstance(space, spaces.Box):
-        return np.shape(value) == space.shape
-    if isinstance(space, spaces.Dict):
-        return isinstance(value, Mapping) and all(
-            name in value and _fits(part, value[name]) for name, part in space.items()
-        )
-    if isinstance(space, spaces.Tuple):
-        return isinstance(value, (tuple, list)) and len(value) == len(space) and all(map(_fits, space, value))
-    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-        array = np.asarray(value)
-        sizes = np.array(heads_of(space))
-        if array.dtype.kind not in "biuf" or array.size != len(sizes):
-            return False
-        index = array.ravel() - np.ravel(getattr(space, "start", 0))
-        return bool(((index == np.rint(index)) & (index >= 0) & (index < sizes)).all())
-    return bool(space.contains(value))
-
-
-def _flat(space: spaces.Space, value: Any) -> np.ndarray:
-    """
-    Flatten a value like Gymnasium's ``flatten``, but without casting numbers to the type of a ``Box``: NaN, infinity
-    and numbers out of an integer type's range would pass for others.
-
-    :raises ValueError: if the value does not hold real numbers
-    """
-    if isinstance(space, spaces.Box):
-        real = type(value) is np.ndarray and value.dtype.kind in "biuf"
-        return np.ravel(value if real else as_numbers(value))
-    if isinstance(space, spaces.Dict):
-        return np.concatenate([_flat(part, value[name]) for name, part in space.items()])
-    if isinstance(space, spaces.Tuple):
-        return np.concatenate([*map(_flat, space, value)])
-    return np.asarray(flatten(space, value))
 
 
 def what_to_pass(env: Any, taker: str) -> str:

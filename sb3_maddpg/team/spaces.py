@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.spaces.utils import flatdim
 
-from sb3_maddpg.errors import InvalidEnvironmentError, InvalidFileError
+from sb3_maddpg.errors import InvalidArgumentError, InvalidEnvironmentError, InvalidFileError
 from sb3_maddpg.files.typed_json import Json, add_codec, few, read_box, write_box
 from sb3_maddpg.utils import shown
 
@@ -26,6 +28,7 @@ class TeamObservation(spaces.Box):
     :param state: flat space of the global state, if critics should read it
     :param masks: by agent, the columns of its observation that hold its action mask: one column per category,
         sub-action after sub-action, or one per bit, positive if the choice is legal
+    :param own: each agent's observation space before it was flattened, by default the flat ones
     """
 
     def __init__(
@@ -33,8 +36,10 @@ class TeamObservation(spaces.Box):
         agents: Mapping[str, spaces.Box],
         state: spaces.Box | None = None,
         masks: Mapping[str, Sequence[int]] | None = None,
+        own: Sequence[spaces.Space] | None = None,
     ):
         self.names = tuple(agents)
+        self.agent_spaces: tuple[spaces.Space, ...] = tuple(agents.values() if own is None else own)
         self.masks = tuple(tuple(map(int, (masks or {}).get(name, ()))) for name in self.names)
         self.obs_dims = tuple(int(np.prod(space.shape)) for space in agents.values())
         self.state_dim = 0 if state is None else int(np.prod(state.shape))
@@ -234,7 +239,11 @@ def check_mask(agent: Any, space: spaces.Space, length: int) -> None:
 def _write_observation(space: TeamObservation, part: Callable[[Any], Json]) -> dict[str, Json]:
     names = {"names": list(space.names), "lengths": list(space.obs_dims), "state": space.state_dim}
     masks: dict[str, Json] = {"masks": [list(mask) for mask in space.masks]} if any(space.masks) else {}
-    return names | masks | write_box(space, part)
+    own: dict[str, Json] = {}
+    if any(not isinstance(one, spaces.Box) or len(one.shape) != 1 for one in space.agent_spaces):
+        with suppress(InvalidArgumentError):  # no file holds a space of an unknown class
+            own["own"] = [*map(part, space.agent_spaces)]
+    return names | masks | own | write_box(space, part)
 
 
 def _read_observation(entry: Mapping[str, Json], part: Callable[[Json], Any]) -> TeamObservation:
@@ -248,10 +257,20 @@ def _read_observation(entry: Mapping[str, Json], part: Callable[[Json], Any]) ->
     masks = dict(zip(entry["names"], entry.get("masks", []), strict=False))
     if any(not 0 <= column < own for mask in masks.values() for column in mask):
         raise InvalidFileError(f"it has action masks outside its observation of length {own}")
-    space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None, masks)
+    given = [*map(part, few(entry["own"]))] if "own" in entry else None
+    if given is not None and [_length(one) for one in given] != list(lengths):
+        raise InvalidFileError(f"its agents observe {shown(given)}, which do not have the lengths {shown(lengths)}")
+    space = TeamObservation(agents, spaces.Box(low, high, dtype=np.float32) if length else None, masks, given)
     if space.shape != box.shape:
         raise InvalidFileError(f"it has a team's observation of shape {box.shape} instead of {space.shape}")
     return space
+
+
+def _length(space: Any) -> int | None:
+    try:
+        return flatdim(space)
+    except (NotImplementedError, ValueError):  # it has none, or is no space
+        return None
 
 
 def _write_agents(space: MixedActions | CategoricalActions, part: Callable[[Any], Json]) -> dict[str, Json]:

@@ -176,6 +176,23 @@ class ObservationStatistics(NamedTuple):
                 )
         return cls(rms.mean, rms.var, rms.count, values["epsilon"], values["clip"])
 
+    def normalize(self, observation: np.ndarray) -> np.ndarray:
+        """
+        :param observation: observations of the team, (..., n_agents, columns)
+        :return: the same, normalised
+        """
+        scaled = (observation - self.mean) / np.sqrt(self.var + self.epsilon)
+        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
+
+    def of_agent(self, index: int, length: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """
+        :param index: index of an agent
+        :param length: length of its observation
+        :return: mean and standard deviation of its observation, (length,) each, and the limit of normalised ones
+        """
+        mean, var = (part[index, :length] for part in (self.mean, self.var))
+        return mean, np.sqrt(var + self.epsilon), self.clip
+
     def fill(self, env: VecNormalize) -> None:
         """:param env: a wrapper without statistics of its own, which goes on with these"""
         rms = env.obs_rms

@@ -22,7 +22,15 @@ from sb3_maddpg.common.estimators import ESTIMATORS
 ROOT = Path(__file__).parents[2]
 TRIED = "benchmarks/results/action_spaces.json"
 LEARNER = ("maddpg", "matd3", "pettingzoo", "relational", "migration", "support", "integrations")
-SITE = ("quickstart", "tensorboard", "resuming", "clusters", "tutorials/swarm", "tutorials/pettingzoo")
+SITE = (
+    "quickstart",
+    "team_environments",
+    "tensorboard",
+    "resuming",
+    "clusters",
+    "tutorials/swarm",
+    "tutorials/pettingzoo",
+)
 NO_LEARNING = (
     "tutorials/scenario",
     "tutorials/rule",
@@ -52,7 +60,7 @@ def examples(page: str) -> list[tuple[int, str]]:
 
 def test_the_reference_of_the_command_line_has_all_commands():
     parsers = re.findall(r"^:func: (.*)$", text_of("docs/cli.md"), re.MULTILINE)
-    assert sorted(parsers) == sorted(COMMANDS)
+    assert sorted(parsers) == sorted([*COMMANDS, "evaluate_elsewhere"])
     for name, command in COMMANDS.items():
         assert f"| [`{name}`](#{name}) | {command.help} |" in text_of("docs/cli.md")
     functions = runpy.run_path(str(ROOT / "docs/commands.py"))
@@ -225,7 +233,8 @@ def test_the_code_of_the_readme_fits_github():
 
 
 def test_the_table_of_libraries_is_what_was_tried():
-    rows = [line.strip("| ").split(" | ") for line in text_of("README.md").splitlines() if line.startswith("| ")]
+    lines = text_of("docs/migration.md").splitlines()
+    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
     titles = next(row for row in rows if "AgileRL 2.58" in row)
     cells = {row[0]: dict(zip(titles, row[1:], strict=True)) for row in rows if len(row) == len(titles) + 1}
     tried = {(row["library"], row["actions"]): row["trains"] for row in json.loads(text_of(TRIED))}

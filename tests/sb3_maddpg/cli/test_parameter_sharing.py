@@ -13,9 +13,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_maddpg.cli.main import main
 from sb3_maddpg.cli.overview import load_environments
 from sb3_maddpg.cli.parameter_sharing import AgentsVecEnv, SharedPolicy, shares_parameters
-from sb3_maddpg.cli.pettingzoo_ids import register
 from sb3_maddpg.cli.runs import latest_model
 from sb3_maddpg.matd3.matd3 import MATD3
+from sb3_maddpg.team.pettingzoo_ids import register
 
 SPREAD, TAG, SWARM = "mpe2/simple_spread_v3", "mpe2/simple_tag_v3", "quad_swarm/parallel_env"
 PADDED = ["supersuit.pad_observations_v0", "supersuit.pad_action_space_v0"]

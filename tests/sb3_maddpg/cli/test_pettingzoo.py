@@ -12,10 +12,10 @@ import quad_swarm
 from sb3_maddpg import MADDPG
 from sb3_maddpg.cli.main import main
 from sb3_maddpg.cli.overview import load_environments
-from sb3_maddpg.cli.pettingzoo_ids import register
 from sb3_maddpg.cli.recipe import check_env_kwargs, check_keys, recipe_path
 from sb3_maddpg.cli.runs import latest_model
 from sb3_maddpg.matd3.matd3 import MATD3
+from sb3_maddpg.team.pettingzoo_ids import register
 
 SPREAD = ["--env", "mpe2/simple_spread_v3"]
 

@@ -26,7 +26,7 @@ from sb3_maddpg.utils import arguments_of
 from toys import Neighbours, toy
 
 ALGOS = {"maddpg": MADDPG, "matd3": MATD3}
-NOISE = {"first_noise", "last_noise"}
+NOISE = {"first_noise", "noise_left"}
 SHARING = {"share_actor", "share_critic"}
 RECIPE = {
     "n_timesteps": 60,
@@ -192,7 +192,7 @@ def test_the_best_trial_is_written_as_a_recipe(folder, capsys):
     params = study().best_params
     assert recipe["gamma"] == pytest.approx(1 - params["one_minus_gamma"])
     assert recipe["tau"] == params["tau"]
-    assert not recipe.keys() & {"one_minus_gamma", "first_noise", "last_noise", "net_arch"}
+    assert not recipe.keys() & {"one_minus_gamma", "first_noise", "noise_left", "net_arch"}
     assert recipe["policy_kwargs"]["threshold"] == 0.25  # of the recipe that was searched from
     assert main([*command.split()[1:], "--eval-freq", "-1", "--verbose", "0"]) == 0
     model = MADDPG.load("logs/maddpg/OwnBit-v0_1/OwnBit-v0.zip")

@@ -284,7 +284,7 @@ def test_a_number_without_a_range_is_left_as_it_is(kind):
     obs = Fixed.observation_space.sample()
     action, _ = model.predict(obs, deterministic=True)
     assert (action[[1, 3]] == 2).all()
-    assert model.agent_policy(0).predict(obs[0])[1] == 2
+    assert model.agent_policy(0).predict(obs[0])[0][1] == 2
 
 
 def test_a_range_that_is_not_finite_is_refused():

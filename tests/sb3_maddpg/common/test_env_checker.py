@@ -17,9 +17,7 @@ from sb3_maddpg.team import toys as team_tasks
 from sb3_maddpg.team.team import TeamAttributes, TeamInfo
 from toys import AGENT_SPACES, Neighbours, Toy
 
-CONVENTION = (
-    (Path(__file__).parents[3] / "CONTRIBUTING.md").read_text().split("## The team convention")[1].split("\n## ")[0]
-)
+CONVENTION = (Path(__file__).parents[3] / "docs" / "team_environments.md").read_text()
 
 
 @pytest.mark.parametrize(

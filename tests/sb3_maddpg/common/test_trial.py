@@ -118,7 +118,7 @@ def policy_with(actor=None, critic=None, networks=None) -> type[MADDPGPolicy]:
 
 def test_a_policy_with_what_contributing_asks_for_learns():
     model = learned(policy=policy_with(Shared))
-    assert model.agent_policy(0).predict(np.ones(model.policy.team.obs_dim, np.float32)).shape == (3,)
+    assert model.agent_policy(0).predict(np.ones(model.policy.team.obs_dim, np.float32))[0].shape == (3,)
 
 
 @pytest.mark.parametrize(

@@ -438,7 +438,7 @@ def test_files_whose_joint_action_space_lost_data_types_still_load(tmp_path, mon
     obs = TeamEnv(Integers()).reset(seed=0)[0]
     before, after = (one.predict(obs, deterministic=True)[0] for one in (model, loaded))
     assert np.abs(before - after).max() <= 0.5  # rounded now
-    assert loaded.agent_policy(0).predict(obs[0, :2]).dtype == np.int64
+    assert loaded.agent_policy(0).predict(obs[0, :2])[0].dtype == np.int64
     loaded.learn(30)
 
 

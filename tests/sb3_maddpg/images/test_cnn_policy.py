@@ -168,7 +168,7 @@ def test_files_and_exported_policies_act_alike(tmp_path):
     expected = model.predict(obs, deterministic=True)[0].reshape(5, 2)
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0].reshape(5, 2), expected)
     agent = loaded.agent_policy("b")
-    np.testing.assert_array_equal(agent.predict(obs[:, 1]).ravel(), expected[:, 1])
+    np.testing.assert_array_equal(agent.predict(obs[:, 1])[0].ravel(), expected[:, 1])
     agent.export(tmp_path / "b.pt")
     script = th.jit.load(io.BytesIO((tmp_path / "b.pt").read_bytes()))
     np.testing.assert_array_equal(script(th.as_tensor(obs[:, 1])).numpy().ravel(), expected[:, 1])
@@ -271,7 +271,7 @@ def test_cnn_policies_divide_the_image_of_the_state_like_those_of_agents(normali
     loaded = MADDPG.load(tmp_path / "model")
     actions = model.actor(obs)
     assert th.equal(model.critic(obs, actions), loaded.critic(obs, actions))
-    assert loaded.agent_policy("a").predict(np.zeros((8, 8, 3), np.uint8)) in (0, 1)
+    assert loaded.agent_policy("a").predict(np.zeros((8, 8, 3), np.uint8))[0] in (0, 1)
 
 
 def test_normalised_images_are_not_divided_too():
@@ -297,8 +297,8 @@ def test_pictures_without_an_axis_of_channels():
     three = MADDPG("CnnPolicy", Pictures(*[spaces.Box(0, 255, (1, 40, 40), np.uint8)] * 2), **SMALL)
     three.policy.load_state_dict(model.policy.state_dict())
     picture = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
-    action = model.agent_policy("a").predict(picture)
-    assert action == three.agent_policy("a").predict(picture[None])
+    action, _ = model.agent_policy("a").predict(picture)
+    assert action == three.agent_policy("a").predict(picture[None])[0]
     assert spaces.Discrete(2).contains(action)
 
 

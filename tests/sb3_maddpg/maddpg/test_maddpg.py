@@ -704,7 +704,7 @@ def test_pytorch_s_default_of_double_precision_changes_nothing(estimator, tmp_pa
             loaded = MADDPG.load(tmp_path / "model")
             obs = np.zeros(model.observation_space.shape)
             assert np.array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
-            models.append((parameters(model), robot.predict(np.zeros(robot.obs_dim))))
+            models.append((parameters(model), robot.predict(np.zeros(robot.obs_dim))[0]))
             assert th.get_default_dtype() is default
         finally:
             th.set_default_dtype(th.float32)

@@ -76,7 +76,7 @@ def test_an_agent_alone_acts_as_in_its_team(kind):
     obs = th.rand(team.n_agents, team.obs_dim).numpy()
     obs[np.arange(team.obs_dim) >= np.array(team.obs_dims)[:, None]] = 0.0  # padding
     joint, _ = model.predict(obs, deterministic=True)
-    own = [model.agent_policy(name).predict(obs[row, : team.obs_dims[row]]) for row, name in enumerate(team.names)]
+    own = [model.agent_policy(name).predict(obs[row, : team.obs_dims[row]])[0] for row, name in enumerate(team.names)]
     # Categories of the joint action count from 0
     own = [np.ravel(one - getattr(space, "start", 0)) for one, space in zip(own, AGENT_SPACES[kind], strict=True)]
     assert np.concatenate(own) == pytest.approx(joint, abs=1e-5)

@@ -213,7 +213,7 @@ def test_masks_travel_with_models_and_single_agents(tmp_path):
     for number, part in enumerate((joint[:, :1], joint[:, 1:3], joint[:, 3:])):
         agent = loaded.agent_policy(number)
         own = obs[:, number, : agent.obs_dim]
-        assert np.array_equal(agent.predict(own), part)
+        assert np.array_equal(agent.predict(own)[0], part)
         for suffix in ("pt", "onnx"):
             agent.export(tmp_path / f"agent.{suffix}")
         assert np.array_equal(th.jit.load(tmp_path / "agent.pt")(th.as_tensor(own)).numpy(), part)

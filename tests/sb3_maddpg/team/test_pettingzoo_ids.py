@@ -4,8 +4,8 @@ import gymnasium
 import pytest
 from gymnasium import spaces
 
-from sb3_maddpg.cli import pettingzoo_ids
 from sb3_maddpg.team import pettingzoo as parallel
+from sb3_maddpg.team import pettingzoo_ids
 
 
 @pytest.fixture

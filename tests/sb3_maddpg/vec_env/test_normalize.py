@@ -265,13 +265,13 @@ def test_agents_carry_the_statistics(tmp_path):
     with pytest.warns(UserWarning, match="predict\\(\\) expects observations that are normalised"):
         loaded = MADDPG.load(tmp_path / "model")
     for agent in (model.agent_policy("b"), loaded.agent_policy("b")):
-        assert [int(agent.predict(obs[1])) for obs in raw] == expected[:, 1].tolist()
+        assert [int(agent.predict(obs[1])[0]) for obs in raw] == expected[:, 1].tolist()
     agent.export(tmp_path / "b.pt")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         program = th.jit.load(tmp_path / "b.pt")
     assert program(th.as_tensor(raw[:, 1])).ravel().tolist() == expected[:, 1].tolist()
-    assert loaded.agent_policy("a").predict(raw[0, 0, :2]).shape == ()
+    assert loaded.agent_policy("a").predict(raw[0, 0, :2])[0].shape == ()
 
 
 def test_a_model_goes_on_only_with_its_statistics(tmp_path):
