@@ -13,7 +13,7 @@ from matplotlib.ticker import FixedLocator, PercentFormatter
 
 from quad_swarm.evaluation.flight import Flight, fly
 from quad_swarm.evaluation.policies import is_model
-from quad_swarm.figures.colours import INK, LEARNED, RULES, STYLE
+from quad_swarm.figures.colours import COLOURS, INK, LEARNED, RULES, STYLE
 from quad_swarm.figures.plots import draw_flight, explain_flights
 from quad_swarm.world.presets import PRESETS, make_config
 from quad_swarm.world.scenarios import without_obstacles
@@ -62,7 +62,7 @@ def _draw_front(axes: Axes, preset: str, rules: Rows, sweep: Rows, tests: Rows) 
         label="hand-made rules, each setting tried (250 to 12,000 episodes)",
     )
     best = sorted((s, c) for s, c in tried if not any(s2 <= s and c2 < c for s2, c2 in tried))
-    axes.plot(*zip(*best, strict=True), color=RULES, drawstyle="steps-post", label="the best rules")
+    axes.plot(*zip(*best, strict=True), color=RULES, drawstyle="steps-post", label="the best rules, sealed flights")
     learned = sorted((r for r in sweep if is_model(r["policy"])), key=lambda r: r["request_share"])
     if learned:
         shares = [r["request_share"] for r in learned]
@@ -97,6 +97,76 @@ def _draw_front(axes: Axes, preset: str, rules: Rows, sweep: Rows, tests: Rows) 
     axes.yaxis.set_minor_locator(FixedLocator([]))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(lambda share, _: f"{100 * share:.4g}%")
+
+
+@rc_context(STYLE)
+def draw_flight_fronts(tried: Rows, sealed: Rows, path: Path) -> None:
+    """Draw plans sent against collisions in the symmetric swap of `flight`, with a panel for each number of robots:
+    rules tried on validation episodes, and the sealed flights of the best rule, five models and full communication.
+
+    :param tried: rows of `studies.swarm.tune_flight`
+    :param sealed: rows of its sealed sets
+    :param path: path of the figure
+    """
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, n in zip(panels, (8, 16), strict=True):
+        tries, flown = ([r for r in rows if _hardest(r, n)] for rows in (tried, sealed))
+        # Most were dropped after few episodes, which say little unless some ended in collisions
+        told = [r for r in tries if r["episodes"] >= 500 or r["collisions"] >= 3]
+        rules = [r for r in told if not is_model(r["setting"]) and r["setting"] != "full"]
+        axes.plot(
+            [r["request_share"] for r in rules],
+            [rate_of(r) for r in rules],
+            ".",
+            color=RULES,
+            markersize=4,
+            alpha=0.45,
+            label="hand-made rules: settings that were tried",
+        )
+        learned = [r for r in flown if is_model(r["policy"])]
+        _points(axes, [r for r in flown if r["policy"].startswith("cpa")], "D", INK, "the best rules, sealed flights")
+        _points(axes, learned, "*", LEARNED, "learned, five seeds at two thresholds, sealed flights")
+        full = [r for r in flown if r["policy"] == "full"]
+        _points(axes, full, "s", COLOURS[0], "full communication, sealed flights")
+        axes.set_title(f"{'Eight' if n == 8 else 'Sixteen'} robots, symmetric swap")
+        axes.set_xscale("log")
+        axes.set_xlim(2e-3, 1.3)
+        axes.set_yscale("symlog", linthresh=1e-3)
+        axes.set_ylim(-1e-4, 1)
+        axes.xaxis.set_major_locator(FixedLocator([0.003, 0.01, 0.03, 0.1, 0.3, 1]))
+        axes.xaxis.set_minor_locator(FixedLocator([]))
+        axes.yaxis.set_major_locator(FixedLocator([0, 1e-3, 1e-2, 1e-1, 1]))
+        axes.yaxis.set_minor_locator(FixedLocator([]))
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(lambda share, _: f"{100 * share:.4g}%")
+        axes.set_xlabel("plans sent, of all possible")
+    panels[0].set_ylabel("flights with a collision")
+    handles = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
+    figure.savefig(path)
+
+
+def _hardest(row: dict[str, Any], n_robots: int) -> bool:
+    return (row["scenario"], row["n_robots"]) == ("symmetric_swap", n_robots)
+
+
+def _points(axes: Axes, rows: Rows, marker: str, colour: str, label: str) -> None:
+    """Draw sealed flights with their 95 % intervals."""
+    rates = [rate_of(r) for r in rows]
+    errors = [[abs(r[f"collision_{end}"] - rate_of(r)) for r in rows] for end in ("low", "high")]
+    axes.errorbar(
+        [r["request_share"] for r in rows],
+        rates,
+        errors,
+        fmt=marker,
+        color=colour,
+        markersize=10 if marker == "*" else 6,
+        markeredgecolor="white",
+        markeredgewidth=0.7,
+        elinewidth=1,
+        label=label,
+    )
 
 
 def flights(model: str, rule: str, preset: str) -> dict[str, Flight]:

@@ -1,11 +1,11 @@
 """Fly the sealed tests of `flight-v2`: full communication, none, rules, a model of version 1, and rivals.
 
 ``python -m studies.swarm.version2 [--part full ...] [--episodes ...] [--jobs 2] [--json F]`` flies sets on which
-nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios with eight robots), ``sixteen``, ``rules``,
-``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and ``crazyflie``
-(the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and ``crowd`` (full
-communication of sixteen) in all scenarios. JSON: one row per policy, scenario and number of robots with the keys of
-`summarise`; written after each part, so that a run that is ended keeps what it has.
+nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios with eight robots), ``sixteen``,
+``rules``, ``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and
+``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
+``crowd`` (full communication of sixteen) in all scenarios. JSON: one row per policy, scenario and number of robots with
+the keys of `summarise`; written after each part, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
