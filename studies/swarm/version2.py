@@ -4,8 +4,8 @@
 nothing was chosen, in parts: set 700 is ``obstacles``, ``full`` (all scenarios with eight robots), ``sixteen``,
 ``rules``, ``teams`` (four and twelve) and ``none``; set 701 ``learned`` (version 1's model), ``hummingbird`` and
 ``crazyflie`` (the foreign simulators), ``delay_check`` (`studies.swarm.delay_check`), and ``four``, ``twelve`` and
-``crowd`` (full communication of sixteen) in all scenarios. JSON: one row per policy, scenario and number of robots with
-the keys of `summarise`; written after each part, so that a run that is ended keeps what it has.
+``crowd`` (full communication of sixteen) in all scenarios; set 702 ``identified``, RotorPy's Hummingbird with its own
+model in the planner. JSON: one row per policy, scenario and number of robots with the keys of `summarise`; written after each part, so that a run that is ended keeps what it has.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from studies.swarm.experiment import condition
 from studies.swarm.fly import CLEARANCE, DELAY_CHECK
 from studies.swarm.protocol import world
 
-SEALED, LATER = 700, 701
+SEALED, LATER, LAST = 700, 701, 702
 SWAPS = ("asymmetric_swap", "symmetric_swap")
 # Version 1's model, at its threshold and at the safe one
 LEARNED = str(pretrained_folder("quad-swarm-flight") / "model.zip")
@@ -48,6 +48,7 @@ class Part(NamedTuple):
     :param episodes: number of episodes of each
     :param set: index of the set of episodes
     :param plant: what flies
+    :param vehicle: whose model the planner has, None for the preset's
     """
 
     policies: tuple[str, ...]
@@ -56,6 +57,7 @@ class Part(NamedTuple):
     episodes: int
     set: int = SEALED
     plant: str = MODEL
+    vehicle: str | None = None
 
 
 PARTS = {
@@ -72,6 +74,9 @@ PARTS = {
     "crazyflie": Part(
         ("full", BEST_RULE, *MODELS, "none"), ("symmetric_swap",), (8,), 1000, LATER, "crazyflow:cf21B_500"
     ),
+    "identified": Part(
+        ("full", BEST_RULE, *MODELS), ("symmetric_swap",), (8,), 1000, LAST, "rotorpy:hummingbird", "hummingbird"
+    ),
     "delay_check": Part((DELAY_CHECK,), SWAPS, (8,), 1000, LATER),
     "four": Part(("full",), EVERYWHERE, (4,), 2000, LATER),
     "twelve": Part(("full",), EVERYWHERE, (12,), 2000, LATER),
@@ -86,7 +91,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
     """
     count = episodes or part.episodes
     for n in part.n_robots:
-        config = make_config(world("flight-v2", n), plant=part.plant)
+        config = make_config(world("flight-v2", n), plant=part.plant, quadrotor=part.vehicle)
         for scenario in part.scenarios:
             flown: dict[str, Rows] = {}
             conditions = [condition(policy, scenario, config) for policy in part.policies if policy != DELAY_CHECK]
@@ -100,7 +105,7 @@ def fly(part: Part, episodes: int | None, executor: Any) -> Iterator[dict[str, A
                 flown[DELAY_CHECK] = [row for rows in executor.map(fly_piece, pieces) for row in rows]
             for policy, rows in flown.items():
                 keys = {"policy": _name(policy), "scenario": scenario, "n_robots": n, "plant": part.plant}
-                yield keys | {"set": part.set} | summarise(rows, config)
+                yield keys | {"vehicle": part.vehicle, "set": part.set} | summarise(rows, config)
 
 
 def _name(policy: str) -> str:
