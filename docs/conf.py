@@ -1,5 +1,6 @@
 """The documentation site: ``make docs``."""
 
+from importlib.metadata import metadata
 from importlib.metadata import version as version_of
 
 project = "sb3-maddpg"
@@ -21,6 +22,9 @@ html_theme = "furo"
 html_title = "sb3-maddpg"
 html_logo = "images/logo.svg"
 html_theme_options = {"light_css_variables": {"code-font-size": "0.75rem"}}  # 98 columns fit beside the menu
+_urls = dict(one.split(", ", 1) for one in metadata("sb3-maddpg").get_all("Project-URL") or ())
+if repository := _urls.get("Repository"):  # `project.urls` in pyproject.toml
+    html_theme_options |= {"source_repository": repository, "source_branch": "main", "source_directory": "docs/"}
 html_static_path = ["_static"]
 html_css_files = ["tables.css"]
 html_js_files = ["keyboard.js"]
@@ -30,6 +34,7 @@ myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 4
 
 autodoc_member_order = "bysource"
+maximum_signature_line_length = 88
 autodoc_typehints = "description"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 # Their signatures and docstrings are their own projects'.

@@ -37,7 +37,13 @@ from studies.swarm.tune_flight import FULL, SWAPS, best_rule
 
 APPENDICES = ("swarm_tables", "flight_tables", "teams", "robustness", "asking")
 RESULTS = ("results", "lab_notebook", *(f"results/{name}" for name in APPENDICES))
-PAGES = (ROOT / "README.md", *(ROOT / "docs" / f"{page}.md" for page in (*RESULTS, "swarm_learning", "flight")))
+PAGES = (
+    ROOT / "README.md",
+    *(
+        ROOT / "docs" / f"{page}.md"
+        for page in (*RESULTS, "swarm_learning", "flight", "flight_policies", "flight_experiments", "simulators")
+    ),
+)
 IMAGES = ROOT / "docs" / "images"
 Rows = list[dict[str, Any]]
 # With which the best one was found; `families` has no longer the 56 of them that only a simulation can fly

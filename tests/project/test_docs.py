@@ -220,7 +220,7 @@ def test_a_duration_is_the_same_on_every_page():
     (flight,) = (run["seconds"] / 60 for run in whole if run["whole"])
     for page in ("README.md", "docs/tutorials/swarm.md", "docs/notebooks/quickstart.ipynb", "examples/train_swarm.py"):
         assert f"{paper:.1f} minutes on one core" in text_of(page), page
-    for page in ("README.md", "docs/flight.md"):
+    for page in ("README.md", "docs/flight_policies.md"):
         assert f"{flight:.0f} minutes on one core" in text_of(page), page
     assert f"whole training, {flight:.0f} minutes" in text_of("docs/resuming.md")
 

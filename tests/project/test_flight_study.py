@@ -15,7 +15,7 @@ from quad_swarm.task.rules import parse_rule
 from quad_swarm.world.presets import make_config
 from quad_swarm.world.scenarios import ScenarioSampler
 from studies import wind
-from studies.swarm import commitment, delay_check, fly, report, tune_flight, version2
+from studies.swarm import commitment, delay_check, fly, half_spaces, report, tune_flight, version2
 from studies.swarm.experiment import Experiment
 from studies.swarm.protocol import EARLIER, EARLIER_TEAMS, FLIGHT_TESTS, NAMES, TEST, VALIDATION, WORLDS
 
@@ -28,7 +28,30 @@ CALM = {
 
 
 def test_sets_of_episodes_are_apart():
-    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, version2.SEALED}) == 8
+    later = (version2.SEALED, version2.LATER, version2.LAST)
+    assert len({VALIDATION, EARLIER, EARLIER_TEAMS, TEST, *FLIGHT_TESTS.values(), WORLDS, *later}) == 10
+
+
+def test_the_table_at_a_glance_says_what_it_costs():
+    def row(policy: str, collisions: int, share: float, steps: float, name: str = "symmetric_swap") -> dict:
+        figures = {"n_robots": 8, "scenario": name, "policy": policy, "request_share": share, "episodes": 12000}
+        figures |= {"collisions": collisions, "steps_to_arrival": steps}
+        return figures | {"collision_low": collisions / 24000, "collision_high": collisions / 6000}
+
+    rows = [row("full", 0, 1.0, 70.0), row("none", 9000, 0.0, 80.0), row("cpa:1:2", 2, 0.07, 77.0)]
+    rows += [row("d/flight_seed0.zip", 3, 0.02, 73.5), row("d/flight_seed1.zip", 1, 0.01, 77.0)]
+    rows += [row("d/flight_seed1.zip", 99, 0.5, 1.0, name="random")]
+    text = report.glance_table(rows, "cpa:1:2").replace("&nbsp;", " ").replace("<br>", " ")
+    none, full, rule, learned = [line.strip("| ").split(" | ") for line in text.splitlines()[2:]]
+    assert none[1:] == ["9,000 of 12,000 [37.50, 150.00] %", "0.0%", "-"]
+    assert full[2:] == ["100.0%", "3.5 s"]
+    assert rule[2:] == ["7.0%", "+10%"]
+    assert learned == [
+        "**learned**, 2 training seeds",
+        "1 to 3 of 12,000 [0.00, 0.05] %",
+        "1.0% to 2.0%",
+        "+5% to +10%",
+    ]
 
 
 @pytest.mark.parametrize("family", tune_flight.families(16))
@@ -231,6 +254,42 @@ def test_plans_that_passed_the_delay_check_never_come_near_each_other(delay):
 def test_a_delay_check_needs_a_longest_delay():
     with pytest.raises(ValueError, match=r"radio\.jitter=1"):
         delay_check.DelayCheckedSwarm(make_config("flight"), 1, clearance=0.62)
+
+
+def test_a_delay_check_keeps_to_no_plans_that_were_sent():
+    with pytest.raises(ValueError, match=r"planner\.commitment=1: set it to 0"):
+        delay_check.DelayCheckedSwarm(make_config("flight-v2", {"radio": {"jitter": 0}}), 1, clearance=0.62)
+
+
+@pytest.mark.parametrize("kind", ["voronoi", "orca"])
+def test_half_spaces_touch_where_they_should(kind):
+    config = make_config("flight-v2", CALM | {"n_robots": 2, "radio": {"loss": 0, "jitter": 0}})
+    swarm = half_spaces.CautiousSwarm(config, 1, half_spaces.Fallback(kind, 0, 3.0))
+    swarm.reset(0, [[-1, 0, 1.5], [1, 0, 1.5]], [[1, 0, 1.5], [-1, 0, 1.5]])
+    problems = swarm._problems(*swarm._believe(np.zeros((1, 2, 1), dtype=bool)))
+    kept = config.planner.separation + problems.clearance[0, 0]
+    # Robot 0 rests at x = -1 and may go as far as half of the separation before the middle. ORCA's velocities shrink
+    # the gap to the separation and its margin within a second, half each
+    last = np.array([-0.5 * config.planner.separation, 0.0, 1.5])
+    if kind == "orca":
+        last = np.array([-1 + 0.5 * (2 - config.planner.separation - 0.15), 0.0, 1.5])
+    assert length(last - problems.others[0, 0, -1]) == pytest.approx(kept[-1], abs=1e-6)
+    assert length(last + np.array([0.05, 0, 0]) - problems.others[0, 0, -1]) < kept[-1]
+    assert swarm.replaced == swarm.beliefs_held == 2
+    far = half_spaces.CautiousSwarm(config, 1, half_spaces.Fallback(kind, 0, 1.9))
+    far.reset(0, [[-1, 0, 1.5], [1, 0, 1.5]], [[1, 0, 1.5], [-1, 0, 1.5]])
+    far.step(np.zeros((1, 2, 1), dtype=bool))
+    assert far.replaced == 0
+
+
+def test_the_table_of_half_spaces(tmp_path, monkeypatch, capsys):
+    words = ["--kind", "voronoi", "--age", "2", "--policy", "none", "--n-robots", "3", "--episodes", "2", "--jobs", "1"]
+    monkeypatch.setattr("sys.argv", ["half_spaces", *words, "--json", str(tmp_path / "rows.json")])
+    half_spaces.main()
+    without, with_it = read_rows(tmp_path / "rows.json")
+    assert (without["kind"], without["replaced"]) == ("none", 0.0)
+    assert (with_it["kind"], with_it["age"]) == ("voronoi", 2)
+    assert "voronoi, 2 steps, 1.2 m" in capsys.readouterr().out
 
 
 def test_the_tables_of_the_sealed_flights_compare_with_full_and_the_rule():

@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, Patch, Polygon
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FixedLocator, PercentFormatter
 from PIL import Image
 
 from quad_swarm.evaluation.flight import Condition, Flight, fly
@@ -22,6 +22,7 @@ from quad_swarm.figures.render import Renderer
 from quad_swarm.geometry import length
 from quad_swarm.world.beliefs import other_indices
 
+_SMALLEST_SHARE = 1e-3  # up to which axes are linear
 _SHORTEST_FRAME = 0.02  # players slow down shorter frames of a GIF (s)
 
 
@@ -72,6 +73,7 @@ def draw_requests(rows: Sequence[Mapping[str, Any]]) -> Figure:
     figure = Figure(figsize=(8, 3.5), layout="constrained")
     axes = figure.subplots()
     _bars(axes, rows, lambda r: r["request_share"], None)
+    _by_magnitude(axes, "y", 0.0)
     axes.set_ylabel("requests made, of all possible")
     return figure
 
@@ -97,11 +99,22 @@ def draw_front(rows: Sequence[Mapping[str, Any]]) -> Figure:
             axes.errorbar([x], [y], np.maximum(bar, 0), label=short_name(row["policy"]), **style)
         axes.set_title(name.replace("_", " "))
         axes.set_xlabel("requests made, of all possible")
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(PercentFormatter(1.0))
+        for which in ("x", "y"):
+            _by_magnitude(axes, which)
     panels[0][0].set_ylabel("episodes with a collision")
-    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    columns = min(5, 2 * len(scenarios))
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     return figure
+
+
+def _by_magnitude(axes: Axes, which: str, low: float = -_SMALLEST_SHARE / 5) -> None:
+    """Show fractions by their order of magnitude, and zero too: policies differ by tenths of a percent."""
+    getattr(axes, f"set_{which}scale")("symlog", linthresh=_SMALLEST_SHARE, linscale=0.5)
+    getattr(axes, f"set_{which}lim")(low, 1.4)
+    axis = getattr(axes, f"{which}axis")
+    axis.set_major_locator(FixedLocator([0, 1e-3, 1e-2, 1e-1, 1]))
+    axis.set_minor_locator(FixedLocator([]))
+    axis.set_major_formatter(lambda share, _: f"{100 * share:.4g}%")
 
 
 def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
