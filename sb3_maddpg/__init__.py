@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sb3_maddpg.common.buffers import PrioritizedTeamReplayBuffer, TeamReplayBuffer
     from sb3_maddpg.common.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
     from sb3_maddpg.common.env_checker import check_team_env
+    from sb3_maddpg.common.evaluation import TeamEvalCallback
     from sb3_maddpg.common.policies import MADDPGPolicy
     from sb3_maddpg.files.registry import allow_in_files
     from sb3_maddpg.files.trust import untrusted
@@ -43,6 +44,7 @@ _MODULES = {
     "PrioritizedTeamReplayBuffer": "common.buffers",
     "SafeVecNormalize": "vec_env.normalize",
     "TeamEnv": "team.pettingzoo",
+    "TeamEvalCallback": "common.evaluation",
     "TeamReplayBuffer": "common.buffers",
     "allow_in_files": "files.registry",
     "check_team_env": "common.env_checker",
@@ -66,6 +68,7 @@ __all__ = [
     "PrioritizedTeamReplayBuffer",
     "SafeVecNormalize",
     "TeamEnv",
+    "TeamEvalCallback",
     "TeamReplayBuffer",
     "allow_in_files",
     "check_team_env",

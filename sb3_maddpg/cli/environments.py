@@ -50,6 +50,11 @@ def find_environment(env_id: str | None) -> str:
         )
     if pettingzoo_ids.register(env_id):
         return env_id
+    if (entry := pettingzoo_ids.module_of(env_id)).isidentifier() and (path := Path(f"{entry}.py")).is_file():
+        raise InvalidArgumentError(
+            f"{path} has no function parallel_env, which creates a PettingZoo environment: add one, such as "
+            "`parallel_env = MyEnv` for a class."
+        )
     package, slash, _ = env_id.rpartition("/")
     ids = pettingzoo_ids.siblings(env_id) or list(gymnasium.registry)
     if slash and not any(name.startswith(f"{package}/") for name in ids):

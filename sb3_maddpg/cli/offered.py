@@ -75,6 +75,8 @@ def run(args: argparse.Namespace, words: list[str], example: str, user_errors: t
 
 def _print_help(group: str, example: str, names: list[str]) -> None:
     print(f"examples:\n{examples(group, example)}\n\nEnvironments (--env): {', '.join(names)}\n")
+    if group == "evaluators":
+        print("In any other environment, evaluate compares returns: `sb3-maddpg evaluate --env ENV --help`.\n")
     if group != "identifiers":
         models = ", ".join(f"pretrained:{name}" for name in pretrained_models())
         print(f"Models: MODEL.zip, latest:LOGDIR, {models}\n")

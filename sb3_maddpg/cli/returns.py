@@ -95,9 +95,11 @@ def run(args: argparse.Namespace, words: list[str]) -> int:
     load_environments()
     env_id = find_environment(args.env)
     policies = [_policy(word, args.algo, env_id) for word in options.policy]
-    if len({one.name for one in policies}) < len(policies):
-        raise InvalidArgumentError("--policy names one twice.")
+    if twice := [one for one in options.policy if options.policy.count(one) > 1]:
+        raise InvalidArgumentError(f"--policy names {twice[0]} twice.")
     if options.plot is not None:
+        if options.plot.exists() and not options.plot.is_dir():
+            raise InvalidArgumentError(f"--plot {options.plot} is a file: name a folder.")
         from sb3_maddpg.cli import plots  # noqa: F401  # which needs the extra 'plot'
     for path in (options.json, options.csv):
         if path not in (None, "-"):
@@ -115,7 +117,8 @@ def run(args: argparse.Namespace, words: list[str]) -> int:
                 for episode in play(model, env, options.episodes, options.seed, not options.stochastic):
                     played[one.name].append(episode)
                     bar.update()
-    rows = [_row(name, env_id, options.seed, episodes, played[policies[0].name]) for name, episodes in played.items()]
+    rival, files = played[policies[0].name], {one.name: one.path for one in policies}
+    rows = [_row(name, files[name], env_id, options.seed, episodes, rival) for name, episodes in played.items()]
     print(tables(rows), file=sys.stderr if options.json == "-" else sys.stdout)
     if options.json is not None:
         _write_json(options.json, rows)
@@ -171,8 +174,22 @@ def _load(policy: Policy, env_id: str, env: VecEnv, settings: Mapping[str, Any],
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".* was trained with VecNormalize")  # as `_Normalising` does
         model = load_model(cls, policy.path, shares, env, settings, options.seed, options.device)
+    if isinstance(model, TeamAlgorithm):
+        _check_team(policy, model, env)
     alone = isinstance(model, TeamAlgorithm) and model.normalized_observations and unwrap_vec_normalize(env) is None
     return _Normalising(model) if alone else model
+
+
+def _check_team(policy: Policy, model: TeamAlgorithm, env: VecEnv) -> None:
+    """:raises ValueError: if a model belongs to another team than an environment's"""
+    seen = (model.observation_space.shape, env.observation_space.shape), (model.action_space, env.action_space)
+    if any(own != other for own, other in seen):
+        trained = (model.env_spec or {}).get("id", "another environment")
+        raise InvalidArgumentError(
+            f"{policy.name} was trained in {trained}, for a team that observes {model.observation_space} and acts in "
+            f"{model.action_space}; here a team observes {env.observation_space} and acts in {env.action_space}. Pass "
+            "the --env and --env-kwargs of its training."
+        )
 
 
 class _Normalising:
@@ -187,8 +204,16 @@ class _Normalising:
         return self.model.predict(observation, **options)
 
 
-def _row(name: str, env_id: str, seed: int, episodes: Sequence[Episode], rival: Sequence[Episode]) -> dict[str, Any]:
-    row = {"policy": name, "env": env_id, "seed": seed, **summarise(episodes)}
+def _row(
+    name: str, path: Path | None, env_id: str, seed: int, episodes: Sequence[Episode], rival: Sequence[Episode]
+) -> dict[str, Any]:
+    row = {
+        "policy": name,
+        "model": None if path is None else str(path),
+        "env": env_id,
+        "seed": seed,
+        **summarise(episodes),
+    }
     return row if rival is episodes else row | {"difference": compare(episodes, rival)}
 
 
@@ -224,7 +249,8 @@ def tables(rows: Sequence[Mapping[str, Any]]) -> str:
         if unequal:
             agents[-1] += [f"{one['length']['mean']:.1f}" for one in figures]
     episodes = f"{rows[0]['episodes']} episodes of {rows[0]['env']} from seed {rows[0]['seed']}"
-    return f"{aligned(lines)}\n\n{aligned(agents)}\n\n{episodes}; sums of rewards, not discounted"
+    rewards = "return: of the team, as step() rewards it (in PettingZoo environments the mean over the agents)"
+    return f"{aligned(lines)}\n\n{aligned(agents)}\n\n{episodes}; {rewards}, not discounted"
 
 
 def _interval(figure: Mapping[str, Any], sign: str = "") -> str:

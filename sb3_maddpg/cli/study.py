@@ -40,6 +40,7 @@ from sb3_maddpg.cli.search import (
 )
 from sb3_maddpg.cli.terminal import aligned, tell
 from sb3_maddpg.cli.tuning import SPACES, Searched, convert_params
+from sb3_maddpg.common.evaluation import MEAN_REWARD
 from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
 from sb3_maddpg.files.model_files import trusted
 from sb3_maddpg.starting import uninterrupted
@@ -67,6 +68,8 @@ def tune(args: argparse.Namespace, words: list[str]) -> int:
     """
     if args.algo not in SPACES:
         raise InvalidArgumentError(suggest("algorithm with a search space", args.algo, SPACES))
+    if args.best_by != MEAN_REWARD:
+        raise InvalidArgumentError("--best-by is an option of train: trials are compared by the team's mean return.")
     if args.jobs not in (None, 1) or args.engine != "local" or args.address is not None:
         return search(args, words)
     given_seed = None if args.seed < 0 else args.seed  # a repeated command would draw another one

@@ -210,6 +210,11 @@ class Training:
                 args.n_eval_envs, experiment.eval_env_kwargs, evaluates=True, statistics=self._statistics()
             )
             team = issubclass(experiment.algorithm, TeamAlgorithm)
+            if args.best_by != MEAN_REWARD and args.eval_freq > experiment.n_timesteps:
+                raise InvalidArgumentError(
+                    f"--best-by {args.best_by} needs evaluations, but this training of {experiment.n_timesteps} steps "
+                    f"has none: pass an --eval-freq below {args.eval_freq}."
+                )
             if args.best_by != MEAN_REWARD and not team:
                 raise InvalidArgumentError(f"--best-by is for teams' algorithms, not for --algo {args.algo}.")
             kind: Any = partial(TeamEvalCallback, best_by=args.best_by) if team else EvalCallback

@@ -67,6 +67,8 @@ def make_vec_env(
     :return: the vectorised environment
     :raises ValueError: if there is no such environment
     """
+    if not isinstance(n_envs, int) or n_envs < 1:
+        raise InvalidEnvironmentError(f"n_envs={shown(n_envs)}: it must be an integer of at least 1.")
     if isinstance(env, str):
         if not register(env):
             raise InvalidEnvironmentError(

@@ -113,7 +113,12 @@ def test_arguments_of_the_environment_are_merged(here, capsys):
     ("words", "message"),
     [
         (("--policy", "nothing.zip"), "there is no file nothing.zip"),
-        (("--policy", "random", "random"), "--policy names one twice"),
+        (("--policy", "random", "random"), "--policy names random twice"),
+        (("--policy", "random", "--plot", "r.yml"), "--plot r.yml is a file: name a folder"),
+        (
+            ("--policy", "logs/maddpg/two_v0_1/two_v0.zip", "--env", "mpe2/simple_spread_v3"),
+            "was trained in two_v0, for a",
+        ),
         (("--policy", "random", "--episodes", "0"), "choose 1 or more"),
         (("--policy", "random", "--env-kwargs", "lenght:4"), "lenght"),
         (("--policy", "matd3:logs/maddpg/two_v0_1/two_v0.zip"), "MADDPG"),
