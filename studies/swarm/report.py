@@ -514,7 +514,7 @@ def glance_table(rows: Rows, best: str) -> str:
     groups = {
         "nobody tells anybody": [row for row in here if row["policy"] == "none"],
         "everybody tells everybody": [row for row in here if row["policy"] == FULL],
-        f"best of {RULES_TRIED} hand-made rules": [r for r in here if r["policy"] == best],
+        f"cheapest of {RULES_TRIED} rules that is safe everywhere": [r for r in here if r["policy"] == best],
         "**learned**": [row for row in here if "/flight_seed" in row["policy"]],
     }
     lines = []
@@ -528,7 +528,7 @@ def glance_table(rows: Rows, best: str) -> str:
         elif times and full and chosen[0]["policy"] != "none":  # only those arrive there that met nobody
             later = spread([f"+{time / full - 1:.0%}" for time in times])
         lines.append([what + seeds, seeds_rate(chosen), spread([f"{share:.1%}" for share in sent]), later])
-    return table(["", "flights with a collision", "plans sent", "all arrive after"], lines)
+    return table(["", "flights with a collision", "plans sent", "arrival (full) or later"], lines)
 
 
 def seeds_rate(rows: Rows) -> str:

@@ -270,7 +270,9 @@ def _fit(windows: _Windows, start: _Fitted | None = None) -> _Fitted:
     """Fit the lags, and then drag to the measured attitudes."""
     with needs_extra("identify", "plants"):
         from scipy.optimize import least_squares  # imported here, so that the help needs no extra
-    robots, lead = int(windows.robot.max()) + 1, windows.lead
+    # Some of the windows may be of fewer robots than all of them
+    robots = int(windows.robot.max()) + 1 if start is None else len(start.delays)
+    lead = windows.lead
     time = windows.time[:, lead:]
     measured = np.moveaxis(windows.state[:, lead:][..., list(_COLUMNS)], -1, 0)
     scale = np.array([0.1, 0.1, 1.0])  # rad, rad, m/s: corrected below

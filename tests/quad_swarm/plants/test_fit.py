@@ -70,6 +70,12 @@ def test_logs_are_fitted_together_across_gaps():
     check(fit(parts), "bebop2", 0.03)
 
 
+def test_a_robot_with_a_single_window_is_no_trouble():
+    """Its delay is known before the errors of the parameters are estimated without it."""
+    found = fit([flown(seconds=40.0, n=1)] + [flown(seconds=3.0, n=1)] * 7)
+    check(found, "bebop2", 0.02)
+
+
 def broken(**changes):
     log = flown(**changes.pop("flown", {}))
     state, setpoint = log.state.copy(), log.setpoint.copy()
