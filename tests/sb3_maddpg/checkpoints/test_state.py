@@ -30,6 +30,7 @@ from sb3_maddpg.checkpoints.callback import RunCheckpoint
 from sb3_maddpg.checkpoints.resume import resume
 from sb3_maddpg.checkpoints.state import digest
 from sb3_maddpg.common.callbacks import CurriculumCallback, DashboardCallback, MetricsCallback
+from sb3_maddpg.common.evaluation import TeamEvalCallback
 from sb3_maddpg.team.toys import OwnBit
 from sb3_maddpg.vec_env.states import Replayable
 
@@ -206,6 +207,7 @@ OBJECTS = {"eval_env", "callback", "callback_on_new_best", "model", "parent", "p
 
 PASSING = {"model", "parent", "locals", "globals", "num_timesteps", "pbar", "_is_success_buffer"}
 PASSING |= {"_total_max_episodes", "n_levels"}  # follow from arguments and the environment
+PASSING |= {"_tallies", "_episodes"}  # of one evaluation
 
 
 @pytest.mark.slow
@@ -224,6 +226,7 @@ def test_the_table_of_callbacks_holds_all_that_training_changes_in_them(tmp_path
         bar = ProgressBarCallback()
     given = [
         evaluation,
+        TeamEvalCallback(DummyVecEnv([lambda: Monitor(curriculum())]), "robot_0", eval_freq=90, verbose=0),
         EveryNTimesteps(90, CheckpointCallback(1, str(tmp_path / "models"))),
         LogEveryNTimesteps(70),
         StopTrainingOnMaxEpisodes(10**6),
@@ -246,6 +249,7 @@ def test_the_table_of_callbacks_holds_all_that_training_changes_in_them(tmp_path
         changed |= {(type(callback), name) for name in differ & kept}
     assert (StopTrainingOnMaxEpisodes, "n_episodes") in changed
     assert (EvalCallback, "best_mean_reward") in changed
+    assert (TeamEvalCallback, "best_value") in changed
 
 
 def test_the_window_of_a_curriculum_is_the_one_passed_now(tmp_path):
