@@ -30,7 +30,7 @@ from sb3_maddpg.cli.show import load_model, run_settings
 from sb3_maddpg.cli.terminal import aligned
 from sb3_maddpg.common.evaluation import Episode, compare, play, summarise
 from sb3_maddpg.common.team_algorithm import TeamAlgorithm
-from sb3_maddpg.errors import InvalidArgumentError
+from sb3_maddpg.errors import InvalidArgumentError, InvalidFileError
 
 RANDOM = "random"
 EXAMPLES = f"""\
@@ -155,7 +155,13 @@ def _prepare(
     settings, kwargs = run_settings(run, env_id, given)
     check_env_kwargs(env_id, kwargs)
     statistics = run / name_of(env_id) / STATISTICS
-    return settings, statistics if settings.get("normalize") and statistics.exists() else None, kwargs
+    if not settings.get("normalize") or statistics.exists():
+        return settings, statistics if settings.get("normalize") else None, kwargs
+    if policy.algo not in ALGORITHMS:  # whose files hold the statistics
+        raise InvalidFileError(
+            f"{statistics} is missing: the run of {policy.name} normalises its observations with it."
+        )
+    return settings, None, kwargs
 
 
 def _environment(

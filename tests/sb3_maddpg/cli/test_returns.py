@@ -102,6 +102,17 @@ def test_normalised_models_are_normalised_with_and_without_their_folder(here, ca
     assert normalised.obs_rms.count > 1
 
 
+def test_statistics_that_are_missing_are_not_left_out(here, capsys, tmp_path):
+    """The files of other algorithms do not hold them."""
+    settings = tmp_path / "two_v0"
+    settings.mkdir()
+    (settings / "config.yml").write_bytes((here / "logs/matd3/two_v0_1/two_v0/config.yml").read_bytes())
+    (tmp_path / "alone.zip").write_bytes((here / "logs/matd3/two_v0_1/two_v0.zip").read_bytes())
+    assert evaluate("--policy", f"ppo:{tmp_path / 'alone.zip'}", "--episodes", "2") == 1
+    assert "vecnormalize.pkl is missing" in capsys.readouterr().err
+    assert evaluate("--policy", f"matd3:{tmp_path / 'alone.zip'}", "--episodes", "2") == 0
+
+
 def test_arguments_of_the_environment_are_merged(here, capsys):
     words = ("--policy", "random", "--episodes", "3", "--env-kwargs", "length:4", "--json", "-")
     assert evaluate(*words) == 0
