@@ -37,6 +37,7 @@ from quad_swarm.world.swarm import Swarm
 from studies.swarm import protocol
 from studies.swarm.commitment import BEST_RULE
 from studies.swarm.experiment import fly_swarm
+from studies.swarm.version2 import OUTCOME, outcome
 
 _RADIUS = 20.0  # of the spheres that stand for half-spaces (m): within 1 m of the touching point, they differ by 2.5 cm
 _MARGIN = 0.15  # of ORCA, as `quad_swarm.planner.OrcaSolver` has it (m)
@@ -126,20 +127,14 @@ def fly(
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Format rows."""
-    texts = [["robots", "policy", "fallback", "collided", "95 % interval", "1 % closer than", "replaced", "plans",
-              "arrived", "steps"]]  # fmt: skip
+    texts = [["robots", "policy", "fallback", "replaced", *OUTCOME]]
     for row in rows:
         texts.append([
             str(row["n_robots"]),
             row["policy"],
             "none" if row["kind"] == "none" else f"{row['kind']}, {row['age']} steps, {row['distance']:g} m",
-            f"{row['collisions']}/{row['episodes']}",
-            f"{100 * row['collision_low']:.2f} - {100 * row['collision_high']:.2f} %",
-            f"{row['min_separation_quantiles']['0.01']:.3f} m",
             f"{row['replaced']:.2%}",
-            f"{row['request_share']:.2%}",
-            str(row["arrived"]),
-            "-" if row["steps_to_arrival"] is None else f"{row['steps_to_arrival']:.1f}",
+            *outcome(row),
         ])  # fmt: skip
     return aligned(texts, 3)
 

@@ -113,22 +113,30 @@ def _name(policy: str) -> str:
     return policy.replace(LEARNED, "pretrained:quad-swarm-flight")
 
 
+OUTCOME = ("collided", "95 % interval", "1 % closer than", "plans", "arrived", "steps")
+
+
+def outcome(row: dict[str, Any]) -> list[str]:
+    """Format what `OUTCOME` names."""
+    return [
+        f"{row['collisions']}/{row['episodes']}",
+        f"{100 * row['collision_low']:.2f} - {100 * row['collision_high']:.2f} %",
+        f"{row['min_separation_quantiles']['0.01']:.3f} m",
+        f"{row['request_share']:.2%}",
+        str(row["arrived"]),
+        "-" if row["steps_to_arrival"] is None else f"{row['steps_to_arrival']:.1f}",
+    ]
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Format rows."""
-    texts = [
-        ["robots", "scenario", "policy", "collided", "95 % interval", "1 % closer than", "plans", "arrived", "steps"]
-    ]
+    texts = [["robots", "scenario", "policy", *OUTCOME]]
     for row in rows:
         texts.append([
             str(row["n_robots"]),
             row["scenario"],
             row["policy"],
-            f"{row['collisions']}/{row['episodes']}",
-            f"{100 * row['collision_low']:.2f} - {100 * row['collision_high']:.2f} %",
-            f"{row['min_separation_quantiles']['0.01']:.3f} m",
-            f"{row['request_share']:.2%}",
-            str(row["arrived"]),
-            "-" if row["steps_to_arrival"] is None else f"{row['steps_to_arrival']:.1f}",
+            *outcome(row),
         ])  # fmt: skip
     return aligned(texts, 3)
 
