@@ -48,6 +48,7 @@ _ATTRIBUTES: dict[tuple[type, ...], tuple[str, ...]] = {
     (int, type(None)): ("seed",),
     (str, type(None)): ("tensorboard_log", "lean"),
     (dict, type(None)): ("env_spec",),
+    (dict,): ("agent_windows",),
     (deque, type(None)): ("ep_info_buffer", "ep_success_buffer"),
 }
 
@@ -245,6 +246,8 @@ def check_attributes(model: Any, path: Any) -> None:
                 fits = fits and 0 <= value <= _MOST.get(name, LARGEST - 1)
             elif isinstance(value, deque):
                 fits = all(map(_is_episode if name == "ep_info_buffer" else _is_real, value))
+            elif name == "agent_windows":
+                fits = all(isinstance(key, str) and _is_window(window) for key, window in value.items())
             if not fits:
                 raise InvalidFileError(f"{path} is damaged: its {name} is {shown(value)}.")
     if (model.ep_info_buffer is None) != (model.ep_success_buffer is None):
@@ -253,6 +256,11 @@ def check_attributes(model: Any, path: Any) -> None:
 
 def _is_real(value: Any) -> bool:
     return isinstance(value, (bool, int, float, np.bool_, np.number)) and math.isfinite(value)
+
+
+def _is_window(value: Any) -> bool:
+    """:return: whether a value holds the last values of a metric, of which there is at least one"""
+    return isinstance(value, deque) and len(value) > 0 and all(map(_is_real, value))
 
 
 def _is_episode(value: Any) -> bool:

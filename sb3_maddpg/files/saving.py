@@ -174,7 +174,7 @@ class SavesSafely(BaseAlgorithm):
             kept = ("actor.", "critic.")[: 1 + (lean == "critic")]
             weights = cast("dict[str, th.Tensor]", parameters["policy"])
             parameters = {"policy": {name: one for name, one in weights.items() if name.startswith(kept)}}
-            left_out |= {"ep_info_buffer", "ep_success_buffer", "_last_episode_starts"}
+            left_out |= {"agent_windows", "ep_info_buffer", "ep_success_buffer", "_last_episode_starts"}
         data = {key: encode(value, key) for key, value in vars(self).items() if key not in left_out}
         save_to_zip_file(file, data=data | {"lean": lean}, params=parameters, pytorch_variables={})
 

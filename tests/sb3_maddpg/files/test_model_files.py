@@ -1,6 +1,7 @@
 """Model files: whose they are, which format they have, and numbers that are not finite."""
 
 import base64
+import inspect
 import io
 import json
 import zipfile
@@ -12,7 +13,7 @@ from stable_baselines3 import PPO, TD3
 
 from sb3_maddpg import MADDPG
 from sb3_maddpg.files.archive import Archive, opened
-from sb3_maddpg.files.model_files import FILE_FORMAT, optimizer_not_finite, read_data
+from sb3_maddpg.files.model_files import _ATTRIBUTES, FILE_FORMAT, optimizer_not_finite, read_data
 from sb3_maddpg.matd3.matd3 import MATD3
 from sb3_maddpg.team.toys import OwnBit
 
@@ -123,12 +124,27 @@ def test_a_file_of_another_format_is_refused(tmp_path, changes):
         {"ep_info_buffer": {"$": "deque", "items": [1], "maxlen": 100}},
         {"ep_info_buffer": {"$": "deque", "items": [{"r": None, "l": 3, "t": 1.0}], "maxlen": 100}},
         {"ep_info_buffer": {"$": "deque", "items": [{"r": 1.0, "t": 1.0}], "maxlen": 100}},
+        {"agent_windows": []},
+        {"agent_windows": {"rollout/ep_rew_mean_a": 1.0}},
+        {"agent_windows": {"rollout/ep_rew_mean_a": {"$": "deque", "items": [], "maxlen": 100}}},
+        {"agent_windows": {"rollout/ep_rew_mean_a": {"$": "deque", "items": ["x"], "maxlen": 100}}},
     ],
 )
 def test_counters_that_no_training_wrote_are_refused(tmp_path, changes):
     learned().save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=f"its {next(iter(changes))} is"):
         MADDPG.load(rewritten(tmp_path / "model.zip", tmp_path / "other.zip", **changes))
+
+
+def test_each_attribute_in_a_file_has_a_check(tmp_path):
+    learned().save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        written = set(json.loads(archive.read("data")))
+    arguments = set(inspect.signature(MADDPG.__init__).parameters)
+    format_and_spaces = {"algorithm", "file_format", "policy_class", "action_space", "observation_space", "action_cost"}
+    recreated = {"lr_schedule", "sde_sample_freq", "_last_episode_starts"}
+    attributes = {name for names in _ATTRIBUTES.values() for name in names}
+    assert written - arguments - format_and_spaces - recreated <= attributes
 
 
 @pytest.mark.parametrize(
