@@ -246,7 +246,7 @@ def check_attributes(model: Any, path: Any) -> None:
                 fits = fits and 0 <= value <= _MOST.get(name, LARGEST - 1)
             elif isinstance(value, deque):
                 fits = all(map(_is_episode if name == "ep_info_buffer" else _is_real, value))
-            elif name == "agent_windows":
+            elif fits and name == "agent_windows":
                 fits = all(isinstance(key, str) and _is_window(window) for key, window in value.items())
             if not fits:
                 raise InvalidFileError(f"{path} is damaged: its {name} is {shown(value)}.")
