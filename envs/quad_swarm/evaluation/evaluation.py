@@ -338,11 +338,13 @@ def make_pool(jobs: int, engine: str = "local", address: str | None = None, mixe
 
 
 def user_modules() -> list[str]:
-    """Return the modules of what the registries hold, which other processes import first."""
+    """Return the modules of what users have added to the registries, which other processes import first."""
     rules = (make for make, _ in RULES.values())
     made = [*SCENARIOS.values(), *rules, *GROUPS.values(), *SOLVERS.values(), *PROBLEMS.values()]
     added = {getattr(one, "__module__", None) for one in made}
-    return sorted(name for name in added if isinstance(name, str) and name != "__main__")
+    return sorted(
+        name for name in added if isinstance(name, str) and name.partition(".")[0] not in ("quad_swarm", "__main__")
+    )
 
 
 # What users add to by name

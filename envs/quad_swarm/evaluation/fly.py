@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from quad_swarm.evaluation.command import preset_of, run
+from quad_swarm.evaluation.evaluation import user_modules
 from quad_swarm.evaluation.export import export
 from quad_swarm.evaluation.flight import first_episode
 from quad_swarm.evaluation.inference import wilson_interval
@@ -215,7 +216,7 @@ def fly(
             yield virtual.result(), True
         return
     exchange: Exchange = RosWorld(team.config.n_robots) if link == "ros2" else UdpWorld()
-    with Arena(team, exchange) as arena:
+    with Arena(team, exchange, modules=user_modules()) as arena:
         for scene, seed in flown:
             places = scene.starts, scene.goals
             for attempt in range(_ATTEMPTS):

@@ -42,7 +42,7 @@ def provenance(condition: Condition, preset: str, seed: int, solver: str) -> dic
         "versions": _versions(condition),
         "code_sha256": sources_digest("quad_swarm"),
     }
-    if modules := [name for name in user_modules() if not name.startswith("quad_swarm.")]:
+    if modules := user_modules():
         row["modules"] = {name: sources_digest(name) for name in modules}
     if is_model(condition.policy):
         row["model_sha256"] = hashlib.sha256(Path(condition.policy.partition("@")[0]).read_bytes()).hexdigest()

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -95,11 +96,18 @@ class Arena:
     :param team: the team
     :param exchange: how the world and the robots talk, by default over UDP
     :param log: folder for what the robots' processes print; by default it is shown
+    :param modules: what their processes import first, such as modules that register rules of your own
     :raises RobotEndedError: if a robot's process does not start
     :raises ValueError: if there are more than 64 robots, or the world's radio depends on distances
     """
 
-    def __init__(self, team: Team, exchange: Exchange | None = None, log: Path | None = None):
+    def __init__(
+        self,
+        team: Team,
+        exchange: Exchange | None = None,
+        log: Path | None = None,
+        modules: Sequence[str] = (),
+    ):
         if team.config.n_robots > _MOST_ROBOTS:
             raise ValueError(f"n_robots={team.config.n_robots}: at most {_MOST_ROBOTS} fly in real time here.")
         for name in ("range", "half_distance"):
@@ -121,7 +129,7 @@ class Arena:
         self._processes: list[subprocess.Popen[bytes]] = []
         self.vehicles.warm_up()
         try:
-            self._start(Path(self._folder.name) / "team.json", log)
+            self._start(Path(self._folder.name) / "team.json", log, modules)
         except BaseException:
             self.close()
             raise
@@ -248,14 +256,17 @@ class Arena:
         self._exchange.close()
         self._folder.cleanup()
 
-    def _start(self, path: Path, log: Path | None) -> None:
+    def _start(self, path: Path, log: Path | None, modules: Sequence[str]) -> None:
         """Start the processes, and wait until all are ready."""
         self.team.write(path)
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        # They import from where this process does, and not from the current folder if this one does not
+        environment |= {"PYTHONPATH": os.pathsep.join(os.path.abspath(one) for one in sys.path), "PYTHONSAFEPATH": "1"}
+        imports = ["--import", *modules] if modules else []
         for k in range(self.team.config.n_robots):
             with contextlib.ExitStack() as stack, without_priority():
                 output = None if log is None else stack.enter_context((log / f"robot_{k}.log").open("wb"))
-                command = self._exchange.process(path, k)
+                command = [*self._exchange.process(path, k), *imports]
                 self._processes.append(subprocess.Popen(command, env=environment, stdout=output, stderr=output))
         ends = time.monotonic() + _READY
         while len(self._ready) < len(self._processes):
@@ -264,7 +275,7 @@ class Arena:
             self.part(())  # who hears nothing for long takes the world to have ended
             if time.monotonic() > ends:
                 missing = [k for k in range(len(self._processes)) if k not in self._ready]
-                raise RobotEndedError(f"The robots {missing} were not ready within {_READY:g} s.")
+                raise RobotEndedError(_not_ready(missing, log))
 
     def _ended(self) -> set[int]:
         """Return the robots whose processes have been ended on purpose."""
@@ -304,3 +315,15 @@ class Arena:
         statistics = [None if one is None else Statistics.from_json(one["statistics"]) for one in done]
         traffic = [None if one is None else Traffic(**one["traffic"]) for one in done]
         return vehicles.flight(begins, statistics, traffic, sorted(killed), self._pace.pauses)
+
+
+def _not_ready(robots: Sequence[int], log: Path | None) -> str:
+    """Say that robots were not ready in time, and what may be the reason."""
+    load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+    where = "above" if log is None else f"in {log / f'robot_{robots[0]}.log'}"
+    return (
+        f"The robots {robots} were not ready within {_READY:g} s, though their processes run. The load of this machine "
+        f"is {load} on {os.cpu_count()} cores: if it is busy, or compiled the planner for the first time, try again or "
+        f"fly fewer robots. Otherwise see what they printed {where}, and whether their messages reach the world: both "
+        "need the same network interface, and with ROS 2 the same ROS_DOMAIN_ID and middleware."
+    )

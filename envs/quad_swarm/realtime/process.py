@@ -5,7 +5,9 @@ The world tells it when to fly and what it perceives, and takes its commands; pl
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import importlib
 import os
 import signal
 import sys
@@ -235,15 +237,29 @@ def without_priority() -> Iterator[None]:
         os.sched_setscheduler(0, policy, parameters)
 
 
-def run(path: str, make: Callable[[Team], tuple[SimulatedLink, SimulatedVehicle]]) -> int:
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a robot's process, see `quad_swarm.realtime.arena.Exchange.process`.
+
+    :param description: description of the process
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("team", type=Path, help="file of the team")
+    parser.add_argument("index", type=int, help="number of the robot")
+    parser.add_argument("--import", nargs="+", default=[], dest="modules", metavar="MODULE", help="modules to import")
+    return parser
+
+
+def run(args: argparse.Namespace, make: Callable[[Team], tuple[SimulatedLink, SimulatedVehicle]]) -> int:
     """Run the process of a robot.
 
-    :param path: file of the team
+    :param args: what `make_parser` parsed
     :param make: creates link and vehicle
     :return: exit status
     """
     try:
-        team = load(Path(path))
+        for name in args.modules:
+            importlib.import_module(name)
+        team = load(args.team)
         process = RobotProcess(team, *make(team))
     except (ValueError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 
-from quad_swarm.realtime.process import run
+from quad_swarm.realtime.process import make_parser, run
 from quad_swarm.realtime.team import Team
 from quad_swarm.realtime.udp import UdpLink
 from quad_swarm.realtime.udp_world import UdpVehicle
@@ -13,9 +12,7 @@ from quad_swarm.realtime.udp_world import UdpVehicle
 
 def main() -> int:
     """Run the process."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("team", help="file of the team")
-    parser.add_argument("index", type=int, help="number of the robot")
+    parser = make_parser(__doc__)
     parser.add_argument("world", help="address of the world, HOST:PORT")
     args = parser.parse_args()
     host, _, port = args.world.rpartition(":")
@@ -24,7 +21,7 @@ def main() -> int:
         link = UdpLink(args.index, group=team.group, session=team.session, checked=team.checked)
         return link, UdpVehicle(link, (host, int(port)), team.config.n_others)
 
-    return run(args.team, make)
+    return run(args, make)
 
 
 if __name__ == "__main__":

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
 
-from quad_swarm.realtime.process import run
+from quad_swarm.realtime.process import make_parser, run
 from quad_swarm.realtime.team import Team
 from quad_swarm.ros.link import RosLink
 from quad_swarm.ros.node import Mailbox, make_node
@@ -15,10 +14,7 @@ from quad_swarm.ros.world import RosVehicle, names_of
 
 def main() -> int:
     """Run the process."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("team", help="file of the team")
-    parser.add_argument("index", type=int, help="number of the robot")
-    args = parser.parse_args()
+    args = make_parser(__doc__).parse_args()
 
     def make(team: Team) -> tuple[RosLink, RosVehicle]:
         names = names_of(team.config.n_robots)
@@ -29,7 +25,7 @@ def main() -> int:
         return link, vehicle
 
     with contextlib.ExitStack() as stack:  # otherwise the middleware leaves its shared memory behind
-        return run(args.team, make)
+        return run(args, make)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ is below the node's, since Crazyswarm2 has a service ``/NAME/land`` of another t
 
 from __future__ import annotations
 
+import importlib
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -73,6 +74,7 @@ from quad_swarm.world.presets import SwarmConfig, make_config, points
 
 PARAMETERS: dict[str, Any] = {
     "policy": "",
+    "modules": [],
     "preset": "flight",
     "world": [],
     "names": [],
@@ -198,7 +200,7 @@ class RobotNode:
         """Take the transition ``configure``.
 
         :raises ValueError: if a parameter is wrong
-        :raises ImportError: if a package of messages is not there
+        :raises ImportError: if a package of messages, or one of the modules, is not there
         :raises OSError: if the folder of a model cannot be read
         """
         if self.flies:
@@ -269,6 +271,8 @@ class RobotNode:
     def _configure(self, values: dict[str, Any]) -> None:
         from std_srvs.srv import Trigger
 
+        for module in texts("modules", values["modules"]):
+            importlib.import_module(module)
         names, index = checked_names(values["names"]), values["index"]
         config = make_config(
             values["preset"], read_assignments("world", texts("world", values["world"])), n_robots=len(names)

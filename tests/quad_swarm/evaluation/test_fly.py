@@ -1,9 +1,12 @@
 """The command that flies robots in real time."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from network import alone
 
 from quad_swarm.evaluation.flight import Condition, begin, first_episode
 from quad_swarm.evaluation.fly import episodes, main
@@ -83,6 +86,34 @@ def test_a_learned_policy_flies_over_udp(tmp_path, capsys):
     assert (row["flights"], row["preset"], row["link"]) == (1, "flight", "udp")
     assert row["periods"] > 100
     assert not [name for name in row["counts"] if name.startswith("errors")]
+
+
+RULES = """
+import numpy as np
+from quad_swarm.task.rules import RULES
+
+def nearest():
+    def rule(view):
+        distance = np.linalg.norm(view.pos, axis=-1)
+        return distance == distance.min(axis=-1, keepdims=True)
+    return rule
+
+RULES["nearest_one"] = (nearest, ())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["udp", "ros2"])
+def test_a_rule_from_the_current_folder_flies_in_the_robots_processes(tmp_path, link):
+    if link == "ros2":
+        pytest.importorskip("rclpy")
+    (tmp_path / "my_rules.py").write_text(RULES)
+    fly = [*alone(), sys.executable, "-m", "sb3_maddpg", "fly", "--gym-packages", "my_rules", "--json", "rows.json"]
+    words = ["--policy", "nearest_one", "--n-robots", "3", "--most", "3", "--link", link]
+    done = subprocess.run([*fly, *words], cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((tmp_path / "rows.json").read_text())
+    assert row["counts"]["requests"] == pytest.approx(row["periods"], rel=0.05), "each robot asks one of two"
 
 
 @pytest.mark.parametrize(

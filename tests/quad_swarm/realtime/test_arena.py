@@ -2,11 +2,13 @@
 
 import os
 import signal
+import sys
 
 import numpy as np
 import pytest
 
 from quad_swarm.realtime import Conditions, Mode
+from quad_swarm.realtime import arena as arena_module
 from quad_swarm.realtime.arena import Arena, Pace, RobotEndedError
 from quad_swarm.realtime.link import monotonic, of_day
 from quad_swarm.realtime.team import Team
@@ -103,6 +105,21 @@ def test_a_process_that_does_not_start_is_told(tmp_path, monkeypatch):
     with pytest.raises(RobotEndedError, match=r"robot \d ended with exit status 1"):
         Arena(Team(CONFIG, "none"), log=tmp_path)
     assert "describes no team" in (tmp_path / "robot_0.log").read_text()
+
+
+class SilentWorld(UdpWorld):
+    """One robot runs, and is never heard."""
+
+    def process(self, team, robot):
+        return [sys.executable, "-c", "import time; time.sleep(60)"] if robot == 1 else super().process(team, robot)
+
+
+@pytest.mark.slow
+def test_a_robot_that_is_never_heard_is_told_with_what_may_be_the_reason(tmp_path, monkeypatch):
+    monkeypatch.setattr(arena_module, "_READY", 3.0)
+    monkeypatch.setattr(arena_module, "_ENDS", 0.1)
+    with pytest.raises(RobotEndedError, match=r"not ready within 3 s, .* load .* cores: .* in .*robot_\d\.log, .*ROS"):
+        Arena(Team(CONFIG, "none"), SilentWorld(), log=tmp_path)
 
 
 class LateWorld(UdpWorld):
