@@ -82,6 +82,7 @@ def judge(name: str, recording: Recording) -> Row:
         "plan_share": both / possible if knows_talk else None,
         **{name: recording.measured.get(name) for name in MEASURED},
         "contact": contact,
+        "radius_known": "radius" not in recording.guessed,
         "goal_radius": config.goal_radius,
         **(_among_obstacles(recording, config, beside) if recording.obstacles else {}),
     }
@@ -249,6 +250,8 @@ def legend(rows: Sequence[Row]) -> list[str]:
     lines = [
         f"collided: pairs of robots closer than {lengths('contact')} m; closest: at any time, straight between samples",
     ]
+    if unknown := ", ".join(row["flight"] for row in rows if not row["radius_known"]):
+        lines.append(f"radii are unknown, so contact is that of the preset (give --world radius=METRES): {unknown}")
     if any(row.get("closest_obstacle") is not None for row in rows):
         lines.append(
             "obstacles: robots that touch obstacles, as robot-obstacle, which count as collisions; closest: surfaces"

@@ -14,9 +14,11 @@ flight and to count its collisions; ``sb3-maddpg identify --log`` also needs att
 ``asked``, ``told``                robots whose plan it asked for, and to whom it sent its own unasked, as in ``2 5``
 ``obstacles``                      obstacles at the first time, see `Obstacle`, as JSON in one row; otherwise those that
                                    the world lists
+``world``, ``policy``              fields of the world, see `SwarmConfig`, as JSON, and what flew, in one row
 ================================== =========================================================
 
-A table does not hold the world, the policy and the plans, which the other two formats do.
+Of velocities, attitudes and goals, a table has all columns or none. It does not hold the plans, which the other two
+formats do.
 """
 
 from __future__ import annotations
@@ -47,8 +49,10 @@ _SET = ("roll_set", "pitch_set", "climb_set", "yaw_rate_set")
 _GOAL = ("goal_x", "goal_y", "goal_z")
 _MOST_ROBOTS, _MOST_TIMES, _MOST_OBSTACLES = 1000, 10**6, 200
 _MOST_DISTANCES = 10**6  # at once
-# What a file need not tell: velocities are then differences, attitudes 0, goals where robots end, and nobody talks
-GUESSES = ("velocity", "attitude", "goal", "talk")
+_FASTEST, _SLOWEST, _SHORT = 100.0, 0.01, 0.5  # m/s, m/s, m
+# What a file need not tell: velocities are then differences, attitudes 0, goals where robots end, nobody talks, and
+# radii are those of a preset
+GUESSES = ("velocity", "attitude", "goal", "talk", "radius")
 # What robots that fly in real time measure in a flight: their periods, missed ones included; plans that all sent; bytes
 # that a robot sent in a second; shares of the periods that were missed, and whose commands were late
 MEASURED = ("periods", "plans_sent", "bytes_per_second", "missed", "late")
@@ -343,11 +347,32 @@ def read(path: Path) -> Recording:
             from quad_swarm.evaluation import mcap_files
         readers[".mcap"] = mcap_files.read
     try:
-        return readers[path.suffix](path)
+        recording = readers[path.suffix](path)
+        _check_units(recording)
+        return recording
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror}).") from None
     except (ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile, EOFError, RecursionError) as error:
         raise ValueError(f"{path} is no recording of a flight: {shown(str(error))}.") from None
+
+
+def _check_units(recording: Recording) -> None:
+    """Check that robots move as fast as robots do.
+
+    :raises ValueError: if they do not
+    """
+    moved = length(np.diff(recording.state[..., POSITION], axis=0))
+    speed, paths = moved / np.diff(recording.time)[:, None], moved.sum(axis=0)
+    typical = float(np.median(speed[moved > 0])) if moved.any() else 0.0
+    if typical > _FASTEST:
+        raise ValueError(
+            f"its robots move at {typical:.3g} m/s, in the median: give positions in metres and times in seconds"
+        )
+    if paths.max() > _SHORT and speed.max() < _SLOWEST:
+        seconds = recording.time[-1] - recording.time[0]
+        raise ValueError(
+            f"its robots take {seconds:.0f} s for {paths.max():.1f} m: give positions in metres and times in seconds"
+        )
 
 
 def read_flights(
@@ -371,7 +396,11 @@ def read_flights(
         listed = world.obstacles.listed
         given = recording.world and listed != recording.config().obstacles.listed
         obstacles = listed if listed and given else recording.obstacles or listed
-        found.append((path, dataclasses.replace(recording, world=dataclasses.asdict(world), obstacles=obstacles)))
+        guessed = recording.guessed
+        if not recording.world and preset is None and not {"radius", "vehicles"} & set(changes or ()):
+            guessed |= {"radius"}
+        told: dict[str, Any] = {"world": dataclasses.asdict(world), "obstacles": obstacles, "guessed": guessed}
+        found.append((path, dataclasses.replace(recording, **told)))
     return found
 
 
@@ -441,8 +470,13 @@ def _write_csv(path: Path, recording: Recording) -> None:
     titles = [name for name, wanted in zip((*_STATE, *_SET, *_GOAL), shown, strict=True) if wanted]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        told = json.dumps(_plain(recording.obstacles)) if recording.obstacles else None
-        titles += [*(["asked", "told"] if known["talk"] else []), *(["obstacles"] if told else [])]
+        once = {
+            "obstacles": json.dumps(_plain(recording.obstacles)) if recording.obstacles else "",
+            "world": json.dumps(recording.world) if recording.world else "",
+            "policy": recording.policy,
+        }
+        once = {name: text for name, text in once.items() if text}
+        titles += [*(["asked", "told"] if known["talk"] else []), *once]
         writer.writerow(["time", "robot", *titles])
         for k, time in enumerate(recording.time):
             for robot in range(recording.n_robots):
@@ -451,11 +485,12 @@ def _write_csv(path: Path, recording: Recording) -> None:
                 texts = ("" if np.isnan(one) else repr(float(one)) for one in wanted)
                 talk = (recording.asked, recording.told) if known["talk"] else ()
                 lists = (" ".join(map(str, np.flatnonzero(one[k, robot]))) for one in talk)
-                writer.writerow([repr(float(time)), robot, *texts, *lists, *([told] if told else [])])
-                told = told and ""
+                writer.writerow([repr(float(time)), robot, *texts, *lists, *once.values()])
+                once = dict.fromkeys(once, "")
 
 
-def _read_csv(path: Path) -> Recording:
+def _rows_of_csv(path: Path) -> tuple[list[dict[str, Any]], np.ndarray, int]:
+    """Return the rows of a table by time and robot, the times (T,), and the number of robots n."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows: list[dict[str, Any]] = list(csv.DictReader(file))
     needed = ("time", "robot", *_STATE[:3])
@@ -472,7 +507,23 @@ def _read_csv(path: Path) -> Recording:
     if robots != list(range(len(robots))) or len(rows) != len(times) * len(robots):
         raise ValueError("it needs one row for each time and each robot, whose numbers count from 0")
     rows.sort(key=lambda row: (float(row["time"]), row["robot"]))
-    shape, time, guessed = (len(times), len(robots)), np.array(times), set()
+    return rows, np.array(times), len(robots)
+
+
+def _has(row: Mapping[str, Any], names: Sequence[str]) -> bool:
+    """Return whether a table has columns that belong together.
+
+    :raises ValueError: if it has some of them
+    """
+    there, missing = ([name for name in names if (name in row) is given] for given in (True, False))
+    if there and missing:
+        raise ValueError(f"it has {', '.join(there)}, but no {', '.join(missing)}: give all of them, or leave all out")
+    return not missing
+
+
+def _read_csv(path: Path) -> Recording:
+    rows, time, n = _rows_of_csv(path)
+    shape, guessed = (len(time), n), set()
 
     def column(name: str) -> np.ndarray:
         return np.array([float(row.get(name) or "nan") for row in rows]).reshape(shape)
@@ -481,25 +532,29 @@ def _read_csv(path: Path) -> Recording:
         return np.stack([column(name) for name in names], axis=-1)
 
     def columns_or(kind: str, names: Sequence[str], otherwise: np.ndarray) -> np.ndarray:
-        if set(names) <= rows[0].keys():
+        if _has(rows[0], names):
             return columns(names)
         guessed.add(kind)
         return otherwise
 
     def sets(name: str) -> np.ndarray:
-        marks = np.zeros((len(rows), len(robots)), dtype=bool)
+        marks = np.zeros((len(rows), n), dtype=bool)
         for row, mark in zip(rows, marks, strict=True):
             mark[[int(one) for one in (row.get(name) or "").split()]] = True
-        return marks.reshape(*shape, len(robots))
+        return marks.reshape(*shape, n)
 
     pos = columns(_STATE[:3])
-    vel = columns_or("velocity", _STATE[3:6], np.gradient(pos, time, axis=0) if len(times) > 1 else np.zeros_like(pos))
+    vel = columns_or("velocity", _STATE[3:6], np.gradient(pos, time, axis=0) if len(time) > 1 else np.zeros_like(pos))
     attitude = columns_or("attitude", _STATE[6:], np.zeros((*shape, 3)))
     goal = columns_or("goal", _GOAL, np.broadcast_to(pos[-1], pos.shape))[-1]
     if rows[0].keys().isdisjoint({"asked", "told"}):
         guessed.add("talk")
     state, plan = np.concatenate([pos, vel, attitude], axis=-1), np.zeros((*shape, 0, 3))
     talk = (sets("asked"), sets("told"))
-    obstacles = _obstacles(json.loads(next(filter(None, (row.get("obstacles") for row in rows)), "[]")))
+
+    def told(name: str) -> str:
+        return next(filter(None, (row.get(name) for row in rows)), "")
+
+    obstacles, world = _obstacles(json.loads(told("obstacles") or "[]")), dict(json.loads(told("world") or "{}"))
     arrays = (time, state, columns(_SET), plan, *talk, goal)
-    return Recording(*arrays, guessed=frozenset(guessed), obstacles=obstacles)
+    return Recording(*arrays, world, told("policy"), guessed=frozenset(guessed), obstacles=obstacles)

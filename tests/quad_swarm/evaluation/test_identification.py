@@ -128,7 +128,8 @@ def test_one_robot_and_a_table_of_your_own_are_enough(leave_out, tolerance, lab,
     ("change", "told"),
     [
         ({"leave_out": ["roll_set", "climb_set"]}, "has nothing in the columns roll_set, climb_set: a fit needs"),
-        ({"leave_out": ["pitch"]}, "has nothing in the columns roll, pitch, yaw"),
+        ({"leave_out": ["roll", "pitch", "yaw"]}, "has nothing in the columns roll, pitch, yaw"),
+        ({"leave_out": ["yaw"]}, "it has roll, pitch, but no yaw: give all of them, or leave all out"),
         (
             {"climb_set": lambda row: 0.0},
             "cannot determine climb_gain and climb_time_constant: climb_set varies by 0 m/s",

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from quad_swarm.evaluation.flight import Condition, fly
-from quad_swarm.evaluation.recordings import MEASURED, SUFFIXES, Recording, read, write
+from quad_swarm.evaluation.judging import judge, legend
+from quad_swarm.evaluation.recordings import MEASURED, SUFFIXES, Recording, read, read_flights, write
 from quad_swarm.world.obstacles import Obstacle
 from quad_swarm.world.presets import make_config
 
@@ -37,10 +38,10 @@ def test_what_is_written_is_read(suffix, recording, tmp_path):
     exact = suffix != ".mcap"  # whose velocities are turned into the robots' frames and back
     for name in ("time", "state", "setpoint", "asked", "told", "goal"):
         np.testing.assert_allclose(getattr(again, name), getattr(recording, name), atol=0 if exact else 1e-9)
+    assert again.policy == "a rule"
+    assert again.config() == recording.config()
     if suffix != ".csv":
         np.testing.assert_array_equal(again.plan, recording.plan)
-        assert again.policy == "a rule"
-        assert again.config() == recording.config()
 
 
 def test_a_recording_is_a_flight_again():
@@ -85,6 +86,9 @@ def test_a_laboratory_needs_five_columns(tmp_path):
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,0\n1,0,0,0,0\n", "one row for each"),
         ("time,robot,x,y,z\n0,0,0,0,0\n0,1,0,0,nan\n1,0,0,0,0\n1,1,0,0,0\n", "finite"),
         ("time,robot,x,y,z\n0,0,0,0,far\n", "far"),
+        ("time,robot,x,y,z,roll,pitch\n0,0,0,0,0,0,0\n", "it has roll, pitch, but no yaw: give all of them"),
+        ("time,robot,x,y,z,vz\n0,0,0,0,0,0\n", "it has vz, but no vx, vy"),
+        ("time,robot,x,y,z,world\n0,0,0,0,0,[1]\n1,0,0,0,0,\n", "no recording"),
         ("time,robot,x,y,z,asked\n0,0,0,0,0,7\n0,1,0,0,1,\n1,0,0,0,0,\n1,1,0,0,1,\n", "7"),
     ],
 )
@@ -94,6 +98,40 @@ def test_tables_of_something_else_are_refused(content, told, tmp_path):
     with pytest.raises(ValueError, match="is no recording of a flight") as error:
         read(path)
     assert told in str(error.value)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    ("metres", "seconds", "told"),
+    [(1000.0, 1.0, r"move at [0-9.e+]+ m/s, in the median"), (1.0, 1000.0, r"take \d+ s for \d\.\d m")],
+)
+def test_millimetres_and_milliseconds_are_refused(suffix, metres, seconds, told, recording, tmp_path):
+    if suffix == ".mcap":
+        pytest.importorskip("mcap_ros2")
+    path = tmp_path / f"flight{suffix}"
+    state = recording.state * np.where(np.arange(9) < 6, metres, 1.0)
+    write(path, dataclasses.replace(recording, state=state, time=recording.time * seconds))
+    with pytest.raises(ValueError, match=rf"its robots {told}: give positions in metres and times in seconds"):
+        read(path)
+
+
+def test_robots_that_stand_have_no_units(tmp_path, recording):
+    path = tmp_path / "flight.npz"
+    write(path, dataclasses.replace(recording, state=np.tile(recording.state[:1], (len(recording.time), 1, 1))))
+    assert read(path).n_robots == recording.n_robots
+
+
+@pytest.mark.parametrize(
+    ("given", "told"), [({}, True), ({"changes": {"radius": 0.1}}, False), ({"preset": "flight"}, False)]
+)
+def test_a_radius_that_nobody_told_is_said(given, told, tmp_path):
+    path = tmp_path / "lab.csv"
+    lines = ["time,robot,x,y,z", *(f"{t / 10},{k},{k},{t / 20},1" for t in range(4) for k in range(2))]
+    path.write_text("\n".join(lines))
+    ((_, recording),) = read_flights([path], **given)
+    row = judge("lab.csv", recording)
+    assert row["radius_known"] is not told
+    assert any("give --world radius=METRES): lab.csv" in line for line in legend([row])) is told
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mcap"])
@@ -163,7 +201,6 @@ def test_obstacles_are_read_as_they_were_written(suffix, recording, tmp_path):
     assert again.obstacles == AMONG
     np.testing.assert_allclose(again.state, recording.state, atol=1e-9)
     write(path, recording)
-    assert b"radius" not in path.read_bytes() or suffix != ".csv", "without obstacles, the file is as it was"
     assert read(path).obstacles == ()
 
 
@@ -175,7 +212,7 @@ def test_obstacles_that_are_none_are_refused(told, recording, tmp_path):
     write(path, dataclasses.replace(recording, obstacles=AMONG))
     with path.open(newline="") as file:
         rows = list(csv.reader(file))
-    rows[1][-1] = told
+    rows[1][rows[0].index("obstacles")] = told
     with path.open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     with pytest.raises(ValueError, match="is no recording of a flight"):
